@@ -1,0 +1,20 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "parallel.hpp"
+
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
+namespace radarsdf {
+
+int resolve_num_threads(int num_threads) {
+#ifdef _OPENMP
+  return num_threads > 0 ? num_threads : omp_get_max_threads();
+#else
+  (void)num_threads;
+  return 1;
+#endif
+}
+
+}  // namespace radarsdf

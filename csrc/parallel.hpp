@@ -1,0 +1,48 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Parallelism as a policy: the kernels are serial functions on a range, and this file runs them on threads.
+// The split depends on the sizes alone, never on which thread comes first, so results do not either.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <exception>
+
+namespace radarsdf {
+
+// 0 or less: as many as OpenMP would use (OMP_NUM_THREADS is respected). Never sets a global.
+int resolve_num_threads(int num_threads);
+
+// Runs task(i) for i in [0, num_tasks) on up to num_threads threads, each task whole on one thread.
+// An exception thrown by a task is rethrown here after all have ended: it must not leave an OpenMP region.
+template <typename Task>
+void parallel_tasks(std::int64_t num_tasks, int num_threads, const Task& task) {
+  const int threads = static_cast<int>(std::min<std::int64_t>(resolve_num_threads(num_threads), num_tasks));
+  if (threads <= 1) {
+    for (std::int64_t i = 0; i < num_tasks; ++i) task(i);
+    return;
+  }
+  std::exception_ptr error;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
+  for (std::int64_t i = 0; i < num_tasks; ++i) {
+    try {
+      task(i);
+    } catch (...) {
+#pragma omp critical(radarsdf_parallel_error)
+      if (!error) error = std::current_exception();
+    }
+  }
+  if (error) std::rethrow_exception(error);
+}
+
+// Runs body(begin, end) over [0, size) in blocks; no thread is woken for less than min_block items.
+template <typename Body>
+void parallel_blocks(std::int64_t size, std::int64_t min_block, int num_threads, const Body& body) {
+  if (size <= 0) return;
+  const std::int64_t threads = resolve_num_threads(num_threads);
+  const std::int64_t blocks = std::clamp<std::int64_t>(size / std::max<std::int64_t>(min_block, 1), 1, threads);
+  parallel_tasks(blocks, num_threads, [&](std::int64_t i) { body(size * i / blocks, size * (i + 1) / blocks); });
+}
+
+}  // namespace radarsdf
