@@ -2,10 +2,11 @@
 // SPDX-License-Identifier: MIT
 //
 // Table of contents of the compiled core. Each subject has its own file; the core itself knows no Python.
-#include <pybind11/pybind11.h>
+#include "arrays.hpp"
 
-namespace py = pybind11;
-
-PYBIND11_MODULE(_core, m, py::mod_gil_not_used()) {
+PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   m.doc() = "Compiled core of radarsdf: private, use the functions of the package.";
+  radarsdf::bind_system(m);
+  radarsdf::bind_vertex_table(m);
+  radarsdf::bind_encodings(m);
 }

@@ -1,0 +1,212 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include <memory>
+#include <optional>
+#include <vector>
+
+#include <pybind11/stl.h>
+
+#include "arrays.hpp"
+#include "cell_set.hpp"
+#include "encodings.hpp"
+#include "vertex_table.hpp"
+
+namespace radarsdf {
+namespace {
+
+// Hands a vector's memory to NumPy without a copy.
+template <typename T>
+Array<T> to_array(std::vector<T> values) {
+  auto owner = std::make_unique<std::vector<T>>(std::move(values));
+  T* data = owner->data();
+  const auto size = static_cast<py::ssize_t>(owner->size());
+  const py::capsule free(owner.get(), [](void* p) { delete static_cast<std::vector<T>*>(p); });
+  owner.release();  // only once the capsule exists
+  return Array<T>({size}, {static_cast<py::ssize_t>(sizeof(T))}, data, free);
+}
+
+std::int64_t check_points(const py::array& points) {
+  if (points.ndim() != 2 || points.shape(1) != 3) throw std::invalid_argument("points must have shape (N, 3)");
+  return points.shape(0);
+}
+
+template <typename T>
+void check_features(const VertexTable& table, const Array<T>& features) {
+  check_shape(features, table.num_rows(), kFeatureDim, "features");
+}
+
+// Checked arguments of the kernels that work on located points.
+template <typename T>
+PointBatch<T> point_batch(const VertexTable& table, const Array<T>& points, const Array<std::int32_t>& located,
+                          const std::optional<Array<T>>& directions) {
+  const std::int64_t count = check_points(points);
+  check_shape(located, count, table.num_levels(), "located");
+  if (directions) check_shape(*directions, count, 3, "directions");
+  return {points.data(), directions ? directions->data() : nullptr, located.data(), count};
+}
+
+template <typename T>
+void bind_kernels(py::class_<VertexTable>& cls) {
+  using Located = Array<std::int32_t>;
+  using Directions = std::optional<Array<T>>;
+  using namespace py::literals;
+
+  cls.def(
+      "locate",
+      [](const VertexTable& table, const Array<T>& points, Located& located, int num_threads) {
+        const std::int64_t count = check_points(points);
+        check_shape(located, count, table.num_levels(), "located");
+        const T* p = points.data();
+        std::int32_t* found = located.mutable_data();
+        const py::gil_scoped_release release;
+        locate(table, p, count, found, num_threads);
+      },
+      "points"_a.noconvert(), "located"_a.noconvert(), "num_threads"_a = 0,
+      "Writes the cell of each point (N, 3), local frame, m, at each level, or -1, to `located` (N, L) int32.");
+
+  cls.def(
+      "encode",
+      [](const VertexTable& table, const Array<T>& features, const Array<T>& points, Located& located, Rows<T>& out,
+         int num_threads) {
+        const std::int64_t count = check_points(points);
+        check_features(table, features);
+        check_shape(located, count, table.num_levels(), "located");
+        check_shape(out, count, table.num_levels() * kFeatureDim, "out");
+        const std::int64_t stride = row_stride(out, "out");
+        const T *f = features.data(), *p = points.data();
+        std::int32_t* found = located.mutable_data();
+        T* result = out.mutable_data();
+        const py::gil_scoped_release release;
+        encode(table, f, p, count, found, result, stride, num_threads);
+      },
+      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "out"_a.noconvert(), "num_threads"_a = 0,
+      "Locates the points and writes their interpolated features to `out` (N, 8 L).");
+
+  cls.def(
+      "interpolate",
+      [](const VertexTable& table, const Array<T>& features, const Array<T>& points, const Located& located,
+         const Directions& directions, Rows<T>& out, int num_threads) {
+        const PointBatch<T> batch = point_batch(table, points, located, directions);
+        check_features(table, features);
+        check_shape(out, batch.count, table.num_levels() * kFeatureDim, "out");
+        const std::int64_t stride = row_stride(out, "out");
+        const T* f = features.data();
+        T* result = out.mutable_data();
+        const py::gil_scoped_release release;
+        interpolate(table, f, batch, result, stride, num_threads);
+      },
+      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true),
+      "out"_a.noconvert(), "num_threads"_a = 0,
+      "Like `encode` for located points; with `directions` (N, 3), the directional derivative of the features.");
+
+  cls.def(
+      "scatter",
+      [](const VertexTable& table, const Array<T>& points, const Located& located, const Directions& directions,
+         const Rows<T>& out_grad, Array<T>& features_grad, int num_threads) {
+        const PointBatch<T> batch = point_batch(table, points, located, directions);
+        check_features(table, features_grad);
+        check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
+        const std::int64_t stride = row_stride(out_grad, "out_grad");
+        const T* grad = out_grad.data();
+        T* result = features_grad.mutable_data();
+        const py::gil_scoped_release release;
+        scatter(table, batch, grad, stride, result, num_threads);
+      },
+      "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true), "out_grad"_a.noconvert(),
+      "features_grad"_a.noconvert(), "num_threads"_a = 0,
+      "Adds the transpose of `interpolate`, applied to `out_grad` (N, 8 L), to `features_grad` (num_rows, 8).");
+
+  cls.def(
+      "coordinate_gradient",
+      [](const VertexTable& table, const Array<T>& features, const Array<T>& points, const Located& located,
+         const Directions& directions, const Rows<T>& out_grad, Array<T>& points_grad, int num_threads) {
+        const PointBatch<T> batch = point_batch(table, points, located, directions);
+        check_features(table, features);
+        check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
+        check_shape(points_grad, batch.count, 3, "points_grad");
+        const std::int64_t stride = row_stride(out_grad, "out_grad");
+        const T *f = features.data(), *grad = out_grad.data();
+        T* result = points_grad.mutable_data();
+        const py::gil_scoped_release release;
+        coordinate_gradient(table, f, batch, grad, stride, result, num_threads);
+      },
+      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true),
+      "out_grad"_a.noconvert(), "points_grad"_a.noconvert(), "num_threads"_a = 0,
+      "Writes the gradient of (interpolate . out_grad) by the points to `points_grad` (N, 3), 1/m.");
+}
+
+template <typename T>
+void bind_insert(py::class_<CellSet>& cls) {
+  using namespace py::literals;
+  cls.def(
+      "insert",
+      [](CellSet& cells, const Array<T>& points, int num_threads) {
+        const std::int64_t count = check_points(points);
+        const T* p = points.data();
+        const py::gil_scoped_release release;
+        cells.insert(p, count, num_threads);
+      },
+      "points"_a.noconvert(), "num_threads"_a = 0, "Marks the leaf cells that hold the points (N, 3), local frame, m.");
+}
+
+}  // namespace
+
+void bind_vertex_table(py::module_& m) {
+  using namespace py::literals;
+
+  py::enum_<Encoding>(m, "Encoding", "Which vertices of a cell carry features.")
+      .value("TRI_QUADTREE", Encoding::kTriQuadtree)
+      .value("OCTREE", Encoding::kOctree);
+
+  py::class_<CellSet> cell_set(m, "CellSet", "Set of occupied leaf cells, filled from points in chunks.");
+  cell_set.def(py::init<double>(), "leaf_size_m"_a)
+      .def("__len__", &CellSet::size)
+      .def(
+          "sorted_keys",
+          [](const CellSet& cells, int num_threads) {
+            std::vector<std::uint64_t> keys;
+            {
+              const py::gil_scoped_release release;
+              keys = cells.sorted_keys(num_threads);
+            }
+            return to_array(std::move(keys));
+          },
+          "num_threads"_a = 0, "Morton keys of the cells (C,) uint64, ascending.");
+  bind_insert<float>(cell_set);
+  bind_insert<double>(cell_set);
+
+  py::class_<VertexTable> table(m, "VertexTable", "From points to rows of the feature matrix (num_rows, 8).");
+  table
+      .def(py::init([](const Array<std::uint64_t>& leaf_keys, double leaf_size_m, int num_levels, Encoding encoding,
+                       int num_threads) {
+             std::vector<std::uint64_t> keys(leaf_keys.data(), leaf_keys.data() + leaf_keys.size());
+             const py::gil_scoped_release release;
+             return std::make_unique<VertexTable>(std::move(keys), leaf_size_m, num_levels, encoding, num_threads);
+           }),
+           "leaf_keys"_a.noconvert(), "leaf_size_m"_a, "num_levels"_a, "encoding"_a = Encoding::kTriQuadtree,
+           "num_threads"_a = 0)
+      .def_property_readonly("num_rows", &VertexTable::num_rows)
+      .def_property_readonly("num_cells", &VertexTable::num_cells)
+      .def_property_readonly("num_levels", &VertexTable::num_levels)
+      .def_property_readonly("leaf_size_m", &VertexTable::leaf_size_m)
+      .def_property_readonly("encoding", &VertexTable::encoding)
+      .def(
+          "leaf_keys", [](const VertexTable& t) { return to_array(std::vector<std::uint64_t>(t.leaf_keys())); },
+          "Morton keys of the occupied leaf cells (C,) uint64, ascending.")
+      .def(
+          "leaf_cells",
+          [](const VertexTable& t) {
+            const auto& keys = t.leaf_keys();
+            std::vector<std::int32_t> cells;
+            {
+              const py::gil_scoped_release release;
+              cells = leaf_coordinates(keys);
+            }
+            return to_array(std::move(cells)).reshape({static_cast<py::ssize_t>(keys.size()), py::ssize_t{3}});
+          },
+          "Lattice coordinates of the occupied leaf cells (C, 3) int32: cell i spans [i, i + 1) * leaf_size_m.");
+  bind_kernels<float>(table);
+  bind_kernels<double>(table);
+}
+
+}  // namespace radarsdf

@@ -1,0 +1,52 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// The encodings of a batch of points, on threads, by the kernels of the instruction set in use. All arrays are C-order;
+// `stride` is the distance between rows, so that encodings can be written side by side into one matrix.
+#pragma once
+
+#include <cstdint>
+
+#include "vertex_table.hpp"
+
+namespace radarsdf {
+
+// Points (count, 3) and the cells that hold them; `directions` as in interpolation_kernels.hpp.
+template <typename T>
+struct PointBatch {
+  const T* points;
+  const T* directions;  // or null
+  const std::int32_t* located;
+  std::int64_t count;
+};
+
+template <typename T>
+void locate(const VertexTable& table, const T* points, std::int64_t count, std::int32_t* located, int num_threads);
+
+// locate and interpolate in one pass.
+template <typename T>
+void encode(const VertexTable& table, const T* features, const T* points, std::int64_t count, std::int32_t* located, T* out,
+            std::int64_t stride, int num_threads);
+
+template <typename T>
+void interpolate(const VertexTable& table, const T* features, const PointBatch<T>& batch, T* out, std::int64_t stride,
+                 int num_threads);
+
+// Adds to features_grad (num_rows, 8). The order of the sums is that of the points, for any number of threads.
+template <typename T>
+void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride, T* features_grad,
+             int num_threads);
+
+template <typename T>
+void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,
+                         std::int64_t stride, T* points_grad, int num_threads);
+
+template <typename T>
+void fourier(const T* points, std::int64_t count, double half_width_m, int first_frequency, int num_frequencies, T* out,
+             std::int64_t stride, int num_threads);
+
+// Real spherical harmonics of degree 0..3 of unit vectors (count, 3): out (count, 16), in the order l, m = -l..l.
+template <typename T>
+void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::int64_t stride, int num_threads);
+
+}  // namespace radarsdf

@@ -1,0 +1,188 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "interpolation_kernels.hpp"
+
+#ifndef RADARSDF_ISA
+#error "RADARSDF_ISA names the instruction set that this copy is compiled for"
+#endif
+
+namespace radarsdf::RADARSDF_ISA {
+namespace {  // internal linkage for everything: see the header
+
+// A group of corners interpolates along NumAxes axes: a plane of the tri-quadtree along two, a cell of space along three.
+template <int NumGroupsV, int NumAxesV>
+struct Corners {
+  static constexpr int kGroups = NumGroupsV, kAxes = NumAxesV, kPerGroup = 1 << NumAxesV;
+};
+using Planes = Corners<3, 2>;
+using Space = Corners<1, 3>;
+
+// The i-th axis of a group: planes xy, xz, yz; or x, y, z.
+template <typename C>
+constexpr int axis_of(int group, int i) {
+  if (C::kAxes == 3) return i;
+  return i == 0 ? (group == 2 ? 1 : 0) : (group == 0 ? 1 : 2);
+}
+
+// Where a point lies in its cell.
+template <typename T>
+struct Local {
+  T fraction[3];
+  T inverse_size;  // 1/m
+};
+
+template <typename T>
+inline Local<T> local_coordinates(const Interpolation<T>& in, std::int64_t n, int level) {
+  Local<T> local;
+  const T scale = T(1) / static_cast<T>(1 << level);  // a power of two: all levels agree exactly on a point's cell
+  local.inverse_size = in.inverse_leaf_size * scale;
+  for (int axis = 0; axis < 3; ++axis) {
+    const T u = in.points[3 * n + axis] * in.inverse_leaf_size * scale;
+    const auto truncated = static_cast<T>(static_cast<std::int32_t>(u));
+    local.fraction[axis] = u - (u < truncated ? truncated - 1 : truncated);
+  }
+  return local;
+}
+
+// Product over the group's axes of the linear basis function of corner c, or, along the axes in the bit mask
+// `derivatives`, of its derivative (1/m). A second derivative along one axis is zero and never asked for.
+template <typename C, typename T>
+inline T basis(const Local<T>& local, int group, int c, int derivatives) {
+  T product = 1;
+  for (int i = 0; i < C::kAxes; ++i) {
+    const bool upper = c >> i & 1;
+    const T f = local.fraction[axis_of<C>(group, i)];
+    if (derivatives >> i & 1) {
+      product *= upper ? local.inverse_size : -local.inverse_size;
+    } else {
+      product *= upper ? f : 1 - f;
+    }
+  }
+  return product;
+}
+
+// W_k of the header for the corners of one group.
+template <typename C, bool kDirectional, typename T>
+inline void corner_weights(const Local<T>& local, const T* direction, int group, T* weights) {
+  for (int c = 0; c < C::kPerGroup; ++c) {
+    if (!kDirectional) {
+      weights[c] = basis<C>(local, group, c, 0);
+    } else {
+      weights[c] = 0;
+      for (int i = 0; i < C::kAxes; ++i) weights[c] += direction[axis_of<C>(group, i)] * basis<C>(local, group, c, 1 << i);
+    }
+  }
+}
+
+// dW_k/dx along the i-th axis of the group.
+template <typename C, bool kDirectional, typename T>
+inline T corner_weight_gradient(const Local<T>& local, const T* direction, int group, int c, int i) {
+  if (!kDirectional) return basis<C>(local, group, c, 1 << i);
+  T sum = 0;
+  for (int j = 0; j < C::kAxes; ++j) {
+    if (j != i) sum += direction[axis_of<C>(group, j)] * basis<C>(local, group, c, 1 << i | 1 << j);
+  }
+  return sum;
+}
+
+template <typename T>
+inline const T* direction_of(const Interpolation<T>& in, std::int64_t n) {
+  return in.directions ? in.directions + 3 * n : nullptr;
+}
+
+template <typename C, bool kDirectional, typename T>
+void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __restrict out, std::int64_t stride,
+                 std::int64_t begin, std::int64_t end) {
+  for (std::int64_t n = begin; n < end; ++n) {
+    for (int level = 0; level < in.num_levels; ++level) {
+      T sum[kFeatureDim] = {};
+      const std::int32_t cell = in.located[n * in.num_levels + level];
+      if (cell >= 0) {
+        const Local<T> local = local_coordinates(in, n, level);
+        T weights[kMaxCorners];
+        for (int group = 0; group < C::kGroups; ++group) {
+          corner_weights<C, kDirectional>(local, direction_of(in, n), group, weights + group * C::kPerGroup);
+        }
+        for (int k = 0; k < C::kGroups * C::kPerGroup; ++k) {
+          const T* row = features + static_cast<std::int64_t>(in.cells[cell].rows[k]) * kFeatureDim;
+          for (int d = 0; d < kFeatureDim; ++d) sum[d] += weights[k] * row[d];
+        }
+      }
+      T* result = out + n * stride + level * kFeatureDim;
+      for (int d = 0; d < kFeatureDim; ++d) result[d] = sum[d];
+    }
+  }
+}
+
+template <typename C, bool kDirectional, typename T>
+void scatter(const Interpolation<T>& in, const T* __restrict out_grad, std::int64_t stride, T* __restrict features_grad,
+             int level, int group, std::int64_t begin, std::int64_t end) {
+  for (std::int64_t n = begin; n < end; ++n) {
+    const std::int32_t cell = in.located[n * in.num_levels + level];
+    if (cell < 0) continue;
+    T weights[C::kPerGroup];
+    corner_weights<C, kDirectional>(local_coordinates(in, n, level), direction_of(in, n), group, weights);
+    const T* grad = out_grad + n * stride + level * kFeatureDim;
+    for (int c = 0; c < C::kPerGroup; ++c) {
+      T* row = features_grad + static_cast<std::int64_t>(in.cells[cell].rows[group * C::kPerGroup + c]) * kFeatureDim;
+      for (int d = 0; d < kFeatureDim; ++d) row[d] += weights[c] * grad[d];
+    }
+  }
+}
+
+template <typename C, bool kDirectional, typename T>
+void coordinate_gradient(const Interpolation<T>& in, const T* __restrict features, const T* __restrict out_grad,
+                         std::int64_t stride, T* __restrict points_grad, std::int64_t begin, std::int64_t end) {
+  for (std::int64_t n = begin; n < end; ++n) {
+    T sum[3][kFeatureDim] = {};  // one lane a feature, added up once a point
+    for (int level = 0; level < in.num_levels; ++level) {
+      const std::int32_t cell = in.located[n * in.num_levels + level];
+      if (cell < 0) continue;
+      const Local<T> local = local_coordinates(in, n, level);
+      const T* grad = out_grad + n * stride + level * kFeatureDim;
+      for (int group = 0; group < C::kGroups; ++group) {
+        for (int c = 0; c < C::kPerGroup; ++c) {
+          const T* row = features + static_cast<std::int64_t>(in.cells[cell].rows[group * C::kPerGroup + c]) * kFeatureDim;
+          for (int i = 0; i < C::kAxes; ++i) {
+            const T weight = corner_weight_gradient<C, kDirectional>(local, direction_of(in, n), group, c, i);
+            for (int d = 0; d < kFeatureDim; ++d) sum[axis_of<C>(group, i)][d] += weight * row[d] * grad[d];
+          }
+        }
+      }
+    }
+    for (int axis = 0; axis < 3; ++axis) {
+      T total = 0;
+      for (int d = 0; d < kFeatureDim; ++d) total += sum[axis][d];
+      points_grad[3 * n + axis] = total;
+    }
+  }
+}
+
+// The version with or without directions is chosen once a call, not once a point.
+template <typename C, typename T>
+constexpr InterpolationKernels<T> kKernels = {
+    [](const Interpolation<T>& in, const T* features, T* out, std::int64_t stride, std::int64_t begin, std::int64_t end) {
+      (in.directions ? interpolate<C, true, T> : interpolate<C, false, T>)(in, features, out, stride, begin, end);
+    },
+    [](const Interpolation<T>& in, const T* out_grad, std::int64_t stride, T* features_grad, int level, int group,
+       std::int64_t begin, std::int64_t end) {
+      (in.directions ? scatter<C, true, T> : scatter<C, false, T>)(in, out_grad, stride, features_grad, level, group,
+                                                                   begin, end);
+    },
+    [](const Interpolation<T>& in, const T* features, const T* out_grad, std::int64_t stride, T* points_grad,
+       std::int64_t begin, std::int64_t end) {
+      (in.directions ? coordinate_gradient<C, true, T> : coordinate_gradient<C, false, T>)(in, features, out_grad, stride,
+                                                                                           points_grad, begin, end);
+    }};
+
+}  // namespace
+
+template <typename T>
+const InterpolationKernels<T>& interpolation_kernels(Encoding encoding) {
+  return encoding == Encoding::kTriQuadtree ? kKernels<Planes, T> : kKernels<Space, T>;
+}
+
+template const InterpolationKernels<float>& interpolation_kernels(Encoding);
+template const InterpolationKernels<double>& interpolation_kernels(Encoding);
+
+}  // namespace radarsdf::RADARSDF_ISA

@@ -1,0 +1,45 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Integer lattice coordinates as one sortable 64-bit key: 21 bits an axis, interleaved (Morton order), so that
+// neighbours in space are neighbours in memory and the key of the parent cell is `key >> 3`.
+#pragma once
+
+#include <cstdint>
+
+namespace radarsdf {
+
+constexpr int kAxisBits = 21;
+// Added to a signed lattice coordinate before packing. Divisible by 2^level for every level that fits, so that
+// shifting a biased coordinate is the floor division that finds the parent.
+constexpr std::int32_t kAxisBias = 1 << (kAxisBits - 1);
+
+// Spreads the low 21 bits of v to every third bit.
+inline std::uint64_t spread_bits(std::uint64_t v) {
+  v &= 0x1fffff;
+  v = (v | v << 32) & 0x001f00000000ffff;
+  v = (v | v << 16) & 0x001f0000ff0000ff;
+  v = (v | v << 8) & 0x100f00f00f00f00f;
+  v = (v | v << 4) & 0x10c30c30c30c30c3;
+  v = (v | v << 2) & 0x1249249249249249;
+  return v;
+}
+
+inline std::uint32_t compact_bits(std::uint64_t v) {
+  v &= 0x1249249249249249;
+  v = (v | v >> 2) & 0x10c30c30c30c30c3;
+  v = (v | v >> 4) & 0x100f00f00f00f00f;
+  v = (v | v >> 8) & 0x001f0000ff0000ff;
+  v = (v | v >> 16) & 0x001f00000000ffff;
+  v = (v | v >> 32) & 0x1fffff;
+  return static_cast<std::uint32_t>(v);
+}
+
+// Biased coordinates in [0, 2^21).
+inline std::uint64_t morton_key(std::uint32_t x, std::uint32_t y, std::uint32_t z) {
+  return spread_bits(x) | spread_bits(y) << 1 | spread_bits(z) << 2;
+}
+
+inline std::uint32_t morton_coordinate(std::uint64_t key, int axis) { return compact_bits(key >> axis); }
+
+}  // namespace radarsdf

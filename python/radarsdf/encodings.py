@@ -1,0 +1,86 @@
+"""Encodings of positions and directions as modules: what the networks see instead of coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from radarsdf import kernels
+from radarsdf._core import Encoding, VertexTable
+
+
+class _VertexFeatures(nn.Module):
+    """Learnable vectors of 8 floats at the vertices of the occupied cells.
+
+    Parameters
+    ----------
+    leaf_keys : ndarray
+        (C,) uint64, Morton keys of the occupied leaf cells, ascending (``CellSet.sorted_keys``).
+    leaf_size_m : float
+        Edge of a cell of the finest level, m.
+    num_levels : int
+        Each level's cells are twice as large as those of the level before.
+    """
+
+    encoding: Encoding
+
+    def __init__(self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_levels: int) -> None:
+        super().__init__()
+        self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, self.encoding, torch.get_num_threads())
+        self.features = nn.Parameter(torch.zeros(self.table.num_rows, kernels.FEATURE_DIM))
+
+    def initialise(self, std: float, generator: torch.Generator | None = None) -> None:
+        """Draws the features from N(0, std²)."""
+        with torch.no_grad():
+            self.features.normal_(0.0, std, generator=generator)
+
+    def occupied(self, points: Tensor) -> Tensor:
+        """Whether each point (N, 3), local frame, m, lies in an occupied leaf cell: (N,) bool."""
+        return kernels.locate(points, self.table)[:, 0] >= 0
+
+
+class TriQuadtree(_VertexFeatures):
+    """Quadtrees on the planes xy, xz, yz: planes summed, levels concatenated (3QFP, ICRA 2024).
+
+    ``forward`` takes points (N, 3), local frame, m, and returns (N, 8 · num_levels).
+    """
+
+    encoding = Encoding.TRI_QUADTREE
+
+    @property
+    def dim(self) -> int:
+        return kernels.FEATURE_DIM * self.table.num_levels
+
+    def forward(self, points: Tensor) -> Tensor:
+        return kernels.interpolate(self.features, points, self.table)
+
+
+class Fourier(nn.Module):
+    """Sine and cosine of 2^k·π·x / half_width for a range of k (3QFP's positional encoding).
+
+    ``forward`` takes points (N, 3), local frame, m, and returns (N, 6 · num_frequencies).
+    """
+
+    def __init__(self, half_width_m: float, first_frequency: int, num_frequencies: int) -> None:
+        super().__init__()
+        self.half_width_m = half_width_m
+        self.first_frequency = first_frequency
+        self.num_frequencies = num_frequencies
+
+    @property
+    def dim(self) -> int:
+        return 6 * self.num_frequencies
+
+    def forward(self, points: Tensor) -> Tensor:
+        return kernels.fourier(points, self.half_width_m, self.first_frequency, self.num_frequencies)
+
+
+class SphericalHarmonics(nn.Module):
+    """Real spherical harmonics of degree 0 to 3 ("degree 4" of the paper): unit vectors (N, 3) to (N, 16)."""
+
+    dim = kernels.NUM_SPHERICAL_HARMONICS
+
+    def forward(self, directions: Tensor) -> Tensor:
+        return kernels.spherical_harmonics(directions)

@@ -1,0 +1,246 @@
+"""The compiled kernels against plain references, their gradients, and what they promise about bits and threads."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import sph_harm_y
+
+from radarsdf import _core, kernels
+
+LEAF_M = 0.2
+ENCODINGS = [_core.Encoding.TRI_QUADTREE, _core.Encoding.OCTREE]
+PLANES = [(0, 1), (0, 2), (1, 2)]
+
+
+@pytest.fixture(params=_core.available_instruction_sets())
+def instruction_set(request):
+    before = _core.instruction_set()
+    _core.set_instruction_set(request.param)
+    yield request.param
+    _core.set_instruction_set(before)
+
+
+def surface_points(count, seed=0, extent_m=4.0, dtype=np.float64):
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(-extent_m, extent_m, (count, 2))
+    z = 0.7 * np.sin(xy[:, 0]) + rng.uniform(-0.3, 0.3, count)
+    return np.column_stack([xy, z]).astype(dtype)
+
+
+def make_table(points, num_levels=3, encoding=_core.Encoding.TRI_QUADTREE, num_threads=0):
+    cells = _core.CellSet(LEAF_M)
+    cells.insert(np.ascontiguousarray(points), num_threads)
+    return _core.VertexTable(cells.sorted_keys(num_threads), LEAF_M, num_levels, encoding, num_threads)
+
+
+class Reference:
+    """Dictionaries and loops: slow, plainly what the method says, and numbered by nothing but its own keys."""
+
+    def __init__(self, points, num_levels, encoding):
+        leaf = {tuple(cell) for cell in np.floor(points / LEAF_M).astype(int).tolist()}
+        self.cells = [{tuple(c >> level for c in cell) for cell in leaf} for level in range(num_levels)]
+        self.groups = PLANES if encoding == _core.Encoding.TRI_QUADTREE else [(0, 1, 2)]
+
+    def weights(self, point, level):
+        """{(level, group, vertex): weight} of one point."""
+        u = point / LEAF_M / 2**level
+        cell = np.floor(u).astype(int)
+        if tuple(cell) not in self.cells[level]:
+            return {}
+        result = {}
+        for group in self.groups:
+            for corner in np.ndindex(*(2,) * len(group)):
+                vertex = tuple(int(cell[axis]) + step for axis, step in zip(group, corner, strict=True))
+                factors = [
+                    u[axis] - cell[axis] if step else 1 - (u[axis] - cell[axis])
+                    for axis, step in zip(group, corner, strict=True)
+                ]
+                result[level, group, vertex] = math.prod(factors)
+        return result
+
+    def num_vertices(self):
+        vertices = set()
+        for level, cells in enumerate(self.cells):
+            for cell in cells:
+                for group in self.groups:
+                    for corner in np.ndindex(*(2,) * len(group)):
+                        vertices.add((level, group, tuple(cell[a] + s for a, s in zip(group, corner, strict=True))))
+        return len(vertices)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("num_levels", [1, 3, 5])
+def test_interpolation_equals_the_dictionary_reference(encoding, num_levels, instruction_set):
+    occupied = surface_points(300)
+    table = make_table(occupied, num_levels, encoding)
+    reference = Reference(occupied, num_levels, encoding)
+    assert table.num_rows == reference.num_vertices()
+
+    rng = np.random.default_rng(1)
+    queries = np.concatenate([occupied[:100], rng.uniform(-5, 5, (200, 3))])
+    # One-hot features of the rows tell which row each vertex has: the map from vertex to row must be one to one.
+    features = rng.normal(size=(table.num_rows, 8))
+    out = kernels.interpolate(torch.tensor(features), torch.tensor(queries), table).numpy()
+    weights_of_rows = np.zeros((len(queries), num_levels, table.num_rows))
+    for block in range(0, table.num_rows, 8):
+        one_hot = np.zeros((table.num_rows, 8))
+        width = min(8, table.num_rows - block)
+        one_hot[block : block + width, :width] = np.eye(width)
+        y = kernels.interpolate(torch.tensor(one_hot), torch.tensor(queries), table).numpy()
+        weights_of_rows[:, :, block : block + width] = y.reshape(len(queries), num_levels, 8)[:, :, :width]
+
+    row_of = {}
+    for n, query in enumerate(queries):
+        for level in range(num_levels):
+            expected = reference.weights(query, level)
+            found = {int(row): weights_of_rows[n, level, row] for row in np.flatnonzero(weights_of_rows[n, level])}
+            assert sorted(found.values()) == pytest.approx(sorted(expected.values()), abs=1e-12)
+            if len(set(np.round(list(expected.values()), 9))) == len(expected):  # weights tell the vertices apart
+                by_weight = sorted(found, key=found.__getitem__)
+                for vertex, row in zip(sorted(expected, key=expected.__getitem__), by_weight, strict=True):
+                    assert row_of.setdefault(vertex, row) == row
+    assert len(set(row_of.values())) == len(row_of)
+    np.testing.assert_allclose(
+        out.reshape(len(queries), num_levels, 8), np.einsum("nlr,rd->nld", weights_of_rows, features), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_gradients_of_interpolation(encoding, instruction_set):
+    table = make_table(surface_points(40, extent_m=1.0), 3, encoding)
+    # Away from the cells' borders, where the gradient by the points jumps.
+    points = surface_points(12, seed=0, extent_m=1.0)
+    points = torch.tensor((np.floor(points / LEAF_M) + 0.1 + 0.8 * np.random.default_rng(2).random(points.shape)) * LEAF_M)
+    features = torch.randn(table.num_rows, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    inputs = (features.requires_grad_(), points.requires_grad_())
+    assert (kernels.locate(points, table) >= 0).any(1).all()
+
+    def function(f, x):
+        return kernels.interpolate(f, x, table)
+
+    assert torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-7)
+    assert torch.autograd.gradgradcheck(function, inputs, eps=1e-6, atol=1e-7)
+
+
+def test_gradients_of_fourier():
+    points = torch.randn(7, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    function = lambda x: kernels.fourier(x, 3.0, 0, 4)  # noqa: E731
+    assert torch.autograd.gradcheck(function, (points,))
+    assert torch.autograd.gradgradcheck(function, (points,))
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-7), (torch.float64, 1e-15)])
+def test_fourier_equals_sin_and_cos(dtype, tolerance, instruction_set):
+    points = (torch.rand(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 2 - 1).to(dtype)
+    points[0] = torch.tensor([0.0, 1.0, -1.0])
+    points[1] = torch.tensor([0.25, -0.5, 0.125])
+    out = kernels.fourier(points, 1.0, 0, 16).double().view(-1, 2, 16, 3)
+    # The angle modulo a full turn is exact in double precision, so the reference is good at every frequency.
+    angle = torch.remainder(points.double()[:, None, :] * 2.0 ** torch.arange(16)[:, None], 2.0) * math.pi
+    np.testing.assert_allclose(out[:, 0], torch.sin(angle), atol=tolerance)
+    np.testing.assert_allclose(out[:, 1], torch.cos(angle), atol=tolerance)
+
+
+def test_spherical_harmonics_equal_scipy():
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1)
+    polar, azimuth = torch.arccos(directions[:, 2]).numpy(), torch.atan2(directions[:, 1], directions[:, 0]).numpy()
+    expected = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            y = sph_harm_y(degree, abs(order), polar, azimuth) * (-1.0) ** order  # without the Condon-Shortley phase
+            part = y.real if order >= 0 else y.imag
+            expected.append(part * (math.sqrt(2) if order else 1))
+    np.testing.assert_allclose(kernels.spherical_harmonics(directions), np.stack(expected, 1), atol=1e-12)
+
+
+def test_spherical_harmonics_refuse_a_gradient():
+    with pytest.raises(NotImplementedError, match="no gradient"):
+        kernels.spherical_harmonics(torch.ones(1, 3, requires_grad=True))
+
+
+def test_same_bits_for_any_number_of_threads():
+    points = surface_points(20_000, dtype=np.float32)
+    tables = [make_table(points, num_threads=threads) for threads in (1, 2, 3)]
+    features = np.random.default_rng(0).normal(size=(tables[0].num_rows, 8)).astype(np.float32)
+    grad = np.random.default_rng(1).normal(size=(len(points), 24)).astype(np.float32)
+    answers = []
+    for threads, table in zip((1, 2, 3), tables, strict=True):
+        located = np.zeros((len(points), 3), np.int32)
+        out, points_grad, features_grad = np.zeros_like(grad), np.zeros_like(points), np.zeros_like(features)
+        table.encode(features, points, located, out, threads)
+        table.scatter(points, located, None, grad, features_grad, threads)
+        table.coordinate_gradient(features, points, located, None, grad, points_grad, threads)
+        answers.append([located, out, features_grad, points_grad])
+    for other in answers[1:]:
+        for first, second in zip(answers[0], other, strict=True):
+            np.testing.assert_array_equal(first, second)
+
+
+def test_cells_do_not_depend_on_chunks_or_order():
+    points = surface_points(5000, dtype=np.float32)
+    whole, pieces = _core.CellSet(LEAF_M), _core.CellSet(LEAF_M)
+    whole.insert(points)
+    for chunk in np.array_split(points[::-1], 7):
+        pieces.insert(np.ascontiguousarray(chunk))
+    np.testing.assert_array_equal(whole.sorted_keys(), pieces.sorted_keys())
+    assert len(whole) == len({tuple(c) for c in np.floor(points / np.float32(LEAF_M)).astype(int).tolist()})
+
+
+def test_free_space_above_a_surface_has_no_features():
+    # Every column is occupied on the planes; only the cell in space tells a point above the ground from the ground.
+    table = make_table(surface_points(5000))
+    features = torch.ones(table.num_rows, 8, dtype=torch.float64)
+    above = torch.tensor(surface_points(100) + np.array([0, 0, 5.0]))
+    assert (kernels.interpolate(features, above, table) == 0).all()
+    assert (kernels.interpolate(features, torch.tensor(surface_points(100)), table) != 0).any()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, -1e9])
+def test_points_outside_every_lattice_have_no_cell(value):
+    table = make_table(surface_points(100))
+    assert (kernels.locate(torch.full((3, 3), value, dtype=torch.float64), table) == -1).all()
+    cells = _core.CellSet(LEAF_M)
+    with pytest.raises(ValueError, match="finite and within"):
+        cells.insert(np.full((1, 3), value))
+    assert len(cells) == 0
+
+
+def test_wrong_arrays_are_refused():
+    table = make_table(surface_points(100))
+    located, out = np.zeros((4, 3), np.int32), np.zeros((4, 24))
+    with pytest.raises(ValueError, match="features must have shape"):
+        table.encode(np.zeros((3, 8)), np.zeros((4, 3)), located, out)
+    with pytest.raises(ValueError, match="points must have shape"):
+        table.encode(np.zeros((table.num_rows, 8)), np.zeros((4, 2)), located, out)
+    with pytest.raises(TypeError):  # never a silent copy: the result would be lost
+        table.encode(np.zeros((table.num_rows, 8)), np.zeros((4, 3)), located, out.astype(np.float32))
+    with pytest.raises(ValueError, match="ascending"):
+        _core.VertexTable(np.array([5, 5], np.uint64), LEAF_M, 3)
+    with pytest.raises(ValueError, match="num_levels"):
+        _core.VertexTable(np.array([5], np.uint64), LEAF_M, 0)
+    with pytest.raises(ValueError, match="not available"):
+        _core.set_instruction_set("abacus")
+
+
+def test_empty_batch_and_empty_table():
+    table = make_table(surface_points(10))
+    assert kernels.interpolate(torch.zeros(table.num_rows, 8), torch.zeros(0, 3), table).shape == (0, 24)
+    empty = _core.VertexTable(np.zeros(0, np.uint64), LEAF_M, 3)
+    assert empty.num_rows == 0
+    assert (kernels.interpolate(torch.zeros(0, 8), torch.zeros(5, 3), empty) == 0).all()
+
+
+def test_a_block_of_columns_is_a_valid_gradient():
+    table = make_table(surface_points(100, dtype=np.float32))
+    points = torch.tensor(surface_points(50, dtype=np.float32))
+    wide = torch.randn(50, 40)
+    gradients = []
+    for grad in (wide[:, 8:32], wide[:, 8:32].contiguous()):
+        features = torch.zeros(table.num_rows, 8, requires_grad=True)
+        kernels.interpolate(features, points, table).backward(grad)
+        gradients.append(features.grad)
+    assert torch.equal(*gradients)
