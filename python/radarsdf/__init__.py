@@ -1,1 +1,8 @@
-"""radarsdf."""
+"""From 3D radar scans with known poses to a surface and a reflectance map, on a CPU."""
+
+from radarsdf.config import FitConfig
+from radarsdf.fitting import fit
+from radarsdf.map import RadarMap
+from radarsdf.storage import load
+
+__all__ = ["FitConfig", "RadarMap", "fit", "load"]

@@ -57,6 +57,20 @@ class TriQuadtree(_VertexFeatures):
         return kernels.interpolate(self.features, points, self.table)
 
 
+class Octree(_VertexFeatures):
+    """Features at the eight corners of the cells in space, trilinear, levels summed (SHINE-Mapping, ICRA 2023).
+
+    ``forward`` takes points (N, 3), local frame, m, and returns (N, 8).
+    """
+
+    encoding = Encoding.OCTREE
+    dim = kernels.FEATURE_DIM
+
+    def forward(self, points: Tensor) -> Tensor:
+        levels = kernels.interpolate(self.features, points, self.table)
+        return levels.view(-1, self.table.num_levels, kernels.FEATURE_DIM).sum(1)
+
+
 class Fourier(nn.Module):
     """Sine and cosine of 2^k·π·x / half_width for a range of k (3QFP's positional encoding).
 

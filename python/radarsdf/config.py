@@ -1,0 +1,202 @@
+"""Every choice of a fit, with its unit and its source."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+MAX_LEVELS = 12  # of the compiled core
+MAX_FREQUENCIES = 24
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """How a map is fitted. The defaults are those measured to be best; :meth:`paper` is 3QFPI as published.
+
+    "3QFP" and "3QFPI" below name the papers (ICRA 2024; Neural Surface and Reflectance Modelling from 3D Radar Data)
+    and their published radar configuration; "measured" refers to the tables in ``BENCHMARK.md``.
+
+    Raises
+    ------
+    ValueError
+        At construction, for a value that makes no sense.
+    """
+
+    # Preparation
+    min_range_m: float = 2.5
+    """Returns nearer than this are dropped as near-field clutter, m (3QFPI: 2.5, for the Oculii sensor 1)."""
+    max_range_m: float | None = None
+    """Returns further than this are dropped, m. None: none are."""
+    accumulate_frames: int = 1
+    """Consecutive scans treated as one, all seen from the middle one's position. 3QFPI: 5, to densify what it feeds
+    scan by scan; here a fit sees all returns at once, so each keeps the position that it was really seen from."""
+
+    # Encoding
+    encoding: Literal["tri-quadtree", "octree"] = "tri-quadtree"
+    """Where the features live: on three planes (3QFP) or in space (SHINE-Mapping)."""
+    leaf_size_m: float = 0.2
+    """Edge of the finest cells, m (3QFPI)."""
+    num_levels: int = 3
+    """Levels of cells, each twice as large as the one before (3QFP)."""
+    feature_std: float = 0.05
+    """Standard deviation of the features at the start (3QFP)."""
+    fourier_half_width_m: float = 409.6
+    """Half of the longest Fourier wavelength, m (3QFP: 2^12 · 0.2 m / 2)."""
+    fourier_first: int = 0
+    """First frequency k: the wavelength is 2 · half width / 2^k (3QFP: 0)."""
+    fourier_count: int = 16
+    """Number of frequencies (3QFP: 16)."""
+
+    # Networks
+    sdf_hidden: tuple[int, ...] = (32, 32)
+    """Widths of the hidden layers of the SDF network (3QFP)."""
+    intensity_hidden: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of the intensity network (3QFPI)."""
+    geometry_feature_dim: int = 0
+    """Numbers handed from the SDF to the intensity network (3QFPI: 15; its ablation: no worth)."""
+    normals: bool = False
+    """Whether the intensity network sees the surface normal (3QFPI: yes; its ablation: no worth)."""
+    sdf_input: bool = True
+    """Whether the intensity network sees the SDF (3QFPI)."""
+    view_direction: bool = True
+    """Whether the intensity network sees the viewing direction (3QFPI)."""
+    log_range: bool = True
+    """Whether it sees log10(range / 10 m), as the radar equation's r^-4 asks for (3QFPI: no; measured: 5 to 15 %)."""
+
+    # Samples
+    near_samples: int = 6
+    """Samples near the surface for every return (3QFPI)."""
+    free_samples: int = 6
+    """Samples in free space for every return (3QFPI)."""
+    near_band_m: float = 0.3
+    """Samples near the surface are uniform within this distance of the return, m (3QFP)."""
+    free_from: float = 0.3
+    """Free-space samples start at this share of the range (3QFP)."""
+    free_beyond_m: float = 0.8
+    """... and end this far behind the return, m (3QFP)."""
+
+    # Losses
+    sigma_m: float = 0.1
+    """Scale of the sigmoid that turns distances into occupancy, m (3QFP: 0.55 · 0.05; measured for radar: 0.1)."""
+    intensity_in_free_space: bool = False
+    """Whether free-space samples are labelled with the lowest intensity (3QFPI: yes; measured: 8 to 29 % worse)."""
+
+    # Schedule
+    batch_size: int = 8192
+    """Samples in an iteration (3QFP)."""
+    sdf_iterations: int | None = None
+    """Iterations of SDF network and features, which are then frozen (3QFPI: 1000). None: `sdf_passes` over the data."""
+    sdf_passes: float = 1.0
+    """Times each sample is seen when `sdf_iterations` is None (measured: more fits the noise)."""
+    intensity_iterations: int | None = None
+    """Iterations of the intensity network (3QFPI: 4000). None: `intensity_passes` over the data."""
+    intensity_passes: float = 2.0
+    """Times each near-surface sample is seen when `intensity_iterations` is None."""
+    joint: bool = False
+    """Whether the intensity network trains from the first iteration on, its gradient reaching features and SDF network
+    until these freeze (3QFPI), or only on the finished geometry."""
+    learning_rate: float = 1e-2
+    """Adam's (3QFPI: 1e-3; 3QFP's radar configuration: 1e-2)."""
+    intensity_learning_rate: float = 1e-2
+    """Adam's for the intensity network (3QFPI: 1e-3)."""
+    cosine_schedule: bool = True
+    """Whether the learning rates fall to zero along a cosine (3QFPI: constant)."""
+    adam_epsilon: float = 1e-15
+    """Adam's (3QFP)."""
+
+    # Mesh
+    min_component_triangles: int = 300
+    """Smaller components of a mesh are dropped (3QFP)."""
+
+    # Machine
+    seed: int = 0
+    """Seed of every random number of the fit: same seed, data and number of threads, same bits."""
+    num_threads: int = 0
+    """Threads; 0: as many as PyTorch uses."""
+
+    def __post_init__(self) -> None:
+        positive = {
+            "leaf_size_m": self.leaf_size_m,
+            "feature_std": self.feature_std,
+            "fourier_half_width_m": self.fourier_half_width_m,
+            "near_band_m": self.near_band_m,
+            "sigma_m": self.sigma_m,
+            "sdf_passes": self.sdf_passes,
+            "intensity_passes": self.intensity_passes,
+            "learning_rate": self.learning_rate,
+            "intensity_learning_rate": self.intensity_learning_rate,
+            "adam_epsilon": self.adam_epsilon,
+        }
+        for name, value in positive.items():
+            if not (math.isfinite(value) and value > 0):
+                msg = f"{name} must be positive and finite, not {value}"
+                raise ValueError(msg)
+        at_least = {
+            "accumulate_frames": (self.accumulate_frames, 1),
+            "num_levels": (self.num_levels, 1),
+            "fourier_first": (self.fourier_first, 0),
+            "fourier_count": (self.fourier_count, 0),
+            "geometry_feature_dim": (self.geometry_feature_dim, 0),
+            "near_samples": (self.near_samples, 1),
+            "free_samples": (self.free_samples, 0),
+            "batch_size": (self.batch_size, 1),
+            "sdf_iterations": (self.sdf_iterations, 1),
+            "intensity_iterations": (self.intensity_iterations, 1),
+            "min_component_triangles": (self.min_component_triangles, 0),
+            "num_threads": (self.num_threads, 0),
+            "min_range_m": (self.min_range_m, 0),
+            "free_beyond_m": (self.free_beyond_m, 0),
+        }
+        for name, (number, lowest) in at_least.items():
+            if number is not None and not lowest <= number < math.inf:
+                msg = f"{name} must be at least {lowest}, not {number}"
+                raise ValueError(msg)
+        if self.encoding not in ("tri-quadtree", "octree"):
+            msg = f"encoding must be 'tri-quadtree' or 'octree', not {self.encoding!r}"
+            raise ValueError(msg)
+        if self.num_levels > MAX_LEVELS or self.fourier_first + self.fourier_count > MAX_FREQUENCIES:
+            msg = f"at most {MAX_LEVELS} levels and frequencies below {MAX_FREQUENCIES} are possible"
+            raise ValueError(msg)
+        if self.max_range_m is not None and not self.max_range_m > self.min_range_m:
+            msg = f"max_range_m must exceed min_range_m, not {self.max_range_m}"
+            raise ValueError(msg)
+        if not 0 <= self.free_from < 1:
+            msg = f"free_from must lie in [0, 1), not {self.free_from}"
+            raise ValueError(msg)
+        if not (self.sdf_hidden and self.intensity_hidden and min(self.sdf_hidden + self.intensity_hidden) > 0):
+            msg = "networks need at least one hidden layer, of positive width"
+            raise ValueError(msg)
+
+    @classmethod
+    def paper(cls, **changes: Any) -> FitConfig:
+        """3QFPI's configuration as published, with `changes` on top."""
+        values: dict[str, Any] = {
+            "accumulate_frames": 5,
+            "geometry_feature_dim": 15,
+            "normals": True,
+            "log_range": False,
+            "sigma_m": 0.55 * 0.05,
+            "intensity_in_free_space": True,
+            "sdf_iterations": 1000,
+            "intensity_iterations": 4000,
+            "joint": True,
+            "learning_rate": 1e-3,
+            "intensity_learning_rate": 1e-3,
+            "cosine_schedule": False,
+        }
+        return cls(**(values | changes))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values only, for JSON."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> FitConfig:
+        """The inverse of :meth:`to_dict`; an unknown key is a ValueError."""
+        known = {field.name for field in dataclasses.fields(cls)}
+        if unknown := sorted(set(values) - known):
+            msg = f"unknown settings: {', '.join(unknown)}"
+            raise ValueError(msg)
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})

@@ -1,0 +1,247 @@
+"""From scans with poses to a map: the training loop."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from radarsdf._core import CellSet
+from radarsdf.config import FitConfig
+from radarsdf.field import Field
+from radarsdf.losses import intensity_loss, sdf_loss
+from radarsdf.map import IntensityScale, RadarMap
+from radarsdf.sampling import RaySampler, Samples
+from radarsdf.scans import Rays, prepare
+
+
+def fit(
+    points: Sequence[ArrayLike],
+    poses: ArrayLike,
+    intensities: Sequence[ArrayLike] | None = None,
+    *,
+    config: FitConfig | None = None,
+    progress: bool | None = None,
+) -> RadarMap:
+    """Fits a signed distance field, and with intensities a reflectance field, to radar returns.
+
+    Parameters
+    ----------
+    points : sequence of F arrays
+        (N_i, 3) each: the returns of one scan, sensor frame, m.
+    poses : array_like
+        (F, 4, 4) T_world_sensor, one for each scan.
+    intensities : sequence of F arrays, optional
+        (N_i,) each, in the sensor's own units. Without them nothing of the reflectance side is built or run.
+    config : FitConfig, optional
+        Every choice of the fit; ``FitConfig.paper()`` is the published configuration.
+    progress : bool, optional
+        Whether to show a progress bar; by default only on a terminal.
+
+    Returns
+    -------
+    RadarMap
+        With the times and counts of the fit in its ``report``. The same input, seed and number of threads give the
+        same bits.
+
+    Raises
+    ------
+    ValueError
+        For scans or poses that cannot be what they should be; see :func:`radarsdf.scans.prepare`.
+    FloatingPointError
+        If a loss stops being finite.
+
+    Examples
+    --------
+    >>> import radarsdf
+    >>> scans = radarsdf.simulate.wall(frames=4)
+    >>> radar_map = radarsdf.fit(scans.points, scans.poses, scans.intensities)
+    >>> distance_m = radar_map.sdf(scans.poses[:, :3, 3])  # of the sensor's positions: all in free space
+    >>> bool((distance_m > 0).all())
+    True
+    """
+    config = FitConfig() if config is None else config
+    clock = _Clock()
+    rays = prepare(
+        points,
+        poses,
+        intensities,
+        min_range_m=config.min_range_m,
+        max_range_m=config.max_range_m,
+        accumulate_frames=config.accumulate_frames,
+    )
+    clock.lap("prepare_s")
+    with _num_threads(config.num_threads):
+        generator = torch.Generator().manual_seed(config.seed)
+        field = _new_field(rays, config, generator)
+        clock.lap("occupied_cells_s")
+        scale = IntensityScale.of(rays.intensities)
+        training = _Training(field, rays, scale, config, generator)
+        training.run(progress)
+        clock.lap("training_s")
+    field.requires_grad_(False)
+    report = {
+        "returns": sum(len(np.asarray(scan)) for scan in points),
+        "returns_used": len(rays),
+        "leaf_cells": len(field.cells.table.leaf_keys()),
+        "vertices": field.cells.table.num_rows,
+        "iterations": training.iterations,
+        "losses": training.losses,
+        **clock.laps,
+    }
+    return RadarMap(field=field, origin=rays.origin, intensity_scale=scale, config=config, report=report)
+
+
+def occupied_leaf_keys(rays: Rays, config: FitConfig) -> NDArray[np.uint64]:
+    """Leaf cells that a near-surface sample can fall into: Morton keys, ascending.
+
+    The line of samples round each return is walked in steps of half a cell instead of being left to chance, so that
+    the map does not depend on the seed.
+    """
+    steps = math.ceil(2 * config.near_band_m / (config.leaf_size_m / 2))
+    cells = CellSet(config.leaf_size_m)
+    for chunk in rays.along(np.linspace(-config.near_band_m, config.near_band_m, steps + 1)):
+        cells.insert(chunk, torch.get_num_threads())
+    return cells.sorted_keys(torch.get_num_threads())
+
+
+def _new_field(rays: Rays, config: FitConfig, generator: torch.Generator) -> Field:
+    with torch.random.fork_rng(devices=[]):  # the layers of torch.nn draw from the global generator
+        torch.manual_seed(config.seed)
+        field = Field(occupied_leaf_keys(rays, config), config, with_intensity=rays.intensities is not None)
+    field.cells.initialise(config.feature_std, generator)
+    return field
+
+
+class _Training:
+    """The schedule: geometry first, then, on frozen geometry, reflectance; or, as published, both from the start."""
+
+    def __init__(
+        self, field: Field, rays: Rays, scale: IntensityScale | None, config: FitConfig, generator: torch.Generator
+    ) -> None:
+        self._field = field
+        self._config = config
+        self._sampler = RaySampler(rays, config, generator)
+        self._intensities = (
+            None if scale is None or rays.intensities is None else torch.from_numpy(scale.to_unit(rays.intensities))
+        )
+        self._directions = torch.from_numpy(rays.directions)
+        self._ranges_m = torch.from_numpy(rays.ranges_m)
+        samples = len(rays) * (config.near_samples + config.free_samples)
+        self._sdf_iterations = config.sdf_iterations or math.ceil(config.sdf_passes * samples / config.batch_size)
+        self._intensity_iterations = 0
+        if self._intensities is not None:
+            self._intensity_iterations = config.intensity_iterations or math.ceil(
+                config.intensity_passes * len(rays) * config.near_samples / config.batch_size
+            )
+        self.iterations = {"sdf": self._sdf_iterations, "intensity": self._intensity_iterations}
+        self.losses: dict[str, float] = {}
+
+    def run(self, progress: bool | None) -> None:
+        config, field = self._config, self._field
+        geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
+        geometry_adam = self._adam(geometry, config.learning_rate)
+        reflectance = field.intensity_network
+        joint = config.joint and reflectance is not None
+        rest = self._intensity_iterations - (self._sdf_iterations if joint else 0)
+        with tqdm(
+            total=self._sdf_iterations + max(rest, 0),
+            desc="fit",
+            unit="it",
+            disable=None if progress is None else not progress,
+        ) as bar:
+            optimisers = [geometry_adam]
+            if reflectance is not None:
+                reflectance_adam = self._adam(reflectance.parameters(), config.intensity_learning_rate)
+                if joint:
+                    optimisers.append(reflectance_adam)
+            self._loop("sdf", self._sdf_iterations, optimisers, lambda: self._geometry_loss(joint), bar)
+            field.cells.requires_grad_(False)
+            field.sdf_network.requires_grad_(False)
+            if reflectance is not None and rest > 0:
+                self._loop("intensity", rest, [reflectance_adam], self._reflectance_loss, bar)
+
+    def _adam(self, parameters: Any, learning_rate: float) -> torch.optim.Adam:
+        return torch.optim.Adam(parameters, lr=learning_rate, eps=self._config.adam_epsilon, fused=True)
+
+    def _loop(
+        self, name: str, iterations: int, optimisers: list[torch.optim.Adam], loss_of: Callable[[], Tensor], bar: Any
+    ) -> None:
+        rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
+        for i in range(iterations):
+            if self._config.cosine_schedule:
+                for optimiser, rate in zip(optimisers, rates, strict=True):
+                    optimiser.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * i / iterations))
+            loss = loss_of()
+            for optimiser in optimisers:
+                optimiser.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            for optimiser in optimisers:
+                optimiser.step()
+            bar.update()
+            if i % 100 == 0 or i == iterations - 1:  # reading it every time would cost more than it tells
+                self.losses[name] = loss.item()
+                if not math.isfinite(self.losses[name]):
+                    msg = f"the {name} loss is {self.losses[name]} at iteration {i}: a lower learning rate may help"
+                    raise FloatingPointError(msg)
+
+    def _geometry_loss(self, joint: bool) -> Tensor:
+        samples = self._sampler.batch()
+        loss = sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
+        if joint:
+            loss = loss + self._intensity_loss(samples, geometry_frozen=False)
+        return loss
+
+    def _reflectance_loss(self) -> Tensor:
+        if self._config.intensity_in_free_space:
+            samples = self._sampler.batch()
+        else:
+            samples = self._sampler.near(self._config.batch_size)
+        return self._intensity_loss(samples, geometry_frozen=True)
+
+    def _intensity_loss(self, samples: Samples, *, geometry_frozen: bool) -> Tensor:
+        assert self._intensities is not None
+        used = slice(None) if self._config.intensity_in_free_space else slice(samples.num_near)
+        rays = samples.rays[used]
+        labels = self._intensities[rays]
+        labels[samples.num_near :] = 0  # no return is expected from free space (3QFPI)
+        predicted = self._field.intensity(
+            samples.points[used],
+            self._directions[rays],
+            self._ranges_m[rays] - samples.sdf_m[used],
+            geometry_frozen=geometry_frozen,
+        )
+        return intensity_loss(predicted, labels)
+
+
+@contextlib.contextmanager
+def _num_threads(num_threads: int) -> Iterator[None]:
+    """PyTorch's number of threads, which the kernels follow, for the time of a fit."""
+    before = torch.get_num_threads()
+    if num_threads:
+        torch.set_num_threads(num_threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class _Clock:
+    """Wall seconds between laps."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.laps: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = now - self._last
+        self._last = now

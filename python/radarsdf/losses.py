@@ -1,0 +1,27 @@
+"""The two losses of the method."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def sdf_loss(logit: Tensor, sdf_m: Tensor, sigma_m: float) -> Tensor:
+    """Binary cross-entropy of sigmoid(logit) and sigmoid(sdf / sigma): near the surface counts most (SHINE-Mapping).
+
+    Parameters
+    ----------
+    logit : Tensor
+        (B,) output of the SDF network, distance / sigma, positive in free space.
+    sdf_m : Tensor
+        (B,) label, m, positive in free space.
+    sigma_m : float
+        Scale of the sigmoid, m.
+    """
+    return functional.binary_cross_entropy_with_logits(logit, torch.sigmoid(sdf_m / sigma_m))
+
+
+def intensity_loss(predicted: Tensor, label: Tensor) -> Tensor:
+    """Mean absolute error of scaled intensities (B,): less drawn by outliers than squares (3QFPI)."""
+    return functional.l1_loss(predicted, label)

@@ -1,0 +1,235 @@
+"""The map that a fit gives: signed distance, gradient, intensity, mesh, and its file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from radarsdf.config import FitConfig
+from radarsdf.field import Field
+
+if TYPE_CHECKING:
+    import trimesh
+
+_CHUNK = 1 << 15  # points evaluated at a time: encodings and hidden layers stay in the second- and third-level cache
+_Array = TypeVar("_Array", NDArray[Any], Tensor)
+
+
+@dataclass(frozen=True)
+class IntensityScale:
+    """Between the sensor's units and the [0, 1] of the intensity network: the training data's range."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, intensities: NDArray[np.float32] | None) -> IntensityScale | None:
+        return None if intensities is None else cls(float(intensities.min()), float(intensities.max()))
+
+    def to_unit(self, intensities: NDArray[np.float32]) -> NDArray[np.float32]:
+        return ((intensities - np.float32(self.low)) / np.float32(self.high - self.low)).astype(np.float32)
+
+    def to_sensor(self, unit: Tensor) -> Tensor:
+        return self.low + (self.high - self.low) * unit
+
+
+class RadarMap:
+    """A fitted map. Made by :func:`radarsdf.fit` or :func:`radarsdf.load`.
+
+    Queries take world coordinates, m, as NumPy arrays or CPU tensors, and answer in kind and in the same precision.
+    Positions are brought to the map's local frame in float64 before they become float32, so UTM coordinates are fine.
+    Queries may run in many threads at once.
+
+    Attributes
+    ----------
+    origin : ndarray
+        (3,) float64, world coordinates of the local frame's zero, m.
+    config : FitConfig
+        What it was fitted with.
+    intensity_scale : IntensityScale or None
+        Range of the training intensities, sensor units; None without a reflectance side.
+    report : dict
+        Counts, losses and seconds of the fit.
+    """
+
+    def __init__(
+        self,
+        *,
+        field: Field,
+        origin: NDArray[np.float64],
+        intensity_scale: IntensityScale | None,
+        config: FitConfig,
+        report: dict[str, Any],
+    ) -> None:
+        self.origin = origin
+        self.config = config
+        self.intensity_scale = intensity_scale
+        self.report = report
+        self._field = field
+
+    def __repr__(self) -> str:
+        kind = "surface and reflectance" if self.has_intensity else "surface"
+        return f"RadarMap({kind}, {len(self._field.cells.table.leaf_keys())} cells, {self.nbytes / 1e6:.1f} MB)"
+
+    @property
+    def has_intensity(self) -> bool:
+        """Whether intensities were given to the fit."""
+        return self.intensity_scale is not None
+
+    @property
+    def nbytes(self) -> int:
+        """Size of features and network weights, bytes: what the paper calls the map's size."""
+        return sum(p.numel() * p.element_size() for p in self._field.parameters())
+
+    @property
+    def field(self) -> Field:
+        """The learnt field in the local frame, for those who build on it."""
+        return self._field
+
+    @overload
+    def sdf(self, x: Tensor) -> Tensor: ...
+    @overload
+    def sdf(self, x: ArrayLike) -> NDArray[Any]: ...
+    def sdf(self, x: Any) -> Any:
+        """Signed distance to the surface.
+
+        Parameters
+        ----------
+        x : (N, 3) array or tensor
+            World, m.
+
+        Returns
+        -------
+        (N,) array or tensor
+            m, positive in free space. Meaningful near the surface (a few sigma); see :meth:`observed`.
+
+        Raises
+        ------
+        ValueError
+            If `x` does not have shape (N, 3).
+        """
+        points, answer = self._local(x)
+        with torch.no_grad():
+            return answer(_in_chunks(self._local_sdf, points))
+
+    @overload
+    def gradient(self, x: Tensor) -> Tensor: ...
+    @overload
+    def gradient(self, x: ArrayLike) -> NDArray[Any]: ...
+    def gradient(self, x: Any) -> Any:
+        """Gradient of the signed distance at x (N, 3), world, m: (N, 3), towards free space, about unit length."""
+        points, answer = self._local(x)
+
+        def gradient(chunk: Tensor) -> Tensor:
+            with torch.enable_grad():
+                chunk = chunk.detach().requires_grad_()
+                return torch.autograd.grad(self._local_sdf(chunk).sum(), chunk)[0]
+
+        return answer(_in_chunks(gradient, points))
+
+    @overload
+    def observed(self, x: Tensor) -> Tensor: ...
+    @overload
+    def observed(self, x: ArrayLike) -> NDArray[np.bool_]: ...
+    def observed(self, x: Any) -> Any:
+        """Whether the data supports a surface at x (N, 3), world, m: its leaf cell lies round some return. (N,) bool."""
+        points, answer = self._local(x)
+        return answer(_in_chunks(self._field.cells.occupied, points))
+
+    @overload
+    def intensity(self, x: Tensor, sensor_positions: Tensor) -> Tensor: ...
+    @overload
+    def intensity(self, x: ArrayLike, sensor_positions: ArrayLike) -> NDArray[Any]: ...
+    def intensity(self, x: Any, sensor_positions: Any) -> Any:
+        """Predicted intensity of the returns that sensors would get from points.
+
+        Parameters
+        ----------
+        x : (N, 3) array or tensor
+            World, m.
+        sensor_positions : (N, 3) or (3,) array or tensor
+            World, m.
+
+        Returns
+        -------
+        (N,) array or tensor
+            In the units of the intensities that the map was fitted to.
+
+        Raises
+        ------
+        ValueError
+            If the map has no intensities, or for wrong shapes.
+        """
+        scale = self.intensity_scale
+        if scale is None:
+            msg = "this map was fitted without intensities"
+            raise ValueError(msg)
+        points, answer = self._local(x)
+        sensors, _ = self._local(sensor_positions, rows=len(points))
+
+        def intensity(chunk: Tensor) -> Tensor:
+            positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
+            ranges_m = rays.norm(dim=1)
+            directions = rays / ranges_m.clamp_min(1e-6)[:, None]
+            return scale.to_sensor(self._field.intensity(positions, directions, ranges_m))
+
+        with torch.no_grad():
+            return answer(_in_chunks(intensity, torch.cat([points, sensors], 1)))
+
+    def mesh(
+        self,
+        voxel_size: float = 0.1,
+        *,
+        box: ArrayLike | None = None,
+        viewpoint: ArrayLike | None = None,
+        progress: bool | None = None,
+    ) -> trimesh.Trimesh:
+        """The surface as triangles; see :func:`radarsdf.meshing.extract_mesh`."""
+        from radarsdf.meshing import extract_mesh  # noqa: PLC0415 - meshing is built on the map
+
+        return extract_mesh(self, voxel_size, box=box, viewpoint=viewpoint, progress=progress)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes the whole map to one safetensors file; :func:`radarsdf.load` reads it back to the same answers."""
+        from radarsdf.storage import save_map  # noqa: PLC0415 - storage is built on the map
+
+        save_map(self, path)
+
+    def _local_sdf(self, points: Tensor) -> Tensor:
+        return self._field.logit(points) * self._field.sigma_m
+
+    def _local(self, x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
+        """`x` in the local frame as float32 (N, 3), and what gives an answer the kind and precision of `x`.
+
+        A single position (3,) is repeated `rows` times where those are given.
+        """
+        is_tensor = isinstance(x, Tensor)
+        world = x.detach() if is_tensor else torch.from_numpy(np.ascontiguousarray(np.asarray(x, np.float64)))
+        dtype = x.dtype if is_tensor else getattr(x, "dtype", None)
+        if rows is not None and world.shape == (3,):
+            world = world.expand(rows, 3)
+        if world.ndim != 2 or world.shape[1] != 3 or (rows is not None and len(world) != rows):
+            msg = f"positions must have shape (N, 3), not {tuple(world.shape)}"
+            raise ValueError(msg)
+        local = (world.double() - torch.from_numpy(self.origin)).float()
+
+        def answer(result: Tensor) -> Any:
+            if result.dtype != torch.bool:
+                keep_double = dtype in (torch.float64, np.dtype(np.float64), None)
+                result = result.double() if keep_double else result
+            return result if is_tensor else result.numpy()
+
+        return local, answer
+
+
+def _in_chunks(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+    if len(points) <= _CHUNK:
+        return function(points)
+    return torch.cat([function(chunk) for chunk in points.split(_CHUNK)])

@@ -1,0 +1,89 @@
+"""The SDF network and the intensity network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from radarsdf.config import FitConfig
+from radarsdf.encodings import SphericalHarmonics
+
+
+def _mlp(widths: Sequence[int]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for i, (inputs, outputs) in enumerate(zip(widths, widths[1:], strict=False)):
+        layers.append(nn.Linear(inputs, outputs))
+        if i < len(widths) - 2:
+            layers.append(nn.ReLU())
+    return nn.Sequential(*layers)
+
+
+class SDFNetwork(nn.Module):
+    """Encoding of a point to distance / sigma (positive in free space) and, where asked for, a geometry feature."""
+
+    def __init__(self, encoding_dim: int, config: FitConfig) -> None:
+        super().__init__()
+        self.layers = _mlp([encoding_dim, *config.sdf_hidden, 1 + config.geometry_feature_dim])
+
+    def forward(self, encoding: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, D) to the logit (N,) and the geometry feature (N, geometry_feature_dim)."""
+        out = self.layers(encoding)
+        return out[:, 0], out[:, 1:]
+
+
+class IntensityNetwork(nn.Module):
+    """How strongly a point answers a sensor, scaled to about [0, 1].
+
+    The radar equation, P ∝ σ / r⁴, needs the range as well as the direction: in dB its logarithm enters linearly.
+    """
+
+    def __init__(self, encoding_dim: int, config: FitConfig) -> None:
+        super().__init__()
+        self.sdf_input = config.sdf_input
+        self.view_direction = config.view_direction
+        self.log_range = config.log_range
+        self.normals = config.normals
+        self.harmonics = SphericalHarmonics()
+        inputs = (
+            encoding_dim
+            + config.sdf_input
+            + config.geometry_feature_dim
+            + 3 * config.normals
+            + self.harmonics.dim * config.view_direction
+            + config.log_range
+        )
+        self.layers = _mlp([inputs, *config.intensity_hidden, 1])
+
+    def forward(
+        self,
+        encoding: Tensor,
+        logit: Tensor,
+        geometry_feature: Tensor,
+        normals: Tensor | None,
+        directions: Tensor,
+        ranges_m: Tensor,
+    ) -> Tensor:
+        """Scaled intensity (N,).
+
+        Parameters
+        ----------
+        encoding, logit, geometry_feature : Tensor
+            (N, D), (N,) and (N, G): input and outputs of the SDF network.
+        normals : Tensor or None
+            (N, 3) unit normals, towards free space; needed where the configuration asks for them.
+        directions, ranges_m : Tensor
+            (N, 3) unit vectors from the sensor to the points, world axes, and the distances (N,), m.
+        """
+        inputs = [encoding, geometry_feature]
+        if self.sdf_input:
+            inputs.append(logit[:, None])
+        if self.normals:
+            assert normals is not None
+            inputs.append(normals)
+        if self.view_direction:
+            inputs.append(self.harmonics(directions))
+        if self.log_range:
+            inputs.append(torch.log10(ranges_m.clamp_min(1e-3) / 10.0)[:, None])
+        return self.layers(torch.cat(inputs, 1))[:, 0]  # type: ignore[no-any-return]

@@ -1,0 +1,169 @@
+"""Radar scans as a fit needs them: checked, in one local frame, as rays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_MAX_ROTATION_ERROR = 1e-3  # of R R^T - 1: float32 poses pass, a scaled or sheared one does not
+
+
+@dataclass(frozen=True)
+class Rays:
+    """All returns of a fit, in the local frame: world axes, with `origin` subtracted.
+
+    float32 resolves 0.06 mm at 500 m and 0.5 m at UTM coordinates; hence the local frame.
+    """
+
+    origin: NDArray[np.float64]
+    """(3,) world coordinates of the local frame's zero, m: the mean of the sensor positions."""
+    points: NDArray[np.float32]
+    """(N, 3) returns, m."""
+    directions: NDArray[np.float32]
+    """(N, 3) unit vectors from the sensor to the return."""
+    ranges_m: NDArray[np.float32]
+    """(N,) distance of the return from the sensor."""
+    intensities: NDArray[np.float32] | None
+    """(N,) sensor units."""
+    scans: NDArray[np.int32]
+    """(N,) which scan each return is from."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def along(self, offsets_m: ArrayLike, chunk: int = 1 << 20) -> Iterator[NDArray[np.float32]]:
+        """Points at fixed offsets along every ray, behind the return where positive, in chunks of (M, 3), local, m."""
+        offsets = np.asarray(offsets_m, np.float32)
+        rays_per_chunk = max(1, chunk // len(offsets))
+        for first in range(0, len(self), rays_per_chunk):
+            rays = slice(first, first + rays_per_chunk)
+            points = self.points[rays, None, :] + offsets[None, :, None] * self.directions[rays, None, :]
+            yield points.reshape(-1, 3)
+
+
+def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
+    """`poses` as (F, 4, 4) float64, or a ValueError that names the first that is not a rigid transform."""
+    T_world_sensor = np.asarray(poses, np.float64)
+    if T_world_sensor.shape != (num_scans, 4, 4):
+        msg = f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
+        raise ValueError(msg)
+    rotation = T_world_sensor[:, :3, :3]
+    rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    rigid = (
+        np.isfinite(T_world_sensor).all(axis=(1, 2))
+        & (rotation_error < _MAX_ROTATION_ERROR)
+        & (np.linalg.det(rotation) > 0)
+        & (T_world_sensor[:, 3] == [0, 0, 0, 1]).all(axis=1)
+    )
+    if not rigid.all():
+        msg = f"pose {int(np.argmin(rigid))} is not a rigid transform (rotation, translation, last row 0 0 0 1)"
+        raise ValueError(msg)
+    return T_world_sensor
+
+
+def _check_scans(
+    points: Sequence[ArrayLike], intensities: Sequence[ArrayLike] | None
+) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None]:
+    scans = [np.asarray(p, np.float64) for p in points]
+    if not scans:
+        msg = "points holds no scans"
+        raise ValueError(msg)
+    for i, scan in enumerate(scans):
+        if scan.ndim != 2 or scan.shape[1] != 3:
+            msg = f"scan {i} must have shape (N, 3), not {scan.shape}"
+            raise ValueError(msg)
+        if len(scan) == 0:
+            msg = f"scan {i} is empty: leave it, and its pose, out"
+            raise ValueError(msg)
+    values = None
+    if intensities is not None:
+        values = [np.asarray(v, np.float32) for v in intensities]
+        if len(values) != len(scans):
+            msg = f"intensities holds {len(values)} scans, points {len(scans)}"
+            raise ValueError(msg)
+        for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
+            if value.shape != (len(scan),):
+                msg = f"intensities of scan {i} must have shape ({len(scan)},), not {value.shape}"
+                raise ValueError(msg)
+    bad = [~np.isfinite(scan).all(axis=1) for scan in scans]
+    if values is not None:
+        bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
+    if count := sum(int(b.sum()) for b in bad):
+        first = next(i for i, b in enumerate(bad) if b.any())
+        msg = f"{count} of {sum(map(len, bad))} returns are not finite, the first in scan {first}: remove them"
+        raise ValueError(msg)
+    return scans, values
+
+
+def prepare(
+    points: Sequence[ArrayLike],
+    poses: ArrayLike,
+    intensities: Sequence[ArrayLike] | None = None,
+    *,
+    min_range_m: float = 0.0,
+    max_range_m: float | None = None,
+    accumulate_frames: int = 1,
+    origin: ArrayLike | None = None,
+) -> Rays:
+    """Checks scans and turns them into rays of the local frame.
+
+    Parameters
+    ----------
+    points : sequence of F arrays
+        (N_i, 3) each, sensor frame, m.
+    poses : array_like
+        (F, 4, 4) T_world_sensor.
+    intensities : sequence of F arrays, optional
+        (N_i,) each, sensor units.
+    min_range_m, max_range_m : float
+        Returns outside are dropped.
+    accumulate_frames : int
+        So many consecutive scans are treated as seen from the position of the middle one.
+    origin : array_like, optional
+        (3,) world, m; the mean of the sensor positions where not given.
+
+    Raises
+    ------
+    ValueError
+        Mismatched lengths or shapes, empty scans, returns that are not finite (with their count), poses that are not
+        rigid, intensities that are all the same, or no return within the ranges.
+    """
+    scans, values = _check_scans(points, intensities)
+    T_world_sensor = check_poses(poses, len(scans))
+    positions = T_world_sensor[:, :3, 3]
+    local_origin = positions.mean(axis=0) if origin is None else np.asarray(origin, np.float64)
+
+    kept_points, kept_origins, kept_values, kept_scans = [], [], [], []
+    for i, scan in enumerate(scans):
+        first = i - i % accumulate_frames
+        middle = (first + min(first + accumulate_frames, len(scans)) - 1) // 2
+        ranges = np.linalg.norm(scan, axis=1)
+        # A return at the sensor itself has no direction.
+        keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= (np.inf if max_range_m is None else max_range_m))
+        local = scan[keep] @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
+        kept_points.append(local)
+        kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))
+        kept_scans.append(np.full(len(local), i, np.int32))
+        if values is not None:
+            kept_values.append(values[i][keep])
+    local_points = np.concatenate(kept_points)
+    if len(local_points) == 0:
+        msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {max_range_m or np.inf} m"
+        raise ValueError(msg)
+    rays = local_points - np.concatenate(kept_origins)
+    ranges = np.maximum(np.linalg.norm(rays, axis=1), 1e-6)
+    intensity = np.concatenate(kept_values) if values is not None else None
+    if intensity is not None and intensity.min() == intensity.max():
+        msg = f"all intensities are {intensity[0]}: leave them out where the sensor does not measure them"
+        raise ValueError(msg)
+    return Rays(
+        origin=local_origin,
+        points=local_points.astype(np.float32),
+        directions=(rays / ranges[:, None]).astype(np.float32),
+        ranges_m=ranges.astype(np.float32),
+        intensities=intensity,
+        scans=np.concatenate(kept_scans),
+    )

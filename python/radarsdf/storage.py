@@ -1,0 +1,126 @@
+"""One safetensors file with everything that a map is: cells, features, weights, origin, units, configuration."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
+from torch import Tensor
+
+from radarsdf.config import FitConfig
+from radarsdf.field import Field
+from radarsdf.map import IntensityScale, RadarMap
+
+FORMAT = "radarsdf.map"
+FORMAT_VERSION = 1
+_UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
+
+
+def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
+    """Writes a map; the old file at `path`, if any, is replaced only once the new one is whole."""
+    tensors: dict[str, Tensor] = {f"field.{name}": value for name, value in radar_map.field.state_dict().items()}
+    tensors["origin"] = torch.from_numpy(radar_map.origin)
+    # Morton keys use 63 bits, so the cast to the signed integers that every reader knows is lossless.
+    tensors["leaf_keys"] = torch.from_numpy(radar_map.field.cells.table.leaf_keys().astype(np.int64))
+    scale = radar_map.intensity_scale
+    description = {
+        "config": radar_map.config.to_dict(),
+        "intensity_scale": None if scale is None else [scale.low, scale.high],
+        "report": radar_map.report,
+    }
+    metadata = {
+        "format": FORMAT,
+        "format_version": str(FORMAT_VERSION),
+        "units": _UNITS,
+        "description": json.dumps(description),
+    }
+    target = Path(path)
+    data = to_bytes({name: tensor.contiguous() for name, tensor in tensors.items()}, metadata)
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).replace(target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load(path: str | PathLike[str]) -> RadarMap:
+    """Reads a map that :meth:`RadarMap.save` wrote. Nothing in the file is executed.
+
+    Parameters
+    ----------
+    path : path-like
+        A file written by this version or an earlier one.
+
+    Returns
+    -------
+    RadarMap
+        Gives the same bits as the map that was saved.
+
+    Raises
+    ------
+    ValueError
+        If the file is not a radarsdf map, is damaged, or comes from a newer version.
+    OSError
+        If it cannot be read.
+    """
+    with open(path, "rb"):  # noqa: PTH123 - a missing or unreadable file is an OSError that names it
+        pass
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            _check_format(metadata, path)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        return _build(tensors, json.loads(metadata["description"]))
+    except (SafetensorError, KeyError, TypeError, RuntimeError, AttributeError, RecursionError, json.JSONDecodeError) as error:
+        msg = f"{path} is not a whole radarsdf map: {error}"
+        raise ValueError(msg) from error
+
+
+def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
+    if metadata.get("format") != FORMAT:
+        msg = f"{path} is not a radarsdf map"
+        raise ValueError(msg)
+    version = metadata.get("format_version", "")
+    if not version.isdecimal() or int(version) > FORMAT_VERSION:
+        msg = f"{path} has format version {version!r}; this radarsdf reads up to {FORMAT_VERSION}"
+        raise ValueError(msg)
+
+
+def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
+    config = FitConfig.from_dict(description["config"])
+    origin = tensors.pop("origin")
+    if origin.shape != (3,) or origin.dtype != torch.float64 or not origin.isfinite().all():
+        msg = "the origin is not three finite numbers"
+        raise ValueError(msg)
+    leaf_keys = tensors.pop("leaf_keys")
+    if leaf_keys.ndim != 1 or leaf_keys.dtype != torch.int64:
+        msg = "leaf_keys is not a list of cells"
+        raise ValueError(msg)
+    scale = None
+    if description["intensity_scale"] is not None:
+        low, high = description["intensity_scale"]
+        scale = IntensityScale(float(low), float(high))
+    field = Field(leaf_keys.numpy().astype(np.uint64), config, with_intensity=scale is not None)
+    state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
+    for name, tensor in state.items():
+        if tensor.dtype != torch.float32 or not tensor.isfinite().all():
+            msg = f"{name} holds something other than finite float32 numbers"
+            raise ValueError(msg)
+    field.load_state_dict(state)  # a RuntimeError for wrong names or shapes
+    field.requires_grad_(False)
+    return RadarMap(
+        field=field, origin=origin.numpy(), intensity_scale=scale, config=config, report=dict(description["report"])
+    )

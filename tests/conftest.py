@@ -1,0 +1,59 @@
+"""Scenes that several tests share: small, analytic, made once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import radarsdf
+
+SEED = 7
+
+
+@dataclass(frozen=True)
+class Scene:
+    points: list
+    poses: np.ndarray
+    intensities: list
+
+
+def pose(position, yaw_rad=0.0):
+    T_world_sensor = np.eye(4)
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    T_world_sensor[:2, :2] = [[c, -s], [s, c]]
+    T_world_sensor[:3, 3] = position
+    return T_world_sensor
+
+
+def ground_and_wall(scans=6, returns_per_scan=1500, noise_m=0.02, offset=(0.0, 0.0, 0.0)):
+    """A sensor 1.5 m above the plane z = 0 drives along x towards the wall x = 20.
+
+    The intensity is that of the radar equation on a perfectly rough surface: 100 - 40 log10(range / 1 m).
+    """
+    rng = np.random.default_rng(SEED)
+    points, poses, intensities = [], [], []
+    for i in range(scans):
+        T_world_sensor = pose(np.array([1.0 * i, 0.3 * np.sin(i), 1.5]), 0.05 * np.cos(i))
+        half = returns_per_scan // 2
+        ground = np.column_stack([rng.uniform(8, 20, half), rng.uniform(-6, 6, half), np.zeros(half)])
+        wall = np.column_stack([np.full(half, 20.0), rng.uniform(-6, 6, half), rng.uniform(0, 4, half)])
+        rays = np.concatenate([ground, wall]) - T_world_sensor[:3, 3]
+        ranges = np.linalg.norm(rays, axis=1)
+        measured = rays * (1 + rng.normal(0, noise_m, len(rays)) / ranges)[:, None]
+        points.append((measured @ T_world_sensor[:3, :3]).astype(np.float32))
+        T_world_sensor[:3, 3] += offset
+        poses.append(T_world_sensor)
+        intensities.append((100 - 40 * np.log10(ranges) + rng.normal(0, 0.5, len(ranges))).astype(np.float32))
+    return Scene(points, np.stack(poses), intensities)
+
+
+@pytest.fixture(scope="session")
+def scene():
+    return ground_and_wall()
+
+
+@pytest.fixture(scope="session")
+def radar_map(scene):
+    return radarsdf.fit(scene.points, scene.poses, scene.intensities, progress=False)

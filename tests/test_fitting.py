@@ -1,0 +1,212 @@
+"""A fit finds the surface and the intensities of an analytic scene, says no to bad input, and repeats itself."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import radarsdf
+from radarsdf import FitConfig
+
+from .conftest import ground_and_wall
+
+QUICK = FitConfig(sdf_iterations=20, intensity_iterations=20, batch_size=1024)
+
+
+def test_surface_and_free_space_are_where_they_should_be(radar_map):
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(9, 18, 500), rng.uniform(-4, 4, 500), np.zeros(500)])
+    for height_m in (-0.1, 0.0, 0.1):
+        error_m = radar_map.sdf(ground + [0, 0, height_m]) - height_m
+        assert abs(np.median(error_m)) < 0.03
+    wall = np.column_stack([np.full(500, 20.0), rng.uniform(-4, 4, 500), rng.uniform(0.5, 3, 500)])
+    assert abs(np.median(radar_map.sdf(wall - [0.1, 0, 0])) - 0.1) < 0.03
+    assert np.median(radar_map.sdf(wall - [1.0, 0, 0])) > 0.2
+    assert np.median(radar_map.sdf(wall + [0.3, 0, 0])) < -0.2
+
+
+def test_gradient_points_to_free_space_and_is_the_derivative(radar_map):
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(9, 18, 300), rng.uniform(-4, 4, 300), rng.uniform(-0.05, 0.05, 300)])
+    gradient = radar_map.gradient(ground)
+    normal = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+    assert np.median(normal[:, 2]) > 0.97
+    step = 1e-3
+    for axis in range(3):
+        offset = step * np.eye(3)[axis]
+        difference = (radar_map.sdf(ground + offset) - radar_map.sdf(ground - offset)) / (2 * step)
+        # Within a cell and a ReLU's linear piece they agree; a few percent of the steps cross a border.
+        assert np.median(np.abs(difference - gradient[:, axis])) < 0.01
+
+
+def test_intensity_follows_the_radar_equation(radar_map):
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([np.full(500, 20.0), rng.uniform(-4, 4, 500), rng.uniform(0.5, 3, 500)])
+    for x in (0.5, 3.5):  # between the training positions
+        sensor = np.array([x, 0.0, 1.5])
+        expected = 100 - 40 * np.log10(np.linalg.norm(wall - sensor, axis=1))
+        assert np.median(np.abs(radar_map.intensity(wall, sensor) - expected)) < 0.5
+
+
+def test_observed_is_near_the_returns_only(scene, radar_map):
+    world = scene.points[0] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
+    assert radar_map.observed(world).all()
+    assert not radar_map.observed(world + [0, 0, 30.0]).any()
+    assert not radar_map.observed(scene.poses[:, :3, 3]).any()
+
+
+def test_same_seed_same_bits_other_seed_other_bits(scene):
+    maps = [radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK) for _ in range(2)]
+    other = radarsdf.fit(
+        scene.points, scene.poses, scene.intensities, config=dataclasses.replace(QUICK, seed=1)
+    )
+    for name, value in maps[0].field.state_dict().items():
+        assert torch.equal(value, maps[1].field.state_dict()[name])
+    assert not torch.equal(maps[0].field.cells.features, other.field.cells.features)
+
+
+def test_a_fit_leaves_the_global_random_state_and_threads_alone(scene):
+    torch.manual_seed(3)
+    state, threads = torch.get_rng_state(), torch.get_num_threads()
+    radarsdf.fit(scene.points, scene.poses, config=dataclasses.replace(QUICK, num_threads=1))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.get_num_threads() == threads
+
+
+def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
+    radar_map = radarsdf.fit(scene.points, scene.poses, config=QUICK)
+    assert radar_map.field.intensity_network is None
+    assert radar_map.report["iterations"]["intensity"] == 0
+    assert set(radar_map.report["losses"]) == {"sdf"}
+    with pytest.raises(ValueError, match="without intensities"):
+        radar_map.intensity(np.zeros((1, 3)), np.zeros(3))
+
+
+def test_utm_coordinates_change_nothing():
+    offset = np.array([5e5, 5.4e6, 300.0])
+    near, far = (
+        radarsdf.fit((s := ground_and_wall(offset=o)).points, s.poses, s.intensities, config=QUICK)
+        for o in (np.zeros(3), offset)
+    )
+    x = np.random.default_rng(0).uniform([8, -5, -0.2], [20, 5, 0.2], (500, 3))
+    np.testing.assert_allclose(far.sdf(x + offset), near.sdf(x), atol=1e-3)
+    sensor = np.array([0.5, 0, 1.5])
+    np.testing.assert_allclose(far.intensity(x + offset, sensor + offset), near.intensity(x, sensor), atol=0.05)
+
+
+@pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
+@pytest.mark.parametrize("joint", [False, True])
+def test_every_input_of_the_intensity_network_runs(scene, encoding, joint):
+    config = dataclasses.replace(
+        QUICK, encoding=encoding, joint=joint, normals=True, geometry_feature_dim=15, intensity_iterations=30
+    )
+    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
+    assert np.isfinite(radar_map.intensity(np.array([[15.0, 0, 0]]), np.zeros(3))).all()
+    bare = dataclasses.replace(config, normals=False, geometry_feature_dim=0, sdf_input=False, view_direction=False)
+    assert radarsdf.fit(scene.points, scene.poses, scene.intensities, config=bare).has_intensity
+
+
+def test_frozen_geometry_does_not_move(scene):
+    config = dataclasses.replace(QUICK, joint=True)
+    frozen = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
+    longer = radarsdf.fit(
+        scene.points, scene.poses, scene.intensities, config=dataclasses.replace(config, intensity_iterations=60)
+    )
+    assert torch.equal(frozen.field.cells.features, longer.field.cells.features)
+    weights = [m.field.intensity_network.layers[0].weight for m in (frozen, longer)]
+    assert not torch.equal(*weights)
+
+
+class TestBadInput:
+    """One clear ValueError each, before any work."""
+
+    @staticmethod
+    def scans():
+        scene = ground_and_wall(scans=3, returns_per_scan=40)
+        return [p.copy() for p in scene.points], scene.poses.copy(), [i.copy() for i in scene.intensities]
+
+    def test_mismatched_lengths(self):
+        points, poses, intensities = self.scans()
+        with pytest.raises(ValueError, match=r"poses must have shape \(3, 4, 4\)"):
+            radarsdf.fit(points, poses[:2], intensities)
+        with pytest.raises(ValueError, match="intensities holds 2 scans"):
+            radarsdf.fit(points, poses, intensities[:2])
+        with pytest.raises(ValueError, match=r"intensities of scan 1 must have shape \(40,\)"):
+            radarsdf.fit(points, poses, [intensities[0], intensities[1][:5], intensities[2]])
+        with pytest.raises(ValueError, match=r"scan 0 must have shape \(N, 3\)"):
+            radarsdf.fit([p[:, :2] for p in points], poses)
+
+    def test_values_that_are_not_finite_are_counted(self):
+        points, poses, intensities = self.scans()
+        points[1][3:5, 0] = np.nan
+        intensities[2][7] = np.inf
+        with pytest.raises(ValueError, match="3 of 120 returns are not finite, the first in scan 1"):
+            radarsdf.fit(points, poses, intensities)
+
+    @pytest.mark.parametrize("fault", ["scale", "shear", "mirror", "nan", "row"])
+    def test_poses_that_are_not_rigid(self, fault):
+        points, poses, _ = self.scans()
+        match fault:
+            case "scale":
+                poses[1, :3, :3] *= 1.01
+            case "shear":
+                poses[1, 0, 1] += 0.01
+            case "mirror":
+                poses[1, :3, 0] *= -1
+            case "nan":
+                poses[1, 0, 3] = np.nan
+            case "row":
+                poses[1, 3, 0] = 1
+        with pytest.raises(ValueError, match="pose 1 is not a rigid transform"):
+            radarsdf.fit(points, poses)
+
+    def test_empty_scans(self):
+        points, poses, _ = self.scans()
+        with pytest.raises(ValueError, match="no scans"):
+            radarsdf.fit([], np.zeros((0, 4, 4)))
+        with pytest.raises(ValueError, match="scan 2 is empty"):
+            radarsdf.fit([*points[:2], np.zeros((0, 3))], poses)
+        with pytest.raises(ValueError, match="none of 120 returns"):
+            radarsdf.fit([p * 0.01 for p in points], poses)
+
+    def test_intensities_without_variation(self):
+        points, poses, intensities = self.scans()
+        with pytest.raises(ValueError, match="all intensities are 3"):
+            radarsdf.fit(points, poses, [np.full_like(i, 3) for i in intensities])
+
+    def test_too_far_apart_for_one_lattice(self):
+        points, poses, _ = self.scans()
+        poses[1, 0, 3] = 1e7
+        with pytest.raises(ValueError, match="within a million cells"):
+            radarsdf.fit(points, poses)
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [("leaf_size_m", 0), ("sigma_m", float("nan")), ("num_levels", 99), ("near_samples", 0), ("free_from", 1.0)]
+        + [("encoding", "tree"), ("sdf_hidden", ()), ("batch_size", -1), ("max_range_m", 1.0)],
+    )
+    def test_settings_that_make_no_sense(self, name, value):
+        with pytest.raises(ValueError, match=r"."):
+            FitConfig(**{name: value})
+
+
+def test_a_loss_that_stops_being_finite_stops_the_fit(scene):
+    with pytest.raises(FloatingPointError, match="sdf loss is"):
+        radarsdf.fit(
+            scene.points, scene.poses, config=FitConfig(learning_rate=1e30, sdf_iterations=50, cosine_schedule=False)
+        )
+
+
+def test_paper_configuration_is_the_published_one():
+    paper = FitConfig.paper()
+    assert (paper.leaf_size_m, paper.num_levels, paper.fourier_count) == (0.2, 3, 16)
+    assert (paper.near_samples, paper.free_samples, paper.batch_size) == (6, 6, 8192)
+    assert (paper.sdf_iterations, paper.intensity_iterations, paper.learning_rate) == (1000, 4000, 1e-3)
+    assert (paper.geometry_feature_dim, paper.normals, paper.log_range) == (15, True, False)
+    assert (paper.joint, paper.intensity_in_free_space, paper.accumulate_frames) == (True, True, 5)
+    assert FitConfig.from_dict(paper.to_dict()) == paper
+    with pytest.raises(ValueError, match="unknown settings: colour"):
+        FitConfig.from_dict({"colour": 1})
