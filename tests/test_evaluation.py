@@ -156,6 +156,11 @@ def test_discarding_hides_what_f_score_all_shows():
     assert m["f_score_all"] == pytest.approx(2 * 0.25 / 1.25, abs=0.01)
 
 
+def test_threshold_beyond_the_discard():
+    m = surface_metrics(plane(0.45), grid(step=0.05), samples=1000, threshold_m=0.5)
+    assert (m["accuracy_error_m"], m["accuracy_ratio"], m["precision"]) == (None, 0.0, 1.0)
+
+
 def test_same_seed_same_numbers_on_any_number_of_threads():
     truth = bumpy().vertices + 0.1
     one = surface_metrics(bumpy(), truth, samples=20_000, seed=5, num_threads=1)
@@ -196,8 +201,10 @@ def test_angles_match_trimesh_on_a_wound_mesh():
 
 
 def test_angles_without_a_distribution_are_none_not_nan():
-    offset = (5e5, 5.4e6, 120.0)
-    m = surface_metrics(plane(offset=offset), grid(step=0.5, offset=offset), samples=1000)
+    tilted = plane()
+    tilted.apply_transform(trimesh.transformations.rotation_matrix(0.3, [1.0, 2.0, 0.5]))
+    tilted.apply_translation((5e5, 5.4e6, 120.0))
+    m = surface_metrics(tilted, tilted.vertices, samples=1000)
     assert m["gamma_shape"] is None
     assert m["gamma_mean"] == pytest.approx(0.0, abs=1e-7)
     single = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
@@ -208,10 +215,13 @@ def test_angles_without_a_distribution_are_none_not_nan():
 
 
 def test_triangles_without_area_change_nothing():
-    mesh = plane()
-    faces = np.vstack([mesh.faces, [[0, 0, 1], [0, 1, 2], [5, 5, 5]]])  # 0, 1, 2 lie on one line
-    m = surface_metrics(trimesh.Trimesh(mesh.vertices, faces, process=False), grid(step=0.1), samples=10_000)
+    vertices = np.vstack([plane().vertices, np.full((3, 3), -100.0)])
+    faces = np.vstack(
+        [plane().faces, [[0, 0, 1], [0, 1, 2], [5, 5, 5], [81, 82, 83]]]
+    )  # 0, 1, 2 are on a line
+    m = surface_metrics(trimesh.Trimesh(vertices, faces, process=False), grid(step=0.1), samples=10_000)
     assert m["num_mesh_samples"] == 10_000
+    assert m["outlier_ratio"] == 0.0
     assert m["gamma_mean"] == pytest.approx(0.0, abs=1e-7)
 
 
