@@ -61,9 +61,9 @@ def test_color_map_limits_and_nan():
 
 @pytest.mark.parametrize("cells", [1, 7, 150])
 def test_a_square_fills_its_place_without_holes(cells):
-    mesh = square((3e5, 5e6, 40.0), cells=cells)
+    mesh = square((5e6, 3e5, 40.0), size=2.3, cells=cells)  # so far out that float32 would bend it
     color = (200, 40, 40)
-    image = render(mesh, one_color(mesh, color), width=300, height=200, viewpoint=(3e5, 5e6 - 10.0, 40.0))
+    image = render(mesh, one_color(mesh, color), width=300, height=200, viewpoint=(5e6, 3e5 - 10.0, 40.0))
     assert image.shape == (200, 300, 3)
     rows, columns = np.nonzero((image != WHITE).any(axis=-1))
     side = np.ptp(rows) + 1
@@ -111,10 +111,38 @@ def test_what_lies_behind_the_viewer_is_left_out():
     room = trimesh.creation.box((10.0, 10.0, 4.0)).subdivide().subdivide().subdivide()
     image = render(room, width=160, height=100, viewpoint=(0.0, -4.0, 0.5))
     assert (image != WHITE).any(axis=-1).mean() > 0.5
-    behind = square((0.0, 0.0, 0.0))
-    behind = trimesh.util.concatenate([behind, square((0.0, -40.0, 0.0))])
-    image = render(behind, width=160, height=100, viewpoint=(0.0, 5.0, 0.0))
-    assert image.shape == (100, 160, 3)
+    ahead, behind = square((0.0, -40.0, 0.0)), square((0.0, 0.0, 0.0))
+    colors = np.vstack([one_color(ahead, (200, 0, 0)), one_color(behind, (0, 200, 0))])
+    mesh = trimesh.util.concatenate([ahead, behind])
+    image = render(mesh, colors, width=160, height=100, viewpoint=(0.0, -10.0, 0.0)).astype(int)
+    assert (image[..., 0] > image[..., 1]).any()
+    assert not (image[..., 1] > image[..., 0]).any()
+    half = trimesh.Trimesh([[-1, -5, -1], [1, -5, -1], [0, 20, -1]], [[0, 1, 2]], process=False)
+    assert (render(half, width=160, height=100, viewpoint=(0.0, 0.0, 0.0)) == WHITE).all()
+
+
+def test_two_triangles_are_drawn_like_many():
+    images = []
+    for cells in (1, 50):
+        wall = square((0.0, 0.0, 0.0), size=10.0, cells=cells)
+        colors = one_color(wall, (0, 120, 120))
+        colors[:, 0] = np.rint(10 + 20 * (wall.vertices[:, 0] + 5))
+        images.append(render(wall, colors, width=200, height=150, viewpoint=(-8.0, -7.0, 1.0)).astype(int))
+    drawn = (images[0] != WHITE).any(axis=-1) & (images[1] != WHITE).any(axis=-1)
+    assert drawn.mean() > 0.2
+    assert (
+        np.percentile(np.abs(images[0] - images[1])[drawn], 99) <= 3
+    )  # colours follow space, not the screen
+
+
+def test_a_few_flying_triangles_do_not_make_the_scene_small():
+    scene = square((0.0, 0.0, 0.0), cells=30)
+    flying = trimesh.util.concatenate([scene, square((25.0, 0.0, 0.0), size=0.1)])
+    share = [
+        (render(m, width=150, height=100, viewpoint=(0.0, -30.0, 0.0)) != WHITE).any(axis=-1).mean()
+        for m in (scene, flying)
+    ]
+    assert share[1] > 0.5 * share[0]
 
 
 def test_save_picture_has_the_colors_of_the_scalar(tmp_path):

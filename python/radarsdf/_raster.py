@@ -20,15 +20,16 @@ def project(seen: _Floats, faces: _Integers, size: tuple[int, int]) -> tuple[_Fl
     depth = np.where(depth > 1e-3 * np.abs(depth).max(), depth, np.nan)
     u, v = seen[:, 0] / depth, -seen[:, 1] / depth
     used = np.unique(faces)
-    used = used[
-        np.isfinite(depth[used]) & (np.hypot(u[used], v[used]) < 1.5)
-    ]  # not wider than a wide-angle lens
+    wide = np.hypot(u[used], v[used]) > 1.5  # no lens is wider
+    used = used[np.isfinite(depth[used]) & ~wide]
     if len(used) == 0:
         return u, v, np.full(len(u), np.nan)
-    bounds = np.percentile(np.stack([u[used], v[used]]), [0.2, 99.8], axis=1)
-    extent = np.maximum(np.ptp(bounds, axis=0), 1e-9)
-    focal = 0.93 * float(np.min(np.array(size[::-1]) / extent))
-    middle = bounds.mean(axis=0)
+    screen = np.stack([u[used], v[used]])
+    low, high = np.percentile(screen, [2, 98], axis=1)
+    reach = 0.2 * (high - low)  # all of a compact scene, but a few flying triangles do not make it small
+    low, high = np.maximum(low - reach, screen.min(axis=1)), np.minimum(high + reach, screen.max(axis=1))
+    focal = 0.93 * float(np.min(np.array(size[::-1]) / np.maximum(high - low, 1e-9)))
+    middle = 0.5 * (low + high)
     return (u - middle[0]) * focal + size[1] / 2, (v - middle[1]) * focal + size[0] / 2, 1.0 / depth
 
 

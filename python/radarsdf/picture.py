@@ -82,7 +82,8 @@ def render(
         Size of the picture in pixels.
     viewpoint
         (3,) where the viewer stands, world frame, metres; the view is turned and zoomed to the mesh. None
-        looks down obliquely on its longer side. What lies behind the viewer is not drawn.
+        looks down obliquely on its longer side. Triangles wholly or partly behind the viewer are
+        not drawn.
 
     Returns
     -------
