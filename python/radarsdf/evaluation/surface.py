@@ -111,9 +111,11 @@ def surface_metrics(
 
     Notes
     -----
-    Memory is bounded: beside mesh and ground truth, a block of samples and its search tree (100 MB) at a time.
-    A ground-truth point's distance is the exact one to the nearest of all samples, not to the triangles, so with
-    few samples per square metre completion suffers; 1e7 leave 1 cm gaps on 1000 m².
+    Memory is bounded: beside mesh and ground truth, a block of samples and its search tree at a time (200 MB in
+    all for 400,000 triangles and 300,000 points).
+    A ground-truth point's distance is the exact one to the nearest of all samples, not to the triangles: even a
+    perfect mesh has a completion error of half the samples' spacing, 0.5 · sqrt(area / samples), 5 mm for 1e7 on
+    1000 m². Compare at equal `samples`.
     """
     if samples < 1 or min(threshold_m, outlier_m, truncation_m) <= 0:
         msg = "samples, threshold_m, outlier_m and truncation_m must be positive"
