@@ -1,0 +1,195 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Pictures: what is in front, no holes, and colours that say what the colour bar says."""
+
+import builtins
+
+import numpy as np
+import pytest
+import trimesh
+from radarsdf.picture import intensity_colors, render, save_picture
+
+WHITE = np.array([255, 255, 255])
+
+
+def square(center, size=2.0, cells=1):
+    """A square facing -y, upright."""
+    t = np.linspace(-size / 2, size / 2, cells + 1)
+    x, z = np.meshgrid(t, t, indexing="ij")
+    vertices = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3) + center
+    i = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def one_color(mesh, color):
+    return np.tile(np.array([*color, 255], dtype=np.uint8), (len(mesh.vertices), 1))
+
+
+def lab(rgb):
+    """OKLab (Ottosson 2020), an independent measure of how colours look."""
+    c = rgb / 255.0
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    m1 = [[0.41222, 0.53633, 0.05145], [0.21190, 0.68070, 0.10740], [0.08830, 0.28172, 0.62998]]
+    m2 = [[0.21045, 0.79362, -0.00407], [1.97800, -2.42859, 0.45059], [0.02590, 0.78277, -0.80868]]
+    return np.cbrt(linear @ np.transpose(m1)) @ np.transpose(m2)
+
+
+def test_color_map_is_perceptually_uniform():
+    colors = intensity_colors(np.linspace(0, 1, 65), 0, 1)
+    assert colors.dtype == np.uint8
+    assert (colors[:, 3] == 255).all()
+    steps = np.diff(lab(colors[::8, :3].astype(float)), axis=0)
+    assert (steps[:, 0] > 0.05).all()  # brighter all the way
+    size = np.linalg.norm(steps, axis=1)
+    assert size.max() / size.min() < 1.15
+
+
+def test_color_map_limits_and_nan():
+    c = intensity_colors([-5.0, 45.0, 73.5, 102.0, 500.0, np.inf, np.nan], 45.0, 102.0)
+    assert (c[0] == c[1]).all()
+    assert (c[3] == c[4]).all()
+    assert (c[3] == c[5]).all()
+    assert len({tuple(row) for row in c.tolist()}) == 4  # low, middle, high, unknown
+    assert np.ptp(c[6, :3]) < 20  # grey
+    np.testing.assert_array_equal(intensity_colors([7.0], 7.0, 7.0), intensity_colors([0.5], 0.0, 1.0))
+    for low, high in ((1.0, 0.0), (np.nan, 1.0)):
+        with pytest.raises(ValueError, match="limits"):
+            intensity_colors([0.5], low, high)
+
+
+@pytest.mark.parametrize("cells", [1, 7, 150])
+def test_a_square_fills_its_place_without_holes(cells):
+    mesh = square((5e6, 3e5, 40.0), size=2.3, cells=cells)  # so far out that float32 would bend it
+    color = (200, 40, 40)
+    image = render(mesh, one_color(mesh, color), width=300, height=200, viewpoint=(5e6, 3e5 - 10.0, 40.0))
+    assert image.shape == (200, 300, 3)
+    rows, columns = np.nonzero((image != WHITE).any(axis=-1))
+    side = np.ptp(rows) + 1
+    assert side == pytest.approx(0.93 * 200, abs=3)
+    assert abs(int(np.ptp(columns)) + 1 - side) <= 1  # still a square
+    inside = image[rows.min() + 8 : rows.max() - 8, columns.min() + 8 : columns.max() - 8].reshape(-1, 3)
+    assert (np.ptp(inside.astype(int), axis=0) <= 2).all()  # one colour: no hole, no seam
+    hue = inside[0] / inside[0].max()
+    np.testing.assert_allclose(hue, np.array(color) / 200, atol=0.02)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_nearer_surface_hides_the_farther(order):
+    near, far = square((0.0, 0.0, 0.0)), square((0.0, 3.0, 0.0), size=6.0)
+    colored = [(near, (0, 200, 0)), (far, (200, 0, 0))][::order]
+    mesh = trimesh.util.concatenate([m for m, _ in colored])
+    colors = np.vstack([one_color(m, c) for m, c in colored])
+    image = render(mesh, colors, width=200, height=200, viewpoint=(0.0, -8.0, 0.0)).astype(int)
+    assert image[100, 100, 1] > 100 > image[100, 100, 0]
+    assert image[100, 20, 0] > 100 > image[100, 20, 1]
+    from_behind = render(mesh, colors, width=200, height=200, viewpoint=(0.0, 12.0, 0.0)).astype(int)
+    assert from_behind[100, 100, 0] > 100 > from_behind[100, 100, 1]
+
+
+def test_nearness_is_by_depth_not_by_order_of_corners():
+    # Two crossing walls: each hides the other on one side of the picture.
+    a, b = square((0.0, 0.0, 0.0), size=4.0), square((0.0, 0.0, 0.0), size=4.0)
+    a.apply_transform(trimesh.transformations.rotation_matrix(0.5, [0, 0, 1]))
+    b.apply_transform(trimesh.transformations.rotation_matrix(-0.5, [0, 0, 1]))
+    colors = np.vstack([one_color(a, (0, 200, 0)), one_color(b, (200, 0, 0))])
+    image = render(
+        trimesh.util.concatenate([a, b]), colors, width=200, height=200, viewpoint=(0, -9, 0)
+    ).astype(int)
+    assert image[100, 60, 1] > image[100, 60, 0]
+    assert image[100, 140, 0] > image[100, 140, 1]
+
+
+def test_surfaces_toward_the_light_are_brighter():
+    image = render(trimesh.creation.icosphere(subdivisions=4), width=200, height=200).astype(int)
+    assert image[65, 70].sum() > image[135, 130].sum() + 60  # upper left against lower right
+    assert (image[2, 2] == WHITE).all()
+
+
+def test_what_lies_behind_the_viewer_is_left_out():
+    room = trimesh.creation.box((10.0, 10.0, 4.0)).subdivide().subdivide().subdivide()
+    image = render(room, width=160, height=100, viewpoint=(0.0, -4.0, 0.5))
+    assert (image != WHITE).any(axis=-1).mean() > 0.5
+    ahead, behind = square((0.0, -40.0, 0.0)), square((0.0, 0.0, 0.0))
+    colors = np.vstack([one_color(ahead, (200, 0, 0)), one_color(behind, (0, 200, 0))])
+    mesh = trimesh.util.concatenate([ahead, behind])
+    image = render(mesh, colors, width=160, height=100, viewpoint=(0.0, -10.0, 0.0)).astype(int)
+    assert (image[..., 0] > image[..., 1]).any()
+    assert not (image[..., 1] > image[..., 0]).any()
+    half = trimesh.Trimesh([[-1, -5, -1], [1, -5, -1], [0, 20, -1]], [[0, 1, 2]], process=False)
+    assert (render(half, width=160, height=100, viewpoint=(0.0, 0.0, 0.0)) == WHITE).all()
+
+
+def test_two_triangles_are_drawn_like_many():
+    images = []
+    for cells in (1, 50):
+        wall = square((0.0, 0.0, 0.0), size=10.0, cells=cells)
+        colors = one_color(wall, (0, 120, 120))
+        colors[:, 0] = np.rint(10 + 20 * (wall.vertices[:, 0] + 5))
+        images.append(render(wall, colors, width=200, height=150, viewpoint=(-8.0, -7.0, 1.0)).astype(int))
+    drawn = (images[0] != WHITE).any(axis=-1) & (images[1] != WHITE).any(axis=-1)
+    assert drawn.mean() > 0.2
+    assert (
+        np.percentile(np.abs(images[0] - images[1])[drawn], 99) <= 3
+    )  # colours follow space, not the screen
+
+
+def test_a_few_flying_triangles_do_not_make_the_scene_small():
+    scene = square((0.0, 0.0, 0.0), cells=30)
+    flying = trimesh.util.concatenate([scene, square((25.0, 0.0, 0.0), size=0.1)])
+    share = [
+        (render(m, width=150, height=100, viewpoint=(0.0, -30.0, 0.0)) != WHITE).any(axis=-1).mean()
+        for m in (scene, flying)
+    ]
+    assert share[1] > 0.5 * share[0]
+
+
+def test_save_picture_has_the_colors_of_the_scalar(tmp_path):
+    pytest.importorskip("matplotlib")
+    from matplotlib.image import imread  # noqa: PLC0415
+
+    mesh = square((0.0, 0.0, 0.0), cells=20)
+    scalar = np.where(mesh.vertices[:, 0] < 0, 60.0, 80.0)
+    scalar[:5] = np.nan
+    path = tmp_path / "map.png"
+    save_picture(
+        path, mesh, scalar=scalar, label="intensity [dB]", width=500, height=300, viewpoint=(0, -5, 0)
+    )
+    image = np.rint(imread(path)[..., :3] * 255)
+    assert image.shape == (300, 500, 3)
+    low, high = intensity_colors([60.0, 80.0], 60.0, 80.0)[:, :3].astype(float)
+    for column, color in ((150, low), (300, high)):
+        shade = image[150, column] / color
+        assert np.ptp(shade) < 0.06  # the colour, darker or brighter by the light
+    bar = image[:, 460:466].reshape(-1, 3)
+    assert np.abs(bar - low).sum(axis=1).min() < 10
+    assert np.abs(bar - high).sum(axis=1).min() < 10
+    plain = tmp_path / "plain.png"
+    save_picture(plain, mesh, width=200, height=100)
+    assert (imread(plain)[..., :3] < 0.9).any()
+
+
+def test_without_matplotlib_the_message_says_what_to_install(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name.startswith("matplotlib"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(ImportError, match=r'pip install "radarsdf\[demo\]"'):
+        save_picture(tmp_path / "map.png", square((0.0, 0.0, 0.0)))
+
+
+def test_refuses_what_it_cannot_draw():
+    mesh = square((0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="no triangles"):
+        render(trimesh.Trimesh())
+    with pytest.raises(ValueError, match="colors must be"):
+        render(mesh, np.zeros((3, 3), np.uint8))
+    with pytest.raises(ValueError, match="viewpoint"):
+        render(mesh, viewpoint=(0.0, 0.0))
+    with pytest.raises(ValueError, match="one value per vertex"):
+        save_picture("unused.png", mesh, scalar=[1.0])
