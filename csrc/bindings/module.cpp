@@ -6,6 +6,11 @@
 
 namespace py = pybind11;
 
+namespace radarsdf {
+void bind_marching_cubes(py::module_& m);
+}
+
 PYBIND11_MODULE(_core, m, py::mod_gil_not_used()) {
   m.doc() = "Compiled core of radarsdf: private, use the functions of the package.";
+  radarsdf::bind_marching_cubes(m);
 }
