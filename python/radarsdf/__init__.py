@@ -2,7 +2,8 @@
 
 from radarsdf.config import FitConfig
 from radarsdf.fitting import fit
+from radarsdf.isosurface import marching_cubes
 from radarsdf.map import RadarMap
 from radarsdf.storage import load
 
-__all__ = ["FitConfig", "RadarMap", "fit", "load"]
+__all__ = ["FitConfig", "RadarMap", "fit", "load", "marching_cubes"]

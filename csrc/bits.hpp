@@ -1,0 +1,34 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// The two bit operations C++17 lacks (they are std::countr_zero and std::popcount from C++20 on).
+#pragma once
+
+#include <cstdint>
+
+#ifdef _MSC_VER
+#include <intrin.h>
+#endif
+
+namespace radarsdf {
+
+// Position of the lowest bit that is set; bits must not be 0.
+inline int lowest_bit(std::uint32_t bits) {
+#ifdef _MSC_VER
+  unsigned long position = 0;
+  _BitScanForward(&position, bits);
+  return static_cast<int>(position);
+#else
+  return __builtin_ctz(bits);
+#endif
+}
+
+// Sums pairs, then fours, then bytes: the x86-64 baseline has no instruction for it and its library call is slower.
+inline int count_bits(std::uint64_t bits) {
+  bits -= (bits >> 1) & 0x5555555555555555u;
+  bits = (bits & 0x3333333333333333u) + ((bits >> 2) & 0x3333333333333333u);
+  bits = (bits + (bits >> 4)) & 0x0f0f0f0f0f0f0f0fu;
+  return static_cast<int>((bits * 0x0101010101010101u) >> 56);
+}
+
+}  // namespace radarsdf

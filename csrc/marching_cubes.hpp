@@ -1,0 +1,47 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Marching cubes on a dense volume and on a list of cells. Both make the same mesh of the same samples:
+//  - a sample is positive iff it is > level; triangles face the positive side (in this project: free space);
+//  - one vertex per cut edge of the cells in use, so the mesh is closed and manifold except where those cells end;
+//  - vertices keep away from the samples by min_edge_fraction of an edge, so vertices of different edges never
+//    coincide and no triangle is empty, even where samples equal the level;
+//  - a cell with a NaN corner is not in use; infinite samples are signs like any other.
+// Vertices and faces come in an order that depends on the data alone, not on the number of threads.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <memory>
+
+namespace radarsdf {
+
+constexpr double min_edge_fraction = 1e-3;
+
+struct Mesh {
+  std::int64_t num_vertices = 0;
+  std::int64_t num_faces = 0;
+  std::unique_ptr<double[]> vertices;    ///< (num_vertices, 3), world units
+  std::unique_ptr<std::int32_t[]> faces;  ///< (num_faces, 3) rows of vertices
+};
+
+// Where the samples are: sample (i, j, k) at origin + spacing * (i, j, k).
+struct Lattice {
+  std::array<double, 3> spacing{1, 1, 1};  ///< world units, finite and > 0
+  std::array<double, 3> origin{0, 0, 0};   ///< world units, finite
+};
+
+// volume: shape[0] * shape[1] * shape[2] samples in C order. mask: null, or as many flags, true where the sample may
+// be used; a cell needs all eight of its corners. T is float or double.
+template <typename T>
+Mesh marching_cubes_dense(const T* volume, const std::array<std::int64_t, 3>& shape, const bool* mask,
+                          const Lattice& lattice, double level, int num_threads);
+
+// corners: (num_corners, 3) lattice coordinates, each at most once; values: one per corner; cells: (num_cells, 8) rows
+// of corners in the order of marching_cubes_table.hpp, each cell at most once. T is float or double.
+template <typename T>
+Mesh marching_cubes_sparse(const std::int32_t* corners, const T* values, std::int64_t num_corners,
+                           const std::int32_t* cells, std::int64_t num_cells, const Lattice& lattice, double level,
+                           int num_threads);
+
+}  // namespace radarsdf

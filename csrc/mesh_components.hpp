@@ -1,0 +1,20 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+namespace radarsdf {
+
+struct MeshComponents {
+  std::unique_ptr<std::int32_t[]> labels;  ///< one per face; components are numbered in the order of their first faces
+  std::vector<std::int64_t> sizes;         ///< faces per component
+};
+
+// faces: (num_faces, 3) vertices in [0, num_vertices). Faces are connected where they share a vertex. Serial: linear
+// time, and the chains it follows allow no more.
+MeshComponents mesh_components(const std::int32_t* faces, std::int64_t num_faces, std::int64_t num_vertices);
+
+}  // namespace radarsdf

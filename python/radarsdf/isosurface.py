@@ -1,0 +1,274 @@
+"""Triangle meshes of the level sets of sampled fields.
+
+All functions here give results that do not depend on the number of threads. Lattice corners, wherever eight of
+them make a cell, come in C order: corner ``4 * dx + 2 * dy + dz`` lies ``(dx, dy, dz)`` above the lower one.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf import _core
+
+Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
+
+__all__ = ["extract_cells", "marching_cubes", "mesh_components", "sparse_lattice"]
+
+
+def marching_cubes(
+    volume: ArrayLike,
+    level: float = 0.0,
+    *,
+    spacing: ArrayLike = (1.0, 1.0, 1.0),
+    origin: ArrayLike = (0.0, 0.0, 0.0),
+    mask: ArrayLike | None = None,
+    num_threads: int = 0,
+) -> Mesh:
+    """Triangulate the surface on which a volume crosses a level.
+
+    A sample is positive if and only if it is greater than `level`, and the triangles' normals point to the positive
+    side. The mesh is closed and manifold except where the cells in use end: at the border of the volume, of the
+    mask and of NaN samples. No triangle has zero area, even where samples equal the level, since vertices keep 0.1 %
+    of an edge's length away from the samples.
+
+    Parameters
+    ----------
+    volume : array_like, shape (nx, ny, nz)
+        Samples; any is allowed to be infinite, which counts as a sign. float32 and float64 are used as they are,
+        float16, booleans and integers are converted to the smaller of the two that holds all their values (float64
+        for 64-bit integers too, rounded).
+    level : float
+        Value of the field on the surface.
+    spacing : array_like, shape (3,)
+        Distance between samples along each axis, finite and positive, in world units.
+    origin : array_like, shape (3,)
+        Position of sample (0, 0, 0), in world units.
+    mask : array_like of bool, shape (nx, ny, nz), optional
+        True where a sample may be used. A cell is triangulated if all eight of its samples may be used and none is
+        NaN. Default: all may be used.
+    num_threads : int
+        0 for as many as OpenMP would use.
+
+    Returns
+    -------
+    vertices : ndarray of float64, shape (V, 3)
+        Positions in world units: index * `spacing` + `origin`.
+    faces : ndarray of int32, shape (F, 3)
+        Rows of `vertices`, counter-clockwise seen from the positive side.
+
+    Raises
+    ------
+    TypeError
+        If `volume` is not real or `mask` is not boolean.
+    ValueError
+        If a shape does not fit, `spacing`, `origin` or `level` is out of range, or int32 cannot number the vertices.
+
+    Examples
+    --------
+    A sphere of radius 0.5 about the origin:
+
+    >>> import numpy as np
+    >>> x, y, z = np.meshgrid(*[np.linspace(-1, 1, 41)] * 3, indexing="ij")
+    >>> vertices, faces = marching_cubes(np.sqrt(x**2 + y**2 + z**2), 0.5, spacing=[0.05] * 3, origin=[-1] * 3)
+    >>> bool(np.allclose(np.linalg.norm(vertices, axis=1), 0.5, atol=1e-3))
+    True
+    """
+    samples = _as_samples(volume, "volume")
+    if samples.ndim != 3:
+        msg = f"volume must have three axes, not {samples.ndim}"
+        raise ValueError(msg)
+    if mask is not None:
+        mask = np.asarray(mask)
+        if mask.dtype != np.bool_:
+            msg = f"mask must be boolean, not {mask.dtype}"
+            raise TypeError(msg)
+        if mask.shape != samples.shape:
+            msg = f"mask must have the shape of volume, {samples.shape}, not {mask.shape}"
+            raise ValueError(msg)
+        mask = np.ascontiguousarray(mask)
+    mesh: Mesh = _core.marching_cubes_dense(
+        samples, mask, *_as_placement(spacing, origin), _as_level(level), num_threads
+    )
+    return mesh
+
+
+def extract_cells(
+    corners: ArrayLike,
+    values: ArrayLike,
+    cells: ArrayLike,
+    level: float = 0.0,
+    *,
+    spacing: ArrayLike = (1.0, 1.0, 1.0),
+    origin: ArrayLike = (0.0, 0.0, 0.0),
+    num_threads: int = 0,
+) -> Mesh:
+    """Triangulate the level set inside some cells of a lattice.
+
+    The mesh is the one of `marching_cubes` on a volume with these cells in use, up to the order of its vertices and
+    faces. Time and memory are proportional to the numbers of cells and corners.
+
+    Parameters
+    ----------
+    corners : array_like of int32, shape (K, 3)
+        Lattice coordinates, each at most once.
+    values : array_like, shape (K,)
+        The field at the corners; types as for `marching_cubes`. Cells with a NaN corner are left out.
+    cells : array_like of int32, shape (M, 8)
+        Rows of `corners` in C order, each cell at most once; as `sparse_lattice` gives them.
+    level, spacing, origin, num_threads
+        As for `marching_cubes`; `origin` is the position of lattice point (0, 0, 0).
+
+    Returns
+    -------
+    vertices : ndarray of float64, shape (V, 3)
+        Positions in world units.
+    faces : ndarray of int32, shape (F, 3)
+        Rows of `vertices`, counter-clockwise seen from the positive side.
+
+    Raises
+    ------
+    TypeError
+        If `values` are not real, or `corners` or `cells` not integers.
+    ValueError
+        If a shape does not fit, or a cell refers to a corner that does not exist.
+
+    Examples
+    --------
+    >>> _, corners, cells = sparse_lattice([[0, 0, 0]])
+    >>> vertices, faces = extract_cells(corners, [1.0, -1, -1, -1, -1, -1, -1, -1], cells)
+    >>> vertices.sum(axis=0).tolist(), faces.shape
+    ([0.5, 0.5, 0.5], (1, 3))
+    """
+    mesh: Mesh = _core.marching_cubes_sparse(
+        _as_int32(corners, "corners"),
+        _as_samples(values, "values"),
+        _as_int32(cells, "cells"),
+        *_as_placement(spacing, origin),
+        _as_level(level),
+        num_threads,
+    )
+    return mesh
+
+
+def sparse_lattice(
+    cells: ArrayLike, *, num_threads: int = 0
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """Collect a set of lattice cells and the corners they share.
+
+    Parameters
+    ----------
+    cells : array_like of int32, shape (M, 3)
+        Lattice coordinates of the cells' lower corners, in any order, any number of times.
+    num_threads : int
+        0 for as many as OpenMP would use.
+
+    Returns
+    -------
+    unique_cells : ndarray of int32, shape (M', 3)
+        The different rows of `cells`, sorted by x, then y, then z.
+    corners : ndarray of int32, shape (K, 3)
+        Lattice coordinates of all their corners, each once, sorted likewise.
+    cell_corners : ndarray of int32, shape (M', 8)
+        Rows of `corners` for each cell, in C order.
+
+    Raises
+    ------
+    TypeError
+        If `cells` are not integers.
+    ValueError
+        If the shape does not fit, or the cells are so far apart that 63 bits cannot number their bounding box.
+
+    Examples
+    --------
+    >>> unique_cells, corners, cell_corners = sparse_lattice([[0, 0, 1], [0, 0, 0], [0, 0, 1]])
+    >>> unique_cells.tolist(), corners.shape
+    ([[0, 0, 0], [0, 0, 1]], (12, 3))
+    >>> corners[cell_corners[1, 0]].tolist()
+    [0, 0, 1]
+    """
+    result: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]] = _core.sparse_lattice(
+        _as_int32(cells, "cells"), num_threads
+    )
+    return result
+
+
+def mesh_components(faces: ArrayLike, num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Label the connected components of a mesh; faces are connected where they share a vertex.
+
+    Parameters
+    ----------
+    faces : array_like of int32, shape (F, 3)
+        Rows of the vertices.
+    num_vertices : int
+        Number of vertices.
+
+    Returns
+    -------
+    labels : ndarray of int32, shape (F,)
+        Component of each face; components are numbered in the order of their first faces.
+    sizes : ndarray of int64, shape (C,)
+        Number of faces of each component.
+
+    Raises
+    ------
+    TypeError
+        If `faces` are not integers.
+    ValueError
+        If the shape does not fit, or a face refers to a vertex that does not exist.
+
+    Examples
+    --------
+    >>> labels, sizes = mesh_components([[0, 1, 2], [3, 4, 5], [2, 1, 6]], 7)
+    >>> labels.tolist(), sizes.tolist()
+    ([0, 1, 0], [2, 1])
+    """
+    result: tuple[NDArray[np.int32], NDArray[np.int64]] = _core.mesh_components(
+        _as_int32(faces, "faces"), num_vertices
+    )
+    return result
+
+
+def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[np.float64]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        msg = f"{name} must be real numbers, not {array.dtype}"
+        raise TypeError(msg)
+    # float32 where it holds every value of the type: it is half of the memory to read
+    dtype = np.float32 if np.can_cast(array.dtype, np.float32, "safe") else np.float64
+    return np.ascontiguousarray(array, dtype=dtype)
+
+
+def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
+    array = np.asarray(values)
+    if array.size == 0 and array.dtype.kind == "f":  # what an empty list becomes
+        array = array.astype(np.int32)
+    if array.dtype.kind not in "iu":
+        msg = f"{name} must be integers, not {array.dtype}"
+        raise TypeError(msg)
+    if array.dtype != np.int32 and array.size > 0:
+        limits = np.iinfo(np.int32)
+        if array.min() < limits.min or array.max() > limits.max:
+            msg = f"{name} must be in the range of int32"
+            raise ValueError(msg)
+    return np.ascontiguousarray(array, dtype=np.int32)
+
+
+def _as_placement(spacing: ArrayLike, origin: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    step, start = np.asarray(spacing, dtype=np.float64), np.asarray(origin, dtype=np.float64)
+    if step.shape != (3,) or not np.all(np.isfinite(step) & (step > 0)):
+        msg = f"spacing must be three finite positive numbers, not {spacing}"
+        raise ValueError(msg)
+    if start.shape != (3,) or not np.all(np.isfinite(start)):
+        msg = f"origin must be three finite numbers, not {origin}"
+        raise ValueError(msg)
+    return step, start
+
+
+def _as_level(level: float) -> float:
+    if not np.isfinite(level):
+        msg = f"level must be finite, not {level}"
+        raise ValueError(msg)
+    return float(level)

@@ -1,0 +1,156 @@
+"""From a map to triangles: where to look for the surface, its vertices, and what they carry."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from tqdm import tqdm
+
+from radarsdf.isosurface import extract_cells, mesh_components, sparse_lattice
+from radarsdf.picture import intensity_colors
+
+if TYPE_CHECKING:
+    from radarsdf.map import RadarMap
+
+_INWARD = 1e-3  # of a voxel: how far corners on the map's border are moved into it to be evaluated
+_CHUNK = 1 << 15  # corners evaluated at a time
+
+
+def extract_mesh(
+    radar_map: RadarMap,
+    voxel_size: float = 0.1,
+    *,
+    box: ArrayLike | None = None,
+    viewpoint: ArrayLike | None = None,
+    progress: bool | None = None,
+) -> trimesh.Trimesh:
+    """Marching cubes on the zero level of the signed distance, only where the map is occupied.
+
+    Parameters
+    ----------
+    radar_map : RadarMap
+        The map.
+    voxel_size : float
+        Edge of the marching cubes' cells, m.
+    box : (2, 3) array_like, optional
+        Lower and upper corner, world, m: only voxels whose centres lie inside are meshed.
+    viewpoint : (3,) array_like, optional
+        Sensor position, world, m. The vertices then carry the predicted intensity for it, in sensor units, as
+        ``mesh.vertex_attributes["intensity"]``, and colours from dark (low) to bright (high).
+    progress : bool, optional
+        Whether to show a progress bar; by default only on a terminal.
+
+    Returns
+    -------
+    trimesh.Trimesh
+        World frame, m; triangles, and so vertex normals, face free space. Components of fewer triangles than
+        ``config.min_component_triangles`` are left out. Empty where there is no surface.
+
+    Raises
+    ------
+    ValueError
+        For a voxel size, box or viewpoint that makes no sense, or a viewpoint for a map without intensities.
+    """
+    if not (math.isfinite(voxel_size) and voxel_size > 0):
+        msg = f"voxel_size must be positive and finite, not {voxel_size}"
+        raise ValueError(msg)
+    if viewpoint is not None and not radar_map.has_intensity:
+        msg = "a viewpoint needs a map with intensities, and this one was fitted without"
+        raise ValueError(msg)
+    voxels = _occupied_voxels(radar_map, voxel_size)
+    if box is not None:
+        lower, upper = _check_box(box) - radar_map.origin
+        centres = (voxels + 0.5) * voxel_size
+        voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
+    num_threads = torch.get_num_threads()
+    voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
+    values = _corner_distances(radar_map, voxel_size, voxels, corners, voxel_corners, progress)
+    vertices, faces = extract_cells(corners, values, voxel_corners, spacing=[voxel_size] * 3, num_threads=num_threads)
+    vertices, faces = _without_small_components(vertices, faces, radar_map.config.min_component_triangles)
+    mesh = trimesh.Trimesh(vertices + radar_map.origin, faces, process=False)
+    if viewpoint is not None:
+        intensity = _viewed_intensity(radar_map, np.asarray(mesh.vertices), viewpoint)
+        mesh.vertex_attributes["intensity"] = intensity
+        scale = radar_map.intensity_scale
+        assert scale is not None
+        mesh.visual.vertex_colors = intensity_colors(intensity, scale.low, scale.high)
+    return mesh
+
+
+def _check_box(box: ArrayLike) -> NDArray[np.float64]:
+    corners = np.asarray(box, np.float64)
+    if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
+        msg = "box must be a lower and a higher corner, (2, 3)"
+        raise ValueError(msg)
+    return corners
+
+
+def _occupied_voxels(radar_map: RadarMap, voxel_size: float) -> NDArray[np.int32]:
+    """Lattice coordinates (M, 3) of the voxels that share space with an occupied leaf cell; some more than once.
+
+    A voxel counts when it holds the centre of one of the equal parts, no larger than a voxel, that a cell is cut into:
+    where voxels divide cells evenly, exactly the voxels inside occupied cells.
+    """
+    leaf_size_m = radar_map.config.leaf_size_m
+    parts = max(1, math.ceil(leaf_size_m / voxel_size - 1e-9))
+    cells = radar_map.field.cells.table.leaf_cells()
+    if parts * voxel_size > leaf_size_m * (1 + 1e-9) or parts == 1:
+        part = (np.stack(np.meshgrid(*[np.arange(parts)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / parts
+        inside = (cells[:, None, :] + part) * (leaf_size_m / voxel_size)
+        return np.floor(inside).astype(np.int32).reshape(-1, 3)
+    part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    return (cells[:, None, :] * np.int32(parts) + part).reshape(-1, 3)
+
+
+def _corner_distances(
+    radar_map: RadarMap,
+    voxel_size: float,
+    voxels: NDArray[np.int32],
+    corners: NDArray[np.int32],
+    voxel_corners: NDArray[np.int32],
+    progress: bool | None,
+) -> NDArray[np.float32]:
+    """Signed distance (K,) at lattice corners (K, 3), m.
+
+    A corner on the border of the occupied cells may belong to the cell beyond, which has no features: its value would
+    jump. It is evaluated a hair inside one of its own voxels instead.
+    """
+    field = radar_map.field
+    points = torch.from_numpy(corners.astype(np.float32) * np.float32(voxel_size))
+    values = []
+    with torch.no_grad():
+        outside = ~np.concatenate([field.cells.occupied(chunk).numpy() for chunk in points.split(_CHUNK)] or [[]]).astype(bool)
+        voxel, corner = np.nonzero(outside[voxel_corners])
+        of = voxel_corners[voxel, corner]
+        centres = torch.from_numpy((voxels[voxel].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size))
+        points[of] = torch.lerp(points[of], centres, _INWARD)
+        chunks = points.split(_CHUNK) if len(points) else ()
+        for chunk in tqdm(chunks, desc="mesh", unit="chunk", disable=None if progress is None else not progress):
+            values.append(field.logit(chunk) * field.sigma_m)
+    return torch.cat(values).numpy() if values else np.zeros(0, np.float32)
+
+
+def _without_small_components(
+    vertices: NDArray[np.float64], faces: NDArray[np.int32], min_triangles: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    labels, sizes = mesh_components(faces, len(vertices))
+    faces = faces[sizes[labels] >= min_triangles] if len(faces) else faces
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return vertices[used], renumbered[faces]
+
+
+def _viewed_intensity(
+    radar_map: RadarMap, vertices: NDArray[np.float64], viewpoint: ArrayLike
+) -> NDArray[np.float32]:
+    sensor_position = np.asarray(viewpoint, np.float64)
+    if sensor_position.shape != (3,) or not np.isfinite(sensor_position).all():
+        msg = "viewpoint must be one position (3,)"
+        raise ValueError(msg)
+    return radar_map.intensity(vertices, sensor_position).astype(np.float32)
