@@ -12,53 +12,48 @@
 #include "parallel.hpp"
 
 namespace radarsdf {
-namespace {
-
-constexpr std::int64_t kChunk = 1 << 20;  // keys held at a time: 8 MB
-
-}  // namespace
 
 CellSet::CellSet(double leaf_size_m) : leaf_size_m_(leaf_size_m) {
   if (!(leaf_size_m > 0) || !std::isfinite(leaf_size_m)) throw std::invalid_argument("leaf_size_m must be positive and finite");
 }
 
 template <typename T>
-void CellSet::insert(const T* points, std::int64_t count, int num_threads) {
+void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uint64_t* keys, int num_threads) {
   // The limit leaves room for the far vertex of the last cell of every level. NaN fails the comparison too.
-  const T inverse = static_cast<T>(1.0 / leaf_size_m_), limit = static_cast<T>(kAxisBias - (1 << kMaxLevels));
+  const T inverse = static_cast<T>(1.0 / leaf_size_m), limit = static_cast<T>(kAxisBias - (1 << kMaxLevels));
   std::atomic<bool> inside{true};
-  parallel_blocks(3 * count, 3 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    bool block_inside = true;
-    for (std::int64_t i = begin; i < end; ++i) block_inside &= std::abs(points[i] * inverse) < limit;
-    if (!block_inside) inside = false;
+  parallel_blocks(count, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      std::uint32_t cell[3] = {};
+      for (int axis = 0; axis < 3; ++axis) {
+        const T u = points[3 * i + axis] * inverse;
+        if (!(std::abs(u) < limit)) {
+          inside = false;
+          return;
+        }
+        cell[axis] = static_cast<std::uint32_t>(static_cast<std::int32_t>(std::floor(u)) + kAxisBias);
+      }
+      keys[i] = morton_key(cell[0], cell[1], cell[2]);
+    }
   });
   if (!inside) throw std::invalid_argument("points must be finite and within a million cells of the origin");
+}
 
-  std::vector<std::uint64_t> keys(static_cast<std::size_t>(std::min(count, kChunk)));
-  for (std::int64_t first = 0; first < count; first += kChunk) {
-    const std::int64_t size = std::min(kChunk, count - first);
-    parallel_blocks(size, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
-      for (std::int64_t i = begin; i < end; ++i) {
-        const T* p = points + 3 * (first + i);
-        const auto cell = [&](int axis) {
-          return static_cast<std::uint32_t>(static_cast<std::int32_t>(std::floor(p[axis] * inverse)) + kAxisBias);
-        };
-        keys[static_cast<std::size_t>(i)] = morton_key(cell(0), cell(1), cell(2));
-      }
-    });
-    const std::int64_t threads = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
-    parallel_tasks(threads, num_threads, [&](std::int64_t task) {
-      std::uint64_t previous = kEmptyKey;  // points along one ray often share a cell
-      for (std::int64_t i = 0; i < size; ++i) {
-        const std::uint64_t key = keys[static_cast<std::size_t>(i)];
-        if (key == previous) continue;
-        previous = key;
-        // Bits that FlatMap does not use for the slot, or the partitions would fill unevenly.
-        const std::uint64_t partition = (hash_key(key) >> 16) % kPartitions;
-        if (static_cast<std::int64_t>(partition) % threads == task) partitions_[partition].insert(key, 0);
-      }
-    });
-  }
+template <typename T>
+void CellSet::insert(const T* points, std::int64_t count, int num_threads) {
+  std::vector<std::uint64_t> keys(static_cast<std::size_t>(count));
+  cell_keys(points, count, leaf_size_m_, keys.data(), num_threads);
+  const std::int64_t threads = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
+  parallel_tasks(threads, num_threads, [&](std::int64_t task) {
+    std::uint64_t previous = kEmptyKey;  // points along one ray often share a cell
+    for (const std::uint64_t key : keys) {
+      if (key == previous) continue;
+      previous = key;
+      // Bits that FlatMap does not use for the slot, or the partitions would fill unevenly.
+      const std::uint64_t partition = (hash_key(key) >> 16) % kPartitions;
+      if (static_cast<std::int64_t>(partition) % threads == task) partitions_[partition].insert(key, 0);
+    }
+  });
 }
 
 std::int64_t CellSet::size() const {
@@ -92,6 +87,8 @@ void parallel_sort(std::vector<std::uint64_t>& keys, int num_threads) {
   }
 }
 
+template void cell_keys(const float*, std::int64_t, double, std::uint64_t*, int);
+template void cell_keys(const double*, std::int64_t, double, std::uint64_t*, int);
 template void CellSet::insert(const float*, std::int64_t, int);
 template void CellSet::insert(const double*, std::int64_t, int);
 

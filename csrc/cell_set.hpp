@@ -12,12 +12,16 @@
 
 namespace radarsdf {
 
+// Morton key of the leaf cell of each point, (count, 3) in the map's local frame, metres. Throws std::invalid_argument
+// for a point that is not finite or further than a million cells from the local origin.
+template <typename T>
+void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uint64_t* keys, int num_threads);
+
 class CellSet {
  public:
   explicit CellSet(double leaf_size_m);
 
-  // Marks the cells that hold the points, (count, 3) in the map's local frame, metres. Throws std::invalid_argument,
-  // before anything is stored, for a point that is not finite or further than a million cells from the local origin.
+  // Marks the cells of the points. Throws as cell_keys does, before anything is stored.
   template <typename T>
   void insert(const T* points, std::int64_t count, int num_threads);
 

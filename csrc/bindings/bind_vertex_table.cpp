@@ -136,8 +136,21 @@ void bind_kernels(py::class_<VertexTable>& cls) {
 }
 
 template <typename T>
-void bind_insert(py::class_<CellSet>& cls) {
+void bind_cells(py::module_& m, py::class_<CellSet>& cls) {
   using namespace py::literals;
+  m.def(
+      "cell_keys",
+      [](const Array<T>& points, double leaf_size_m, int num_threads) {
+        std::vector<std::uint64_t> keys(static_cast<std::size_t>(check_points(points)));
+        const T* p = points.data();
+        {
+          const py::gil_scoped_release release;
+          cell_keys(p, static_cast<std::int64_t>(keys.size()), leaf_size_m, keys.data(), num_threads);
+        }
+        return to_array(std::move(keys));
+      },
+      "points"_a.noconvert(), "leaf_size_m"_a, "num_threads"_a = 0,
+      "Morton key (N,) uint64 of the leaf cell of each point (N, 3), local frame, m.");
   cls.def(
       "insert",
       [](CellSet& cells, const Array<T>& points, int num_threads) {
@@ -172,8 +185,8 @@ void bind_vertex_table(py::module_& m) {
             return to_array(std::move(keys));
           },
           "num_threads"_a = 0, "Morton keys of the cells (C,) uint64, ascending.");
-  bind_insert<float>(cell_set);
-  bind_insert<double>(cell_set);
+  bind_cells<float>(m, cell_set);
+  bind_cells<double>(m, cell_set);
 
   py::class_<VertexTable> table(m, "VertexTable", "From points to rows of the feature matrix (num_rows, 8).");
   table

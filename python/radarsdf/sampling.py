@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from radarsdf._core import cell_keys
 from radarsdf.config import FitConfig
 from radarsdf.scans import Rays
 
@@ -30,34 +32,37 @@ class RaySampler:
 
     Rays are taken in random order without replacement, so that after one pass each has been seen equally often; the
     positions along the rays are random. A batch takes one near-surface and one free-space sample from each of its rays
-    rather than all twelve from a twelfth as many: the gradient sees more of the scene.
+    rather than all twelve from a twelfth as many: the gradient sees more of the scene. Within a batch, rays go in
+    Morton order of their returns, so that neighbours share cache lines.
     """
 
     def __init__(self, rays: Rays, config: FitConfig, generator: torch.Generator) -> None:
         self._config = config
         self._generator = generator
+        order = np.argsort(cell_keys(rays.points, config.leaf_size_m, torch.get_num_threads()), kind="stable")
+        self._original = torch.from_numpy(order)
         # One gather a batch fetches point, direction and range: 28 bytes, mostly one cache line.
         self._rays = torch.cat(
-            [torch.from_numpy(rays.points), torch.from_numpy(rays.directions), torch.from_numpy(rays.ranges_m)[:, None]], 1
-        )
-        self._order = torch.zeros(0, dtype=torch.int64)
+            [torch.from_numpy(a) for a in (rays.points, rays.directions, rays.ranges_m[:, None])], 1
+        )[self._original]
+        self._order = np.zeros(0, np.int64)
         self._next = 0
         share = config.near_samples / (config.near_samples + config.free_samples)
         self._num_near = max(1, round(config.batch_size * share))
         self._num_free = config.batch_size - self._num_near
 
     def _take(self, count: int) -> Tensor:
-        """The next `count` rays of the random order, beginning a new order where one ends."""
+        """The next `count` rays of the random order, sorted; a new order begins where one ends."""
         parts = []
         while count > 0:
             if self._next >= len(self._order):
-                self._order = torch.randperm(len(self._rays), generator=self._generator)
+                self._order = torch.randperm(len(self._rays), generator=self._generator).numpy()
                 self._next = 0
             part = self._order[self._next : self._next + count]
             self._next += len(part)
             count -= len(part)
             parts.append(part)
-        return parts[0] if len(parts) == 1 else torch.cat(parts)
+        return torch.from_numpy(np.sort(np.concatenate(parts)))
 
     def _uniform(self, count: int) -> Tensor:
         return torch.rand(count, generator=self._generator)
@@ -67,13 +72,14 @@ class RaySampler:
         rays = self._take(count)
         sdf_m = (2 * self._uniform(count) - 1) * self._config.near_band_m
         ray = self._rays[rays]
-        return Samples(ray[:, :3] - sdf_m[:, None] * ray[:, 3:6], sdf_m, rays, count)
+        return Samples(ray[:, :3] - sdf_m[:, None] * ray[:, 3:6], sdf_m, self._original[rays], count)
 
     def batch(self) -> Samples:
         """A batch of `batch_size` samples, near the surface and in free space."""
         rays = self._take(max(self._num_near, self._num_free))
-        # Both kinds run along the whole list of rays in turn where they are not equally many.
-        index = torch.cat([rays[: self._num_near], rays[len(rays) - self._num_free :]])
+        # Where one kind is rarer, every so many-th ray has one of it: each kind still covers the whole scene.
+        near, free = (rays[torch.arange(n) * len(rays) // max(n, 1)] for n in (self._num_near, self._num_free))
+        index = torch.cat([near, free])
         ray = self._rays[index]
         config = self._config
         near_m = (2 * self._uniform(self._num_near) - 1) * config.near_band_m
@@ -83,4 +89,4 @@ class RaySampler:
             config.free_from * range_m, range_m + config.free_beyond_m, self._uniform(self._num_free)
         )
         sdf_m = torch.cat([near_m, free_m])
-        return Samples(ray[:, :3] - sdf_m[:, None] * ray[:, 3:6], sdf_m, index, self._num_near)
+        return Samples(ray[:, :3] - sdf_m[:, None] * ray[:, 3:6], sdf_m, self._original[index], self._num_near)

@@ -1,0 +1,7 @@
+"""`python -m radarsdf`."""
+
+import sys
+
+from radarsdf.cli import main
+
+sys.exit(main())
