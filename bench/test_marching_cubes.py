@@ -116,7 +116,7 @@ def test_sparse_extraction(benchmark, shell, threads):
     values = (np.linalg.norm(corners, axis=1) - 200.0).astype(np.float32)
     vertices, faces = benchmark(extract_cells, corners, values, cells, num_threads=threads)
     assert np.linalg.norm(vertices, axis=1) == pytest.approx(200, abs=0.01)
-    assert len(faces) == 1_431_280
+    assert len(faces) == 1_431_246
 
 
 def test_components(benchmark):
