@@ -135,10 +135,10 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
         if (upper == no_vertex) continue;
         const double fraction =
             edge_fraction(static_cast<double>(values[c]), static_cast<double>(values[upper]), level);
-        write_vertex(lattice,
-                     {static_cast<double>(position[0]), static_cast<double>(position[1]),
-                      static_cast<double>(position[2])},
-                     axis, fraction, mesh.vertices.get() + 3 * int64_t{vertex});
+        write_vertex(
+            lattice,
+            {static_cast<double>(position[0]), static_cast<double>(position[1]), static_cast<double>(position[2])},
+            axis, fraction, mesh.vertices.get() + 3 * int64_t{vertex});
         edge.store(vertex++, std::memory_order_relaxed);
       }
     }

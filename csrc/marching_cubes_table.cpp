@@ -51,7 +51,8 @@ void trace_face(int pattern, const std::array<int, 4>& corners, std::array<int, 
     if (!positive(i) || positive(i + 1)) continue;
     int first = i;
     while (positive(first - 1)) --first;
-    next[static_cast<std::size_t>(edge_between(corner(i), corner(i + 1)))] = edge_between(corner(first - 1), corner(first));
+    next[static_cast<std::size_t>(edge_between(corner(i), corner(i + 1)))] =
+        edge_between(corner(first - 1), corner(first));
   }
 }
 

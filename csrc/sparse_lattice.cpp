@@ -65,7 +65,8 @@ KeyFormat key_format(const int32_t* cells, int64_t num_cells) {
     const int64_t last_corner = int64_t{highest[axis]} + 1 - lowest[axis];
     while (last_corner >> (format.bits - format.shift[axis]) != 0) ++format.bits;
   }
-  if (format.bits > 63) throw std::invalid_argument("the cells are too far apart: their extents need more than 63 bits");
+  if (format.bits > 63)
+    throw std::invalid_argument("the cells are too far apart: their extents need more than 63 bits");
   return format;
 }
 
@@ -130,7 +131,8 @@ Keys sorted_set(const int32_t* cells, int64_t num_cells, const KeyFormat& format
   });
   for (; parts.size() > 1; parts.resize((parts.size() + 1) / 2)) {
     const size_t half = (parts.size() + 1) / 2;
-    for (size_t i = half; i < parts.size(); ++i) parts[i - half] = merge_shifted(parts[i - half], parts[i], 0, num_threads);
+    for (size_t i = half; i < parts.size(); ++i)
+      parts[i - half] = merge_shifted(parts[i - half], parts[i], 0, num_threads);
   }
   return std::move(parts[0]);
 }
@@ -172,7 +174,8 @@ SparseLattice sparse_lattice(const int32_t* cells, int64_t num_cells, int num_th
     const uint64_t* const keys = corner_keys.data();
     std::array<const uint64_t*, 4> found{};
     for (size_t row = 0; row < 4; ++row) {
-      found[row] = std::lower_bound(keys, keys + corner_keys.size(), cell_keys[static_cast<size_t>(begin)] + steps[row]);
+      found[row] =
+          std::lower_bound(keys, keys + corner_keys.size(), cell_keys[static_cast<size_t>(begin)] + steps[row]);
     }
     for (int64_t m = begin; m < end; ++m) {
       for (size_t row = 0; row < 4; ++row) {
