@@ -87,7 +87,7 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
   // For each edge that is cut: first its upper corner, then its vertex. Cells that share an edge write the same
   // number, so which one comes last does not matter; atomics only make that well defined, at no cost.
   const int64_t num_edges = 3 * num_corners;
-  const std::unique_ptr<std::atomic<int32_t>[]> edges(new std::atomic<int32_t>[static_cast<size_t>(num_edges)]);
+  const auto edges = large_array<std::atomic<int32_t>>(num_edges);
   for_each_block(num_edges, num_threads, [&](size_t, int64_t begin, int64_t end) {
     for (int64_t e = begin; e < end; ++e) edges[static_cast<size_t>(e)].store(no_vertex, std::memory_order_relaxed);
   });
@@ -96,7 +96,7 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
     return edges[static_cast<size_t>(3 * int64_t{cell[corner]} + axis)];
   };
 
-  const std::unique_ptr<std::uint8_t[]> patterns(new std::uint8_t[static_cast<size_t>(num_cells)]);
+  const auto patterns = large_array<std::uint8_t>(num_cells);
   std::vector<int64_t> first_face = block_counts(num_cells);
   for_each_block(num_cells, num_threads, [&](size_t block, int64_t begin, int64_t end) {
     for (int64_t m = begin; m < end; ++m) {

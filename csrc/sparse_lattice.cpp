@@ -12,6 +12,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "large_array.hpp"
 #include "parallel.hpp"
 
 namespace radarsdf {
@@ -138,7 +139,7 @@ Keys sorted_set(const int32_t* cells, int64_t num_cells, const KeyFormat& format
 }
 
 std::unique_ptr<int32_t[]> decode_all(const Keys& keys, const KeyFormat& format, int num_threads) {
-  std::unique_ptr<int32_t[]> points(new int32_t[3 * keys.size()]);
+  auto points = large_array<int32_t>(3 * static_cast<int64_t>(keys.size()));
   parallel_blocks(static_cast<int64_t>(keys.size()), min_block, num_threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) format.decode(keys[static_cast<size_t>(i)], points.get() + 3 * i);
   });
@@ -166,7 +167,7 @@ SparseLattice sparse_lattice(const int32_t* cells, int64_t num_cells, int num_th
   lattice.num_corners = static_cast<int64_t>(corner_keys.size());
   lattice.cells = decode_all(cell_keys, format, num_threads);
   lattice.corners = decode_all(corner_keys, format, num_threads);
-  lattice.cell_corners.reset(new int32_t[8 * cell_keys.size()]);
+  lattice.cell_corners = large_array<int32_t>(8 * lattice.num_cells);
   parallel_blocks(lattice.num_cells, min_block, num_threads, [&](int64_t begin, int64_t end) {
     // The corner above another along z is the next in order. The other four of a cell are found by walking on from
     // those of the cell before.
