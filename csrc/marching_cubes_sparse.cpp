@@ -7,6 +7,7 @@
 #include <atomic>
 #include <vector>
 
+#include "bits.hpp"
 #include "marching_cubes.hpp"
 #include "marching_cubes_common.hpp"
 #include "marching_cubes_table.hpp"
@@ -106,10 +107,10 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
       if (pattern == 0 || pattern == 255) continue;
       check_corner_positions(corners, cell);
       first_face[block + 1] += table[pattern].num_triangles;
-      for (int edge = 0; edge < 12; ++edge) {
+      for (std::uint32_t bits = table[pattern].cut_edges; bits != 0; bits &= bits - 1) {
+        const int edge = lowest_bit(bits);
         const auto [lower, axis] = cell_edge(edge);
         const int upper = lower | axis_bit(axis);
-        if (((pattern >> lower ^ pattern >> upper) & 1) == 0) continue;
         edge_of(cell, edge).store(cell[upper], std::memory_order_relaxed);
       }
     }

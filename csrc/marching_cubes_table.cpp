@@ -131,6 +131,7 @@ CellTriangles build_case(int pattern) {
   for (const Loop& loop : trace_loops(pattern)) {
     const Triangulation triangulation = triangulate(loop, 0, loop.size() - 1);
     if (std::isinf(triangulation.cost)) throw std::logic_error("a loop of marching cubes without triangulation");
+    for (const int edge : loop) result.cut_edges = static_cast<std::uint16_t>(result.cut_edges | 1 << edge);
     for (const int edge : triangulation.edges) result.edges.at(used++) = static_cast<std::uint8_t>(edge);
   }
   result.num_triangles = static_cast<std::uint8_t>(used / 3);
