@@ -4,125 +4,25 @@ import itertools
 
 import numpy as np
 import pytest
+from mesh_checks import (
+    area,
+    cells_in_use,
+    euler_characteristic,
+    gyroid,
+    has_single_cycle_links,
+    noise,
+    normals,
+    on_border,
+    plateaus,
+    same_mesh,
+    signed_volume,
+    single_edges,
+    sphere,
+    torus,
+)
 from radarsdf import _core
-from radarsdf.isosurface import extract_cells, marching_cubes, mesh_components, sparse_lattice
+from radarsdf.isosurface import extract_cells, marching_cubes, sparse_lattice
 from reference_marching_cubes import reference_marching_cubes
-
-
-def grid(n, low=-1.0, high=1.0):
-    return np.meshgrid(*[np.linspace(low, high, n)] * 3, indexing="ij")
-
-
-def sphere(n):
-    x, y, z = grid(n)
-    return np.sqrt(x**2 + y**2 + z**2) - 0.8
-
-
-def torus(n):
-    x, y, z = grid(n)
-    return np.hypot(np.hypot(x, y) - 0.6, z) - 0.25
-
-
-def gyroid(n):
-    x, y, z = (2 * np.pi * a for a in grid(n))
-    return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
-
-
-def noise(seed, shape=(14, 15, 40), dtype=np.float32):
-    return np.random.default_rng(seed).normal(size=shape).astype(dtype)
-
-
-def plateaus(seed, shape=(14, 15, 40)):
-    return np.random.default_rng(seed).integers(-1, 2, size=shape)
-
-
-def directed_edges(faces):
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-
-
-def single_edges(faces):
-    """Edges of one triangle only; fails unless all others have two, which run along them in opposite directions."""
-    edges = directed_edges(faces)
-    assert len(np.unique(edges, axis=0)) == len(edges), (
-        "two triangles run along an edge in the same direction"
-    )
-    unique, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-    assert counts.max(initial=0) <= 2
-    return unique[counts == 1]
-
-
-def has_single_cycle_links(faces, num_vertices):
-    """True for each vertex whose triangles form one fan, closed or open."""
-    following = {}
-    for a, b, c in faces.tolist():
-        for v, p, q in ((a, b, c), (b, c, a), (c, a, b)):
-            following.setdefault(v, {})[p] = q
-    good = np.zeros(num_vertices, dtype=bool)
-    for v, links in following.items():
-        starts = set(links) - set(links.values())
-        start = next(iter(starts)) if starts else next(iter(links))
-        count, node = 0, start
-        while node in links and count < len(links):
-            node = links[node]
-            count += 1
-        good[v] = count == len(links) and len(starts) <= 1
-    return good
-
-
-def euler_characteristic(vertices, faces):
-    return len(vertices) - len(np.unique(np.sort(directed_edges(faces), axis=1), axis=0)) + len(faces)
-
-
-def normals(vertices, faces):
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.cross(b - a, c - a) / 2
-
-
-def area(vertices, faces):
-    return np.linalg.norm(normals(vertices, faces), axis=1).sum()
-
-
-def signed_volume(vertices, faces):
-    return (normals(vertices, faces) * vertices[faces[:, 0]]).sum() / 3
-
-
-def triangle_set(vertices, faces):
-    """Triangles by position, each rotated so that its smallest vertex comes first, in sorted order."""
-    triangles = vertices[faces]
-    # Every vertex has a position of its own, so their order by position names them.
-    _, names = np.unique(vertices, axis=0, return_inverse=True)
-    first = names.reshape(-1)[faces].argmin(axis=1)
-    rotated = np.take_along_axis(triangles, ((first[:, None] + np.arange(3)) % 3)[:, :, None], axis=1)
-    flat = rotated.reshape(-1, 9)
-    return flat[np.lexsort(flat.T)]
-
-
-def same_mesh(mesh_a, mesh_b):
-    a, b = triangle_set(*mesh_a), triangle_set(*mesh_b)
-    return a.shape == b.shape and np.array_equal(a, b) and len(mesh_a[0]) == len(mesh_b[0])
-
-
-def cells_in_use(volume, mask=None):
-    usable = ~np.isnan(volume) if mask is None else mask & ~np.isnan(volume)
-    shape = tuple(n - 1 for n in volume.shape)
-    views = [
-        usable[tuple(slice(o, o + n) for o, n in zip(offset, shape, strict=True))]
-        for offset in itertools.product((0, 1), repeat=3)
-    ]
-    return np.logical_and.reduce(views)
-
-
-def on_border(vertices, edges, cells):
-    """Whether each edge lies in a face between a cell in use and one that is not."""
-    padded = np.pad(cells, 1)
-    ends = vertices[edges]
-    answer = np.zeros(len(edges), dtype=bool)
-    for axis in range(3):
-        flat = (ends[:, 0, axis] == ends[:, 1, axis]) & (ends[:, 0, axis] % 1 == 0)
-        upper = np.floor(ends.mean(axis=1)).astype(int) + 1  # + 1 for the padding
-        lower = upper - np.eye(3, dtype=int)[axis]
-        answer |= flat & (padded[tuple(upper.T)] != padded[tuple(lower.T)])
-    return answer
 
 
 @pytest.mark.parametrize(
@@ -442,82 +342,3 @@ def test_results_own_their_memory():
     vertices += 0.0  # writable
     assert np.array_equal(vertices, copies[0])
     assert np.array_equal(faces, copies[1])
-
-
-@pytest.mark.parametrize("threads", [1, 2, 3])
-@pytest.mark.parametrize("count", [1, 7, 200_000])
-def test_sparse_lattice_against_numpy(threads, count):
-    rng = np.random.default_rng(count)
-    cells = rng.integers([-5, 1000, -(2**31)], [60, 1030, -(2**31) + 40], size=(count, 3), dtype=np.int64)
-    unique, corners, cell_corners = sparse_lattice(cells, num_threads=threads)
-    offsets = np.array(list(itertools.product((0, 1), repeat=3)))
-    expected = np.unique(cells, axis=0)
-    assert np.array_equal(unique, expected)
-    all_corners = expected[:, None] + offsets
-    assert np.array_equal(corners, np.unique(all_corners.reshape(-1, 3), axis=0))
-    assert np.array_equal(corners[cell_corners], all_corners)
-
-
-def test_sparse_lattice_at_the_limits():
-    empty = sparse_lattice(np.zeros((0, 3), dtype=np.int32))
-    assert [a.shape for a in empty] == [(0, 3), (0, 3), (0, 8)]
-    assert len(sparse_lattice([[-(2**31), 0, 0], [2**31 - 2, 0, 0]])[1]) == 16
-    with pytest.raises(ValueError, match="beyond int32"):
-        sparse_lattice([[2**31 - 1, 0, 0]])
-    with pytest.raises(ValueError, match="too far apart"):
-        sparse_lattice([[-(2**31)] * 3, [2**31 - 2] * 3])
-    with pytest.raises(ValueError, match="range of int32"):
-        sparse_lattice([[2**31, 0, 0]])
-    with pytest.raises(TypeError, match="integers"):
-        sparse_lattice([[0.5, 0, 0]])
-    with pytest.raises(ValueError, match="shape"):
-        sparse_lattice([[0, 0]])
-
-
-def test_sparse_cells_are_checked():
-    _, corners, cells = sparse_lattice([[0, 0, 0]])
-    values = np.array([1.0, -1, -1, -1, -1, -1, -1, -1])
-    assert extract_cells(corners[:0], values[:0], cells[:0])[1].shape == (0, 3)
-    for bad in (cells + 1, cells - 1):
-        with pytest.raises(ValueError, match="does not exist"):
-            extract_cells(corners, values, bad)
-    with pytest.raises(ValueError, match="C order"):
-        extract_cells(corners, values, cells[:, ::-1])
-    with pytest.raises(ValueError, match="one for each corner"):
-        extract_cells(corners, values[:-1], cells)
-    with pytest.raises(ValueError, match="level"):
-        extract_cells(corners, values, cells, np.nan)
-
-
-def test_components_are_labelled_in_order():
-    x, y, z = grid(40)
-    spheres = np.minimum(np.hypot(np.hypot(x - 0.5, y), z) - 0.3, np.hypot(np.hypot(x + 0.6, y), z) - 0.15)
-    vertices, faces = marching_cubes(spheres)
-    is_small = vertices[faces[:, 0], 0] < 17
-    assert is_small[0], "the small sphere comes first along x"
-    for order in (slice(None), slice(None, None, -1)):
-        labels, sizes = mesh_components(faces[order], len(vertices))
-        assert labels[0] == 0
-        assert np.array_equal(labels == labels[0], is_small[order] == is_small[order][0])
-        assert np.array_equal(sizes, np.bincount(labels))
-        assert len(sizes) == 2
-
-
-def test_components_against_scipy():
-    sparse = pytest.importorskip("scipy.sparse")
-    vertices, faces = marching_cubes(noise(17) + 1.6)
-    edges = directed_edges(faces)
-    graph = sparse.coo_array((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
-    count, of_vertex = sparse.csgraph.connected_components(graph, directed=False)
-    labels, sizes = mesh_components(faces, len(vertices))
-    assert len(sizes) == count > 10
-    pairs = np.unique(np.stack([labels, of_vertex[faces[:, 0]]]), axis=1)
-    assert pairs.shape[1] == count
-
-
-def test_components_of_nothing_and_of_wrong_faces():
-    labels, sizes = mesh_components(np.zeros((0, 3), dtype=np.int32), 0)
-    assert labels.shape == sizes.shape == (0,)
-    for bad in ([[0, 1, 3]], [[-1, 0, 1]]):
-        with pytest.raises(ValueError, match="does not exist"):
-            mesh_components(bad, 3)
