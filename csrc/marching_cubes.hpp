@@ -21,7 +21,7 @@ constexpr double min_edge_fraction = 1e-3;
 struct Mesh {
   std::int64_t num_vertices = 0;
   std::int64_t num_faces = 0;
-  std::unique_ptr<double[]> vertices;    ///< (num_vertices, 3), world units
+  std::unique_ptr<double[]> vertices;     ///< (num_vertices, 3), world units
   std::unique_ptr<std::int32_t[]> faces;  ///< (num_faces, 3) rows of vertices
 };
 

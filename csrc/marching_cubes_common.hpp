@@ -12,11 +12,8 @@
 #include <limits>
 #include <stdexcept>
 
+#include "large_array.hpp"
 #include "marching_cubes.hpp"
-
-#ifdef __linux__
-#include <sys/mman.h>
-#endif
 
 namespace radarsdf {
 
@@ -47,22 +44,6 @@ inline void check_lattice(const Lattice& lattice, double level) {
   if (!std::isfinite(level)) throw std::invalid_argument("level must be finite");
 }
 
-// Uninitialised on purpose: the caller writes every entry, and clearing first would cost a pass over memory. Large
-// arrays ask for huge pages, as NumPy's do: a quarter of the time of a large mesh went into faults of small ones.
-template <typename T>
-std::unique_ptr<T[]> allocate_array(std::int64_t size) {
-  std::unique_ptr<T[]> array(new T[static_cast<std::size_t>(size)]);
-#if defined(__linux__) && defined(MADV_HUGEPAGE)
-  constexpr std::uintptr_t page = 4096;
-  constexpr std::uintptr_t huge_page = std::uintptr_t{1} << 21;
-  const auto begin = (reinterpret_cast<std::uintptr_t>(array.get()) + page - 1) / page * page;
-  const auto end = reinterpret_cast<std::uintptr_t>(array.get() + size);
-  // Only a hint: it may fail where the kernel knows no huge pages.
-  if (begin + 2 * huge_page <= end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
-#endif
-  return array;
-}
-
 inline Mesh allocate_mesh(std::int64_t num_vertices, std::int64_t num_faces) {
   if (num_vertices > std::numeric_limits<std::int32_t>::max()) {
     throw std::invalid_argument("the mesh has more vertices than int32 faces can number: extract it in parts");
@@ -70,8 +51,8 @@ inline Mesh allocate_mesh(std::int64_t num_vertices, std::int64_t num_faces) {
   Mesh mesh;
   mesh.num_vertices = num_vertices;
   mesh.num_faces = num_faces;
-  mesh.vertices = allocate_array<double>(3 * num_vertices);
-  mesh.faces = allocate_array<std::int32_t>(3 * num_faces);
+  mesh.vertices = large_array<double>(3 * num_vertices);
+  mesh.faces = large_array<std::int32_t>(3 * num_faces);
   return mesh;
 }
 

@@ -7,6 +7,7 @@
 #include <atomic>
 #include <vector>
 
+#include "bits.hpp"
 #include "marching_cubes.hpp"
 #include "marching_cubes_common.hpp"
 #include "marching_cubes_table.hpp"
@@ -87,7 +88,7 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
   // For each edge that is cut: first its upper corner, then its vertex. Cells that share an edge write the same
   // number, so which one comes last does not matter; atomics only make that well defined, at no cost.
   const int64_t num_edges = 3 * num_corners;
-  const std::unique_ptr<std::atomic<int32_t>[]> edges(new std::atomic<int32_t>[static_cast<size_t>(num_edges)]);
+  const auto edges = large_array<std::atomic<int32_t>>(num_edges);
   for_each_block(num_edges, num_threads, [&](size_t, int64_t begin, int64_t end) {
     for (int64_t e = begin; e < end; ++e) edges[static_cast<size_t>(e)].store(no_vertex, std::memory_order_relaxed);
   });
@@ -96,7 +97,7 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
     return edges[static_cast<size_t>(3 * int64_t{cell[corner]} + axis)];
   };
 
-  const std::unique_ptr<std::uint8_t[]> patterns(new std::uint8_t[static_cast<size_t>(num_cells)]);
+  const auto patterns = large_array<std::uint8_t>(num_cells);
   std::vector<int64_t> first_face = block_counts(num_cells);
   for_each_block(num_cells, num_threads, [&](size_t block, int64_t begin, int64_t end) {
     for (int64_t m = begin; m < end; ++m) {
@@ -106,10 +107,10 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
       if (pattern == 0 || pattern == 255) continue;
       check_corner_positions(corners, cell);
       first_face[block + 1] += table[pattern].num_triangles;
-      for (int edge = 0; edge < 12; ++edge) {
+      for (std::uint32_t bits = table[pattern].cut_edges; bits != 0; bits &= bits - 1) {
+        const int edge = lowest_bit(bits);
         const auto [lower, axis] = cell_edge(edge);
         const int upper = lower | axis_bit(axis);
-        if (((pattern >> lower ^ pattern >> upper) & 1) == 0) continue;
         edge_of(cell, edge).store(cell[upper], std::memory_order_relaxed);
       }
     }
@@ -135,10 +136,10 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
         if (upper == no_vertex) continue;
         const double fraction =
             edge_fraction(static_cast<double>(values[c]), static_cast<double>(values[upper]), level);
-        write_vertex(lattice,
-                     {static_cast<double>(position[0]), static_cast<double>(position[1]),
-                      static_cast<double>(position[2])},
-                     axis, fraction, mesh.vertices.get() + 3 * int64_t{vertex});
+        write_vertex(
+            lattice,
+            {static_cast<double>(position[0]), static_cast<double>(position[1]), static_cast<double>(position[2])},
+            axis, fraction, mesh.vertices.get() + 3 * int64_t{vertex});
         edge.store(vertex++, std::memory_order_relaxed);
       }
     }

@@ -51,7 +51,8 @@ void trace_face(int pattern, const std::array<int, 4>& corners, std::array<int, 
     if (!positive(i) || positive(i + 1)) continue;
     int first = i;
     while (positive(first - 1)) --first;
-    next[static_cast<std::size_t>(edge_between(corner(i), corner(i + 1)))] = edge_between(corner(first - 1), corner(first));
+    next[static_cast<std::size_t>(edge_between(corner(i), corner(i + 1)))] =
+        edge_between(corner(first - 1), corner(first));
   }
 }
 
@@ -130,6 +131,7 @@ CellTriangles build_case(int pattern) {
   for (const Loop& loop : trace_loops(pattern)) {
     const Triangulation triangulation = triangulate(loop, 0, loop.size() - 1);
     if (std::isinf(triangulation.cost)) throw std::logic_error("a loop of marching cubes without triangulation");
+    for (const int edge : loop) result.cut_edges = static_cast<std::uint16_t>(result.cut_edges | 1 << edge);
     for (const int edge : triangulation.edges) result.edges.at(used++) = static_cast<std::uint8_t>(edge);
   }
   result.num_triangles = static_cast<std::uint8_t>(used / 3);

@@ -30,6 +30,7 @@ constexpr CellEdge cell_edge(int edge) {
 
 struct CellTriangles {
   static constexpr int max_triangles = 5;  // the builder checks it
+  std::uint16_t cut_edges = 0;             ///< bit e is set where the ends of edge e differ in sign
   std::uint8_t num_triangles = 0;
   std::array<std::uint8_t, 3 * max_triangles> edges{};  ///< three edges per triangle; its normal points to the positive
 };

@@ -12,6 +12,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "large_array.hpp"
 #include "parallel.hpp"
 
 namespace radarsdf {
@@ -65,7 +66,8 @@ KeyFormat key_format(const int32_t* cells, int64_t num_cells) {
     const int64_t last_corner = int64_t{highest[axis]} + 1 - lowest[axis];
     while (last_corner >> (format.bits - format.shift[axis]) != 0) ++format.bits;
   }
-  if (format.bits > 63) throw std::invalid_argument("the cells are too far apart: their extents need more than 63 bits");
+  if (format.bits > 63)
+    throw std::invalid_argument("the cells are too far apart: their extents need more than 63 bits");
   return format;
 }
 
@@ -130,13 +132,14 @@ Keys sorted_set(const int32_t* cells, int64_t num_cells, const KeyFormat& format
   });
   for (; parts.size() > 1; parts.resize((parts.size() + 1) / 2)) {
     const size_t half = (parts.size() + 1) / 2;
-    for (size_t i = half; i < parts.size(); ++i) parts[i - half] = merge_shifted(parts[i - half], parts[i], 0, num_threads);
+    for (size_t i = half; i < parts.size(); ++i)
+      parts[i - half] = merge_shifted(parts[i - half], parts[i], 0, num_threads);
   }
   return std::move(parts[0]);
 }
 
 std::unique_ptr<int32_t[]> decode_all(const Keys& keys, const KeyFormat& format, int num_threads) {
-  std::unique_ptr<int32_t[]> points(new int32_t[3 * keys.size()]);
+  auto points = large_array<int32_t>(3 * static_cast<int64_t>(keys.size()));
   parallel_blocks(static_cast<int64_t>(keys.size()), min_block, num_threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) format.decode(keys[static_cast<size_t>(i)], points.get() + 3 * i);
   });
@@ -164,7 +167,7 @@ SparseLattice sparse_lattice(const int32_t* cells, int64_t num_cells, int num_th
   lattice.num_corners = static_cast<int64_t>(corner_keys.size());
   lattice.cells = decode_all(cell_keys, format, num_threads);
   lattice.corners = decode_all(corner_keys, format, num_threads);
-  lattice.cell_corners.reset(new int32_t[8 * cell_keys.size()]);
+  lattice.cell_corners = large_array<int32_t>(8 * lattice.num_cells);
   parallel_blocks(lattice.num_cells, min_block, num_threads, [&](int64_t begin, int64_t end) {
     // The corner above another along z is the next in order. The other four of a cell are found by walking on from
     // those of the cell before.
@@ -172,7 +175,8 @@ SparseLattice sparse_lattice(const int32_t* cells, int64_t num_cells, int num_th
     const uint64_t* const keys = corner_keys.data();
     std::array<const uint64_t*, 4> found{};
     for (size_t row = 0; row < 4; ++row) {
-      found[row] = std::lower_bound(keys, keys + corner_keys.size(), cell_keys[static_cast<size_t>(begin)] + steps[row]);
+      found[row] =
+          std::lower_bound(keys, keys + corner_keys.size(), cell_keys[static_cast<size_t>(begin)] + steps[row]);
     }
     for (int64_t m = begin; m < end; ++m) {
       for (size_t row = 0; row < 4; ++row) {

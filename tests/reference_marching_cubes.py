@@ -7,7 +7,6 @@ import itertools
 from functools import cache
 
 import numpy as np
-
 from radarsdf.isosurface import marching_cubes
 
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # C order

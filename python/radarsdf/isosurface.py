@@ -237,8 +237,9 @@ def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[n
         msg = f"{name} must be real numbers, not {array.dtype}"
         raise TypeError(msg)
     # float32 where it holds every value of the type: it is half of the memory to read
-    dtype = np.float32 if np.can_cast(array.dtype, np.float32, "safe") else np.float64
-    return np.ascontiguousarray(array, dtype=dtype)
+    if np.can_cast(array.dtype, np.float32, "safe"):
+        return np.ascontiguousarray(array, dtype=np.float32)
+    return np.ascontiguousarray(array, dtype=np.float64)
 
 
 def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
@@ -259,10 +260,10 @@ def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
 def _as_placement(spacing: ArrayLike, origin: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     step, start = np.asarray(spacing, dtype=np.float64), np.asarray(origin, dtype=np.float64)
     if step.shape != (3,) or not np.all(np.isfinite(step) & (step > 0)):
-        msg = f"spacing must be three finite positive numbers, not {spacing}"
+        msg = f"spacing must be three finite positive numbers, not {spacing!r}"
         raise ValueError(msg)
     if start.shape != (3,) or not np.all(np.isfinite(start)):
-        msg = f"origin must be three finite numbers, not {origin}"
+        msg = f"origin must be three finite numbers, not {origin!r}"
         raise ValueError(msg)
     return step, start
 

@@ -1,0 +1,121 @@
+"""Fields with known level sets, and what can be measured on a mesh."""
+
+import itertools
+
+import numpy as np
+
+
+def grid(n, low=-1.0, high=1.0):
+    return np.meshgrid(*[np.linspace(low, high, n)] * 3, indexing="ij")
+
+
+def sphere(n):
+    x, y, z = grid(n)
+    return np.sqrt(x**2 + y**2 + z**2) - 0.8
+
+
+def torus(n):
+    x, y, z = grid(n)
+    return np.hypot(np.hypot(x, y) - 0.6, z) - 0.25
+
+
+def gyroid(n):
+    x, y, z = (2 * np.pi * a for a in grid(n))
+    return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+
+
+def noise(seed, shape=(14, 15, 40), dtype=np.float32):
+    return np.random.default_rng(seed).normal(size=shape).astype(dtype)
+
+
+def plateaus(seed, shape=(14, 15, 40)):
+    return np.random.default_rng(seed).integers(-1, 2, size=shape)
+
+
+def directed_edges(faces):
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def single_edges(faces):
+    """Edges of one triangle only; fails unless all others have two, which run along them in opposite directions."""
+    edges = directed_edges(faces)
+    assert len(np.unique(edges, axis=0)) == len(edges), (
+        "two triangles run along an edge in the same direction"
+    )
+    unique, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    assert counts.max(initial=0) <= 2
+    return unique[counts == 1]
+
+
+def has_single_cycle_links(faces, num_vertices):
+    """True for each vertex whose triangles form one fan, closed or open."""
+    following = {}
+    for a, b, c in faces.tolist():
+        for v, p, q in ((a, b, c), (b, c, a), (c, a, b)):
+            following.setdefault(v, {})[p] = q
+    good = np.zeros(num_vertices, dtype=bool)
+    for v, links in following.items():
+        starts = set(links) - set(links.values())
+        start = next(iter(starts)) if starts else next(iter(links))
+        count, node = 0, start
+        while node in links and count < len(links):
+            node = links[node]
+            count += 1
+        good[v] = count == len(links) and len(starts) <= 1
+    return good
+
+
+def euler_characteristic(vertices, faces):
+    return len(vertices) - len(np.unique(np.sort(directed_edges(faces), axis=1), axis=0)) + len(faces)
+
+
+def normals(vertices, faces):
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def area(vertices, faces):
+    return np.linalg.norm(normals(vertices, faces), axis=1).sum()
+
+
+def signed_volume(vertices, faces):
+    return (normals(vertices, faces) * vertices[faces[:, 0]]).sum() / 3
+
+
+def triangle_set(vertices, faces):
+    """Triangles by position, each rotated so that its smallest vertex comes first, in sorted order."""
+    triangles = vertices[faces]
+    # Every vertex has a position of its own, so their order by position names them.
+    _, names = np.unique(vertices, axis=0, return_inverse=True)
+    first = names.reshape(-1)[faces].argmin(axis=1)
+    rotated = np.take_along_axis(triangles, ((first[:, None] + np.arange(3)) % 3)[:, :, None], axis=1)
+    flat = rotated.reshape(-1, 9)
+    return flat[np.lexsort(flat.T)]
+
+
+def same_mesh(mesh_a, mesh_b):
+    a, b = triangle_set(*mesh_a), triangle_set(*mesh_b)
+    return a.shape == b.shape and np.array_equal(a, b) and len(mesh_a[0]) == len(mesh_b[0])
+
+
+def cells_in_use(volume, mask=None):
+    usable = ~np.isnan(volume) if mask is None else mask & ~np.isnan(volume)
+    shape = tuple(n - 1 for n in volume.shape)
+    views = [
+        usable[tuple(slice(o, o + n) for o, n in zip(offset, shape, strict=True))]
+        for offset in itertools.product((0, 1), repeat=3)
+    ]
+    return np.logical_and.reduce(views)
+
+
+def on_border(vertices, edges, cells):
+    """Whether each edge lies in a face between a cell in use and one that is not."""
+    padded = np.pad(cells, 1)
+    ends = vertices[edges]
+    answer = np.zeros(len(edges), dtype=bool)
+    for axis in range(3):
+        flat = (ends[:, 0, axis] == ends[:, 1, axis]) & (ends[:, 0, axis] % 1 == 0)
+        upper = np.floor(ends.mean(axis=1)).astype(int) + 1  # + 1 for the padding
+        lower = upper - np.eye(3, dtype=int)[axis]
+        answer |= flat & (padded[tuple(upper.T)] != padded[tuple(lower.T)])
+    return answer

@@ -1,0 +1,344 @@
+"""Marching cubes by property: topology, geometry, agreement of dense, sparse and reference."""
+
+import itertools
+
+import numpy as np
+import pytest
+from mesh_checks import (
+    area,
+    cells_in_use,
+    euler_characteristic,
+    gyroid,
+    has_single_cycle_links,
+    noise,
+    normals,
+    on_border,
+    plateaus,
+    same_mesh,
+    signed_volume,
+    single_edges,
+    sphere,
+    torus,
+)
+from radarsdf import _core
+from radarsdf.isosurface import extract_cells, marching_cubes, sparse_lattice
+from reference_marching_cubes import reference_marching_cubes
+
+
+@pytest.mark.parametrize(
+    ("field", "exact_area", "exact_volume", "characteristic"),
+    [
+        (sphere, 4 * np.pi * 0.8**2, 4 / 3 * np.pi * 0.8**3, 2),
+        (torus, 4 * np.pi**2 * 0.6 * 0.25, 2 * np.pi**2 * 0.6 * 0.25**2, 0),
+    ],
+)
+def test_closed_surfaces_have_their_size_and_topology(field, exact_area, exact_volume, characteristic):
+    n = 61
+    h = 2 / (n - 1)
+    vertices, faces = marching_cubes(field(n), spacing=[h] * 3, origin=[-1] * 3)
+    assert vertices.dtype == np.float64
+    assert faces.dtype == np.int32
+    assert len(single_edges(faces)) == 0
+    assert has_single_cycle_links(faces, len(vertices)).all()
+    assert euler_characteristic(vertices, faces) == characteristic
+    assert area(vertices, faces) == pytest.approx(exact_area, rel=3e-3)
+    # normals point to larger values, that is outwards, so the volume is positive
+    assert signed_volume(vertices, faces) == pytest.approx(exact_volume, rel=5e-3)
+    x, y, z = vertices.T
+    distance = (
+        np.sqrt(x**2 + y**2 + z**2) - 0.8 if field is sphere else np.hypot(np.hypot(x, y) - 0.6, z) - 0.25
+    )
+    assert np.abs(distance).max() < h**2
+
+
+def test_gyroid_is_manifold_and_lies_on_the_surface():
+    n = 64
+    h = 2 / (n - 1)
+    vertices, faces = marching_cubes(gyroid(n), spacing=[h] * 3, origin=[-1] * 3)
+    border = vertices[single_edges(faces)]
+    assert (np.abs(border) == 1).any(axis=2).all()
+    assert has_single_cycle_links(faces, len(vertices)).all()
+    x, y, z = (2 * np.pi * vertices).T
+    value = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+    assert np.abs(value).max() < 0.04
+    gradient = np.stack(
+        [
+            np.cos(x) * np.cos(y) - np.sin(z) * np.sin(x),
+            np.cos(y) * np.cos(z) - np.sin(x) * np.sin(y),
+            np.cos(z) * np.cos(x) - np.sin(y) * np.sin(z),
+        ],
+        axis=1,
+    )
+    towards_larger = (normals(vertices, faces) * gradient[faces].mean(axis=1)).sum(axis=1)
+    assert (towards_larger > 0).mean() > 0.999  # slivers next to samples may lean
+
+
+@pytest.mark.parametrize("make", [noise, plateaus])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_any_volume_gives_a_manifold(make, seed):
+    volume = make(seed)
+    vertices, faces = marching_cubes(volume)
+    open_edges = single_edges(faces)
+    ends = np.array(volume.shape) - 1
+    at_border = (vertices == 0) | (vertices == ends)
+    shared = at_border[open_edges[:, 0]] & at_border[open_edges[:, 1]]
+    assert shared.any(axis=1).all()
+    assert has_single_cycle_links(faces, len(vertices)).all()
+    assert (np.linalg.norm(normals(vertices, faces), axis=1) > 0).all()
+    assert len(np.unique(vertices, axis=0)) == len(vertices)
+    assert np.unique(faces).size == len(vertices), "a vertex without a triangle"
+
+
+def test_noise_shows_every_pattern():
+    positive = noise(0) > 0
+    patterns = sum(
+        positive[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None].astype(int) << (4 * i + 2 * j + k)
+        for i, j, k in itertools.product((0, 1), repeat=3)
+    )
+    assert len(np.unique(patterns)) == 256
+
+
+@pytest.mark.parametrize("pattern", range(256))
+def test_each_pattern_is_closed_by_any_surroundings(pattern):
+    rng = np.random.default_rng(pattern)
+    volume = np.where(rng.random((6, 6, 6)) < 0.5, 1.0, -1.0)
+    volume[2:4, 2:4, 2:4] = np.array([1.0 if pattern >> c & 1 else -1.0 for c in range(8)]).reshape(2, 2, 2)
+    volume = np.pad(volume, 1, constant_values=1.0)
+    vertices, faces = marching_cubes(volume)
+    assert len(single_edges(faces)) == 0
+    assert has_single_cycle_links(faces, len(vertices)).all()
+    # every volume here is negative inside of positive padding, so the normals point out of it
+    assert signed_volume(vertices, faces) > 0
+
+
+@pytest.mark.parametrize(
+    "volume",
+    [
+        noise(2, (5, 6, 7)),
+        noise(3, (3, 2, 70), np.float64),
+        noise(4, (2, 9, 33)),
+        noise(5, (4, 4, 32)),
+        plateaus(6, (5, 6, 35)),
+        sphere(12),
+    ],
+)
+@pytest.mark.parametrize("masked", [False, True])
+def test_dense_and_sparse_equal_the_reference(volume, masked):
+    volume = np.asarray(volume, dtype=np.float32)
+    placement = {"level": 0.1, "spacing": (0.5, 2.0, 0.1), "origin": (-3.0, 1e3, 0.25)}
+    mask = None
+    if masked:
+        rng = np.random.default_rng(7)
+        mask = rng.random(volume.shape) < 0.9
+        volume = np.where(rng.random(volume.shape) < 0.03, np.nan, volume)
+        volume[0, 0, 0], volume[-1, -1, -1] = np.inf, -np.inf
+    dense = marching_cubes(volume, mask=mask, **placement)
+    assert same_mesh(dense, reference_marching_cubes(volume, mask=mask, **placement))
+    _, corners, cell_corners = sparse_lattice(np.argwhere(cells_in_use(volume, mask)))
+    sparse = extract_cells(corners, volume[tuple(corners.T)], cell_corners, **placement)
+    assert same_mesh(dense, sparse)
+
+
+def test_holes_of_a_mask_are_the_only_borders():
+    volume = np.pad(noise(8, (12, 12, 36)), 1, constant_values=5)
+    mask = np.ones(volume.shape, dtype=bool)
+    mask[4:7, 5:8, 20:30] = False
+    mask[9, 3, 2] = False
+    for kwargs in ({"mask": mask}, {}):
+        field = volume if kwargs else np.where(mask, volume, np.nan)
+        vertices, faces = marching_cubes(field, **kwargs)
+        open_edges = single_edges(faces)
+        assert len(open_edges) > 50
+        assert on_border(vertices, open_edges, cells_in_use(volume, mask)).all()
+        assert np.unique(faces).size == len(vertices)
+        centres = np.floor(vertices[faces].mean(axis=1)).astype(int)
+        assert cells_in_use(volume, mask)[tuple(centres.T)].all()
+
+
+def test_an_all_false_mask_gives_nothing():
+    vertices, faces = marching_cubes(noise(9), mask=np.zeros((14, 15, 40), dtype=bool))
+    assert vertices.shape == (0, 3)
+    assert faces.shape == (0, 3)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_infinite_samples_are_signs(dtype):
+    volume = np.where(sphere(20) > 0, np.inf, -np.inf).astype(dtype)
+    vertices, faces = marching_cubes(volume)
+    assert np.isfinite(vertices).all()
+    assert (np.sort(vertices % 1, axis=1) == (0, 0, 0.5)).all()
+    assert len(single_edges(faces)) == 0
+    one_sided, same_faces = marching_cubes(np.where(volume > 0, dtype(1), volume))
+    assert np.array_equal(faces, same_faces)
+    assert np.isfinite(one_sided).all()
+    far = np.abs(one_sided - np.rint(one_sided)).max(axis=1)
+    assert far == pytest.approx(1e-3)  # next to the finite sample
+
+
+def test_the_largest_doubles_do_not_overflow():
+    volume = np.where(sphere(10) > 0, 1.7e308, -1.7e308)
+    for level in (0.0, 1.6e308, -1.6e308):
+        vertices, faces = marching_cubes(volume, level)
+        assert np.isfinite(vertices).all()
+        assert len(faces) > 0
+
+
+@pytest.mark.parametrize(("value", "is_positive"), [(1.0, False), (np.nextafter(1.0, 2), True)])
+def test_only_samples_above_the_level_are_positive(value, is_positive):
+    volume = np.zeros((2, 2, 2))
+    volume[0, 0, 0] = value
+    assert (len(marching_cubes(volume, 1.0)[1]) == 1) == is_positive
+
+
+def test_a_float32_volume_is_compared_with_the_level_in_double():
+    third = np.float32(0.1)  # larger than 0.1
+    volume = np.zeros((2, 2, 2), dtype=np.float32)
+    volume[1, 1, 1] = third
+    assert len(marching_cubes(volume, 0.1)[1]) == 1
+    assert len(marching_cubes(volume, float(third))[1]) == 0
+    assert len(marching_cubes(-volume, -float(third))[1]) == 1
+
+
+@pytest.mark.parametrize("level", [1e300, -1e300, 100.0, -100.0])
+def test_a_level_beyond_all_samples_gives_nothing(level):
+    assert len(marching_cubes(noise(10), level)[1]) == 0
+
+
+def test_a_level_beyond_float32_still_cuts_infinite_samples():
+    volume = np.zeros((2, 2, 2), dtype=np.float32)
+    volume[0, 0, 0] = np.inf
+    assert len(marching_cubes(volume, 1e300)[1]) == 1
+    assert len(marching_cubes(-volume, -1e300)[1]) == 1
+
+
+@pytest.mark.parametrize(
+    "shape", [(0, 0, 0), (0, 5, 5), (5, 5, 0), (1, 1, 1), (1, 9, 9), (9, 1, 9), (9, 9, 1)]
+)
+def test_volumes_without_a_cell_give_nothing(shape):
+    mask = np.ones(shape, dtype=bool)
+    for vertices, faces in (marching_cubes(np.zeros(shape)), marching_cubes(np.zeros(shape), mask=mask)):
+        assert vertices.shape == (0, 3)
+        assert faces.shape == (0, 3)
+
+
+def test_one_corner_of_one_cell():
+    volume = -np.ones((2, 2, 2))
+    volume[0, 0, 0] = 3
+    vertices, faces = marching_cubes(volume, spacing=(1, 2, 4), origin=(10, 20, 30))
+    assert vertices.tolist() == [[10.75, 20, 30], [10, 21.5, 30], [10, 20, 33]]
+    normal = normals(vertices, faces)[0]
+    assert (normal < 0).all()  # towards the positive corner
+
+
+@pytest.mark.parametrize("n", [31, 32, 33, 34, 64, 65, 66])
+def test_rows_of_any_length_end_right(n):
+    volume = np.ones((4, 4, n))
+    volume[1:3, 1:3, 1:-1] = -1
+    vertices, faces = marching_cubes(volume)
+    assert euler_characteristic(vertices, faces) == 2
+    assert len(single_edges(faces)) == 0
+    assert vertices[:, 2].min() == 0.5
+    assert vertices[:, 2].max() == n - 1.5
+    assert len(marching_cubes(volume > 0, 0.5)[1]) == len(faces)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("masked", [False, True])
+def test_threads_do_not_change_a_bit(dtype, masked):
+    volume = noise(11, (40, 33, 47), dtype)
+    mask = noise(12, volume.shape) > -2 if masked else None
+    _, corners, cells = sparse_lattice(np.argwhere(cells_in_use(volume, mask)), num_threads=1)
+    values = volume[tuple(corners.T)]
+    expected = (
+        marching_cubes(volume, mask=mask, num_threads=1),
+        extract_cells(corners, values, cells, num_threads=1),
+    )
+    for threads in (2, 3, 0):
+        got = (
+            marching_cubes(volume, mask=mask, num_threads=threads),
+            extract_cells(corners, values, cells, num_threads=threads),
+        )
+        for (vertices, faces), (same_vertices, same_faces) in zip(expected, got, strict=True):
+            assert vertices.tobytes() == same_vertices.tobytes()
+            assert faces.tobytes() == same_faces.tobytes()
+
+
+def test_far_from_the_origin_the_mesh_keeps_its_shape():
+    volume = plateaus(13)
+    near, faces = marching_cubes(volume, spacing=[0.1] * 3)
+    far, same_faces = marching_cubes(volume, spacing=[0.1] * 3, origin=(1e7, -1e7, 1e7))
+    assert np.array_equal(faces, same_faces)
+    assert np.abs(far - (1e7, -1e7, 1e7) - near).max() < 4e-9  # a few roundings at 1e7
+    assert (np.linalg.norm(normals(far, faces), axis=1) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "kept"),
+    [
+        (np.float16, np.float32),
+        (np.int8, np.float32),
+        (np.uint16, np.float32),
+        (np.int32, np.float64),
+        (np.bool_, np.float32),
+        (">f4", np.float32),
+        ("<f8", np.float64),
+    ],
+)
+def test_types_of_samples(dtype, kept):
+    volume = plateaus(14, (6, 7, 8)).astype(dtype)
+    vertices, faces = marching_cubes(volume, 0.5)
+    expected = marching_cubes(volume.astype(kept), 0.5)
+    assert np.array_equal(vertices, expected[0])
+    assert np.array_equal(faces, expected[1])
+
+
+def test_views_of_other_layouts():
+    volume = noise(15, (10, 11, 12))
+    expected = marching_cubes(volume)
+    assert same_mesh(marching_cubes(np.asfortranarray(volume)), expected)
+    assert same_mesh(marching_cubes(np.repeat(volume, 2, axis=2)[:, :, ::2]), expected)
+    assert marching_cubes(volume.tolist())[1].shape == expected[1].shape
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"volume": np.zeros((3, 3))}, ValueError, "three axes"),
+        ({"volume": np.zeros((3, 3, 3), dtype=complex)}, TypeError, "real"),
+        ({"volume": np.full((3, 3, 3), "a")}, TypeError, "real"),
+        ({"level": np.nan}, ValueError, "level"),
+        ({"level": np.inf}, ValueError, "level"),
+        ({"spacing": (1, 1)}, ValueError, "spacing"),
+        ({"spacing": (1, 0, 1)}, ValueError, "spacing"),
+        ({"spacing": (1, np.inf, 1)}, ValueError, "spacing"),
+        ({"origin": (0, np.nan, 0)}, ValueError, "origin"),
+        ({"mask": np.ones((3, 3, 2), dtype=bool)}, ValueError, "mask"),
+        ({"mask": np.ones((3, 3, 3))}, TypeError, "mask"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, error, message):
+    with pytest.raises(error, match=message):
+        marching_cubes(**{"volume": np.zeros((3, 3, 3)), **arguments})
+
+
+def test_the_core_checks_for_itself():
+    volume = np.zeros((3, 3, 3))
+    for arguments in (
+        (volume[0], None, [1] * 3, [0] * 3, 0.0),
+        (volume, np.ones((3, 3, 2), dtype=bool), [1] * 3, [0] * 3, 0.0),
+        (volume, None, [1, -1, 1], [0] * 3, 0.0),
+        (volume, None, [1] * 3, [0, np.inf, 0], 0.0),
+        (volume, None, [1] * 3, [0] * 3, np.nan),
+    ):
+        with pytest.raises(ValueError, match=r"."):
+            _core.marching_cubes_dense(*arguments)
+
+
+def test_results_own_their_memory():
+    vertices, faces = marching_cubes(sphere(20))
+    copies = vertices.copy(), faces.copy()
+    for _ in range(5):
+        marching_cubes(noise(16))
+    vertices += 0.0  # writable
+    assert np.array_equal(vertices, copies[0])
+    assert np.array_equal(faces, copies[1])
