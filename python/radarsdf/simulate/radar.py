@@ -17,6 +17,7 @@ __all__ = ["Origin", "RadarSensor", "Scan", "generator"]
 FloatArray = NDArray[np.float64]
 
 _OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, so as not to hit it again
+_MIN_LEG_M = 0.01  # shorter ways from a mirror to the next surface are no reflection
 # Streams of random numbers within a scan: more clutter, say, must not change the noise of the surface returns.
 _BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER = range(6)
 
@@ -209,13 +210,14 @@ class RadarSensor:
         mirrored = directions[rows] - 2 * cos[:, None] * normals
         mirror = origin + first[:, None] * directions[rows] + _OFF_SURFACE_M * normals
         second = scene.raycast(mirror, mirrored, self.max_range_m)
-        noiseless = self.echo_power_db(scene, mirror, mirrored, second)
         path = first + second.range_m
-        seen = path <= self.max_range_m
-        rows, path, second_range = rows[seen], path[seen], second.range_m[seen]
-        # The radar equation takes the whole path, `echo_power_db` only its second leg; both passes pay the mirror.
-        power = noiseless[seen] + 40 * np.log10(second_range / path) - 2 * loss[rows]
-        looks = scene.material_values(second, "looks", 1.0)[seen]
+        # A mirror's foot in the ground gives a second leg of no length, and no ghost.
+        seen = (path <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
+        rows, path, second = rows[seen], path[seen], second.select(seen)
+        mirrored, target = mirrored[seen], mirror[seen] + second.range_m[:, None] * mirrored[seen]
+        # The radar equation sees the whole path, and both passes pay the mirror.
+        power = self.gain_db + scene.echo_db(target, mirrored, second) - 40 * np.log10(path) - 2 * loss[rows]
+        looks = scene.material_values(second, "looks", 1.0)
         return _Echoes(path, angles[rows], power + _speckle_db(looks, rng), np.full(len(rows), np.nan))
 
     def _clutter(self, angles: FloatArray, range_m: FloatArray, rng: np.random.Generator) -> _Echoes:

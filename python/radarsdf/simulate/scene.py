@@ -26,6 +26,10 @@ class Hits(NamedTuple):
     normals: FloatArray  # (N, 3) world, unit, towards the ray's origin; zero where it hits nothing
     primitive: NDArray[np.int64]  # (N,) index into `Scene.parts`, -1 where it hits nothing
 
+    def select(self, rows: NDArray[np.bool_]) -> Hits:
+        """Hits of some of the rays only, given by an (N,) mask."""
+        return Hits(self.range_m[rows], self.normals[rows], self.primitive[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -70,7 +74,11 @@ class Scene:
             self._raycast(o[i : i + _CHUNK], d[i : i + _CHUNK], max_range_m)
             for i in range(0, max(len(d), 1), _CHUNK)
         ]
-        return Hits(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
+        return Hits(
+            np.concatenate([piece.range_m for piece in pieces]),
+            np.concatenate([piece.normals for piece in pieces]),
+            np.concatenate([piece.primitive for piece in pieces]),
+        )
 
     def _raycast(self, origins: FloatArray, directions: FloatArray, max_range_m: float) -> Hits:
         nearest = np.full(len(directions), max_range_m)

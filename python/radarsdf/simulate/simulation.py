@@ -79,7 +79,7 @@ def simulate(
     *,
     name: str,
     seed: int = 0,
-    lidar_rays: int = 400_000,
+    lidar_rays: int = 10_000,
 ) -> Simulation:
     """Scan a scene from every pose.
 
@@ -96,7 +96,7 @@ def simulate(
     seed : int
         Fixes every random number: same arguments, same bits.
     lidar_rays : int
-        Rays cast for the ground truth, spread over the poses.
+        Rays cast from a pose for the ground truth; of more than 80 poses only every n-th is used, 40 to 79.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def lidar_points(scene: Scene, sensor: RadarSensor, poses: FloatArray, seed: int
     scene, sensor, poses, seed
         As in `simulate`.
     rays : int
-        Rays in all.
+        Rays from a pose.
 
     Returns
     -------
@@ -135,10 +135,9 @@ def lidar_points(scene: Scene, sensor: RadarSensor, poses: FloatArray, seed: int
     """
     rng = generator(seed, _LIDAR_STREAM)
     poses = poses[:: max(1, len(poses) // 40)]  # neighbouring poses see the same
-    per_pose = max(1, rays // max(1, len(poses)))
     found = [np.zeros((0, 3))]
     for T_world_sensor in poses:
-        u = rng.uniform(-1, 1, size=(per_pose, 2))
+        u = rng.uniform(-1, 1, size=(rays, 2))
         elevation = np.arcsin(u[:, 1] * np.sin(sensor.elevation_fov_rad / 2))
         angles = np.stack([u[:, 0] * sensor.azimuth_fov_rad / 2, elevation], axis=1)
         directions, origin = unit_vectors(angles) @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]

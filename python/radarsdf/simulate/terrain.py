@@ -74,15 +74,14 @@ class Terrain:
     ) -> tuple[FloatArray, FloatArray]:
         """First hits of (N, 3) rays from above the ground; see `Primitive.intersect`.
 
-        March by steps the steepest possible slope makes safe, but at least 5 cm + 0.5 % of the range (a crest
-        thinner than that may be missed), then close in by Newton's method inside the last step.
+        March by steps the steepest possible slope makes safe, but at least 10 cm + 1 % of the range (a crest of
+        millimetres, which the ray leaves again within such a step, is missed); then close in by Newton's method
+        inside the last step.
         """
         steepest = float(np.abs(self.amplitudes) @ np.linalg.norm(self.waves, axis=1))
         top = self.level_m + float(np.abs(self.amplitudes).sum())
-        dz, closing = (
-            directions[:, 2],
-            np.linalg.norm(directions[:, :2], axis=1) * steepest - directions[:, 2],
-        )
+        dz = directions[:, 2]
+        closing = np.linalg.norm(directions[:, :2], axis=1) * steepest - dz
         # Rays from above the highest crest start where they come down to it.
         above = origins[:, 2] > top
         start = np.where(above, (origins[:, 2] - top) / np.maximum(-dz, 1e-9), 0.0)
@@ -97,7 +96,7 @@ class Terrain:
             gone = ~below & ((t[active] > max_range_m[active]) | ((p[:, 2] > top) & (dz[active] >= 0)))
             keep = ~below & ~gone
             active, gap = active[keep], gap[keep]
-            step = np.maximum(gap / np.maximum(closing[active], 1e-9), 0.05 + 0.005 * t[active])
+            step = np.maximum(gap / np.maximum(closing[active], 1e-9), 0.1 + 0.01 * t[active])
             before[active] = t[active]
             t[active] += step
         rows = np.flatnonzero(hit)
