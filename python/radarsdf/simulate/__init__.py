@@ -1,0 +1,39 @@
+"""Radar scans of made-up worlds whose true surface is known.
+
+`SCENES` has the ready-made ones by name; `simulate` scans a `Scene` of your own with a `RadarSensor`.
+
+Examples
+--------
+>>> from radarsdf.simulate import hugin
+>>> simulation = hugin(seed=1, frames=2)
+>>> len(simulation), simulation.poses.shape
+(2, (2, 4, 4))
+"""
+
+from .materials import Material
+from .primitives import Box, CornerReflector, Pole, Primitive
+from .radar import Origin, RadarSensor, Scan
+from .scene import Hits, Scene
+from .simulation import Simulation, simulate
+from .terrain import Terrain
+from .worlds import SCENES, hugin, oculii, wall
+
+__all__ = [
+    "SCENES",
+    "Box",
+    "CornerReflector",
+    "Hits",
+    "Material",
+    "Origin",
+    "Pole",
+    "Primitive",
+    "RadarSensor",
+    "Scan",
+    "Scene",
+    "Simulation",
+    "Terrain",
+    "hugin",
+    "oculii",
+    "simulate",
+    "wall",
+]

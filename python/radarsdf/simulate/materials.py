@@ -1,0 +1,109 @@
+"""What a surface does to a radar wave: how much comes back, from which angles, and how much it flickers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "ASPHALT",
+    "BRICK",
+    "CONCRETE",
+    "GLASS",
+    "GRASS",
+    "METAL",
+    "REFLECTOR",
+    "STEEL_POLE",
+    "TREE",
+    "Material",
+]
+
+FloatArray = NDArray[np.float64]
+
+# A texture is three plane waves (rad/m), none of them along an axis, so that every face of a box shows it.
+_TEXTURE_WAVES = np.array([[1.7, 0.9, 1.3], [-0.8, 2.1, -1.1], [0.5, -1.2, 2.6]])
+
+
+@dataclass(frozen=True)
+class Material:
+    """Radar properties of a surface.
+
+    The echo of a surface at incidence angle θ is ``reflectivity_db`` plus, in dB, a diffuse lobe cos²θ and a
+    specular lobe exp(-θ²/2w²), weighted by ``specular``; both together are 1 at normal incidence.
+
+    Raises
+    ------
+    ValueError
+        If a value is outside the range its comment gives.
+    """
+
+    name: str
+    reflectivity_db: float  # echo at normal incidence, relative to the other materials [dB]
+    specular: float = 0.5  # share of the specular lobe at normal incidence, 0..1
+    lobe_width_rad: float = 0.25  # standard deviation of the specular lobe [rad], > 0
+    looks: float = 3.0  # independent scatterers averaged in one return, > 0: few flicker much
+    texture_db: float = 0.0  # amplitude of the reflectivity's slow change over the surface [dB], >= 0
+    mirror_loss_db: float = np.inf  # loss of a wave mirrored by the surface [dB], >= 0; inf: rough, no ghosts
+
+    def __post_init__(self) -> None:
+        """Refuse values no surface can have."""
+        if not 0 <= self.specular <= 1:
+            msg = f"specular must be in [0, 1], not {self.specular}"
+            raise ValueError(msg)
+        if not (self.lobe_width_rad > 0 and self.looks > 0):
+            msg = "lobe_width_rad and looks must be positive"
+            raise ValueError(msg)
+        if not (self.texture_db >= 0 and self.mirror_loss_db >= 0):
+            msg = "texture_db and mirror_loss_db must not be negative"
+            raise ValueError(msg)
+
+    def lobe_db(self, cos_incidence: FloatArray) -> FloatArray:
+        """Change of the echo with the angle of incidence.
+
+        Parameters
+        ----------
+        cos_incidence : (N,) float64
+            Cosine of the angle between the surface normal and the direction back to the sensor.
+
+        Returns
+        -------
+        (N,) float64
+            dB, 0 at normal incidence.
+        """
+        cos = np.clip(cos_incidence, 1e-3, 1.0)
+        specular = np.exp(-0.5 * (np.arccos(cos) / self.lobe_width_rad) ** 2)
+        lobe: FloatArray = 10 * np.log10((1 - self.specular) * cos**2 + self.specular * specular + 1e-6)
+        return lobe
+
+    def echo_db(self, points: FloatArray, cos_incidence: FloatArray) -> FloatArray:
+        """Echo of the surface without the radar equation's range: reflectivity, texture and lobe.
+
+        Parameters
+        ----------
+        points : (N, 3) float64
+            Where the surface is hit, world frame, metres.
+        cos_incidence : (N,) float64
+            As in `lobe_db`.
+
+        Returns
+        -------
+        (N,) float64
+            dB.
+        """
+        texture = np.sin(points @ _TEXTURE_WAVES.T).mean(axis=1)
+        echo: FloatArray = self.reflectivity_db + self.texture_db * texture + self.lobe_db(cos_incidence)
+        return echo
+
+
+GRASS = Material("grass", -13.0, specular=0.1, lobe_width_rad=0.5, looks=2.0, texture_db=3.0)
+ASPHALT = Material("asphalt", -12.0, specular=0.3, lobe_width_rad=0.4, texture_db=1.5, mirror_loss_db=9.0)
+CONCRETE = Material("concrete", 3.0, specular=0.8, lobe_width_rad=0.3, texture_db=2.0, mirror_loss_db=12.0)
+BRICK = Material("brick", 1.0, specular=0.6, lobe_width_rad=0.4, texture_db=3.0, mirror_loss_db=18.0)
+GLASS = Material("glass", 0.0, specular=0.97, lobe_width_rad=0.12, looks=4.0, mirror_loss_db=5.0)
+METAL = Material("metal", 9.0, specular=0.9, lobe_width_rad=0.25, looks=2.0, mirror_loss_db=6.0)
+# Plates of a corner reflector: what they mirror into each other is the reflector's own lobe, not a ghost.
+REFLECTOR = Material("reflector plate", -6.0, specular=0.5, looks=8.0)
+STEEL_POLE = Material("steel pole", 6.0, specular=0.6, lobe_width_rad=0.5)
+TREE = Material("tree", -2.0, specular=0.2, lobe_width_rad=0.6, looks=2.0, texture_db=2.0)

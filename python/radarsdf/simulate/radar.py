@@ -1,0 +1,265 @@
+"""A radar that obeys the radar equation: noisy in angle, blind below its threshold, fooled by mirrors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from .scene import Hits, Scene
+
+__all__ = ["Origin", "RadarSensor", "Scan", "generator"]
+
+FloatArray = NDArray[np.float64]
+
+_OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, so as not to hit it again
+_MIN_LEG_M = 0.01  # shorter ways from a mirror to the next surface are no reflection
+# Streams of random numbers within a scan: more clutter, say, must not change the noise of the surface returns.
+_BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER = range(6)
+
+
+class Origin(IntEnum):
+    """Where a return comes from: the codes of `Simulation.origin_kind`."""
+
+    SURFACE = 0
+    CLUTTER = 1
+    GHOST = 2
+
+
+class Scan(NamedTuple):
+    """N returns of one frame."""
+
+    points: NDArray[np.float32]  # (N, 3) sensor frame, metres
+    intensities: NDArray[np.float32]  # (N,) sensor units, dB
+    noiseless_intensities: NDArray[np.float32]  # (N,) without speckle, noise and steps; NaN for false returns
+    origin_kind: NDArray[np.int8]  # (N,) codes of `Origin`
+
+
+class _Rays(NamedTuple):
+    """The beams of a scan and what they hit first."""
+
+    origin: FloatArray  # (3,) world, metres
+    directions: FloatArray  # (N, 3) world, unit
+    angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
+    hits: Hits
+
+
+class _Echoes(NamedTuple):
+    """Candidate returns before detection."""
+
+    range_m: FloatArray  # (N,)
+    angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
+    power_db: FloatArray  # (N,) with speckle
+    noiseless_db: FloatArray  # (N,) NaN for false returns
+
+
+def generator(seed: int, *key: int) -> np.random.Generator:
+    """Random numbers of the part `key` of a simulation: other keys give independent streams."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+
+
+@dataclass(frozen=True)
+class RadarSensor:
+    """A scanning 3D radar: x forward, y left, z up.
+
+    The power of a return is ``gain_db`` + echo of the surface − 40·log10(range) + speckle + noise, in dB. Speckle is
+    the fading of ``Material.looks`` independent scatterers (a Gamma distribution), with its median at 0 dB.
+
+    Raises
+    ------
+    ValueError
+        If a value is outside the range its comment gives.
+    """
+
+    azimuth_fov_rad: float = 1.92  # full width, centred on x [rad], 0..2π
+    elevation_fov_rad: float = 0.52  # full height, centred on the xy plane [rad], 0..π
+    beams: int = 3000  # candidate directions in a scan, a jittered grid over the field of view; > 0
+    min_range_m: float = 0.5  # nothing nearer is returned [m], > 0
+    max_range_m: float = 60.0  # nothing further is returned [m], > min_range_m
+    sigma_range_m: float = 0.04  # standard deviation along the beam [m]
+    sigma_azimuth_rad: float = 0.004  # standard deviation of the azimuth [rad]
+    sigma_elevation_rad: float = 0.006  # standard deviation of the elevation [rad]
+    sigma_power_db: float = 1.0  # standard deviation of the receiver's noise on top of speckle [dB]
+    gain_db: float = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
+    threshold_db: float = 64.0  # weaker returns are not detected [dB]
+    floor_db: float = (
+        -np.inf
+    )  # intensities are clipped to this from below [dB]; above the threshold, they pile up
+    saturation_db: float = 118.0  # intensities are clipped to this from above [dB]
+    step_db: float = 0.1  # intensities are multiples of this [dB], >= 0; 0: continuous
+    clutter_per_scan: float = 0.0  # expected number of false returns in free space, >= 0
+    ghost_share: float = 0.0  # share of the beams on a mirroring surface that are followed on, 0..1
+
+    def __post_init__(self) -> None:
+        """Refuse what no sensor can be."""
+        if not (0 < self.azimuth_fov_rad <= 2 * np.pi and 0 < self.elevation_fov_rad <= np.pi):
+            msg = "the field of view must be within (0, 2π] in azimuth and (0, π] in elevation"
+            raise ValueError(msg)
+        if not 0 < self.min_range_m < self.max_range_m < np.inf:
+            msg = f"need 0 < min_range_m < max_range_m, not {self.min_range_m} and {self.max_range_m}"
+            raise ValueError(msg)
+        if self.beams < 1:
+            msg = f"beams must be positive, not {self.beams}"
+            raise ValueError(msg)
+        sigmas = (self.sigma_range_m, self.sigma_azimuth_rad, self.sigma_elevation_rad, self.sigma_power_db)
+        if not all(value >= 0 for value in (*sigmas, self.step_db, self.clutter_per_scan)):
+            msg = "standard deviations, step_db and clutter_per_scan must not be negative"
+            raise ValueError(msg)
+        if not 0 <= self.ghost_share <= 1:
+            msg = f"ghost_share must be in [0, 1], not {self.ghost_share}"
+            raise ValueError(msg)
+        if not self.saturation_db > max(self.threshold_db, self.floor_db):
+            msg = "saturation_db must be above threshold_db and floor_db"
+            raise ValueError(msg)
+
+    def scan(self, scene: Scene, T_world_sensor: FloatArray, seed: int = 0, frame: int = 0) -> Scan:
+        """One scan of a scene.
+
+        Parameters
+        ----------
+        scene : Scene
+            What is there to see.
+        T_world_sensor : (4, 4) float64
+            Pose of the sensor.
+        seed, frame : int
+            Together they fix every random number of the scan: same numbers, same bits.
+
+        Returns
+        -------
+        Scan
+            Detected returns in random order.
+        """
+        angles = self._beam_angles(generator(seed, frame, _BEAMS))
+        R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
+        directions = unit_vectors(angles) @ R.T
+        rays = _Rays(origin, directions, angles, scene.raycast(origin, directions, self.max_range_m))
+        candidates = {
+            Origin.SURFACE: self._surface(scene, rays, generator(seed, frame, _SPECKLE)),
+            Origin.CLUTTER: self._clutter(angles, rays.hits.range_m, generator(seed, frame, _CLUTTER)),
+            Origin.GHOST: self._ghosts(scene, rays, generator(seed, frame, _GHOSTS)),
+        }
+        scans = [
+            self._measure(echoes, kind, generator(seed, frame, _NOISE, int(kind)))
+            for kind, echoes in candidates.items()
+        ]
+        order = generator(seed, frame, _ORDER).permutation(sum(len(scan.points) for scan in scans))
+        return Scan(
+            np.concatenate([scan.points for scan in scans])[order],
+            np.concatenate([scan.intensities for scan in scans])[order],
+            np.concatenate([scan.noiseless_intensities for scan in scans])[order],
+            np.concatenate([scan.origin_kind for scan in scans])[order],
+        )
+
+    def echo_power_db(
+        self, scene: Scene, origins: FloatArray, directions: FloatArray, hits: Hits
+    ) -> FloatArray:
+        """Received power of surface hits by the radar equation, without speckle.
+
+        Parameters
+        ----------
+        scene : Scene
+            Where the rays were cast.
+        origins, directions : (3,) or (N, 3), and (N, 3) float64
+            Of the rays, world frame.
+        hits : Hits
+            Of the rays.
+
+        Returns
+        -------
+        (N,) float64
+            dB, neither clipped nor rounded; -inf where there is no hit.
+        """
+        hit = hits.primitive >= 0
+        range_m = np.where(hit, hits.range_m, 1.0)
+        echo = scene.echo_db(origins + range_m[:, None] * directions, directions, hits)
+        power: FloatArray = self.gain_db + echo - 40 * np.log10(range_m)
+        return power
+
+    def _beam_angles(self, rng: np.random.Generator) -> FloatArray:
+        """Azimuth and elevation (beams, 2) of a jittered grid, uniform in azimuth and in the sine of elevation."""
+        columns = max(1, round(np.sqrt(self.beams * self.azimuth_fov_rad / self.elevation_fov_rad)))
+        rows = -(-self.beams // columns)
+        cell = rng.permutation(rows * columns)[: self.beams]
+        u = (np.stack([cell % columns, cell // columns], axis=1) + rng.random((self.beams, 2))) / [
+            columns,
+            rows,
+        ]
+        azimuth = (u[:, 0] - 0.5) * self.azimuth_fov_rad
+        elevation = np.arcsin((2 * u[:, 1] - 1) * np.sin(self.elevation_fov_rad / 2))
+        return np.stack([azimuth, elevation], axis=1)
+
+    def _surface(self, scene: Scene, rays: _Rays, rng: np.random.Generator) -> _Echoes:
+        hits = rays.hits
+        noiseless = self.echo_power_db(scene, rays.origin, rays.directions, hits)
+        power = noiseless + _speckle_db(scene.material_values(hits, "looks", 1.0), rng)
+        rows = hits.range_m >= self.min_range_m
+        rows &= hits.primitive >= 0
+        return _Echoes(hits.range_m[rows], rays.angles[rows], power[rows], noiseless[rows])
+
+    def _ghosts(self, scene: Scene, rays: _Rays, rng: np.random.Generator) -> _Echoes:
+        """Returns over a mirror: sensor, mirror, target and back, placed straight on at the total path length."""
+        origin, directions, angles, hits = rays
+        loss = scene.material_values(hits, "mirror_loss_db", np.inf)
+        rows = np.flatnonzero((rng.random(len(directions)) < self.ghost_share) & np.isfinite(loss))
+        normals, first = hits.normals[rows], hits.range_m[rows]
+        cos = np.einsum("ni,ni->n", directions[rows], normals)
+        mirrored = directions[rows] - 2 * cos[:, None] * normals
+        mirror = origin + first[:, None] * directions[rows] + _OFF_SURFACE_M * normals
+        second = scene.raycast(mirror, mirrored, self.max_range_m)
+        path = first + second.range_m
+        # A mirror's foot in the ground gives a second leg of no length, and no ghost.
+        seen = (path <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
+        rows, path, second = rows[seen], path[seen], second.select(seen)
+        mirrored, target = mirrored[seen], mirror[seen] + second.range_m[:, None] * mirrored[seen]
+        # The radar equation sees the whole path, and both passes pay the mirror.
+        power = self.gain_db + scene.echo_db(target, mirrored, second) - 40 * np.log10(path) - 2 * loss[rows]
+        looks = scene.material_values(second, "looks", 1.0)
+        return _Echoes(path, angles[rows], power + _speckle_db(looks, rng), np.full(len(rows), np.nan))
+
+    def _clutter(self, angles: FloatArray, range_m: FloatArray, rng: np.random.Generator) -> _Echoes:
+        """Weak false returns in free space: half anywhere along a beam, half piled up near the sensor."""
+        beam = rng.integers(len(angles), size=rng.poisson(self.clutter_per_scan))
+        free = np.minimum(range_m[beam], self.max_range_m)
+        anywhere = free * rng.uniform(0.05, 0.95, size=len(beam))
+        near = self.min_range_m + rng.exponential(1.5, size=len(beam))
+        distance = np.where(rng.random(len(beam)) < 0.5, anywhere, near)
+        power = self.threshold_db + rng.exponential(3.0, size=len(beam))
+        rows = (distance >= self.min_range_m) & (distance < 0.95 * free)
+        return _Echoes(distance[rows], angles[beam[rows]], power[rows], np.full(int(rows.sum()), np.nan))
+
+    def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> Scan:
+        """Add the sensor's noise, detect, round and clip the intensities."""
+        noise = rng.standard_normal((len(echoes.range_m), 4))
+        range_m = echoes.range_m + self.sigma_range_m * noise[:, 0]
+        angles = echoes.angles + noise[:, 1:3] * [self.sigma_azimuth_rad, self.sigma_elevation_rad]
+        power = echoes.power_db + self.sigma_power_db * noise[:, 3]
+        if self.step_db > 0:
+            power = np.round(power / self.step_db) * self.step_db
+        rows = (power >= self.threshold_db) & (range_m >= self.min_range_m) & (range_m <= self.max_range_m)
+        points = range_m[rows, None] * unit_vectors(angles[rows])
+        intensities = np.clip(power[rows], self.floor_db, self.saturation_db)
+        low = max(self.floor_db, self.threshold_db)
+        noiseless = np.clip(echoes.noiseless_db[rows], low, self.saturation_db)
+        kinds = np.full(len(points), kind, dtype=np.int8)
+        return Scan(
+            points.astype(np.float32), intensities.astype(np.float32), noiseless.astype(np.float32), kinds
+        )
+
+
+def unit_vectors(angles: FloatArray) -> FloatArray:
+    """Unit vectors (N, 3) of (N, 2) azimuths and elevations [rad], sensor frame."""
+    azimuth, elevation = angles[:, 0], angles[:, 1]
+    cos = np.cos(elevation)
+    return np.stack([cos * np.cos(azimuth), cos * np.sin(azimuth), np.sin(elevation)], axis=1)
+
+
+def _speckle_db(looks: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Fading (N,) in dB of (N,) numbers of scatterers, with median 0: what an L1 fit would find is the rest."""
+    power = rng.standard_gamma(looks)
+    values, index = np.unique(looks, return_inverse=True)
+    fading: FloatArray = 10 * np.log10(np.maximum(power, 1e-12) / gammaincinv(values, 0.5)[index])
+    return fading

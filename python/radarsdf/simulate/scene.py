@@ -1,0 +1,156 @@
+"""A world of ground and solids: exact ray hits, exact distances, and the echo of every hit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .materials import Material
+from .primitives import Primitive
+from .terrain import Terrain
+
+__all__ = ["Hits", "Scene"]
+
+FloatArray = NDArray[np.float64]
+_CHUNK = 32768  # rays or points at a time: some tens of MB of working memory
+
+
+class Hits(NamedTuple):
+    """First hits of N rays."""
+
+    range_m: FloatArray  # (N,) inf where the ray hits nothing
+    normals: FloatArray  # (N, 3) world, unit, towards the ray's origin; zero where it hits nothing
+    primitive: NDArray[np.int64]  # (N,) index into `Scene.parts`, -1 where it hits nothing
+
+    def select(self, rows: NDArray[np.bool_]) -> Hits:
+        """Hits of some of the rays only, given by an (N,) mask."""
+        return Hits(self.range_m[rows], self.normals[rows], self.primitive[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A static world.
+
+    Parameters
+    ----------
+    solids : sequence of Primitive
+        Boxes, poles, reflectors; they may overlap and reach below the ground.
+    terrain : Terrain, optional
+        The ground; without it solids float in empty space.
+    """
+
+    solids: Sequence[Primitive]
+    terrain: Terrain | None = None
+
+    @property
+    def parts(self) -> list[Primitive | Terrain]:
+        """All primitives in the order of `Hits.primitive`: the solids, then the ground."""
+        return [*self.solids, *([self.terrain] if self.terrain is not None else [])]
+
+    def raycast(self, origins: ArrayLike, directions: ArrayLike, max_range_m: float) -> Hits:
+        """First surface along each ray.
+
+        Parameters
+        ----------
+        origins : (N, 3) or (3,) array_like
+            World frame, metres.
+        directions : (N, 3) array_like
+            Unit vectors, world frame.
+        max_range_m : float
+            Hits further away do not count.
+
+        Returns
+        -------
+        Hits
+            float64, exact to about 1e-9 m.
+        """
+        d = np.asarray(directions, dtype=np.float64)
+        o = np.broadcast_to(np.asarray(origins, dtype=np.float64), d.shape)
+        pieces = [
+            self._raycast(o[i : i + _CHUNK], d[i : i + _CHUNK], max_range_m)
+            for i in range(0, max(len(d), 1), _CHUNK)
+        ]
+        return Hits(
+            np.concatenate([piece.range_m for piece in pieces]),
+            np.concatenate([piece.normals for piece in pieces]),
+            np.concatenate([piece.primitive for piece in pieces]),
+        )
+
+    def _raycast(self, origins: FloatArray, directions: FloatArray, max_range_m: float) -> Hits:
+        nearest = np.full(len(directions), max_range_m)
+        normals = np.zeros_like(directions)
+        primitive = np.full(len(directions), -1, dtype=np.int64)
+        for index, part in enumerate(self.parts):
+            rows = np.arange(len(directions))
+            if not isinstance(part, Terrain):
+                center, radius = part.bounding_sphere()
+                to_center = center - origins
+                along = np.einsum("ni,ni->n", to_center, directions)
+                off = np.einsum("ni,ni->n", to_center, to_center) - along**2
+                rows = np.flatnonzero((off <= radius**2) & (along > -radius) & (along < nearest + radius))
+            t, n = part.intersect(origins[rows], directions[rows], nearest[rows])
+            hit = np.isfinite(t)
+            rows = rows[hit]
+            nearest[rows], normals[rows], primitive[rows] = t[hit], n[hit], index
+        return Hits(np.where(primitive >= 0, nearest, np.inf), normals, primitive)
+
+    def signed_distance(self, points: ArrayLike) -> FloatArray:
+        """Signed distance to the union of all parts.
+
+        Parameters
+        ----------
+        points : (N, 3) array_like
+            World frame, metres.
+
+        Returns
+        -------
+        (N,) float64
+            Metres, positive in free space. Exact there (see `Terrain.signed_distance` for points metres off the
+            ground); inside, where parts overlap, the depth may come out too small.
+        """
+        p = np.asarray(points, dtype=np.float64)
+        best = np.full(len(p), np.inf)
+        for i in range(0, len(p), _CHUNK):
+            piece = p[i : i + _CHUNK]
+            for part in self.parts:
+                best[i : i + _CHUNK] = np.minimum(best[i : i + _CHUNK], part.signed_distance(piece))
+        return best
+
+    def distance(self, points: ArrayLike) -> FloatArray:
+        """Distance (N,) in metres of (N, 3) world points to the nearest surface, from either side."""
+        return np.abs(self.signed_distance(points))
+
+    def echo_db(self, points: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
+        """Strength of each hit's echo without the loss by range.
+
+        Parameters
+        ----------
+        points, directions : (N, 3) float64
+            Where the rays hit, and their unit directions; world frame, metres.
+        hits : Hits
+            Of those rays.
+
+        Returns
+        -------
+        (N,) float64
+            dB; -inf where there is no hit.
+        """
+        echo = np.full(len(points), -np.inf)
+        for index in np.unique(hits.primitive[hits.primitive >= 0]):
+            rows = hits.primitive == index
+            echo[rows] = self.parts[index].echo_db(points[rows], directions[rows], hits.normals[rows])
+        return echo
+
+    def materials(self, hits: Hits) -> list[Material | None]:
+        """Material of each of the N hits, None where there is none."""
+        parts = [part.material for part in self.parts]
+        return [parts[i] if i >= 0 else None for i in hits.primitive]
+
+    def material_values(self, hits: Hits, field: str, missing: float) -> FloatArray:
+        """One numeric field of each hit's material, (N,) float64; `missing` where there is no hit."""
+        table = np.array([*(getattr(part.material, field) for part in self.parts), missing], dtype=np.float64)
+        return table[hits.primitive]

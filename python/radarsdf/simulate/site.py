@@ -1,0 +1,117 @@
+"""Building site: puts houses, walls, cars and poles on the ground where there is still room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import materials
+from .materials import Material
+from .primitives import Box, Pole, Primitive
+from .terrain import Terrain
+
+__all__ = ["Site", "vary"]
+
+FloatArray = NDArray[np.float64]
+
+_BURIED_M = 1.0  # solids reach this far into the ground, so that no slope uncovers their lower end
+
+
+def vary(rng: np.random.Generator, material: Material) -> Material:
+    """Return a material as found on one object: no two walls reflect the same."""
+    return replace(material, reflectivity_db=material.reflectivity_db + rng.normal(0, 1.5))
+
+
+class Site:
+    """Puts solids on the ground, where there is still room."""
+
+    def __init__(
+        self, rng: np.random.Generator, terrain: Terrain, taken: list[tuple[float, float, float]]
+    ) -> None:
+        self.solids: list[Primitive] = []
+        self._rng, self._terrain = rng, terrain
+        self._taken = list(taken)  # circles: x, y, radius [m]
+
+    def _free(self, circles: list[tuple[float, float, float]]) -> bool:
+        old, new = np.array(self._taken).reshape(-1, 3), np.array(circles)
+        gap = np.linalg.norm(old[:, None, :2] - new[None, :, :2], axis=2) - old[:, None, 2] - new[None, :, 2]
+        if (gap < 0).any():
+            return False
+        self._taken += circles
+        return True
+
+    def _block(self, xy: FloatArray, yaw: float, size: FloatArray, material: Material) -> bool:
+        """Put a box of length, width and height on the ground, unless something else stands there."""
+        along = np.array([np.cos(yaw), np.sin(yaw)])
+        spots = np.linspace(-0.5, 0.5, max(1, round(size[0] / size[1]))) * max(0.0, size[0] - size[1])
+        if not self._free([(*(xy + s * along), 0.75 * size[1]) for s in spots]):
+            return False
+        ground = float(self._terrain.height(xy[None])[0])
+        self._add_box(xy, yaw, ground - _BURIED_M, np.array([*size[:2], size[2] + _BURIED_M]), material)
+        return True
+
+    def _add_box(
+        self, xy: FloatArray, yaw: float, bottom: float, size: FloatArray, material: Material
+    ) -> None:
+        self.solids.append(Box(np.array([*xy, bottom + size[2] / 2]), size / 2, yaw, material))
+
+    def fill(
+        self,
+        count: int,
+        put: Callable[[FloatArray, float], bool],
+        where: Callable[[], tuple[FloatArray, float]],
+    ) -> None:
+        """Put `count` objects at random places, trying ten places for each."""
+        for _ in range(count):
+            any(put(*where()) for _ in range(10))
+
+    def building(self, xy: FloatArray, yaw: float) -> bool:
+        """Rather a house than a hut, of concrete or brick."""
+        material = vary(self._rng, materials.CONCRETE if self._rng.random() < 0.5 else materials.BRICK)
+        size = self._rng.uniform([9, 6, 5], [16, 9, 9])
+        return self._block(xy, yaw + self._rng.normal(0, 0.15), size, material)
+
+    def wall(self, xy: FloatArray, yaw: float) -> bool:
+        """Free-standing, about as high as a man."""
+        size = self._rng.uniform([5, 0.25, 1.4], [12, 0.4, 2.6])
+        return self._block(xy, yaw + self._rng.normal(0, 0.15), size, vary(self._rng, materials.CONCRETE))
+
+    def car(self, xy: FloatArray, yaw: float) -> bool:
+        """Two boxes: body, and cabin on top."""
+        metal = vary(self._rng, materials.METAL)
+        yaw, size = yaw + self._rng.normal(0, 0.05), self._rng.uniform([3.9, 1.7, 0.8], [4.8, 1.9, 1.0])
+        if not self._block(xy, yaw, size, metal):
+            return False
+        roof = float(self._terrain.height(xy[None])[0]) + size[2]
+        self._add_box(xy, yaw, roof - 0.05, np.array([0.5 * size[0], 0.9 * size[1], 0.6]), metal)
+        return True
+
+    def pole(self, xy: FloatArray, _yaw: float) -> bool:
+        """A lamp post of steel or the trunk of a tree."""
+        tree = self._rng.random() < 0.4
+        radius = self._rng.uniform(0.15, 0.3) if tree else self._rng.uniform(0.06, 0.12)
+        height = self._rng.uniform(4, 8)
+        material = vary(self._rng, materials.TREE if tree else materials.STEEL_POLE)
+        if not self._free([(*xy, radius)]):
+            return False
+        base = float(self._terrain.height(xy[None])[0]) - _BURIED_M
+        self.solids.append(Pole(np.array([*xy, base]), radius, height + _BURIED_M, material))
+        return True
+
+    def basket(self, xy: FloatArray, facing: float) -> None:
+        """Post and backboard, the board 0.6 m in front of the post in the direction of x times `facing`."""
+        base = float(self._terrain.height(xy[None])[0])
+        if self._free([(*xy, 0.3)]):
+            self.solids.append(
+                Pole(np.array([*xy, base - _BURIED_M]), 0.1, 3.2 + _BURIED_M, materials.STEEL_POLE)
+            )
+            self._add_box(
+                xy + np.array([0.6 * facing, 0.0]),
+                0.0,
+                base + 2.9,
+                np.array([0.06, 1.8, 1.05]),
+                materials.METAL,
+            )

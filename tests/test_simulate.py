@@ -1,0 +1,379 @@
+"""The simulator against its own claims: exact geometry, the radar equation, and labels that tell the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from radarsdf import simulate as sim
+from radarsdf.simulate import materials
+
+FACING = sim.Material("facing wall", 0.0, specular=0.0, looks=3.0)
+QUIET = sim.RadarSensor(
+    azimuth_fov_rad=0.4, elevation_fov_rad=0.3, beams=2000, max_range_m=80.0, sigma_range_m=0.0, sigma_azimuth_rad=0.0,
+    sigma_elevation_rad=0.0, sigma_power_db=0.0, threshold_db=-200.0, saturation_db=300.0, step_db=0.0,
+)  # fmt: skip
+
+
+def wall_ahead(x: float, material: sim.Material = FACING) -> sim.Scene:
+    """Return a wall whose front is the plane at x, facing the origin."""
+    return sim.Scene([sim.Box(np.array([x + 0.5, 0.0, 0.0]), np.array([0.5, 200.0, 200.0]), 0.0, material)])
+
+
+@pytest.fixture(scope="module", params=sorted(sim.SCENES))
+def simulation(request):
+    return sim.SCENES[request.param](seed=3, frames=8)
+
+
+@pytest.fixture(scope="module")
+def mixed_scene():
+    """Terrain and one solid of each kind, none of them aligned with the axes."""
+    terrain = sim.Terrain.random(np.random.default_rng(5), 0.4, materials.GRASS)
+    axis = np.array([-0.8, 0.36, 0.48])
+    solids = [
+        sim.Box(np.array([8.0, 2.0, 1.0]), np.array([1.0, 2.0, 1.5]), 0.5, FACING),
+        sim.Pole(np.array([6.0, -3.0, -1.0]), 0.4, 4.0, FACING),
+        sim.CornerReflector(np.array([5.0, 0.5, 2.0]), axis, 0.8, materials.METAL),
+    ]
+    return sim.Scene(solids, terrain)
+
+
+def rays(rng, count):
+    directions = rng.normal(size=(count, 3)) * [0.5, 0.8, 0.4] + [1.0, 0.0, -0.1]
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def test_hits_lie_on_the_surface_and_nothing_lies_before_them(mixed_scene):
+    rng = np.random.default_rng(0)
+    origin, directions = np.array([0.0, 0.0, 2.0]), rays(rng, 4000)
+    hits = mixed_scene.raycast(origin, directions, 40.0)
+    seen = hits.primitive >= 0
+    assert set(hits.primitive[seen]) == {0, 1, 2, 3}
+    np.testing.assert_array_equal(np.isfinite(hits.range_m), seen)
+    np.testing.assert_allclose(np.linalg.norm(hits.normals[seen], axis=1), 1.0)
+    assert (np.einsum("ni,ni->n", hits.normals[seen], directions[seen]) < 0).all()
+    points = origin + hits.range_m[seen, None] * directions[seen]
+    assert mixed_scene.distance(points).max() < 1e-7
+    # A millimetre-high crest of the ground may be skipped, a solid may not.
+    before = (
+        origin + (rng.uniform(0, 0.999, size=seen.sum()) * hits.range_m[seen])[:, None] * directions[seen]
+    )
+    assert mixed_scene.signed_distance(before).min() > -5e-3
+
+
+def test_normals_are_the_gradient_of_the_distance(mixed_scene):
+    origin, directions = np.array([0.0, 0.0, 2.0]), rays(np.random.default_rng(1), 500)
+    hits = mixed_scene.raycast(origin, directions, 30.0)
+    seen = hits.primitive >= 0
+    points = origin + hits.range_m[seen, None] * directions[seen]
+    outside = mixed_scene.signed_distance(points + 1e-3 * hits.normals[seen])
+    # Within a millimetre of an edge another face may be nearer.
+    assert np.mean(np.abs(outside - 1e-3) < 1e-5) > 0.98
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_distance_against_brute_force(mixed_scene, part):
+    """Whoever samples the surface densely finds nothing nearer, and something about as near."""
+    rng = np.random.default_rng(2)
+    primitive = mixed_scene.parts[part]
+    if part == 3:
+        xy = np.stack(np.meshgrid(np.arange(-4, 4, 0.02), np.arange(-4, 4, 0.02)), axis=-1).reshape(-1, 2)
+        surface = np.concatenate([xy, primitive.height(xy)[:, None]], axis=1)
+        points = np.concatenate([rng.uniform(-2, 2, size=(30, 2)), rng.uniform(-1, 2, size=(30, 1))], axis=1)
+    else:
+        center, radius = primitive.bounding_sphere()
+        outward = rng.normal(size=(400_000, 3))
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        aim = center + rng.uniform(-1, 1, size=outward.shape) * radius
+        start = aim + 2 * radius * outward
+        t, _ = primitive.intersect(start, -outward, np.full(len(start), np.inf))
+        surface = (start - t[:, None] * outward)[np.isfinite(t)]
+        points = center + rng.uniform(-1.5, 1.5, size=(30, 3)) * radius
+    brute = np.array([np.linalg.norm(surface - p, axis=1).min() for p in points])
+    distance = np.abs(primitive.signed_distance(points))
+    assert (distance <= brute + 1e-9).all()
+    np.testing.assert_allclose(distance, brute, atol=0.05)
+
+
+def test_inside_is_negative(mixed_scene):
+    box, pole = mixed_scene.solids[:2]
+    inside = np.array([box.center, pole.base + np.array([0, 0, 2.0]), [0.0, 0.0, -5.0]])
+    assert (mixed_scene.signed_distance(inside) < 0).all()
+    np.testing.assert_allclose(box.signed_distance(inside[:1]), -1.0)
+
+
+def test_poses_are_rigid_and_smooth(simulation):
+    R = simulation.poses[:, :3, :3]
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0)
+    assert (simulation.poses[:, 3] == [0, 0, 0, 1]).all()
+    assert (R[:, 2, 2] > 0.99).all()  # level within some degrees
+    height = simulation.poses[:, 2, 3] - simulation.scene.terrain.height(simulation.poses[:, :2, 3])
+    assert ((height > 0.9) & (height < 1.7)).all()
+    fine = sim.SCENES[simulation.name](seed=3, frames=8 * 3)
+    np.testing.assert_allclose(fine.poses[1::3], simulation.poses, atol=1e-9)  # more frames, same path
+    assert np.linalg.norm(np.diff(fine.poses[:, :3, 3], axis=0), axis=1).max() < 4.0
+
+
+def test_arrays_agree(simulation):
+    assert len(simulation) == 8
+    for points, intensities, noiseless, kind in zip(
+        simulation.points,
+        simulation.intensities,
+        simulation.noiseless_intensities,
+        simulation.origin_kind,
+        strict=True,
+    ):
+        assert points.shape == (len(points), 3)
+        assert len(points) == len(intensities) == len(noiseless) == len(kind) > 0
+        assert (points.dtype, intensities.dtype, noiseless.dtype) == (np.float32, np.float32, np.float32)
+        assert kind.dtype == np.int8
+        np.testing.assert_array_equal(np.isnan(noiseless), kind != sim.Origin.SURFACE)
+    assert simulation.world_points().shape == (simulation.num_returns, 3)
+    assert simulation.poses.dtype == simulation.ground_truth.dtype == np.float64
+
+
+def test_true_returns_lie_near_the_surface(simulation):
+    """Nearer than the position noise of each return allows: 5 sigma along, and across the beam."""
+    sensor, surface = simulation.sensor, simulation.is_surface()
+    distance = simulation.scene.distance(simulation.world_points()[surface])
+    range_m = np.linalg.norm(np.concatenate(simulation.points)[surface], axis=1)
+    across = np.hypot(sensor.sigma_azimuth_rad, sensor.sigma_elevation_rad)
+    sigma = np.hypot(sensor.sigma_range_m, across * range_m)
+    assert (distance < 5 * sigma).all()
+    assert 0.2 < np.sqrt(np.mean((distance / sigma) ** 2)) < 0.8  # and the noise is there
+    assert surface.mean() > 0.8
+
+
+def test_intensities_respect_the_sensor(simulation):
+    sensor = simulation.sensor
+    intensities = np.concatenate(simulation.intensities).astype(np.float64)
+    low = max(sensor.floor_db, sensor.threshold_db)
+    assert intensities.min() >= low - 1e-4
+    assert intensities.max() <= sensor.saturation_db + 1e-4
+    steps = intensities / sensor.step_db
+    np.testing.assert_allclose(steps, np.round(steps), atol=2e-3)
+    assert np.ptp(np.percentile(intensities, [1, 99])) > 0.6 * (sensor.saturation_db - low)
+    assert 1.5 < simulation.intensity_noise_floor() < 4.0
+
+
+def test_lidar_lies_on_what_the_radar_could_see(simulation):
+    truth, sensor = simulation.ground_truth, simulation.sensor
+    assert len(truth) > 20_000
+    assert simulation.scene.distance(truth).max() < 0.055
+    assert simulation.scene.distance(truth).mean() < 0.01
+    seen = np.zeros(len(truth), dtype=bool)
+    for T in simulation.poses:
+        local = (truth - T[:3, 3]) @ T[:3, :3]
+        range_m = np.linalg.norm(local, axis=1)
+        azimuth, elevation = np.arctan2(local[:, 1], local[:, 0]), np.arcsin(local[:, 2] / range_m)
+        seen |= (
+            (np.abs(azimuth) <= sensor.azimuth_fov_rad / 2 + 1e-9)
+            & (np.abs(elevation) <= sensor.elevation_fov_rad / 2 + 1e-9)
+            & (range_m < sensor.max_range_m + 0.055)
+        )
+    assert seen.all()
+
+
+def test_same_seed_same_bits_other_seed_other_layout(simulation):
+    again = sim.SCENES[simulation.name](seed=3, frames=8)
+    other = sim.SCENES[simulation.name](seed=4, frames=8)
+    for field in ("points", "intensities", "noiseless_intensities", "origin_kind"):
+        for a, b in zip(getattr(simulation, field), getattr(again, field), strict=True):
+            np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(simulation.ground_truth, again.ground_truth)
+    probe = np.random.default_rng(0).uniform([-5, -8, 0], [40, 8, 3], size=(200, 3))
+    np.testing.assert_array_equal(simulation.scene.distance(probe), again.scene.distance(probe))
+    assert np.mean(np.abs(simulation.scene.distance(probe) - other.scene.distance(probe)) > 0.01) > 0.3
+
+
+def test_clutter_does_not_change_the_other_returns():
+    scene, pose = wall_ahead(10.0), np.eye(4)
+    clean = QUIET.scan(scene, pose, seed=1)
+    cluttered = replace(QUIET, clutter_per_scan=50.0).scan(scene, pose, seed=1)
+    surface = cluttered.origin_kind == sim.Origin.SURFACE
+    order_a, order_b = np.lexsort(clean.points.T), np.lexsort(cluttered.points[surface].T)
+    np.testing.assert_array_equal(clean.points[order_a], cluttered.points[surface][order_b])
+    np.testing.assert_array_equal(clean.intensities[order_a], cluttered.intensities[surface][order_b])
+
+
+@pytest.mark.parametrize("distance", [10.0, 40.0])
+def test_noise_along_and_across_the_beam(distance):
+    """A pole-thin field of view on a wall: range noise is the spread in x, angles times range the spread across."""
+    sensor = replace(
+        QUIET, azimuth_fov_rad=1e-6, elevation_fov_rad=1e-6, beams=20_000,
+        sigma_range_m=0.07, sigma_azimuth_rad=0.005, sigma_elevation_rad=0.011,
+    )  # fmt: skip
+    points = sensor.scan(wall_ahead(distance), np.eye(4)).points.astype(np.float64)
+    assert len(points) == 20_000
+    range_m = np.linalg.norm(points, axis=1)
+    assert range_m.mean() == pytest.approx(distance, abs=0.003)
+    assert range_m.std() == pytest.approx(0.07, rel=0.03)
+    assert points[:, 1].std() == pytest.approx(0.005 * distance, rel=0.03)
+    assert points[:, 2].std() == pytest.approx(0.011 * distance, rel=0.03)
+
+
+def test_power_falls_with_the_fourth_power_of_range():
+    """Regress the measured, speckled dB on log10 of the range: the slope is -40, the offset gain + reflectivity."""
+    sensor = replace(QUIET, azimuth_fov_rad=0.01, elevation_fov_rad=0.01, gain_db=120.0)
+    log_range, power = [], []
+    for frame, distance in enumerate(np.geomspace(3, 60, 12)):
+        scan = sensor.scan(wall_ahead(distance), np.eye(4), seed=0, frame=frame)
+        log_range.append(np.full(len(scan.points), np.log10(distance)))
+        power.append(scan.intensities)
+        assert np.median(scan.intensities - scan.noiseless_intensities) == pytest.approx(0.0, abs=0.3)
+    slope, offset = np.polyfit(np.concatenate(log_range), np.concatenate(power), 1)
+    assert slope == pytest.approx(-40.0, abs=0.5)
+    fading_mean = -0.50  # dB, of a Gamma variable of 3 looks whose median is 1: 10·(ψ(3) - ln 2.674)/ln 10
+    assert offset == pytest.approx(120.0 + fading_mean, abs=0.6)
+
+
+def test_incidence_lobe():
+    """Noiseless power over a wide wall, range taken out, is the material's lobe of the known angle."""
+    material = sim.Material("shiny", 2.0, specular=0.9, lobe_width_rad=0.3)
+    sensor = replace(QUIET, azimuth_fov_rad=2.4, elevation_fov_rad=0.01)
+    scan = sensor.scan(wall_ahead(5.0, material), np.eye(4))
+    range_m = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    lobe = scan.noiseless_intensities - sensor.gain_db - 2.0 + 40 * np.log10(range_m)
+    cos = 5.0 / range_m
+    expected = 10 * np.log10(0.1 * cos**2 + 0.9 * np.exp(-(np.arccos(cos) ** 2) / (2 * 0.3**2)))
+    np.testing.assert_allclose(lobe, expected, atol=1e-3)
+    assert lobe[cos > 0.99].min() > lobe[cos < 0.5].max() + 10
+
+
+def test_threshold_censors():
+    """Half of the returns survive where the noiseless power equals the threshold: its speckle has median 0."""
+    sensor = replace(QUIET, azimuth_fov_rad=0.01, elevation_fov_rad=0.01, beams=4000)
+    at_threshold = replace(sensor, threshold_db=sensor.gain_db - 40.0)
+    scan = at_threshold.scan(wall_ahead(10.0), np.eye(4))
+    assert len(scan.points) / 4000 == pytest.approx(0.5, abs=0.03)
+    assert scan.intensities.min() >= at_threshold.threshold_db
+    deaf = replace(sensor, threshold_db=sensor.gain_db)
+    assert len(deaf.scan(wall_ahead(10.0), np.eye(4)).points) == 0
+
+
+def test_clutter_is_labelled_weak_and_in_free_space():
+    sensor = replace(QUIET, clutter_per_scan=400.0, threshold_db=40.0)
+    scan = sensor.scan(wall_ahead(4.0), np.eye(4))
+    clutter = scan.origin_kind == sim.Origin.CLUTTER
+    assert 250 < clutter.sum() < 450  # what would lie beyond the wall is left out
+    assert (scan.points[clutter, 0] < 0.96 * 4.0).all()
+    assert (np.linalg.norm(scan.points[clutter], axis=1) >= sensor.min_range_m).all()
+    np.testing.assert_allclose(scan.points[~clutter, 0], 4.0, atol=1e-4)
+    assert np.median(scan.intensities[clutter]) < np.median(scan.intensities[~clutter])
+
+
+def test_ghosts_lie_behind_the_mirror_at_the_length_of_the_path():
+    """A mirror across the lane, tilted by 45 degrees, shows a wall at its left as if it stood straight on."""
+    shiny = replace(FACING, mirror_loss_db=3.0)
+    mirror = sim.Box(np.array([10.0, 0.0, 0.0]), np.array([3.0, 0.05, 3.0]), np.pi / 4, shiny)
+    target = sim.Box(np.array([10.0, 20.5, 0.0]), np.array([9.0, 0.5, 9.0]), 0.0, FACING)
+    sensor = replace(QUIET, azimuth_fov_rad=0.02, elevation_fov_rad=0.02, ghost_share=1.0)
+    scene, pose = sim.Scene([mirror, target]), np.eye(4)
+    scan = sensor.scan(scene, pose)
+    ghosts = scan.origin_kind == sim.Origin.GHOST
+    assert ghosts.sum() == (~ghosts).sum() == sensor.beams
+    # Mirrored at the plane x - y = 10 - 0.05·√2, the target's face y = 20 appears at this x.
+    np.testing.assert_allclose(scan.points[ghosts, 0], 30.0 - 0.05 * np.sqrt(2), atol=1e-3)
+    assert np.median(scan.intensities[ghosts]) < np.median(scan.intensities[~ghosts])
+    ranges = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    first = scene.raycast(np.zeros(3), scan.points / ranges[:, None], 80.0).range_m
+    assert (ranges[ghosts] > first[ghosts] + 1.0).all()
+
+
+def test_ghosts_of_a_court_lie_behind_its_surfaces():
+    court = sim.oculii(seed=3, frames=2)
+    sensor = replace(court.sensor, sigma_range_m=0.0, sigma_azimuth_rad=0.0, sigma_elevation_rad=0.0)
+    scan = sensor.scan(court.scene, court.poses[0])
+    ghosts = scan.points[scan.origin_kind == sim.Origin.GHOST].astype(np.float64)
+    assert len(ghosts) > 20
+    range_m = np.linalg.norm(ghosts, axis=1)
+    T = court.poses[0]
+    first = court.scene.raycast(T[:3, 3], ghosts @ T[:3, :3].T / range_m[:, None], sensor.max_range_m).range_m
+    assert (range_m > first).all()
+
+
+def test_no_ghost_from_a_mirror_hit_below_a_crest():
+    """Ripples too fine for the march let beams reach the mirror's foot under ground, where no second leg starts."""
+    crest_at_mirror = np.array([np.pi / 2 - 40.0 * 9.5])
+    ripples = sim.Terrain(np.array([[40.0, 0.0]]), np.array([0.02]), crest_at_mirror, 0.0, materials.GRASS)
+    mirror = sim.Box(np.array([10.0, 0.0, 0.0]), np.array([0.5, 5.0, 2.0]), 0.0, materials.GLASS)
+    pose = np.eye(4)
+    pose[2, 3] = 0.2
+    sensor = replace(QUIET, elevation_fov_rad=0.1, beams=20_000, ghost_share=1.0)
+    scene = sim.Scene([mirror], ripples)
+    scan = sensor.scan(scene, pose)
+    ghosts = scan.points[scan.origin_kind == sim.Origin.GHOST].astype(np.float64)
+    assert len(ghosts) > 100
+    range_m = np.linalg.norm(ghosts, axis=1)
+    first = scene.raycast(pose[:3, 3], ghosts / range_m[:, None], 80.0).range_m
+    assert (range_m > first + 0.009).all()
+
+
+def test_reflector_lobe_in_the_wall_scene():
+    """On its axis the reflector outshines the wall by far; 70 degrees off, the lobe has gone."""
+    scene = sim.wall(seed=0, frames=1)
+    reflector = scene.scene.solids[-1]
+    sensor = replace(scene.sensor, threshold_db=0.0, saturation_db=300.0, beams=40_000, azimuth_fov_rad=0.3,
+                     elevation_fov_rad=0.3)  # fmt: skip
+    strongest = []
+    for angle in np.deg2rad([0, 20, 40, 75]):
+        eye = reflector.apex + 10 * np.array([np.cos(angle), np.sin(angle), 0.0])
+        yaw = angle + np.pi
+        T = np.eye(4)
+        T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        T[:3, 3] = eye
+        scan = replace(sensor, sigma_azimuth_rad=0.0, sigma_elevation_rad=0.0, sigma_range_m=0.0).scan(
+            scene.scene, T
+        )
+        world = scan.points.astype(np.float64) @ T[:3, :3].T + eye
+        at = reflector.signed_distance(world) < 1e-4
+        assert at.sum() > 50
+        strongest.append(np.median(scan.noiseless_intensities[at]))
+        if angle == 0:
+            around = (np.abs(world[:, 0]) < 1e-3) & (scan.origin_kind == sim.Origin.SURFACE)
+            assert strongest[0] > np.median(scan.noiseless_intensities[around]) + 15
+    assert strongest == sorted(strongest, reverse=True)
+    assert strongest[0] - strongest[1] < 5
+    assert strongest[0] - strongest[-1] > 25
+
+
+def test_wall_returns_fade_with_incidence():
+    simulation = sim.wall(seed=0, frames=30)
+    world, surface = simulation.world_points(), simulation.is_surface()
+    eyes = np.repeat(simulation.poses[:, :3, 3], [len(p) for p in simulation.points], axis=0)
+    ray = world - eyes
+    range_m = np.linalg.norm(ray, axis=1)
+    wall = surface & (np.abs(world[:, 0]) < 0.1) & (world[:, 2] > 0.5) & (np.abs(world[:, 1]) > 0.6)
+    at_1m = np.concatenate(simulation.intensities) + 40 * np.log10(range_m)
+    incidence = np.degrees(np.arccos(np.clip(-ray[:, 0] / range_m, -1, 1)))
+    medians = [np.median(at_1m[wall & (incidence > a) & (incidence <= a + 15)]) for a in (0, 15, 30, 45, 60)]
+    assert (np.diff(medians) < 0).all()
+    assert medians[0] - medians[-1] > 8
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"beams": 0}, {"min_range_m": 70.0}, {"azimuth_fov_rad": 7.0}, {"sigma_range_m": -1.0}, {"ghost_share": 1.5},
+     {"saturation_db": 10.0}, {"sigma_power_db": float("nan")}],
+)  # fmt: skip
+def test_impossible_sensors_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong)).split("_")[0] + "|view|deviations"):
+        sim.RadarSensor(**wrong)
+
+
+def test_impossible_materials_and_frames_are_refused():
+    with pytest.raises(ValueError, match="specular"):
+        sim.Material("odd", 0.0, specular=2.0)
+    with pytest.raises(ValueError, match="looks"):
+        sim.Material("odd", 0.0, looks=0.0)
+    with pytest.raises(ValueError, match="frames"):
+        sim.wall(frames=-1)
+
+
+def test_an_empty_world_returns_nothing():
+    simulation = sim.simulate(sim.Scene([]), QUIET, np.eye(4)[None], name="void")
+    assert simulation.num_returns == 0
+    assert simulation.ground_truth.shape == (0, 3)
+    assert np.isnan(simulation.intensity_noise_floor())
