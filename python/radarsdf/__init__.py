@@ -1,9 +1,10 @@
 """From 3D radar scans with known poses to a surface and a reflectance map, on a CPU."""
 
+from radarsdf import simulate
 from radarsdf.config import FitConfig
 from radarsdf.fitting import fit
 from radarsdf.isosurface import marching_cubes
 from radarsdf.map import RadarMap
 from radarsdf.storage import load
 
-__all__ = ["FitConfig", "RadarMap", "fit", "load", "marching_cubes"]
+__all__ = ["FitConfig", "RadarMap", "fit", "load", "marching_cubes", "simulate"]

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 MAX_LEVELS = 12  # of the compiled core
 MAX_FREQUENCIES = 24
+MAX_THREADS = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +154,9 @@ class FitConfig:
             if number is not None and not lowest <= number < math.inf:
                 msg = f"{name} must be at least {lowest}, not {number}"
                 raise ValueError(msg)
+        if self.num_threads > MAX_THREADS:
+            msg = f"num_threads must be at most {MAX_THREADS}, not {self.num_threads}"
+            raise ValueError(msg)
         if self.encoding not in ("tri-quadtree", "octree"):
             msg = f"encoding must be 'tri-quadtree' or 'octree', not {self.encoding!r}"
             raise ValueError(msg)

@@ -22,19 +22,20 @@ class _VertexFeatures(nn.Module):
         Edge of a cell of the finest level, m.
     num_levels : int
         Each level's cells are twice as large as those of the level before.
+    num_threads : int
+        For building the table; 0: as many as OpenMP uses.
     """
 
     encoding: Encoding
 
-    def __init__(self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_levels: int) -> None:
+    def __init__(self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_levels: int, num_threads: int = 0) -> None:
         super().__init__()
-        self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, self.encoding, torch.get_num_threads())
+        self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, self.encoding, num_threads)
         self.features = nn.Parameter(torch.zeros(self.table.num_rows, kernels.FEATURE_DIM))
 
-    def initialise(self, std: float, generator: torch.Generator | None = None) -> None:
+    def initialise(self, std: float) -> None:
         """Draws the features from N(0, std²)."""
-        with torch.no_grad():
-            self.features.normal_(0.0, std, generator=generator)
+        nn.init.normal_(self.features, std=std)
 
     def occupied(self, points: Tensor) -> Tensor:
         """Whether each point (N, 3), local frame, m, lies in an occupied leaf cell: (N,) bool."""

@@ -24,13 +24,17 @@ class Field(nn.Module):
         Shapes and scales.
     with_intensity : bool
         Whether there is an intensity network at all.
+    num_threads : int
+        For building the table of cells; 0: as many as OpenMP uses.
     """
 
-    def __init__(self, leaf_keys: NDArray[np.uint64], config: FitConfig, *, with_intensity: bool) -> None:
+    def __init__(
+        self, leaf_keys: NDArray[np.uint64], config: FitConfig, *, with_intensity: bool, num_threads: int = 0
+    ) -> None:
         super().__init__()
         encoding = TriQuadtree if config.encoding == "tri-quadtree" else Octree
         self.sigma_m = config.sigma_m
-        self.cells = encoding(leaf_keys, config.leaf_size_m, config.num_levels)
+        self.cells = encoding(leaf_keys, config.leaf_size_m, config.num_levels, num_threads)
         self.fourier = Fourier(config.fourier_half_width_m, config.fourier_first, config.fourier_count)
         dim = self.cells.dim + self.fourier.dim
         self.sdf_network = SDFNetwork(dim, config)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf._core import CellSet
-from radarsdf.config import FitConfig
+from radarsdf.config import MAX_THREADS, FitConfig
 from radarsdf.field import Field
 from radarsdf.losses import intensity_loss, sdf_loss
 from radarsdf.map import IntensityScale, RadarMap
 from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays, prepare
+from radarsdf.threads import Workers
 
 
 def fit(
@@ -79,12 +80,11 @@ def fit(
         accumulate_frames=config.accumulate_frames,
     )
     clock.lap("prepare_s")
-    with _num_threads(config.num_threads):
-        generator = torch.Generator().manual_seed(config.seed)
-        field = _new_field(rays, config, generator)
+    with Workers(config.num_threads) as workers:
+        field = _new_field(rays, config, workers.num_threads)
         clock.lap("occupied_cells_s")
         scale = IntensityScale.of(rays.intensities)
-        training = _Training(field, rays, scale, config, generator)
+        training = _Training(field, rays, scale, config, workers)
         training.run(progress)
         clock.lap("training_s")
     field.requires_grad_(False)
@@ -100,7 +100,7 @@ def fit(
     return RadarMap(field=field, origin=rays.origin, intensity_scale=scale, config=config, report=report)
 
 
-def occupied_leaf_keys(rays: Rays, config: FitConfig) -> NDArray[np.uint64]:
+def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
     """Leaf cells that a near-surface sample can fall into: Morton keys, ascending.
 
     The line of samples round each return is walked in steps of half a cell instead of being left to chance, so that
@@ -109,102 +109,46 @@ def occupied_leaf_keys(rays: Rays, config: FitConfig) -> NDArray[np.uint64]:
     steps = math.ceil(2 * config.near_band_m / (config.leaf_size_m / 2))
     cells = CellSet(config.leaf_size_m)
     for chunk in rays.along(np.linspace(-config.near_band_m, config.near_band_m, steps + 1)):
-        cells.insert(chunk, torch.get_num_threads())
-    return cells.sorted_keys(torch.get_num_threads())
+        cells.insert(chunk, num_threads)
+    return cells.sorted_keys(num_threads)
 
 
-def _new_field(rays: Rays, config: FitConfig, generator: torch.Generator) -> Field:
+def _new_field(rays: Rays, config: FitConfig, num_threads: int) -> Field:
+    leaf_keys = occupied_leaf_keys(rays, config, num_threads)
     with torch.random.fork_rng(devices=[]):  # the layers of torch.nn draw from the global generator
         torch.manual_seed(config.seed)
-        field = Field(occupied_leaf_keys(rays, config), config, with_intensity=rays.intensities is not None)
-    field.cells.initialise(config.feature_std, generator)
+        field = Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
+        field.cells.initialise(config.feature_std)
     return field
 
 
-class _Training:
-    """The schedule: geometry first, then, on frozen geometry, reflectance; or, as published, both from the start."""
+class _Shard:
+    """One thread's share of the rays and of each batch: it draws samples and computes gradients."""
 
     def __init__(
-        self, field: Field, rays: Rays, scale: IntensityScale | None, config: FitConfig, generator: torch.Generator
+        self, field: Field, rays: Rays, intensities: Tensor | None, config: FitConfig, batch_size: int, seed: int
     ) -> None:
         self._field = field
         self._config = config
-        self._sampler = RaySampler(rays, config, generator)
-        self._intensities = (
-            None if scale is None or rays.intensities is None else torch.from_numpy(scale.to_unit(rays.intensities))
-        )
+        self._intensities = intensities
         self._directions = torch.from_numpy(rays.directions)
         self._ranges_m = torch.from_numpy(rays.ranges_m)
-        samples = len(rays) * (config.near_samples + config.free_samples)
-        self._sdf_iterations = config.sdf_iterations or math.ceil(config.sdf_passes * samples / config.batch_size)
-        self._intensity_iterations = 0
-        if self._intensities is not None:
-            self._intensity_iterations = config.intensity_iterations or math.ceil(
-                config.intensity_passes * len(rays) * config.near_samples / config.batch_size
-            )
-        self.iterations = {"sdf": self._sdf_iterations, "intensity": self._intensity_iterations}
-        self.losses: dict[str, float] = {}
+        self._sampler = RaySampler(rays, config, batch_size, torch.Generator().manual_seed(seed))
 
-    def run(self, progress: bool | None) -> None:
-        config, field = self._config, self._field
-        geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
-        geometry_adam = self._adam(geometry, config.learning_rate)
-        reflectance = field.intensity_network
-        joint = config.joint and reflectance is not None
-        rest = self._intensity_iterations - (self._sdf_iterations if joint else 0)
-        with tqdm(
-            total=self._sdf_iterations + max(rest, 0),
-            desc="fit",
-            unit="it",
-            disable=None if progress is None else not progress,
-        ) as bar:
-            optimisers = [geometry_adam]
-            if reflectance is not None:
-                reflectance_adam = self._adam(reflectance.parameters(), config.intensity_learning_rate)
-                if joint:
-                    optimisers.append(reflectance_adam)
-            self._loop("sdf", self._sdf_iterations, optimisers, lambda: self._geometry_loss(joint), bar)
-            field.cells.requires_grad_(False)
-            field.sdf_network.requires_grad_(False)
-            if reflectance is not None and rest > 0:
-                self._loop("intensity", rest, [reflectance_adam], self._reflectance_loss, bar)
+    def geometry_loss(self) -> Tensor:
+        samples = self._sampler.batch()
+        return sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
 
-    def _adam(self, parameters: Any, learning_rate: float) -> torch.optim.Adam:
-        return torch.optim.Adam(parameters, lr=learning_rate, eps=self._config.adam_epsilon, fused=True)
-
-    def _loop(
-        self, name: str, iterations: int, optimisers: list[torch.optim.Adam], loss_of: Callable[[], Tensor], bar: Any
-    ) -> None:
-        rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
-        for i in range(iterations):
-            if self._config.cosine_schedule:
-                for optimiser, rate in zip(optimisers, rates, strict=True):
-                    optimiser.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * i / iterations))
-            loss = loss_of()
-            for optimiser in optimisers:
-                optimiser.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            for optimiser in optimisers:
-                optimiser.step()
-            bar.update()
-            if i % 100 == 0 or i == iterations - 1:  # reading it every time would cost more than it tells
-                self.losses[name] = loss.item()
-                if not math.isfinite(self.losses[name]):
-                    msg = f"the {name} loss is {self.losses[name]} at iteration {i}: a lower learning rate may help"
-                    raise FloatingPointError(msg)
-
-    def _geometry_loss(self, joint: bool) -> Tensor:
+    def joint_loss(self) -> Tensor:
         samples = self._sampler.batch()
         loss = sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
-        if joint:
-            loss = loss + self._intensity_loss(samples, geometry_frozen=False)
-        return loss
+        return loss + self._intensity_loss(samples, geometry_frozen=False)
 
-    def _reflectance_loss(self) -> Tensor:
+    def reflectance_loss(self) -> Tensor:
         if self._config.intensity_in_free_space:
             samples = self._sampler.batch()
         else:
-            samples = self._sampler.near(self._config.batch_size)
+            samples = self._sampler.near()
         return self._intensity_loss(samples, geometry_frozen=True)
 
     def _intensity_loss(self, samples: Samples, *, geometry_frozen: bool) -> Tensor:
@@ -222,16 +166,97 @@ class _Training:
         return intensity_loss(predicted, labels)
 
 
-@contextlib.contextmanager
-def _num_threads(num_threads: int) -> Iterator[None]:
-    """PyTorch's number of threads, which the kernels follow, for the time of a fit."""
-    before = torch.get_num_threads()
-    if num_threads:
-        torch.set_num_threads(num_threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+class _Training:
+    """The schedule: geometry first, then, on frozen geometry, reflectance; or, as published, both from the start.
+
+    Every batch is split over the threads; their gradients are added in the order of the threads, so the same number of
+    threads gives the same bits.
+    """
+
+    def __init__(
+        self, field: Field, rays: Rays, scale: IntensityScale | None, config: FitConfig, workers: Workers
+    ) -> None:
+        self._field = field
+        self._config = config
+        self._workers = workers
+        threads = min(workers.num_threads, len(rays), config.batch_size)
+        self._shards = []
+        for i in range(threads):
+            share = rays.every(threads, i)
+            intensities = None
+            if scale is not None and share.intensities is not None:
+                intensities = torch.from_numpy(scale.to_unit(share.intensities))
+            batch_size = config.batch_size * (i + 1) // threads - config.batch_size * i // threads
+            seed = config.seed * MAX_THREADS + i
+            self._shards.append(_Shard(field, share, intensities, config, batch_size, seed))
+        samples = len(rays) * (config.near_samples + config.free_samples)
+        self._sdf_iterations = config.sdf_iterations or math.ceil(config.sdf_passes * samples / config.batch_size)
+        self._intensity_iterations = 0
+        if scale is not None:
+            self._intensity_iterations = config.intensity_iterations or math.ceil(
+                config.intensity_passes * len(rays) * config.near_samples / config.batch_size
+            )
+        self.iterations = {"sdf": self._sdf_iterations, "intensity": self._intensity_iterations}
+        self.losses: dict[str, float] = {}
+
+    def run(self, progress: bool | None) -> None:
+        config, field = self._config, self._field
+        reflectance = field.intensity_network
+        joint = config.joint and reflectance is not None
+        rest = max(0, self._intensity_iterations - (self._sdf_iterations if joint else 0))
+        with tqdm(
+            total=self._sdf_iterations + rest,
+            desc="fit",
+            unit="it",
+            disable=None if progress is None else not progress,
+        ) as bar:
+            geometry = _adam([*field.cells.parameters(), *field.sdf_network.parameters()], config.learning_rate, config)
+            adams = [geometry]
+            if reflectance is not None:
+                reflectance_adam = _adam(reflectance.parameters(), config.intensity_learning_rate, config)
+                if joint:
+                    adams.append(reflectance_adam)
+            loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
+            self._loop("sdf", self._sdf_iterations, adams, loss_of, bar)
+            field.cells.requires_grad_(False)
+            field.sdf_network.requires_grad_(False)
+            if reflectance is not None and rest:
+                self._loop("intensity", rest, [reflectance_adam], _Shard.reflectance_loss, bar)
+
+    def _loop(
+        self,
+        name: str,
+        iterations: int,
+        adams: list[torch.optim.Adam],
+        loss_of: Callable[[_Shard], Tensor],
+        bar: Any,
+    ) -> None:
+        parameters = [p for adam in adams for group in adam.param_groups for p in group["params"]]
+        rates = [adam.param_groups[0]["lr"] for adam in adams]
+
+        def loss_and_gradients(shard: _Shard) -> tuple[Tensor, tuple[Tensor, ...]]:
+            loss = loss_of(shard) / len(self._shards)
+            return loss.detach(), torch.autograd.grad(loss, parameters)
+
+        for i in range(iterations):
+            if self._config.cosine_schedule:
+                for adam, rate in zip(adams, rates, strict=True):
+                    adam.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * i / iterations))
+            losses, gradients = zip(*self._workers.map(loss_and_gradients, self._shards), strict=True)
+            for parameter, *parts in zip(parameters, *gradients, strict=True):
+                parameter.grad = functools.reduce(Tensor.add_, parts)
+            for adam in adams:
+                adam.step()
+            bar.update()
+            if i % 100 == 0 or i == iterations - 1:
+                self.losses[name] = float(sum(losses))
+                if not math.isfinite(self.losses[name]):
+                    msg = f"the {name} loss is {self.losses[name]} at iteration {i}: a lower learning rate may help"
+                    raise FloatingPointError(msg)
+
+
+def _adam(parameters: Iterable[Tensor], learning_rate: float, config: FitConfig) -> torch.optim.Adam:
+    return torch.optim.Adam(parameters, lr=learning_rate, eps=config.adam_epsilon, fused=True)
 
 
 class _Clock:

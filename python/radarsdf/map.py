@@ -11,14 +11,16 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
+from radarsdf.threads import Workers
 
 if TYPE_CHECKING:
     import trimesh
 
-_CHUNK = 1 << 15  # points evaluated at a time: encodings and hidden layers stay in the second- and third-level cache
+_CHUNK = 1 << 13  # points evaluated at a time: hidden layers stay in the second-level cache
 _Array = TypeVar("_Array", NDArray[Any], Tensor)
 
 
@@ -116,8 +118,7 @@ class RadarMap:
             If `x` does not have shape (N, 3).
         """
         points, answer = self._local(x)
-        with torch.no_grad():
-            return answer(_in_chunks(self._local_sdf, points))
+        return answer(evaluate(self.local_sdf, points))
 
     @overload
     def gradient(self, x: Tensor) -> Tensor: ...
@@ -130,9 +131,9 @@ class RadarMap:
         def gradient(chunk: Tensor) -> Tensor:
             with torch.enable_grad():
                 chunk = chunk.detach().requires_grad_()
-                return torch.autograd.grad(self._local_sdf(chunk).sum(), chunk)[0]
+                return torch.autograd.grad(self.local_sdf(chunk).sum(), chunk)[0]
 
-        return answer(_in_chunks(gradient, points))
+        return answer(evaluate(gradient, points))
 
     @overload
     def observed(self, x: Tensor) -> Tensor: ...
@@ -141,7 +142,7 @@ class RadarMap:
     def observed(self, x: Any) -> Any:
         """Whether the data supports a surface at x (N, 3), world, m: its leaf cell lies round some return. (N,) bool."""
         points, answer = self._local(x)
-        return answer(_in_chunks(self._field.cells.occupied, points))
+        return answer(evaluate(self._field.cells.occupied, points))
 
     @overload
     def intensity(self, x: Tensor, sensor_positions: Tensor) -> Tensor: ...
@@ -180,8 +181,7 @@ class RadarMap:
             directions = rays / ranges_m.clamp_min(1e-6)[:, None]
             return scale.to_sensor(self._field.intensity(positions, directions, ranges_m))
 
-        with torch.no_grad():
-            return answer(_in_chunks(intensity, torch.cat([points, sensors], 1)))
+        return answer(evaluate(intensity, torch.cat([points, sensors], 1)))
 
     def mesh(
         self,
@@ -202,7 +202,8 @@ class RadarMap:
 
         save_map(self, path)
 
-    def _local_sdf(self, points: Tensor) -> Tensor:
+    def local_sdf(self, points: Tensor) -> Tensor:
+        """Signed distance (N,), m, at points of the local frame (N, 3) float32."""
         return self._field.logit(points) * self._field.sigma_m
 
     def _local(self, x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
@@ -229,7 +230,19 @@ class RadarMap:
         return local, answer
 
 
-def _in_chunks(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-    if len(points) <= _CHUNK:
-        return function(points)
-    return torch.cat([function(chunk) for chunk in points.split(_CHUNK)])
+def evaluate(
+    function: Callable[[Tensor], Tensor], points: Tensor, *, description: str = "", progress: bool | None = False
+) -> Tensor:
+    """function(points), without gradients, in chunks on all threads; with a progress bar where asked for."""
+
+    def without_gradients(chunk: Tensor) -> Tensor:
+        with torch.no_grad():
+            return function(chunk)
+
+    chunks = points.split(_CHUNK) if len(points) > _CHUNK else (points,)
+    if len(chunks) == 1:
+        return without_gradients(points)
+    with Workers() as workers:
+        results = workers.map(without_gradients, chunks)
+        disable = None if progress is None else not progress
+        return torch.cat(list(tqdm(results, description, len(chunks), unit="chunk", disable=disable)))

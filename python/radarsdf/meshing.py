@@ -9,16 +9,15 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 from radarsdf.isosurface import extract_cells, mesh_components, sparse_lattice
+from radarsdf.map import evaluate
 from radarsdf.picture import intensity_colors
 
 if TYPE_CHECKING:
     from radarsdf.map import RadarMap
 
 _INWARD = 1e-3  # of a voxel: how far corners on the map's border are moved into it to be evaluated
-_CHUNK = 1 << 15  # corners evaluated at a time
 
 
 def extract_mesh(
@@ -120,19 +119,13 @@ def _corner_distances(
     A corner on the border of the occupied cells may belong to the cell beyond, which has no features: its value would
     jump. It is evaluated a hair inside one of its own voxels instead.
     """
-    field = radar_map.field
     points = torch.from_numpy(corners.astype(np.float32) * np.float32(voxel_size))
-    values = []
-    with torch.no_grad():
-        outside = ~np.concatenate([field.cells.occupied(chunk).numpy() for chunk in points.split(_CHUNK)] or [[]]).astype(bool)
-        voxel, corner = np.nonzero(outside[voxel_corners])
-        of = voxel_corners[voxel, corner]
-        centres = torch.from_numpy((voxels[voxel].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size))
-        points[of] = torch.lerp(points[of], centres, _INWARD)
-        chunks = points.split(_CHUNK) if len(points) else ()
-        for chunk in tqdm(chunks, desc="mesh", unit="chunk", disable=None if progress is None else not progress):
-            values.append(field.logit(chunk) * field.sigma_m)
-    return torch.cat(values).numpy() if values else np.zeros(0, np.float32)
+    outside = ~evaluate(radar_map.field.cells.occupied, points).numpy()
+    voxel, corner = np.nonzero(outside[voxel_corners])
+    border = voxel_corners[voxel, corner]
+    centres = torch.from_numpy((voxels[voxel].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size))
+    points[border] = torch.lerp(points[border], centres, _INWARD)
+    return evaluate(radar_map.local_sdf, points, description="mesh", progress=progress).numpy()
 
 
 def _without_small_components(

@@ -36,10 +36,10 @@ class RaySampler:
     Morton order of their returns, so that neighbours share cache lines.
     """
 
-    def __init__(self, rays: Rays, config: FitConfig, generator: torch.Generator) -> None:
+    def __init__(self, rays: Rays, config: FitConfig, batch_size: int, generator: torch.Generator) -> None:
         self._config = config
         self._generator = generator
-        order = np.argsort(cell_keys(rays.points, config.leaf_size_m, torch.get_num_threads()), kind="stable")
+        order = np.argsort(cell_keys(np.ascontiguousarray(rays.points), config.leaf_size_m, 1), kind="stable")
         self._original = torch.from_numpy(order)
         # One gather a batch fetches point, direction and range: 28 bytes, mostly one cache line.
         self._rays = torch.cat(
@@ -48,8 +48,8 @@ class RaySampler:
         self._order = np.zeros(0, np.int64)
         self._next = 0
         share = config.near_samples / (config.near_samples + config.free_samples)
-        self._num_near = max(1, round(config.batch_size * share))
-        self._num_free = config.batch_size - self._num_near
+        self._num_near = max(1, round(batch_size * share))
+        self._num_free = batch_size - self._num_near
 
     def _take(self, count: int) -> Tensor:
         """The next `count` rays of the random order, sorted; a new order begins where one ends."""
@@ -67,8 +67,9 @@ class RaySampler:
     def _uniform(self, count: int) -> Tensor:
         return torch.rand(count, generator=self._generator)
 
-    def near(self, count: int) -> Samples:
-        """`count` samples within `near_band_m` of their returns."""
+    def near(self) -> Samples:
+        """As many samples as a batch has, all within `near_band_m` of their returns."""
+        count = self._num_near + self._num_free
         rays = self._take(count)
         sdf_m = (2 * self._uniform(count) - 1) * self._config.near_band_m
         ray = self._rays[rays]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -33,6 +34,18 @@ class Rays:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def every(self, step: int, first: int) -> Rays:
+        """Each `step`-th ray from `first` on."""
+        part = slice(first, None, step)
+        return dataclasses.replace(
+            self,
+            points=self.points[part],
+            directions=np.ascontiguousarray(self.directions[part]),
+            ranges_m=np.ascontiguousarray(self.ranges_m[part]),
+            intensities=None if self.intensities is None else self.intensities[part],
+            scans=self.scans[part],
+        )
 
     def along(self, offsets_m: ArrayLike, chunk: int = 1 << 20) -> Iterator[NDArray[np.float32]]:
         """Points at fixed offsets along every ray, behind the return where positive, in chunks of (M, 3), local, m."""

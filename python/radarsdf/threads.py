@@ -1,0 +1,72 @@
+"""Threads that each run whole pieces of work, with PyTorch's own threads off.
+
+PyTorch splits every single operation over OpenMP's threads, which spin while they wait for each other. Beside another
+busy process, a fit of 1.8 s took 88 s, since a thread that should work waited for the time slice of one that spun.
+Pieces of work on Python's threads, which sleep when they wait, meet once an iteration instead of a hundred times, and
+share the processor fairly; on an idle machine they are no slower. The interpreter's lock costs little: PyTorch and the
+compiled core release it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from types import TracebackType
+from typing import TypeVar
+
+import torch
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+_lock = threading.Lock()
+_users = 0
+_threads_before = 0
+
+
+def resolve_num_threads(num_threads: int) -> int:
+    """`num_threads`, or where it is 0 as many as PyTorch would use."""
+    with _lock:
+        return num_threads or (_threads_before if _users else torch.get_num_threads())
+
+
+class Workers:
+    """`num_threads` threads for the time of a ``with`` block.
+
+    PyTorch's number of threads is one for the whole process, so it is set to 1 by the first block that is entered and
+    restored by the last that is left, in whichever threads these run.
+    """
+
+    def __init__(self, num_threads: int = 0) -> None:
+        self.num_threads = resolve_num_threads(num_threads)
+        self._pool: ThreadPoolExecutor | None = None
+
+    def __enter__(self) -> Workers:
+        global _users, _threads_before  # noqa: PLW0603 - there is one PyTorch
+        with _lock:
+            if _users == 0:
+                _threads_before = torch.get_num_threads()
+                torch.set_num_threads(1)
+            _users += 1
+        # Threads are started anew for each block, so that a process may fork between two.
+        self._pool = ThreadPoolExecutor(self.num_threads, "radarsdf", initializer=torch.set_num_threads, initargs=(1,))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        global _users  # noqa: PLW0603
+        assert self._pool is not None
+        self._pool.shutdown(cancel_futures=True)
+        with _lock:
+            _users -= 1
+            if _users == 0:
+                torch.set_num_threads(_threads_before)
+
+    def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
+        """Like the built-in, in order, the items on different threads. Grad mode is each thread's own."""
+        assert self._pool is not None
+        if self.num_threads == 1 or len(items) == 1:
+            return map(function, items)
+        return self._pool.map(function, items)
