@@ -23,8 +23,8 @@ FloatArray = NDArray[np.float64]
 
 _LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams apart from those of the frames
 
-# Fields of view, ranges and intensity scales after the paper's sensors; noise, gain and clutter are chosen so that
-# counts and the spread of intensities resemble its data sets.
+# Only the intensity scales are the paper's (Table II). The rest is assumed, not measured: fields of view as usual for
+# such sensors, and noise and gain such that the kNN baseline's errors come out near those of the paper's data sets.
 HUGIN_A3 = RadarSensor(
     azimuth_fov_rad=np.deg2rad(110), elevation_fov_rad=np.deg2rad(30), beams=2950, max_range_m=50.0,
     sigma_range_m=0.06, sigma_azimuth_rad=np.deg2rad(0.4), sigma_elevation_rad=np.deg2rad(0.6), sigma_power_db=1.0,
