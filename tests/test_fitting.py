@@ -6,9 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
-
 import radarsdf
+import torch
 from radarsdf import FitConfig
 
 from .conftest import ground_and_wall
@@ -30,7 +29,9 @@ def test_surface_and_free_space_are_where_they_should_be(radar_map):
 
 def test_gradient_points_to_free_space_and_is_the_derivative(radar_map):
     rng = np.random.default_rng(0)
-    ground = np.column_stack([rng.uniform(9, 18, 300), rng.uniform(-4, 4, 300), rng.uniform(-0.05, 0.05, 300)])
+    ground = np.column_stack(
+        [rng.uniform(9, 18, 300), rng.uniform(-4, 4, 300), rng.uniform(-0.05, 0.05, 300)]
+    )
     gradient = radar_map.gradient(ground)
     normal = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
     assert np.median(normal[:, 2]) > 0.97
@@ -94,7 +95,9 @@ def test_utm_coordinates_change_nothing():
     x = np.random.default_rng(0).uniform([8, -5, -0.2], [20, 5, 0.2], (500, 3))
     np.testing.assert_allclose(far.sdf(x + offset), near.sdf(x), atol=1e-3)
     sensor = np.array([0.5, 0, 1.5])
-    np.testing.assert_allclose(far.intensity(x + offset, sensor + offset), near.intensity(x, sensor), atol=0.05)
+    np.testing.assert_allclose(
+        far.intensity(x + offset, sensor + offset), near.intensity(x, sensor), atol=0.05
+    )
 
 
 @pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
@@ -105,7 +108,9 @@ def test_every_input_of_the_intensity_network_runs(scene, encoding, joint):
     )
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     assert np.isfinite(radar_map.intensity(np.array([[15.0, 0, 0]]), np.zeros(3))).all()
-    bare = dataclasses.replace(config, normals=False, geometry_feature_dim=0, sdf_input=False, view_direction=False)
+    bare = dataclasses.replace(
+        config, normals=False, geometry_feature_dim=0, sdf_input=False, view_direction=False
+    )
     assert radarsdf.fit(scene.points, scene.poses, scene.intensities, config=bare).has_intensity
 
 
@@ -113,7 +118,10 @@ def test_frozen_geometry_does_not_move(scene):
     config = dataclasses.replace(QUICK, joint=True)
     frozen = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     longer = radarsdf.fit(
-        scene.points, scene.poses, scene.intensities, config=dataclasses.replace(config, intensity_iterations=60)
+        scene.points,
+        scene.poses,
+        scene.intensities,
+        config=dataclasses.replace(config, intensity_iterations=60),
     )
     assert torch.equal(frozen.field.cells.features, longer.field.cells.features)
     weights = [m.field.intensity_network.layers[0].weight for m in (frozen, longer)]
@@ -185,7 +193,13 @@ class TestBadInput:
 
     @pytest.mark.parametrize(
         ("name", "value"),
-        [("leaf_size_m", 0), ("sigma_m", float("nan")), ("num_levels", 99), ("near_samples", 0), ("free_from", 1.0)]
+        [
+            ("leaf_size_m", 0),
+            ("sigma_m", float("nan")),
+            ("num_levels", 99),
+            ("near_samples", 0),
+            ("free_from", 1.0),
+        ]
         + [("encoding", "tree"), ("sdf_hidden", ()), ("batch_size", -1), ("max_range_m", 1.0)],
     )
     def test_settings_that_make_no_sense(self, name, value):
@@ -196,7 +210,9 @@ class TestBadInput:
 def test_a_loss_that_stops_being_finite_stops_the_fit(scene):
     with pytest.raises(FloatingPointError, match="sdf loss is"):
         radarsdf.fit(
-            scene.points, scene.poses, config=FitConfig(learning_rate=1e30, sdf_iterations=50, cosine_schedule=False)
+            scene.points,
+            scene.poses,
+            config=FitConfig(learning_rate=1e30, sdf_iterations=50, cosine_schedule=False),
         )
 
 

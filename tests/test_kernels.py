@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.special import sph_harm_y
-
 from radarsdf import _core, kernels
+from scipy.special import sph_harm_y
 
 LEAF_M = 0.2
 ENCODINGS = [_core.Encoding.TRI_QUADTREE, _core.Encoding.OCTREE]
@@ -68,13 +67,16 @@ class Reference:
             for cell in cells:
                 for group in self.groups:
                     for corner in np.ndindex(*(2,) * len(group)):
-                        vertices.add((level, group, tuple(cell[a] + s for a, s in zip(group, corner, strict=True))))
+                        vertices.add(
+                            (level, group, tuple(cell[a] + s for a, s in zip(group, corner, strict=True)))
+                        )
         return len(vertices)
 
 
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("num_levels", [1, 3, 5])
-def test_interpolation_equals_the_dictionary_reference(encoding, num_levels, instruction_set):
+def test_interpolation_equals_the_dictionary_reference(encoding, num_levels):
     occupied = surface_points(300)
     table = make_table(occupied, num_levels, encoding)
     reference = Reference(occupied, num_levels, encoding)
@@ -97,24 +99,33 @@ def test_interpolation_equals_the_dictionary_reference(encoding, num_levels, ins
     for n, query in enumerate(queries):
         for level in range(num_levels):
             expected = reference.weights(query, level)
-            found = {int(row): weights_of_rows[n, level, row] for row in np.flatnonzero(weights_of_rows[n, level])}
+            found = {
+                int(row): weights_of_rows[n, level, row] for row in np.flatnonzero(weights_of_rows[n, level])
+            }
             assert sorted(found.values()) == pytest.approx(sorted(expected.values()), abs=1e-12)
-            if len(set(np.round(list(expected.values()), 9))) == len(expected):  # weights tell the vertices apart
+            if len(set(np.round(list(expected.values()), 9))) == len(
+                expected
+            ):  # weights tell the vertices apart
                 by_weight = sorted(found, key=found.__getitem__)
                 for vertex, row in zip(sorted(expected, key=expected.__getitem__), by_weight, strict=True):
                     assert row_of.setdefault(vertex, row) == row
     assert len(set(row_of.values())) == len(row_of)
     np.testing.assert_allclose(
-        out.reshape(len(queries), num_levels, 8), np.einsum("nlr,rd->nld", weights_of_rows, features), atol=1e-12
+        out.reshape(len(queries), num_levels, 8),
+        np.einsum("nlr,rd->nld", weights_of_rows, features),
+        atol=1e-12,
     )
 
 
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_gradients_of_interpolation(encoding, instruction_set):
+def test_gradients_of_interpolation(encoding):
     table = make_table(surface_points(40, extent_m=1.0), 3, encoding)
     # Away from the cells' borders, where the gradient by the points jumps.
     points = surface_points(12, seed=0, extent_m=1.0)
-    points = torch.tensor((np.floor(points / LEAF_M) + 0.1 + 0.8 * np.random.default_rng(2).random(points.shape)) * LEAF_M)
+    points = torch.tensor(
+        (np.floor(points / LEAF_M) + 0.1 + 0.8 * np.random.default_rng(2).random(points.shape)) * LEAF_M
+    )
     features = torch.randn(table.num_rows, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     inputs = (features.requires_grad_(), points.requires_grad_())
     assert (kernels.locate(points, table) >= 0).any(1).all()
@@ -127,15 +138,20 @@ def test_gradients_of_interpolation(encoding, instruction_set):
 
 
 def test_gradients_of_fourier():
-    points = torch.randn(7, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    function = lambda x: kernels.fourier(x, 3.0, 0, 4)  # noqa: E731
+    points = torch.randn(
+        7, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    ).requires_grad_()
+    function = lambda x: kernels.fourier(x, 3.0, 0, 4)
     assert torch.autograd.gradcheck(function, (points,))
     assert torch.autograd.gradgradcheck(function, (points,))
 
 
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-7), (torch.float64, 1e-15)])
-def test_fourier_equals_sin_and_cos(dtype, tolerance, instruction_set):
-    points = (torch.rand(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 2 - 1).to(dtype)
+def test_fourier_equals_sin_and_cos(dtype, tolerance):
+    points = (torch.rand(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 2 - 1).to(
+        dtype
+    )
     points[0] = torch.tensor([0.0, 1.0, -1.0])
     points[1] = torch.tensor([0.25, -0.5, 0.125])
     out = kernels.fourier(points, 1.0, 0, 16).double().view(-1, 2, 16, 3)
@@ -147,11 +163,16 @@ def test_fourier_equals_sin_and_cos(dtype, tolerance, instruction_set):
 
 def test_spherical_harmonics_equal_scipy():
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1)
-    polar, azimuth = torch.arccos(directions[:, 2]).numpy(), torch.atan2(directions[:, 1], directions[:, 0]).numpy()
+    polar, azimuth = (
+        torch.arccos(directions[:, 2]).numpy(),
+        torch.atan2(directions[:, 1], directions[:, 0]).numpy(),
+    )
     expected = []
     for degree in range(4):
         for order in range(-degree, degree + 1):
-            y = sph_harm_y(degree, abs(order), polar, azimuth) * (-1.0) ** order  # without the Condon-Shortley phase
+            y = (
+                sph_harm_y(degree, abs(order), polar, azimuth) * (-1.0) ** order
+            )  # without the Condon-Shortley phase
             part = y.real if order >= 0 else y.imag
             expected.append(part * (math.sqrt(2) if order else 1))
     np.testing.assert_allclose(kernels.spherical_harmonics(directions), np.stack(expected, 1), atol=1e-12)

@@ -40,10 +40,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    demo = _command(commands, "demo", _demo, "simulate a drive, fit it, write map, mesh and picture, print the errors")
-    demo.add_argument("--scene", choices=sorted(radarsdf.simulate.SCENES), default="hugin", help="default: hugin")
+    demo = _command(
+        commands, "demo", _demo, "simulate a drive, fit it, write map, mesh and picture, print the errors"
+    )
+    demo.add_argument(
+        "--scene", choices=sorted(radarsdf.simulate.SCENES), default="hugin", help="default: hugin"
+    )
     demo.add_argument("--frames", type=int, help="number of scans; default: the scene's own")
-    demo.add_argument("--out", type=Path, default=Path("radarsdf_demo"), help="folder; default: radarsdf_demo")
+    demo.add_argument(
+        "--out", type=Path, default=Path("radarsdf_demo"), help="folder; default: radarsdf_demo"
+    )
     _fit_options(demo)
 
     fit = _command(commands, "fit", _fit, "fit a map to scans")
@@ -56,10 +62,18 @@ def _parser() -> argparse.ArgumentParser:
     mesh = _command(commands, "mesh", _mesh, "turn a map into triangles")
     mesh.add_argument("map", type=Path, help="what fit wrote")
     mesh.add_argument("-o", "--out", type=Path, required=True, help="the mesh: .ply, .obj, .stl, .glb")
-    mesh.add_argument("--voxel", type=float, default=0.1, metavar="M", help="edge of a voxel, m; default: 0.1")
-    mesh.add_argument("--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help="world, m")
     mesh.add_argument(
-        "--viewpoint", type=float, nargs=3, metavar=("X", "Y", "Z"), help="colour by the intensity seen from here"
+        "--voxel", type=float, default=0.1, metavar="M", help="edge of a voxel, m; default: 0.1"
+    )
+    mesh.add_argument(
+        "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help="world, m"
+    )
+    mesh.add_argument(
+        "--viewpoint",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="colour by the intensity seen from here",
     )
     mesh.add_argument("--picture", type=Path, metavar="PNG", help="draw it, too")
     mesh.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -67,9 +81,15 @@ def _parser() -> argparse.ArgumentParser:
     evaluate = _command(commands, "eval", _eval, "errors of a mesh or a map")
     evaluate.add_argument("what", type=Path, help="a mesh, or a map (.safetensors)")
     evaluate.add_argument("truth", type=Path, help="lidar points (.ply, .npy, .xyz), or scans (.npz)")
-    evaluate.add_argument("--holdout", type=int, metavar="N", help="intensity errors on the scans that fit left out")
-    evaluate.add_argument("--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help="world, m")
-    evaluate.add_argument("--samples", type=int, default=10_000_000, help="points on the mesh; default: 10000000")
+    evaluate.add_argument(
+        "--holdout", type=int, metavar="N", help="intensity errors on the scans that fit left out"
+    )
+    evaluate.add_argument(
+        "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help="world, m"
+    )
+    evaluate.add_argument(
+        "--samples", type=int, default=10_000_000, help="points on the mesh; default: 10000000"
+    )
 
     _command(commands, "info", _info, "versions, compiler, instruction set, threads: for bug reports")
     return parser
@@ -82,9 +102,15 @@ def _command(commands: Any, name: str, run: Any, text: str) -> argparse.Argument
 
 
 def _fit_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--paper", action="store_true", help="the published configuration: slower, for comparison")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of FitConfig; may be repeated"
+        "--paper", action="store_true", help="the published configuration: slower, for comparison"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a setting of FitConfig; may be repeated",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -121,7 +147,9 @@ def _demo(options: argparse.Namespace) -> None:
     print(f"simulated {options.scene}: {sum(map(len, scans.points))} returns in {len(scans.points)} scans")
     started = time.perf_counter()
     kept = scans.select(train)
-    radar_map = radarsdf.fit(kept.points, kept.poses, kept.intensities, config=config, progress=_progress(options))
+    radar_map = radarsdf.fit(
+        kept.points, kept.poses, kept.intensities, config=config, progress=_progress(options)
+    )
     fitted = time.perf_counter()
     viewpoint = scans.poses[len(scans.poses) // 2, :3, 3]
     mesh = radar_map.mesh(viewpoint=viewpoint, progress=_progress(options))
@@ -156,7 +184,9 @@ def _fit(options: argparse.Namespace) -> None:
 
 def _mesh(options: argparse.Namespace) -> None:
     radar_map = radarsdf.load(options.map)
-    mesh = radar_map.mesh(options.voxel, box=_box(options), viewpoint=options.viewpoint, progress=_progress(options))
+    mesh = radar_map.mesh(
+        options.voxel, box=_box(options), viewpoint=options.viewpoint, progress=_progress(options)
+    )
     mesh.export(options.out)
     print(f"{len(mesh.vertices)} vertices and {len(mesh.faces)} triangles written to {options.out}")
     if options.picture:
@@ -193,7 +223,11 @@ def _read_points(path: Path) -> np.ndarray[Any, Any]:
 def _world(scans: Scans, config: FitConfig) -> tuple[Any, Any, Any]:
     """World points, sensor positions and intensities of the returns within the ranges that the map was fitted to."""
     rays = radarsdf.scans.prepare(
-        scans.points, scans.poses, scans.intensities, min_range_m=config.min_range_m, max_range_m=config.max_range_m
+        scans.points,
+        scans.poses,
+        scans.intensities,
+        min_range_m=config.min_range_m,
+        max_range_m=config.max_range_m,
     )
     points = rays.points.astype(np.float64) + rays.origin
     return points, points - rays.directions.astype(np.float64) * rays.ranges_m[:, None], rays.intensities

@@ -169,7 +169,9 @@ class FitConfig:
         if not 0 <= self.free_from < 1:
             msg = f"free_from must lie in [0, 1), not {self.free_from}"
             raise ValueError(msg)
-        if not (self.sdf_hidden and self.intensity_hidden and min(self.sdf_hidden + self.intensity_hidden) > 0):
+        if not (
+            self.sdf_hidden and self.intensity_hidden and min(self.sdf_hidden + self.intensity_hidden) > 0
+        ):
             msg = "networks need at least one hidden layer, of positive width"
             raise ValueError(msg)
 

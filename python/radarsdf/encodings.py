@@ -28,7 +28,9 @@ class _VertexFeatures(nn.Module):
 
     encoding: Encoding
 
-    def __init__(self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_levels: int, num_threads: int = 0) -> None:
+    def __init__(
+        self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_levels: int, num_threads: int = 0
+    ) -> None:
         super().__init__()
         self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, self.encoding, num_threads)
         self.features = nn.Parameter(torch.zeros(self.table.num_rows, kernels.FEATURE_DIM))

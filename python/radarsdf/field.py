@@ -48,7 +48,9 @@ class Field(nn.Module):
         """Signed distance / sigma (N,), positive in free space."""
         return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
 
-    def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor, *, geometry_frozen: bool = True) -> Tensor:
+    def intensity(
+        self, points: Tensor, directions: Tensor, ranges_m: Tensor, *, geometry_frozen: bool = True
+    ) -> Tensor:
         """Scaled intensity (N,); arguments as of :class:`~radarsdf.networks.IntensityNetwork`.
 
         With `geometry_frozen`, no gradient reaches features and SDF network, and none of their graph is kept.
@@ -57,7 +59,7 @@ class Field(nn.Module):
         assert network is not None
         normals = None
         # The normal is itself a gradient: where it is wanted, its own graph is needed for a moment.
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not geometry_frozen or network.normals):
+        with torch.set_grad_enabled((torch.is_grad_enabled() and not geometry_frozen) or network.normals):
             if network.normals:
                 points = points.detach().requires_grad_()
             encoding = self.encode(points)

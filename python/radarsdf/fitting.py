@@ -126,7 +126,13 @@ class _Shard:
     """One thread's share of the rays and of each batch: it draws samples and computes gradients."""
 
     def __init__(
-        self, field: Field, rays: Rays, intensities: Tensor | None, config: FitConfig, batch_size: int, seed: int
+        self,
+        field: Field,
+        rays: Rays,
+        intensities: Tensor | None,
+        config: FitConfig,
+        batch_size: int,
+        seed: int,
     ) -> None:
         self._field = field
         self._config = config
@@ -145,10 +151,7 @@ class _Shard:
         return loss + self._intensity_loss(samples, geometry_frozen=False)
 
     def reflectance_loss(self) -> Tensor:
-        if self._config.intensity_in_free_space:
-            samples = self._sampler.batch()
-        else:
-            samples = self._sampler.near()
+        samples = self._sampler.batch() if self._config.intensity_in_free_space else self._sampler.near()
         return self._intensity_loss(samples, geometry_frozen=True)
 
     def _intensity_loss(self, samples: Samples, *, geometry_frozen: bool) -> Tensor:
@@ -190,7 +193,9 @@ class _Training:
             seed = config.seed * MAX_THREADS + i
             self._shards.append(_Shard(field, share, intensities, config, batch_size, seed))
         samples = len(rays) * (config.near_samples + config.free_samples)
-        self._sdf_iterations = config.sdf_iterations or math.ceil(config.sdf_passes * samples / config.batch_size)
+        self._sdf_iterations = config.sdf_iterations or math.ceil(
+            config.sdf_passes * samples / config.batch_size
+        )
         self._intensity_iterations = 0
         if scale is not None:
             self._intensity_iterations = config.intensity_iterations or math.ceil(
@@ -210,7 +215,9 @@ class _Training:
             unit="it",
             disable=None if progress is None else not progress,
         ) as bar:
-            geometry = _adam([*field.cells.parameters(), *field.sdf_network.parameters()], config.learning_rate, config)
+            geometry = _adam(
+                [*field.cells.parameters(), *field.sdf_network.parameters()], config.learning_rate, config
+            )
             adams = [geometry]
             if reflectance is not None:
                 reflectance_adam = _adam(reflectance.parameters(), config.intensity_learning_rate, config)

@@ -39,7 +39,9 @@ def _threads() -> int:
     return torch.get_num_threads()
 
 
-def _interpolate(table: VertexTable, features: Tensor, points: Tensor, located: Tensor, directions: Tensor | None) -> Tensor:
+def _interpolate(
+    table: VertexTable, features: Tensor, points: Tensor, located: Tensor, directions: Tensor | None
+) -> Tensor:
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
     table.interpolate(
         _view(features),
@@ -52,7 +54,9 @@ def _interpolate(table: VertexTable, features: Tensor, points: Tensor, located: 
     return out
 
 
-def _scatter(table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor) -> Tensor:
+def _scatter(
+    table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
+) -> Tensor:
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
     table.scatter(
         _view(points),
@@ -103,7 +107,13 @@ class _Interpolate(torch.autograd.Function):
         features, points, located = ctx.saved_tensors
         return (
             *_InterpolateBackward.apply(
-                out_grad, features, points, located, ctx.table, ctx.needs_input_grad[0], ctx.needs_input_grad[1]
+                out_grad,
+                features,
+                points,
+                located,
+                ctx.table,
+                ctx.needs_input_grad[0],
+                ctx.needs_input_grad[1],
             ),
             None,
         )
@@ -123,7 +133,9 @@ class _InterpolateBackward(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None]:
         ctx.save_for_backward(out_grad, features, points, located)
         ctx.table = table
-        ctx.set_materialize_grads(False)  # an unused gradient is None, not a matrix of zeros to be interpolated
+        ctx.set_materialize_grads(
+            False
+        )  # an unused gradient is None, not a matrix of zeros to be interpolated
         return (
             _scatter(table, points, located, None, out_grad) if needs_features else None,
             _coordinate_gradient(table, features, points, located, None, out_grad) if needs_points else None,
@@ -171,7 +183,9 @@ class _Fourier(torch.autograd.Function):
         # Differentiable torch operations on the saved output, so that autograd can differentiate them again.
         (out,) = ctx.saved_tensors
         half_width_m, first, count = ctx.frequencies
-        scale = torch.tensor([math.pi * 2**k / half_width_m for k in range(first, first + count)], dtype=out.dtype)
+        scale = torch.tensor(
+            [math.pi * 2**k / half_width_m for k in range(first, first + count)], dtype=out.dtype
+        )
         sine, cosine = out.view(-1, 2, count, 3).unbind(1)
         sine_grad, cosine_grad = out_grad.reshape(-1, 2, count, 3).unbind(1)
         return ((sine_grad * cosine - cosine_grad * sine) * scale[:, None]).sum(1), None, None, None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import trimesh
 
 _CHUNK = 1 << 13  # points evaluated at a time: hidden layers stay in the second-level cache
-_Array = TypeVar("_Array", NDArray[Any], Tensor)
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,9 @@ class RadarMap:
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
-        return f"RadarMap({kind}, {len(self._field.cells.table.leaf_keys())} cells, {self.nbytes / 1e6:.1f} MB)"
+        return (
+            f"RadarMap({kind}, {len(self._field.cells.table.leaf_keys())} cells, {self.nbytes / 1e6:.1f} MB)"
+        )
 
     @property
     def has_intensity(self) -> bool:
@@ -231,7 +232,11 @@ class RadarMap:
 
 
 def evaluate(
-    function: Callable[[Tensor], Tensor], points: Tensor, *, description: str = "", progress: bool | None = False
+    function: Callable[[Tensor], Tensor],
+    points: Tensor,
+    *,
+    description: str = "",
+    progress: bool | None = False,
 ) -> Tensor:
     """function(points), without gradients, in chunks on all threads; with a progress bar where asked for."""
 

@@ -69,7 +69,9 @@ def extract_mesh(
     num_threads = torch.get_num_threads()
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     values = _corner_distances(radar_map, voxel_size, voxels, corners, voxel_corners, progress)
-    vertices, faces = extract_cells(corners, values, voxel_corners, spacing=[voxel_size] * 3, num_threads=num_threads)
+    vertices, faces = extract_cells(
+        corners, values, voxel_corners, spacing=[voxel_size] * 3, num_threads=num_threads
+    )
     vertices, faces = _without_small_components(vertices, faces, radar_map.config.min_component_triangles)
     mesh = trimesh.Trimesh(vertices + radar_map.origin, faces, process=False)
     if viewpoint is not None:
@@ -99,7 +101,9 @@ def _occupied_voxels(radar_map: RadarMap, voxel_size: float) -> NDArray[np.int32
     parts = max(1, math.ceil(leaf_size_m / voxel_size - 1e-9))
     cells = radar_map.field.cells.table.leaf_cells()
     if parts * voxel_size > leaf_size_m * (1 + 1e-9) or parts == 1:
-        part = (np.stack(np.meshgrid(*[np.arange(parts)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / parts
+        part = (
+            np.stack(np.meshgrid(*[np.arange(parts)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5
+        ) / parts
         inside = (cells[:, None, :] + part) * (leaf_size_m / voxel_size)
         return np.floor(inside).astype(np.int32).reshape(-1, 3)
     part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1).reshape(-1, 3)

@@ -79,7 +79,9 @@ class RaySampler:
         """A batch of `batch_size` samples, near the surface and in free space."""
         rays = self._take(max(self._num_near, self._num_free))
         # Where one kind is rarer, every so many-th ray has one of it: each kind still covers the whole scene.
-        near, free = (rays[torch.arange(n) * len(rays) // max(n, 1)] for n in (self._num_near, self._num_free))
+        near, free = (
+            rays[torch.arange(n) * len(rays) // max(n, 1)] for n in (self._num_near, self._num_free)
+        )
         index = torch.cat([near, free])
         ray = self._rays[index]
         config = self._config
@@ -90,4 +92,6 @@ class RaySampler:
             config.free_from * range_m, range_m + config.free_beyond_m, self._uniform(self._num_free)
         )
         sdf_m = torch.cat([near_m, free_m])
-        return Samples(ray[:, :3] - sdf_m[:, None] * ray[:, 3:6], sdf_m, self._original[index], self._num_near)
+        return Samples(
+            ray[:, :3] - sdf_m[:, None] * ray[:, 3:6], sdf_m, self._original[index], self._num_near
+        )

@@ -72,7 +72,9 @@ def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
         & (T_world_sensor[:, 3] == [0, 0, 0, 1]).all(axis=1)
     )
     if not rigid.all():
-        msg = f"pose {int(np.argmin(rigid))} is not a rigid transform (rotation, translation, last row 0 0 0 1)"
+        msg = (
+            f"pose {int(np.argmin(rigid))} is not a rigid transform (rotation, translation, last row 0 0 0 1)"
+        )
         raise ValueError(msg)
     return T_world_sensor
 
@@ -106,7 +108,9 @@ def _check_scans(
         bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
     if count := sum(int(b.sum()) for b in bad):
         first = next(i for i, b in enumerate(bad) if b.any())
-        msg = f"{count} of {sum(map(len, bad))} returns are not finite, the first in scan {first}: remove them"
+        msg = (
+            f"{count} of {sum(map(len, bad))} returns are not finite, the first in scan {first}: remove them"
+        )
         raise ValueError(msg)
     return scans, values
 
@@ -155,7 +159,11 @@ def prepare(
         middle = (first + min(first + accumulate_frames, len(scans)) - 1) // 2
         ranges = np.linalg.norm(scan, axis=1)
         # A return at the sensor itself has no direction.
-        keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= (np.inf if max_range_m is None else max_range_m))
+        keep = (
+            (ranges > 0)
+            & (ranges >= min_range_m)
+            & (ranges <= (np.inf if max_range_m is None else max_range_m))
+        )
         local = scan[keep] @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
         kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))

@@ -26,7 +26,9 @@ _UNITS = "positions and distances in m, world frame; signed distance positive in
 
 def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
     """Writes a map; the old file at `path`, if any, is replaced only once the new one is whole."""
-    tensors: dict[str, Tensor] = {f"field.{name}": value for name, value in radar_map.field.state_dict().items()}
+    tensors: dict[str, Tensor] = {
+        f"field.{name}": value for name, value in radar_map.field.state_dict().items()
+    }
     tensors["origin"] = torch.from_numpy(radar_map.origin)
     # Morton keys use 63 bits, so the cast to the signed integers that every reader knows is lossless.
     tensors["leaf_keys"] = torch.from_numpy(radar_map.field.cells.table.leaf_keys().astype(np.int64))
@@ -84,7 +86,15 @@ def load(path: str | PathLike[str]) -> RadarMap:
             _check_format(metadata, path)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         return _build(tensors, json.loads(metadata["description"]))
-    except (SafetensorError, KeyError, TypeError, RuntimeError, AttributeError, RecursionError, json.JSONDecodeError) as error:
+    except (
+        SafetensorError,
+        KeyError,
+        TypeError,
+        RuntimeError,
+        AttributeError,
+        RecursionError,
+        json.JSONDecodeError,
+    ) as error:
         msg = f"{path} is not a whole radarsdf map: {error}"
         raise ValueError(msg) from error
 
@@ -122,5 +132,9 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
     field.load_state_dict(state)  # a RuntimeError for wrong names or shapes
     field.requires_grad_(False)
     return RadarMap(
-        field=field, origin=origin.numpy(), intensity_scale=scale, config=config, report=dict(description["report"])
+        field=field,
+        origin=origin.numpy(),
+        intensity_scale=scale,
+        config=config,
+        report=dict(description["report"]),
     )

@@ -13,9 +13,12 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -42,7 +45,7 @@ class Workers:
         self.num_threads = resolve_num_threads(num_threads)
         self._pool: ThreadPoolExecutor | None = None
 
-    def __enter__(self) -> Workers:
+    def __enter__(self) -> Self:
         global _users, _threads_before  # noqa: PLW0603 - there is one PyTorch
         with _lock:
             if _users == 0:
@@ -50,7 +53,9 @@ class Workers:
                 torch.set_num_threads(1)
             _users += 1
         # Threads are started anew for each block, so that a process may fork between two.
-        self._pool = ThreadPoolExecutor(self.num_threads, "radarsdf", initializer=torch.set_num_threads, initargs=(1,))
+        self._pool = ThreadPoolExecutor(
+            self.num_threads, "radarsdf", initializer=torch.set_num_threads, initargs=(1,)
+        )
         return self
 
     def __exit__(
