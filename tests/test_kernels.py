@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -265,3 +268,15 @@ def test_a_block_of_columns_is_a_valid_gradient():
         kernels.interpolate(features, points, table).backward(grad)
         gradients.append(features.grad)
     assert torch.equal(*gradients)
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/maps").exists(), reason="reads the list of loaded libraries from /proc"
+)
+def test_core_and_torch_share_one_openmp_runtime():
+    code = "import radarsdf, pathlib; print(pathlib.Path('/proc/self/maps').read_text())"
+    maps = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    runtimes = {
+        line.split()[-1] for line in maps.splitlines() if "gomp" in line or "iomp" in line or "libomp" in line
+    }
+    assert len(runtimes) == 1
