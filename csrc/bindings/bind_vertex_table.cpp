@@ -196,8 +196,7 @@ void bind_vertex_table(py::module_& m) {
              const py::gil_scoped_release release;
              return std::make_unique<VertexTable>(std::move(keys), leaf_size_m, num_levels, encoding, num_threads);
            }),
-           "leaf_keys"_a.noconvert(), "leaf_size_m"_a, "num_levels"_a, "encoding"_a = Encoding::kTriQuadtree,
-           "num_threads"_a = 0)
+           "leaf_keys"_a.noconvert(), "leaf_size_m"_a, "num_levels"_a, py::arg_v("encoding", Encoding::kTriQuadtree, "Encoding.TRI_QUADTREE"), "num_threads"_a = 0)
       .def_property_readonly("num_rows", &VertexTable::num_rows)
       .def_property_readonly("num_cells", &VertexTable::num_cells)
       .def_property_readonly("num_levels", &VertexTable::num_levels)
@@ -215,7 +214,8 @@ void bind_vertex_table(py::module_& m) {
               const py::gil_scoped_release release;
               cells = leaf_coordinates(keys);
             }
-            return to_array(std::move(cells)).reshape({static_cast<py::ssize_t>(keys.size()), py::ssize_t{3}});
+            const auto count = static_cast<py::ssize_t>(keys.size());
+            return Array<std::int32_t>(to_array(std::move(cells)).reshape({count, py::ssize_t{3}}));
           },
           "Lattice coordinates of the occupied leaf cells (C, 3) int32: cell i spans [i, i + 1) * leaf_size_m.");
   bind_kernels<float>(table);
