@@ -44,8 +44,9 @@ void check_columns(const py::array& array, py::ssize_t columns, const char* mess
 }
 
 template <typename T>
-Arrays<double, std::int32_t> dense(const Array<T>& volume, const std::optional<Array<bool>>& mask, const std::array<double, 3>& spacing,
-                const std::array<double, 3>& origin, double level, int num_threads) {
+Arrays<double, std::int32_t> dense(const Array<T>& volume, const std::optional<Array<bool>>& mask,
+                                   const std::array<double, 3>& spacing, const std::array<double, 3>& origin,
+                                   double level, int num_threads) {
   if (volume.ndim() != 3) throw std::invalid_argument("volume must have three axes");
   const std::array<std::int64_t, 3> shape{volume.shape(0), volume.shape(1), volume.shape(2)};
   if (mask && (mask->ndim() != 3 || !std::equal(shape.begin(), shape.end(), mask->shape()))) {
@@ -62,9 +63,9 @@ Arrays<double, std::int32_t> dense(const Array<T>& volume, const std::optional<A
 }
 
 template <typename T>
-Arrays<double, std::int32_t> sparse(const Array<std::int32_t>& corners, const Array<T>& values, const Array<std::int32_t>& cells,
-                 const std::array<double, 3>& spacing, const std::array<double, 3>& origin, double level,
-                 int num_threads) {
+Arrays<double, std::int32_t> sparse(const Array<std::int32_t>& corners, const Array<T>& values,
+                                    const Array<std::int32_t>& cells, const std::array<double, 3>& spacing,
+                                    const std::array<double, 3>& origin, double level, int num_threads) {
   check_columns(corners, 3, "corners must have shape (K, 3)");
   check_columns(cells, 8, "cells must have shape (M, 8)");
   const std::int64_t num_corners = corners.shape(0);
