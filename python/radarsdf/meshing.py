@@ -101,10 +101,8 @@ def _occupied_voxels(radar_map: RadarMap, voxel_size: float) -> NDArray[np.int32
     parts = max(1, math.ceil(leaf_size_m / voxel_size - 1e-9))
     cells = radar_map.field.cells.table.leaf_cells()
     if parts * voxel_size > leaf_size_m * (1 + 1e-9) or parts == 1:
-        part = (
-            np.stack(np.meshgrid(*[np.arange(parts)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5
-        ) / parts
-        inside = (cells[:, None, :] + part) * (leaf_size_m / voxel_size)
+        lower = np.stack(np.meshgrid(*[np.arange(parts)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        inside = (cells[:, None, :] + (lower + 0.5) / parts) * (leaf_size_m / voxel_size)
         return np.floor(inside).astype(np.int32).reshape(-1, 3)
     part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1).reshape(-1, 3)
     return (cells[:, None, :] * np.int32(parts) + part).reshape(-1, 3)
