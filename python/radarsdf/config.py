@@ -47,8 +47,9 @@ class FitConfig:
     """Half of the longest Fourier wavelength, m (3QFP: 2^12 · 0.2 m / 2)."""
     fourier_first: int = 0
     """First frequency k: the wavelength is 2 · half width / 2^k (3QFP: 0)."""
-    fourier_count: int = 16
-    """Number of frequencies (3QFP: 16)."""
+    fourier_count: int = 10
+    """Number of frequencies (3QFP: 16). The tenth's wavelength, 1.6 m, spans the coarsest cells, inside which the features
+    take over; finer ones, down to 2.5 cm, are noise to learn by heart."""
 
     # Networks
     sdf_hidden: tuple[int, ...] = (32, 32)
@@ -78,23 +79,36 @@ class FitConfig:
     free_beyond_m: float = 0.8
     """... and end this far behind the return, m (3QFP)."""
 
+    cross_range_noise_rad: float = 0.005
+    """Samples for the intensity are spread across the beam by this angle times the range, one standard deviation, as the
+    sensor's angular noise spreads returns (3QFPI: 0)."""
+
     # Losses
-    sigma_m: float = 0.1
-    """Scale of the sigmoid that turns distances into occupancy, m (3QFP: 0.55 · 0.05; measured for radar: 0.1)."""
+    sigma_m: float = 0.15
+    """Scale of the sigmoid that turns distances into occupancy, m (3QFP: 0.55 · 0.05; measured for radar: 0.1 to 0.2)."""
     intensity_in_free_space: bool = False
     """Whether free-space samples are labelled with the lowest intensity (3QFPI: yes; measured: 8 to 29 % worse)."""
 
     # Schedule
-    batch_size: int = 8192
-    """Samples in an iteration (3QFP)."""
+    batch_size: int = 4096
+    """Samples in an iteration of SDF network and features (3QFP: 8192; measured: half of it, twice as often, goes
+    further)."""
     sdf_iterations: int | None = None
-    """Iterations of SDF network and features, which are then frozen (3QFPI: 1000). None: `sdf_passes` over the data."""
+    """Iterations of SDF network and features, which are then frozen (3QFPI: 1000). None: `sdf_passes` over the data,
+    but at least `min_sdf_iterations`."""
     sdf_passes: float = 1.0
-    """Times each sample is seen when `sdf_iterations` is None (measured: more fits the noise)."""
+    """Times each sample is seen where `sdf_iterations` is None (measured: more fits the noise)."""
+    min_sdf_iterations: int = 150
+    """Fewer leave the surface of a small scene unfinished."""
+    intensity_batch_size: int = 2048
+    """Samples in an iteration of the intensity network (3QFPI: 8192; measured: more and smaller steps go further)."""
     intensity_iterations: int | None = None
-    """Iterations of the intensity network (3QFPI: 4000). None: `intensity_passes` over the data."""
-    intensity_passes: float = 2.0
-    """Times each near-surface sample is seen when `intensity_iterations` is None."""
+    """Iterations of the intensity network, those of a joint beginning included (3QFPI: 4000). None: `intensity_passes`
+    over the data, but at least `min_intensity_iterations`."""
+    intensity_passes: float = 1.0
+    """Times each near-surface sample is seen where `intensity_iterations` is None."""
+    min_intensity_iterations: int = 1200
+    """Fewer leave the reflectance of a small scene unfinished."""
     joint: bool = False
     """Whether the intensity network trains from the first iteration on, its gradient reaching features and SDF network
     until these freeze (3QFPI), or only on the finished geometry."""
@@ -143,6 +157,10 @@ class FitConfig:
             "near_samples": (self.near_samples, 1),
             "free_samples": (self.free_samples, 0),
             "batch_size": (self.batch_size, 1),
+            "intensity_batch_size": (self.intensity_batch_size, 1),
+            "min_sdf_iterations": (self.min_sdf_iterations, 1),
+            "min_intensity_iterations": (self.min_intensity_iterations, 1),
+            "cross_range_noise_rad": (self.cross_range_noise_rad, 0),
             "sdf_iterations": (self.sdf_iterations, 1),
             "intensity_iterations": (self.intensity_iterations, 1),
             "min_component_triangles": (self.min_component_triangles, 0),
@@ -180,6 +198,10 @@ class FitConfig:
         """3QFPI's configuration as published, with `changes` on top."""
         values: dict[str, Any] = {
             "accumulate_frames": 5,
+            "fourier_count": 16,
+            "cross_range_noise_rad": 0.0,
+            "batch_size": 8192,
+            "intensity_batch_size": 8192,
             "geometry_feature_dim": 15,
             "normals": True,
             "log_range": False,

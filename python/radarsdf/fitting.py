@@ -129,17 +129,22 @@ class _Shard:
         self,
         field: Field,
         rays: Rays,
-        intensities: Tensor | None,
+        scale: IntensityScale | None,
         config: FitConfig,
-        batch_size: int,
-        seed: int,
+        part: int,
+        parts: int,
     ) -> None:
+        rays = rays.every(parts, part)
         self._field = field
         self._config = config
-        self._intensities = intensities
+        self._intensities = None
+        if scale is not None and rays.intensities is not None:
+            self._intensities = torch.from_numpy(scale.to_unit(rays.intensities))
         self._directions = torch.from_numpy(rays.directions)
         self._ranges_m = torch.from_numpy(rays.ranges_m)
-        self._sampler = RaySampler(rays, config, batch_size, torch.Generator().manual_seed(seed))
+        generator = torch.Generator().manual_seed(config.seed * MAX_THREADS + part)
+        self._sampler = RaySampler(rays, config, _share(config.batch_size, part, parts), generator)
+        self._intensity_batch_size = _share(config.intensity_batch_size, part, parts)
 
     def geometry_loss(self) -> Tensor:
         samples = self._sampler.batch()
@@ -151,7 +156,10 @@ class _Shard:
         return loss + self._intensity_loss(samples, geometry_frozen=False)
 
     def reflectance_loss(self) -> Tensor:
-        samples = self._sampler.batch() if self._config.intensity_in_free_space else self._sampler.near()
+        if self._config.intensity_in_free_space:
+            samples = self._sampler.batch()
+        else:
+            samples = self._sampler.spread(self._intensity_batch_size)
         return self._intensity_loss(samples, geometry_frozen=True)
 
     def _intensity_loss(self, samples: Samples, *, geometry_frozen: bool) -> Tensor:
@@ -182,25 +190,19 @@ class _Training:
         self._field = field
         self._config = config
         self._workers = workers
-        threads = min(workers.num_threads, len(rays), config.batch_size)
-        self._shards = []
-        for i in range(threads):
-            share = rays.every(threads, i)
-            intensities = None
-            if scale is not None and share.intensities is not None:
-                intensities = torch.from_numpy(scale.to_unit(share.intensities))
-            batch_size = config.batch_size * (i + 1) // threads - config.batch_size * i // threads
-            seed = config.seed * MAX_THREADS + i
-            self._shards.append(_Shard(field, share, intensities, config, batch_size, seed))
+        parts = min(workers.num_threads, len(rays), config.batch_size, config.intensity_batch_size)
+        self._shards = [_Shard(field, rays, scale, config, part, parts) for part in range(parts)]
         samples = len(rays) * (config.near_samples + config.free_samples)
-        self._sdf_iterations = config.sdf_iterations or math.ceil(
-            config.sdf_passes * samples / config.batch_size
+        self._sdf_iterations = config.sdf_iterations or max(
+            config.min_sdf_iterations, math.ceil(config.sdf_passes * samples / config.batch_size)
         )
-        self._intensity_iterations = 0
-        if scale is not None:
-            self._intensity_iterations = config.intensity_iterations or math.ceil(
-                config.intensity_passes * len(rays) * config.near_samples / config.batch_size
-            )
+        samples = len(rays) * config.near_samples
+        self._intensity_iterations = config.intensity_iterations or max(
+            config.min_intensity_iterations,
+            math.ceil(config.intensity_passes * samples / config.intensity_batch_size),
+        )
+        if scale is None:
+            self._intensity_iterations = 0
         self.iterations = {"sdf": self._sdf_iterations, "intensity": self._intensity_iterations}
         self.losses: dict[str, float] = {}
 
@@ -260,6 +262,11 @@ class _Training:
                 if not math.isfinite(self.losses[name]):
                     msg = f"the {name} loss is {self.losses[name]} at iteration {i}: a lower learning rate may help"
                     raise FloatingPointError(msg)
+
+
+def _share(count: int, part: int, parts: int) -> int:
+    """`count` things over `parts`: how many the `part`-th gets."""
+    return count * (part + 1) // parts - count * part // parts
 
 
 def _adam(parameters: Iterable[Tensor], learning_rate: float, config: FitConfig) -> torch.optim.Adam:

@@ -111,7 +111,9 @@ class RadarMap:
         Returns
         -------
         (N,) array or tensor
-            m, positive in free space. Meaningful near the surface (a few sigma); see :meth:`observed`.
+            m, positive in free space. Meaningful near the surface (a few sigma); see :meth:`observed`. Zero on the
+            surface; beside it the distance along the sensor's rays, which where they graze it is longer than the
+            shortest.
 
         Raises
         ------

@@ -67,13 +67,18 @@ class RaySampler:
     def _uniform(self, count: int) -> Tensor:
         return torch.rand(count, generator=self._generator)
 
-    def near(self) -> Samples:
-        """As many samples as a batch has, all within `near_band_m` of their returns."""
-        count = self._num_near + self._num_free
+    def spread(self, count: int) -> Samples:
+        """`count` samples round returns: within `near_band_m` along the beam, and across it as angular noise spreads."""
+        config = self._config
         rays = self._take(count)
-        sdf_m = (2 * self._uniform(count) - 1) * self._config.near_band_m
+        sdf_m = (2 * self._uniform(count) - 1) * config.near_band_m
         ray = self._rays[rays]
-        return Samples(ray[:, :3] - sdf_m[:, None] * ray[:, 3:6], sdf_m, self._original[rays], count)
+        points = ray[:, :3] - sdf_m[:, None] * ray[:, 3:6]
+        if config.cross_range_noise_rad > 0:
+            # Isotropic: what it adds along the beam is lost in the width of the band.
+            noise = torch.randn(points.shape, generator=self._generator)
+            points += noise * (config.cross_range_noise_rad * ray[:, 6:7])
+        return Samples(points, sdf_m, self._original[rays], count)
 
     def batch(self) -> Samples:
         """A batch of `batch_size` samples, near the surface and in free space."""
