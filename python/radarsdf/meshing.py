@@ -79,7 +79,8 @@ def extract_mesh(
         mesh.vertex_attributes["intensity"] = intensity
         scale = radar_map.intensity_scale
         assert scale is not None
-        mesh.visual.vertex_colors = intensity_colors(intensity, scale.low, scale.high)
+        colors = intensity_colors(intensity, scale.low, scale.high)
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
     return mesh
 
 
