@@ -14,7 +14,8 @@
 namespace radarsdf {
 
 CellSet::CellSet(double leaf_size_m) : leaf_size_m_(leaf_size_m) {
-  if (!(leaf_size_m > 0) || !std::isfinite(leaf_size_m)) throw std::invalid_argument("leaf_size_m must be positive and finite");
+  if (!(leaf_size_m > 0) || !std::isfinite(leaf_size_m))
+    throw std::invalid_argument("leaf_size_m must be positive and finite");
 }
 
 template <typename T>

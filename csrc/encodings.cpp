@@ -47,8 +47,8 @@ FourierKernel<T> fourier_kernel() {
 
 template <typename T>
 Interpolation<T> interpolation(const VertexTable& table, const PointBatch<T>& batch) {
-  return {table.cells().data(), batch.located, batch.points, batch.directions, table.num_levels(),
-          static_cast<T>(1.0 / table.leaf_size_m())};
+  return {table.cells().data(), batch.located,      batch.points,
+          batch.directions,     table.num_levels(), static_cast<T>(1.0 / table.leaf_size_m())};
 }
 
 }  // namespace
@@ -61,8 +61,8 @@ void locate(const VertexTable& table, const T* points, std::int64_t count, std::
 }
 
 template <typename T>
-void encode(const VertexTable& table, const T* features, const T* points, std::int64_t count, std::int32_t* located, T* out,
-            std::int64_t stride, int num_threads) {
+void encode(const VertexTable& table, const T* features, const T* points, std::int64_t count, std::int32_t* located,
+            T* out, std::int64_t stride, int num_threads) {
   const InterpolationKernels<T>& kernels = kernels_for<T>(table);
   const Interpolation<T> in = interpolation<T>(table, {points, nullptr, located, count});
   parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
@@ -86,8 +86,8 @@ void interpolate(const VertexTable& table, const T* features, const PointBatch<T
 }
 
 template <typename T>
-void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride, T* features_grad,
-             int num_threads) {
+void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
+             T* features_grad, int num_threads) {
   const InterpolationKernels<T>& kernels = kernels_for<T>(table);
   const Interpolation<T> in = interpolation(table, batch);
   // Threads take whole (level, group) pairs, whose rows are disjoint: no atomics, no private copies of the gradient,
@@ -115,7 +115,8 @@ void fourier(const T* points, std::int64_t count, double half_width_m, int first
              std::int64_t stride, int num_threads) {
   const FourierKernel<T> kernel = fourier_kernel<T>();
   parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    kernel.encode(points, static_cast<T>(1.0 / half_width_m), first_frequency, num_frequencies, out, stride, begin, end);
+    kernel.encode(points, static_cast<T>(1.0 / half_width_m), first_frequency, num_frequencies, out, stride, begin,
+                  end);
   });
 }
 
@@ -147,13 +148,14 @@ void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::i
   });
 }
 
-#define RADARSDF_INSTANTIATE(T)                                                                                            \
-  template void locate(const VertexTable&, const T*, std::int64_t, std::int32_t*, int);                                    \
-  template void encode(const VertexTable&, const T*, const T*, std::int64_t, std::int32_t*, T*, std::int64_t, int);        \
-  template void interpolate(const VertexTable&, const T*, const PointBatch<T>&, T*, std::int64_t, int);                    \
-  template void scatter(const VertexTable&, const PointBatch<T>&, const T*, std::int64_t, T*, int);                        \
-  template void coordinate_gradient(const VertexTable&, const T*, const PointBatch<T>&, const T*, std::int64_t, T*, int);  \
-  template void fourier(const T*, std::int64_t, double, int, int, T*, std::int64_t, int);                                  \
+#define RADARSDF_INSTANTIATE(T)                                                                                     \
+  template void locate(const VertexTable&, const T*, std::int64_t, std::int32_t*, int);                             \
+  template void encode(const VertexTable&, const T*, const T*, std::int64_t, std::int32_t*, T*, std::int64_t, int); \
+  template void interpolate(const VertexTable&, const T*, const PointBatch<T>&, T*, std::int64_t, int);             \
+  template void scatter(const VertexTable&, const PointBatch<T>&, const T*, std::int64_t, T*, int);                 \
+  template void coordinate_gradient(const VertexTable&, const T*, const PointBatch<T>&, const T*, std::int64_t, T*, \
+                                    int);                                                                           \
+  template void fourier(const T*, std::int64_t, double, int, int, T*, std::int64_t, int);                           \
   template void spherical_harmonics(const T*, std::int64_t, T*, std::int64_t, int);
 RADARSDF_INSTANTIATE(float)
 RADARSDF_INSTANTIATE(double)

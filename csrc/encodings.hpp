@@ -25,8 +25,8 @@ void locate(const VertexTable& table, const T* points, std::int64_t count, std::
 
 // locate and interpolate in one pass.
 template <typename T>
-void encode(const VertexTable& table, const T* features, const T* points, std::int64_t count, std::int32_t* located, T* out,
-            std::int64_t stride, int num_threads);
+void encode(const VertexTable& table, const T* features, const T* points, std::int64_t count, std::int32_t* located,
+            T* out, std::int64_t stride, int num_threads);
 
 template <typename T>
 void interpolate(const VertexTable& table, const T* features, const PointBatch<T>& batch, T* out, std::int64_t stride,
@@ -34,8 +34,8 @@ void interpolate(const VertexTable& table, const T* features, const PointBatch<T
 
 // Adds to features_grad (num_rows, 8). The order of the sums is that of the points, for any number of threads.
 template <typename T>
-void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride, T* features_grad,
-             int num_threads);
+void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
+             T* features_grad, int num_threads);
 
 template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,

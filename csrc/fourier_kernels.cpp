@@ -42,8 +42,8 @@ inline void sincos_pi(T t, T* sine, T* cosine) {
 }
 
 template <typename T>
-void encode(const T* points, T inverse_half_width, int first, int count, T* out, std::int64_t stride, std::int64_t begin,
-            std::int64_t end) {
+void encode(const T* points, T inverse_half_width, int first, int count, T* out, std::int64_t stride,
+            std::int64_t begin, std::int64_t end) {
   for (std::int64_t n = begin; n < end; ++n) {
     T angles[3 * kMaxFrequencies];  // in units of pi; scaling by a power of two is exact
     T scale = static_cast<T>(1 << first);

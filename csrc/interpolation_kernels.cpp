@@ -9,7 +9,8 @@
 namespace radarsdf::RADARSDF_ISA {
 namespace {  // internal linkage for everything: see the header
 
-// A group of corners interpolates along NumAxes axes: a plane of the tri-quadtree along two, a cell of space along three.
+// A group of corners interpolates along NumAxes axes: a plane of the tri-quadtree along two, a cell of space along
+// three.
 template <int NumGroupsV, int NumAxesV>
 struct Corners {
   static constexpr int kGroups = NumGroupsV, kAxes = NumAxesV, kPerGroup = 1 << NumAxesV;
@@ -69,7 +70,8 @@ inline void corner_weights(const Local<T>& local, const T* direction, int group,
       weights[c] = basis<C>(local, group, c, 0);
     } else {
       weights[c] = 0;
-      for (int i = 0; i < C::kAxes; ++i) weights[c] += direction[axis_of<C>(group, i)] * basis<C>(local, group, c, 1 << i);
+      for (int i = 0; i < C::kAxes; ++i)
+        weights[c] += direction[axis_of<C>(group, i)] * basis<C>(local, group, c, 1 << i);
     }
   }
 }
@@ -142,7 +144,8 @@ void coordinate_gradient(const Interpolation<T>& in, const T* __restrict feature
       const T* grad = out_grad + n * stride + level * kFeatureDim;
       for (int group = 0; group < C::kGroups; ++group) {
         for (int c = 0; c < C::kPerGroup; ++c) {
-          const T* row = features + static_cast<std::int64_t>(in.cells[cell].rows[group * C::kPerGroup + c]) * kFeatureDim;
+          const T* row =
+              features + static_cast<std::int64_t>(in.cells[cell].rows[group * C::kPerGroup + c]) * kFeatureDim;
           for (int i = 0; i < C::kAxes; ++i) {
             const T weight = corner_weight_gradient<C, kDirectional>(local, direction_of(in, n), group, c, i);
             for (int d = 0; d < kFeatureDim; ++d) sum[axis_of<C>(group, i)][d] += weight * row[d] * grad[d];
@@ -161,7 +164,8 @@ void coordinate_gradient(const Interpolation<T>& in, const T* __restrict feature
 // The version with or without directions is chosen once a call, not once a point.
 template <typename C, typename T>
 constexpr InterpolationKernels<T> kKernels = {
-    [](const Interpolation<T>& in, const T* features, T* out, std::int64_t stride, std::int64_t begin, std::int64_t end) {
+    [](const Interpolation<T>& in, const T* features, T* out, std::int64_t stride, std::int64_t begin,
+       std::int64_t end) {
       (in.directions ? interpolate<C, true, T> : interpolate<C, false, T>)(in, features, out, stride, begin, end);
     },
     [](const Interpolation<T>& in, const T* out_grad, std::int64_t stride, T* features_grad, int level, int group,
@@ -171,8 +175,8 @@ constexpr InterpolationKernels<T> kKernels = {
     },
     [](const Interpolation<T>& in, const T* features, const T* out_grad, std::int64_t stride, T* points_grad,
        std::int64_t begin, std::int64_t end) {
-      (in.directions ? coordinate_gradient<C, true, T> : coordinate_gradient<C, false, T>)(in, features, out_grad, stride,
-                                                                                           points_grad, begin, end);
+      (in.directions ? coordinate_gradient<C, true, T>
+                     : coordinate_gradient<C, false, T>)(in, features, out_grad, stride, points_grad, begin, end);
     }};
 
 }  // namespace

@@ -32,8 +32,8 @@ struct InterpolationKernels {
                       std::int64_t end);
   // features_grad (rows, 8) += W^T out_grad, for one level and one group of corners (a plane, or all of space):
   // different (level, group) touch different rows.
-  void (*scatter)(const Interpolation<T>&, const T* out_grad, std::int64_t stride, T* features_grad, int level, int group,
-                  std::int64_t begin, std::int64_t end);
+  void (*scatter)(const Interpolation<T>&, const T* out_grad, std::int64_t stride, T* features_grad, int level,
+                  int group, std::int64_t begin, std::int64_t end);
   // points_grad (n, 3) = d(out . out_grad)/dx, 1/m.
   void (*coordinate_gradient)(const Interpolation<T>&, const T* features, const T* out_grad, std::int64_t stride,
                               T* points_grad, std::int64_t begin, std::int64_t end);
@@ -41,9 +41,9 @@ struct InterpolationKernels {
 
 inline int num_vertex_groups(Encoding encoding) { return encoding == Encoding::kTriQuadtree ? 3 : 1; }
 
-#define RADARSDF_DECLARE_KERNELS(isa) \
-  namespace isa {                     \
-  template <typename T>               \
+#define RADARSDF_DECLARE_KERNELS(isa)                                      \
+  namespace isa {                                                          \
+  template <typename T>                                                    \
   const InterpolationKernels<T>& interpolation_kernels(Encoding encoding); \
   }
 RADARSDF_DECLARE_KERNELS(baseline)

@@ -57,12 +57,13 @@ void sort_unique(std::vector<std::uint64_t>& keys, int num_threads) {
 
 // Gives every vertex of the group at this level a row, from first_row on, and writes the rows into the cells at
 // slot `first_corner`. Returns the number of vertices.
-std::int64_t assign_rows(const VertexGroup& group, const std::vector<std::uint64_t>& keys, Cell* cells, int first_corner,
-                         std::int64_t first_row, int num_threads) {
+std::int64_t assign_rows(const VertexGroup& group, const std::vector<std::uint64_t>& keys, Cell* cells,
+                         int first_corner, std::int64_t first_row, int num_threads) {
   std::vector<std::uint64_t> projected(keys.size());
   const auto count = static_cast<std::int64_t>(keys.size());
   parallel_blocks(count, 1 << 13, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (auto i = static_cast<std::size_t>(begin); i < static_cast<std::size_t>(end); ++i) projected[i] = group.project(keys[i]);
+    for (auto i = static_cast<std::size_t>(begin); i < static_cast<std::size_t>(end); ++i)
+      projected[i] = group.project(keys[i]);
   });
   std::vector<std::uint64_t> columns = projected;
   sort_unique(columns, num_threads);
@@ -79,7 +80,8 @@ std::int64_t assign_rows(const VertexGroup& group, const std::vector<std::uint64
   }
 
   FlatMap row_of(vertices.size());
-  for (std::size_t i = 0; i < vertices.size(); ++i) row_of.insert(vertices[i], static_cast<std::int32_t>(first_row) + static_cast<std::int32_t>(i));
+  for (std::size_t i = 0; i < vertices.size(); ++i)
+    row_of.insert(vertices[i], static_cast<std::int32_t>(first_row) + static_cast<std::int32_t>(i));
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       for (int c = 0; c < group.num_corners; ++c) {
@@ -125,10 +127,12 @@ inline int count_bits(std::uint32_t eight_bits) {
 VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_m, int num_levels, Encoding encoding,
                          int num_threads)
     : leaf_keys_(std::move(leaf_keys)), leaf_size_m_(leaf_size_m), num_levels_(num_levels), encoding_(encoding) {
-  if (!(leaf_size_m > 0) || !std::isfinite(leaf_size_m)) throw std::invalid_argument("leaf_size_m must be positive and finite");
+  if (!(leaf_size_m > 0) || !std::isfinite(leaf_size_m))
+    throw std::invalid_argument("leaf_size_m must be positive and finite");
   if (num_levels < 1 || num_levels > kMaxLevels) throw std::invalid_argument("num_levels must be 1 to 12");
   for (std::size_t i = 0; i < leaf_keys_.size(); ++i) {
-    if (i > 0 && leaf_keys_[i - 1] >= leaf_keys_[i]) throw std::invalid_argument("leaf_keys must be ascending and unique");
+    if (i > 0 && leaf_keys_[i - 1] >= leaf_keys_[i])
+      throw std::invalid_argument("leaf_keys must be ascending and unique");
     for (int axis = 0; axis < 3; ++axis) {
       // The far vertex of a cell, at every level, must fit its key.
       if (leaf_keys_[i] >> 63 || morton_coordinate(leaf_keys_[i], axis) >= (1u << kAxisBits) - (1u << num_levels)) {
@@ -188,7 +192,8 @@ void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cell
       const T u[3] = {p[0] * inverse, p[1] * inverse, p[2] * inverse};
       root_key[i] = kEmptyKey;
       if (!(std::abs(u[0]) < limit && std::abs(u[1]) < limit && std::abs(u[2]) < limit)) continue;
-      for (int axis = 0; axis < 3; ++axis) leaf[i][axis] = static_cast<std::uint32_t>(floor_to_int(u[axis]) + kAxisBias);
+      for (int axis = 0; axis < 3; ++axis)
+        leaf[i][axis] = static_cast<std::uint32_t>(floor_to_int(u[axis]) + kAxisBias);
       root_key[i] = morton_key(leaf[i][0] >> coarsest, leaf[i][1] >> coarsest, leaf[i][2] >> coarsest);
       prefetch(&roots.slots[roots.home(root_key[i])]);
     }
@@ -217,7 +222,8 @@ std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& lea
   std::vector<std::int32_t> coordinates;
   coordinates.reserve(3 * leaf_keys.size());
   for (const std::uint64_t key : leaf_keys) {
-    for (int axis = 0; axis < 3; ++axis) coordinates.push_back(static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias);
+    for (int axis = 0; axis < 3; ++axis)
+      coordinates.push_back(static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias);
   }
   return coordinates;
 }

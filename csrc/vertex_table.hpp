@@ -20,7 +20,8 @@ class VertexTable {
  public:
   // leaf_keys: Morton keys of the occupied leaf cells, ascending and unique (CellSet::sorted_keys). Rows are numbered
   // level by level, plane by plane, in Morton order: the same keys always give the same numbers.
-  VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_m, int num_levels, Encoding encoding, int num_threads);
+  VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_m, int num_levels, Encoding encoding,
+              int num_threads);
 
   std::int64_t num_rows() const { return num_rows_; }
   std::int64_t num_cells() const { return static_cast<std::int64_t>(cells_.size()); }

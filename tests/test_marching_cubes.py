@@ -4,7 +4,10 @@ import itertools
 
 import numpy as np
 import pytest
-from mesh_checks import (
+from radarsdf import _core
+from radarsdf.isosurface import extract_cells, marching_cubes, sparse_lattice
+
+from .mesh_checks import (
     area,
     cells_in_use,
     euler_characteristic,
@@ -20,9 +23,7 @@ from mesh_checks import (
     sphere,
     torus,
 )
-from radarsdf import _core
-from radarsdf.isosurface import extract_cells, marching_cubes, sparse_lattice
-from reference_marching_cubes import reference_marching_cubes
+from .reference_marching_cubes import reference_marching_cubes
 
 
 @pytest.mark.parametrize(

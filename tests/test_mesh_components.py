@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from mesh_checks import directed_edges, grid, noise
 from radarsdf.isosurface import marching_cubes, mesh_components
+
+from .mesh_checks import directed_edges, grid, noise
 
 
 def test_components_are_labelled_in_order():

@@ -3,6 +3,7 @@
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
+#include <pybind11/typing.h>
 
 #include <memory>
 #include <optional>
@@ -29,7 +30,11 @@ py::array_t<T> adopt(std::unique_ptr<T[]> data, const std::vector<py::ssize_t>& 
   return py::array_t<T>(shape, data.release(), owner);
 }
 
-py::tuple adopt_mesh(Mesh mesh) {
+// What the functions return, spelled out for the type stub.
+template <typename... T>
+using Arrays = py::typing::Tuple<py::array_t<T>...>;
+
+Arrays<double, std::int32_t> adopt_mesh(Mesh mesh) {
   return py::make_tuple(adopt(std::move(mesh.vertices), {mesh.num_vertices, 3}),
                         adopt(std::move(mesh.faces), {mesh.num_faces, 3}));
 }
@@ -39,8 +44,9 @@ void check_columns(const py::array& array, py::ssize_t columns, const char* mess
 }
 
 template <typename T>
-py::tuple dense(const Array<T>& volume, const std::optional<Array<bool>>& mask, const std::array<double, 3>& spacing,
-                const std::array<double, 3>& origin, double level, int num_threads) {
+Arrays<double, std::int32_t> dense(const Array<T>& volume, const std::optional<Array<bool>>& mask,
+                                   const std::array<double, 3>& spacing, const std::array<double, 3>& origin,
+                                   double level, int num_threads) {
   if (volume.ndim() != 3) throw std::invalid_argument("volume must have three axes");
   const std::array<std::int64_t, 3> shape{volume.shape(0), volume.shape(1), volume.shape(2)};
   if (mask && (mask->ndim() != 3 || !std::equal(shape.begin(), shape.end(), mask->shape()))) {
@@ -57,9 +63,9 @@ py::tuple dense(const Array<T>& volume, const std::optional<Array<bool>>& mask, 
 }
 
 template <typename T>
-py::tuple sparse(const Array<std::int32_t>& corners, const Array<T>& values, const Array<std::int32_t>& cells,
-                 const std::array<double, 3>& spacing, const std::array<double, 3>& origin, double level,
-                 int num_threads) {
+Arrays<double, std::int32_t> sparse(const Array<std::int32_t>& corners, const Array<T>& values,
+                                    const Array<std::int32_t>& cells, const std::array<double, 3>& spacing,
+                                    const std::array<double, 3>& origin, double level, int num_threads) {
   check_columns(corners, 3, "corners must have shape (K, 3)");
   check_columns(cells, 8, "cells must have shape (M, 8)");
   const std::int64_t num_corners = corners.shape(0);
@@ -78,7 +84,7 @@ py::tuple sparse(const Array<std::int32_t>& corners, const Array<T>& values, con
   return adopt_mesh(std::move(mesh));
 }
 
-py::tuple lattice(const Array<std::int32_t>& cells, int num_threads) {
+Arrays<std::int32_t, std::int32_t, std::int32_t> lattice(const Array<std::int32_t>& cells, int num_threads) {
   check_columns(cells, 3, "cells must have shape (M, 3)");
   const std::int32_t* data = cells.data();
   const std::int64_t num_cells = cells.shape(0);
@@ -92,7 +98,7 @@ py::tuple lattice(const Array<std::int32_t>& cells, int num_threads) {
                         adopt(std::move(result.cell_corners), {result.num_cells, 8}));
 }
 
-py::tuple components(const Array<std::int32_t>& faces, std::int64_t num_vertices) {
+Arrays<std::int32_t, std::int64_t> components(const Array<std::int32_t>& faces, std::int64_t num_vertices) {
   check_columns(faces, 3, "faces must have shape (F, 3)");
   const std::int32_t* data = faces.data();
   const std::int64_t num_faces = faces.shape(0);

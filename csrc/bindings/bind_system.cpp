@@ -36,7 +36,9 @@ void bind_system(py::module_& m) {
       },
       "OpenMP version as yyyymm, 0 for a serial build.");
   m.def("num_threads", &resolve_num_threads, "num_threads"_a = 0, "Threads that a call with this argument uses.");
-  m.def("instruction_set", [] { return instruction_set_name(instruction_set()); }, "Instruction set of the kernels in use.");
+  m.def(
+      "instruction_set", [] { return instruction_set_name(instruction_set()); },
+      "Instruction set of the kernels in use.");
   m.def(
       "available_instruction_sets",
       [] {
@@ -46,8 +48,8 @@ void bind_system(py::module_& m) {
       },
       "Instruction sets that were compiled in and that this processor runs, slowest first.");
   m.def(
-      "set_instruction_set", [](const std::string& name) { set_instruction_set(instruction_set_from_name(name)); }, "name"_a,
-      "Chooses the kernels: for tests and benches; not while another call runs.");
+      "set_instruction_set", [](const std::string& name) { set_instruction_set(instruction_set_from_name(name)); },
+      "name"_a, "Chooses the kernels: for tests and benches; not while another call runs.");
 }
 
 }  // namespace radarsdf

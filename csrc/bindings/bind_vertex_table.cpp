@@ -1,10 +1,10 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
+#include <pybind11/stl.h>
+
 #include <memory>
 #include <optional>
 #include <vector>
-
-#include <pybind11/stl.h>
 
 #include "arrays.hpp"
 #include "cell_set.hpp"
@@ -79,8 +79,8 @@ void bind_kernels(py::class_<VertexTable>& cls) {
         const py::gil_scoped_release release;
         encode(table, f, p, count, found, result, stride, num_threads);
       },
-      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "out"_a.noconvert(), "num_threads"_a = 0,
-      "Locates the points and writes their interpolated features to `out` (N, 8 L).");
+      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "out"_a.noconvert(),
+      "num_threads"_a = 0, "Locates the points and writes their interpolated features to `out` (N, 8 L).");
 
   cls.def(
       "interpolate",
@@ -196,8 +196,8 @@ void bind_vertex_table(py::module_& m) {
              const py::gil_scoped_release release;
              return std::make_unique<VertexTable>(std::move(keys), leaf_size_m, num_levels, encoding, num_threads);
            }),
-           "leaf_keys"_a.noconvert(), "leaf_size_m"_a, "num_levels"_a, "encoding"_a = Encoding::kTriQuadtree,
-           "num_threads"_a = 0)
+           "leaf_keys"_a.noconvert(), "leaf_size_m"_a, "num_levels"_a,
+           py::arg_v("encoding", Encoding::kTriQuadtree, "Encoding.TRI_QUADTREE"), "num_threads"_a = 0)
       .def_property_readonly("num_rows", &VertexTable::num_rows)
       .def_property_readonly("num_cells", &VertexTable::num_cells)
       .def_property_readonly("num_levels", &VertexTable::num_levels)
@@ -215,7 +215,8 @@ void bind_vertex_table(py::module_& m) {
               const py::gil_scoped_release release;
               cells = leaf_coordinates(keys);
             }
-            return to_array(std::move(cells)).reshape({static_cast<py::ssize_t>(keys.size()), py::ssize_t{3}});
+            const auto count = static_cast<py::ssize_t>(keys.size());
+            return Array<std::int32_t>(to_array(std::move(cells)).reshape({count, py::ssize_t{3}}));
           },
           "Lattice coordinates of the occupied leaf cells (C, 3) int32: cell i spans [i, i + 1) * leaf_size_m.");
   bind_kernels<float>(table);

@@ -217,7 +217,11 @@ def _read_points(path: Path) -> np.ndarray[Any, Any]:
         return np.asarray(np.load(path, allow_pickle=False), np.float64)
     if path.suffix in (".xyz", ".txt", ".csv"):
         return np.loadtxt(path, delimiter="," if path.suffix == ".csv" else None, ndmin=2)[:, :3]
-    return np.asarray(trimesh.load(path, process=False).vertices)
+    vertices = getattr(trimesh.load(path, process=False), "vertices", None)
+    if vertices is None:  # a scene of several geometries
+        msg = f"{path} is not one cloud or mesh"
+        raise ValueError(msg)
+    return np.asarray(vertices)
 
 
 def _world(scans: Scans, config: FitConfig) -> tuple[Any, Any, Any]:

@@ -228,4 +228,5 @@ class FitConfig:
         if unknown := sorted(set(values) - known):
             msg = f"unknown settings: {', '.join(unknown)}"
             raise ValueError(msg)
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**settings)

@@ -89,10 +89,9 @@ def marching_cubes(
             msg = f"mask must have the shape of volume, {samples.shape}, not {mask.shape}"
             raise ValueError(msg)
         mask = np.ascontiguousarray(mask)
-    mesh: Mesh = _core.marching_cubes_dense(
+    return _core.marching_cubes_dense(
         samples, mask, *_as_placement(spacing, origin), _as_level(level), num_threads
     )
-    return mesh
 
 
 def extract_cells(
@@ -142,7 +141,7 @@ def extract_cells(
     >>> vertices.sum(axis=0).tolist(), faces.shape
     ([0.5, 0.5, 0.5], (1, 3))
     """
-    mesh: Mesh = _core.marching_cubes_sparse(
+    return _core.marching_cubes_sparse(
         _as_int32(corners, "corners"),
         _as_samples(values, "values"),
         _as_int32(cells, "cells"),
@@ -150,7 +149,6 @@ def extract_cells(
         _as_level(level),
         num_threads,
     )
-    return mesh
 
 
 def sparse_lattice(
@@ -189,10 +187,7 @@ def sparse_lattice(
     >>> corners[cell_corners[1, 0]].tolist()
     [0, 0, 1]
     """
-    result: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]] = _core.sparse_lattice(
-        _as_int32(cells, "cells"), num_threads
-    )
-    return result
+    return _core.sparse_lattice(_as_int32(cells, "cells"), num_threads)
 
 
 def mesh_components(faces: ArrayLike, num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
@@ -225,10 +220,7 @@ def mesh_components(faces: ArrayLike, num_vertices: int) -> tuple[NDArray[np.int
     >>> labels.tolist(), sizes.tolist()
     ([0, 1, 0], [2, 1])
     """
-    result: tuple[NDArray[np.int32], NDArray[np.int64]] = _core.mesh_components(
-        _as_int32(faces, "faces"), num_vertices
-    )
-    return result
+    return _core.mesh_components(_as_int32(faces, "faces"), num_vertices)
 
 
 def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[np.float64]:
@@ -257,7 +249,7 @@ def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
     return np.ascontiguousarray(array, dtype=np.int32)
 
 
-def _as_placement(spacing: ArrayLike, origin: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _as_placement(spacing: ArrayLike, origin: ArrayLike) -> tuple[list[float], list[float]]:
     step, start = np.asarray(spacing, dtype=np.float64), np.asarray(origin, dtype=np.float64)
     if step.shape != (3,) or not np.all(np.isfinite(step) & (step > 0)):
         msg = f"spacing must be three finite positive numbers, not {spacing!r}"
@@ -265,7 +257,7 @@ def _as_placement(spacing: ArrayLike, origin: ArrayLike) -> tuple[NDArray[np.flo
     if start.shape != (3,) or not np.all(np.isfinite(start)):
         msg = f"origin must be three finite numbers, not {origin!r}"
         raise ValueError(msg)
-    return step, start
+    return step.tolist(), start.tolist()
 
 
 def _as_level(level: float) -> float:

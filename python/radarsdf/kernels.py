@@ -106,7 +106,7 @@ class _Interpolate(torch.autograd.Function):
     def backward(ctx: Any, out_grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         features, points, located = ctx.saved_tensors
         return (
-            *_InterpolateBackward.apply(
+            *_InterpolateBackward.apply(  # type: ignore[no-untyped-call]
                 out_grad,
                 features,
                 points,
@@ -142,7 +142,7 @@ class _InterpolateBackward(torch.autograd.Function):
         )
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, a: Tensor | None, v: Tensor | None) -> tuple[Tensor | None, ...]:
         # The scalar differentiated here is  a . W(x)^T g  +  v . d(W(x) F . g)/dx.
         g, features, points, located = ctx.saved_tensors
@@ -209,7 +209,7 @@ def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
         (N, 8 · num_levels), finest level first; zero at the levels where the point's cell is not occupied.
         Differentiable twice, by features and points. The gradient by points is that inside the cell.
     """
-    return _Interpolate.apply(features, points, table)  # type: ignore[no-any-return]
+    return _Interpolate.apply(features, points, table)  # type: ignore[no-any-return, no-untyped-call]
 
 
 def locate(points: Tensor, table: VertexTable) -> Tensor:
@@ -221,7 +221,7 @@ def locate(points: Tensor, table: VertexTable) -> Tensor:
 
 def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequencies: int) -> Tensor:
     """Sines, then cosines, of 2^k·π·points / half_width_m for k = first_frequency, …: (N, 6 · num_frequencies)."""
-    return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-any-return]
+    return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-any-return, no-untyped-call]
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:

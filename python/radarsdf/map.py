@@ -246,7 +246,7 @@ def evaluate(
         with torch.no_grad():
             return function(chunk)
 
-    chunks = points.split(_CHUNK) if len(points) > _CHUNK else (points,)
+    chunks = torch.split(points, _CHUNK) if len(points) > _CHUNK else (points,)
     if len(chunks) == 1:
         return without_gradients(points)
     with Workers() as workers:

@@ -79,7 +79,8 @@ def extract_mesh(
         mesh.vertex_attributes["intensity"] = intensity
         scale = radar_map.intensity_scale
         assert scale is not None
-        mesh.visual.vertex_colors = intensity_colors(intensity, scale.low, scale.high)
+        colors = intensity_colors(intensity, scale.low, scale.high)
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
     return mesh
 
 
@@ -101,10 +102,8 @@ def _occupied_voxels(radar_map: RadarMap, voxel_size: float) -> NDArray[np.int32
     parts = max(1, math.ceil(leaf_size_m / voxel_size - 1e-9))
     cells = radar_map.field.cells.table.leaf_cells()
     if parts * voxel_size > leaf_size_m * (1 + 1e-9) or parts == 1:
-        part = (
-            np.stack(np.meshgrid(*[np.arange(parts)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5
-        ) / parts
-        inside = (cells[:, None, :] + part) * (leaf_size_m / voxel_size)
+        lower = np.stack(np.meshgrid(*[np.arange(parts)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        inside = (cells[:, None, :] + (lower + 0.5) / parts) * (leaf_size_m / voxel_size)
         return np.floor(inside).astype(np.int32).reshape(-1, 3)
     part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1).reshape(-1, 3)
     return (cells[:, None, :] * np.int32(parts) + part).reshape(-1, 3)

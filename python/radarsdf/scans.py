@@ -108,9 +108,7 @@ def _check_scans(
         bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
     if count := sum(int(b.sum()) for b in bad):
         first = next(i for i, b in enumerate(bad) if b.any())
-        msg = (
-            f"{count} of {sum(map(len, bad))} returns are not finite, the first in scan {first}: remove them"
-        )
+        msg = f"{count} of {sum(map(len, scans))} returns are not finite, the first in scan {first}: remove them"
         raise ValueError(msg)
     return scans, values
 
