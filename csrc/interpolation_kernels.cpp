@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: MIT
 #include "interpolation_kernels.hpp"
 
+#include <string.h>  // not <cstring>: see fourier_kernels.cpp
+
 #ifndef RADARSDF_ISA
 #error "RADARSDF_ISA names the instruction set that this copy is compiled for"
 #endif
@@ -23,6 +25,56 @@ template <typename C>
 constexpr int axis_of(int group, int i) {
   if (C::kAxes == 3) return i;
   return i == 0 ? (group == 2 ? 1 : 0) : (group == 0 ? 1 : 2);
+}
+
+// The features of one vertex as one vector: left to itself, the compiler unrolls eight floats into scalars.
+#if defined(__GNUC__)
+template <typename T>
+struct VectorOf {
+  typedef T Type __attribute__((vector_size(kFeatureDim * sizeof(T))));
+};
+#else
+template <typename T>
+struct VectorOf {
+  struct Type {
+    T lanes[kFeatureDim];
+    T operator[](int i) const { return lanes[i]; }
+  };
+};
+template <typename V>
+inline V operator*(V a, V b) {
+  for (int i = 0; i < kFeatureDim; ++i) a.lanes[i] *= b.lanes[i];
+  return a;
+}
+template <typename T, typename V>
+inline V operator*(T a, V b) {
+  for (int i = 0; i < kFeatureDim; ++i) b.lanes[i] *= a;
+  return b;
+}
+template <typename V>
+inline V operator+(V a, V b) {
+  for (int i = 0; i < kFeatureDim; ++i) a.lanes[i] += b.lanes[i];
+  return a;
+}
+template <typename V>
+inline V& operator+=(V& a, V b) {
+  return a = a + b;
+}
+#endif
+template <typename T>
+using Features = typename VectorOf<T>::Type;
+
+// Rows are aligned to the size of a number only.
+template <typename T>
+inline Features<T> load(const T* row) {
+  Features<T> features;
+  memcpy(&features, row, sizeof features);
+  return features;
+}
+
+template <typename T>
+inline void store(T* row, Features<T> features) {
+  memcpy(row, &features, sizeof features);
 }
 
 // Where a point lies in its cell.
@@ -97,7 +149,7 @@ void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __
                  std::int64_t begin, std::int64_t end) {
   for (std::int64_t n = begin; n < end; ++n) {
     for (int level = 0; level < in.num_levels; ++level) {
-      T sum[kFeatureDim] = {};
+      Features<T> sum = {};
       const std::int32_t cell = in.located[n * in.num_levels + level];
       if (cell >= 0) {
         const Local<T> local = local_coordinates(in, n, level);
@@ -107,11 +159,10 @@ void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __
         }
         for (int k = 0; k < C::kGroups * C::kPerGroup; ++k) {
           const T* row = features + static_cast<std::int64_t>(in.cells[cell].rows[k]) * kFeatureDim;
-          for (int d = 0; d < kFeatureDim; ++d) sum[d] += weights[k] * row[d];
+          sum += weights[k] * load(row);
         }
       }
-      T* result = out + n * stride + level * kFeatureDim;
-      for (int d = 0; d < kFeatureDim; ++d) result[d] = sum[d];
+      store(out + n * stride + level * kFeatureDim, sum);
     }
   }
 }
@@ -124,10 +175,10 @@ void scatter(const Interpolation<T>& in, const T* __restrict out_grad, std::int6
     if (cell < 0) continue;
     T weights[C::kPerGroup];
     corner_weights<C, kDirectional>(local_coordinates(in, n, level), direction_of(in, n), group, weights);
-    const T* grad = out_grad + n * stride + level * kFeatureDim;
+    const Features<T> grad = load(out_grad + n * stride + level * kFeatureDim);
     for (int c = 0; c < C::kPerGroup; ++c) {
       T* row = features_grad + static_cast<std::int64_t>(in.cells[cell].rows[group * C::kPerGroup + c]) * kFeatureDim;
-      for (int d = 0; d < kFeatureDim; ++d) row[d] += weights[c] * grad[d];
+      store(row, load(row) + weights[c] * grad);
     }
   }
 }
@@ -136,19 +187,20 @@ template <typename C, bool kDirectional, typename T>
 void coordinate_gradient(const Interpolation<T>& in, const T* __restrict features, const T* __restrict out_grad,
                          std::int64_t stride, T* __restrict points_grad, std::int64_t begin, std::int64_t end) {
   for (std::int64_t n = begin; n < end; ++n) {
-    T sum[3][kFeatureDim] = {};  // one lane a feature, added up once a point
+    Features<T> sum[3] = {};  // one lane a feature, added up once a point
     for (int level = 0; level < in.num_levels; ++level) {
       const std::int32_t cell = in.located[n * in.num_levels + level];
       if (cell < 0) continue;
       const Local<T> local = local_coordinates(in, n, level);
-      const T* grad = out_grad + n * stride + level * kFeatureDim;
+      const Features<T> grad = load(out_grad + n * stride + level * kFeatureDim);
       for (int group = 0; group < C::kGroups; ++group) {
         for (int c = 0; c < C::kPerGroup; ++c) {
           const T* row =
               features + static_cast<std::int64_t>(in.cells[cell].rows[group * C::kPerGroup + c]) * kFeatureDim;
+          const Features<T> product = load(row) * grad;
           for (int i = 0; i < C::kAxes; ++i) {
             const T weight = corner_weight_gradient<C, kDirectional>(local, direction_of(in, n), group, c, i);
-            for (int d = 0; d < kFeatureDim; ++d) sum[axis_of<C>(group, i)][d] += weight * row[d] * grad[d];
+            sum[axis_of<C>(group, i)] += weight * product;
           }
         }
       }
