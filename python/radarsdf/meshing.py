@@ -128,7 +128,8 @@ def _corner_distances(
     voxel, corner = np.nonzero(outside[voxel_corners])
     border = voxel_corners[voxel, corner]
     centres = torch.from_numpy((voxels[voxel].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size))
-    points[border] = torch.lerp(points[border], centres, _INWARD)
+    # By NumPy: a corner of several voxels is moved several times, and in PyTorch threads race for which comes last.
+    points.numpy()[border] = torch.lerp(points[border], centres, _INWARD).numpy()
     return evaluate(radar_map.local_sdf, points, description="mesh", progress=progress).numpy()
 
 
