@@ -81,6 +81,9 @@ def test_strided_and_read_only_arrays(query):
     view.setflags(write=False)
     np.testing.assert_array_equal(function(view), function(x))
     np.testing.assert_array_equal(function(np.asfortranarray(x)), function(x))
+    read_only = x.copy()  # as those that trimesh gives
+    read_only.setflags(write=False)
+    np.testing.assert_array_equal(function(read_only), function(x))
     np.testing.assert_array_equal(function(torch.from_numpy(wide)[::2, ::2]), function(x))
 
 
