@@ -288,7 +288,7 @@ def test_values_do_not_jump_at_the_borders_of_cells(dtype, num_levels):
         assert (kernels.locate(points, table) >= 0).all()
         out = kernels.interpolate(features, points, table)
         together = np.diff(line.astype(np.float64)) < 1e-5
-        assert together.sum() > 30
+        assert together.sum() >= 30
         # Weights change by the step over a cell's size; a point put into the wrong cell jumps by a feature.
         assert (out[1:] - out[:-1]).abs()[torch.from_numpy(together)].max() < 1e-3
 
