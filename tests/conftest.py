@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf import FitConfig
 
 SEED = 7
 
@@ -56,3 +57,13 @@ def scene():
 @pytest.fixture(scope="session")
 def radar_map(scene):
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, progress=False)
+
+
+@pytest.fixture(scope="session")
+def sharp_map(scene):
+    """Fitted until the plane and the wall are sharp, by numbers of its own: no test of a map's use is a test of the
+    default schedule."""
+    config = FitConfig(
+        sdf_iterations=150, intensity_iterations=60, batch_size=4096, min_component_triangles=100
+    )
+    return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)

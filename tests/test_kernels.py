@@ -280,3 +280,94 @@ def test_core_and_torch_share_one_openmp_runtime():
         line.split()[-1] for line in maps.splitlines() if "gomp" in line or "iomp" in line or "libomp" in line
     }
     assert len(runtimes) == 1
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("num_levels", [1, 3, 12])
+def test_values_do_not_jump_at_the_borders_of_cells(dtype, num_levels):
+    # On a vertex, the next number to either side of it, both zeros, and the smallest numbers beside zero.
+    border = (np.arange(-8, 8, dtype=dtype) * dtype(LEAF_M)).astype(dtype)
+    # Scaled to the coarsest of 12 levels, this is still a normal number; below, a sign may be lost to underflow.
+    tiny = np.finfo(dtype).smallest_normal * 2**12
+    beside = [np.nextafter(border[border != 0], dtype(way)) for way in (-9, 9)]
+    line = np.concatenate([border, *beside, np.array([0.0, -0.0, tiny, -tiny], dtype)])
+    line = np.sort(line[(line > -1.5) & (line < 1.3)])
+    cells = (np.stack(np.meshgrid(*[np.arange(-8, 8)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) * LEAF_M
+    table = make_table(cells, num_levels)
+    features = torch.tensor(np.random.default_rng(0).normal(size=(table.num_rows, 8)).astype(dtype))
+    for axis in range(3):
+        points = np.full((len(line), 3), 0.05, dtype)
+        points[:, axis] = line
+        points = torch.from_numpy(points)
+        assert (kernels.locate(points, table) >= 0).all()
+        out = kernels.interpolate(features, points, table)
+        together = np.diff(line.astype(np.float64)) < 1e-5
+        assert together.sum() >= 30
+        # Weights change by the step over a cell's size; a point put into the wrong cell jumps by a feature.
+        assert (out[1:] - out[:-1]).abs()[torch.from_numpy(together)].max() < 1e-3
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_cells_are_half_open():
+    cells = np.array([[0.1, 0.1, 0.1], [-0.1, -0.1, -0.1]])
+    table = make_table(cells, 1)
+    corners = torch.tensor([[0.0] * 3, [-0.0] * 3, [-1e-300] * 3, [0.2] * 3, [-0.2] * 3], dtype=torch.float64)
+    found = (kernels.locate(corners, table)[:, 0] >= 0).tolist()
+    assert found == [True, True, True, False, True]
+    # The set of cells and the table agree on who is where.
+    keys = _core.cell_keys(corners.numpy(), LEAF_M)
+    assert [key in table.leaf_keys() for key in keys] == found
+    outside = torch.tensor([[0.1, 0.1, 0.2], [-0.1, -0.1, 1e-300]], dtype=torch.float64)
+    assert (kernels.locate(outside, table) == -1).all()
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_the_outermost_cells_of_the_lattice():
+    last = ((1 << 20) - (1 << 12) - 1) * LEAF_M
+    points = np.array([[last] * 3, [-last] * 3, [last, -last, 0.0]])
+    table = make_table(points, 12)
+    assert (kernels.locate(torch.from_numpy(points), table) >= 0).all()
+    ones = torch.ones(table.num_rows, 8, dtype=torch.float64)
+    np.testing.assert_allclose(kernels.interpolate(ones, torch.from_numpy(points), table), 3.0, rtol=1e-9)
+    with pytest.raises(ValueError, match="within a million cells"):
+        make_table(points + LEAF_M * 2)
+
+
+def test_one_row_hit_by_every_sample():
+    count = 1_000_000
+    table = make_table(np.array([[0.1, 0.1, 0.1]]), 3)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, LEAF_M, (count, 3)).astype(np.float32)
+    # All of one sign, so that the sum grows to where float32 has lost the small numbers' last digits.
+    grad = rng.uniform(0.5, 1.5, (count, 24)).astype(np.float32)
+    sums = {}
+    for dtype in (torch.float32, torch.float64):
+        features = torch.zeros(table.num_rows, 8, dtype=dtype, requires_grad=True)
+        kernels.interpolate(features, torch.tensor(points, dtype=dtype), table).backward(
+            torch.tensor(grad, dtype=dtype)
+        )
+        sums[dtype] = features.grad.double().numpy()
+    # Weights are one on each plane of each level.
+    total = sums[torch.float64].reshape(3, -1, 8).sum(1)
+    np.testing.assert_allclose(total, 3 * grad.astype(np.float64).sum(0).reshape(3, 8), rtol=1e-6)
+    np.testing.assert_allclose(sums[torch.float32], sums[torch.float64], rtol=2e-3)
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_empty_batches_of_everything():
+    table = make_table(surface_points(10))
+    features = torch.ones(table.num_rows, 8, dtype=torch.float64, requires_grad=True)
+    points = torch.zeros(0, 3, dtype=torch.float64, requires_grad=True)
+    out = kernels.interpolate(features, points, table)
+    features_grad, points_grad = torch.autograd.grad(out.sum(), (features, points), create_graph=True)
+    assert points_grad.shape == (0, 3)
+    assert not features_grad.any()
+    (second,) = torch.autograd.grad(points_grad.sum() + features_grad.sum(), features, allow_unused=True)
+    assert second is None or not second.any()
+    assert kernels.fourier(points, 1.0, 0, 4).shape == (0, 24)
+    assert kernels.spherical_harmonics(points.detach()).shape == (0, 16)
+    assert kernels.locate(points, table).shape == (0, 3)
+    cells = _core.CellSet(LEAF_M)
+    cells.insert(np.zeros((0, 3)))
+    assert len(cells) == len(cells.sorted_keys()) == 0

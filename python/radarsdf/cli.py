@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         options.run(options)
-    except (ValueError, OSError, ImportError) as error:
+    except (ValueError, OSError, ImportError, FloatingPointError) as error:
         print(f"radarsdf {options.command}: {error}", file=sys.stderr)
         return 1
     return 0
@@ -140,6 +140,9 @@ def _box(options: argparse.Namespace) -> np.ndarray[Any, Any] | None:
 
 def _demo(options: argparse.Namespace) -> None:
     config = _config(options)
+    if options.frames is not None and options.frames < 2:
+        msg = f"--frames must be at least 2, one of them to be held out, not {options.frames}"
+        raise ValueError(msg)
     options.out.mkdir(parents=True, exist_ok=True)
     simulation = radarsdf.simulate.SCENES[options.scene](frames=options.frames)
     scans = Scans(simulation.points, simulation.poses, simulation.intensities, simulation.ground_truth)

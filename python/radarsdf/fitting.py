@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -22,6 +23,8 @@ from radarsdf.map import IntensityScale, RadarMap
 from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays, prepare
 from radarsdf.threads import Workers
+
+_global_generator = threading.Lock()
 
 
 def fit(
@@ -115,7 +118,8 @@ def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArr
 
 def _new_field(rays: Rays, config: FitConfig, num_threads: int) -> Field:
     leaf_keys = occupied_leaf_keys(rays, config, num_threads)
-    with torch.random.fork_rng(devices=[]):  # the layers of torch.nn draw from the global generator
+    # The layers of torch.nn draw from the global generator, of which fits in several threads take turns.
+    with _global_generator, torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         field = Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
         field.cells.initialise(config.feature_std)

@@ -215,7 +215,8 @@ class RadarMap:
         A single position (3,) is repeated `rows` times where those are given.
         """
         is_tensor = isinstance(x, Tensor)
-        world = x.detach() if is_tensor else torch.from_numpy(np.ascontiguousarray(np.asarray(x, np.float64)))
+        # Writable, or PyTorch warns: a read-only array is copied.
+        world = x.detach() if is_tensor else torch.from_numpy(np.require(x, np.float64, ["C", "W"]))
         dtype = x.dtype if is_tensor else getattr(x, "dtype", None)
         if rows is not None and world.shape == (3,):
             world = world.expand(rows, 3)

@@ -93,20 +93,17 @@ def _check_box(box: ArrayLike) -> NDArray[np.float64]:
 
 
 def _occupied_voxels(radar_map: RadarMap, voxel_size: float) -> NDArray[np.int32]:
-    """Lattice coordinates (M, 3) of the voxels that share space with an occupied leaf cell; some more than once.
-
-    A voxel counts when it holds the centre of one of the equal parts, no larger than a voxel, that a cell is cut into:
-    where voxels divide cells evenly, exactly the voxels inside occupied cells.
-    """
+    """Lattice coordinates (M, 3) of the voxels that overlap an occupied leaf cell; some more than once."""
     leaf_size_m = radar_map.config.leaf_size_m
-    parts = max(1, math.ceil(leaf_size_m / voxel_size - 1e-9))
     cells = radar_map.field.cells.table.leaf_cells()
-    if parts * voxel_size > leaf_size_m * (1 + 1e-9) or parts == 1:
-        lower = np.stack(np.meshgrid(*[np.arange(parts)] * 3, indexing="ij"), -1).reshape(-1, 3)
-        inside = (cells[:, None, :] + (lower + 0.5) / parts) * (leaf_size_m / voxel_size)
-        return np.floor(inside).astype(np.int32).reshape(-1, 3)
-    part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    return (cells[:, None, :] * np.int32(parts) + part).reshape(-1, 3)
+    parts = max(1, math.ceil(leaf_size_m / voxel_size - 1e-9))
+    if math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9):  # voxels divide cells evenly
+        part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1)
+        return (cells[:, None, :] * np.int32(parts) + part.reshape(1, -1, 3)).reshape(-1, 3)
+    # Points of the cell no further apart than a voxel, from one end to the other, fall into each voxel that overlaps it.
+    ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
+    inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
+    return np.floor((cells[:, None, :] + inside) * (leaf_size_m / voxel_size)).astype(np.int32).reshape(-1, 3)
 
 
 def _corner_distances(
@@ -120,15 +117,24 @@ def _corner_distances(
     """Signed distance (K,) at lattice corners (K, 3), m.
 
     A corner on the border of the occupied cells may belong to the cell beyond, which has no features: its value would
-    jump. It is evaluated a hair inside one of its own voxels instead.
+    jump. It is evaluated a hair inside one of its own voxels instead. A corner further out, as voxels have that do not
+    divide the cells, is moved until it is inside, and the way is added to its distance.
     """
-    points = torch.from_numpy(corners.astype(np.float32) * np.float32(voxel_size))
-    outside = ~evaluate(radar_map.field.cells.occupied, points).numpy()
-    voxel, corner = np.nonzero(outside[voxel_corners])
-    border = voxel_corners[voxel, corner]
-    centres = torch.from_numpy((voxels[voxel].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size))
-    points[border] = torch.lerp(points[border], centres, _INWARD)
-    return evaluate(radar_map.local_sdf, points, description="mesh", progress=progress).numpy()
+    field = radar_map.field
+    corner_points = corners.astype(np.float32) * np.float32(voxel_size)
+    points = corner_points.copy()
+    for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
+        outside = ~evaluate(field.cells.occupied, torch.from_numpy(points)).numpy()
+        voxel, corner = np.nonzero(outside[voxel_corners])
+        if len(voxel) == 0:
+            break
+        moved = voxel_corners[voxel, corner]  # a corner of several voxels several times: the last one counts
+        centres = (voxels[voxel].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+        points[moved] = corner_points[moved] + np.float32(share) * (centres - corner_points[moved])
+    values = evaluate(
+        radar_map.local_sdf, torch.from_numpy(points), description="mesh", progress=progress
+    ).numpy()
+    return values + np.sign(values) * np.linalg.norm(points - corner_points, axis=1)
 
 
 def _without_small_components(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -50,12 +52,24 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     if Path(path).suffix != ".npz":
         msg = f"{path}: only .npz files of scans can be read"
         raise ValueError(msg)
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
+    try:
+        with zipfile.ZipFile(path) as file:
+            arrays = {Path(n).stem: np.lib.format.read_array(file.open(n)) for n in file.namelist()}
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:
+        msg = f"{path} is not a whole .npz file: {error}"
+        raise ValueError(msg) from error
     if missing := sorted({"points", "frame", "poses"} - set(arrays)):
         msg = f"{path} lacks the arrays {', '.join(missing)}"
         raise ValueError(msg)
     points, frame, poses = arrays["points"], arrays["frame"], arrays["poses"]
+    if (
+        points.ndim != 2
+        or poses.ndim != 3
+        or frame.dtype.kind not in "iuf"
+        or (frame != np.floor(frame)).any()
+    ):
+        msg = f"{path}: points must have shape (N, 3), poses (F, 4, 4), and frame be row numbers"
+        raise ValueError(msg)
     count = len(points)
     for name in ("frame", "intensity", "static"):
         if name in arrays and arrays[name].shape != (count,):
@@ -65,6 +79,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         msg = f"{path}: frame must lie in [0, {len(poses)})"
         raise ValueError(msg)
     used = arrays.get("static", np.ones(count, bool)).astype(bool)
+    frame = frame.astype(np.int64)
     frames = np.unique(frame[used])
     rows = [np.flatnonzero(used & (frame == i)) for i in frames]
     return Scans(

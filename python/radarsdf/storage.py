@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-import tempfile
+import secrets
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -46,15 +47,16 @@ def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
     }
     target = Path(path)
     data = to_bytes({name: tensor.contiguous() for name, tensor in tensors.items()}, metadata)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    # Not tempfile, whose files only their owner may read, and a map would stay so.
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        Path(temporary).replace(target)
+        temporary.replace(target)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -90,6 +92,7 @@ def load(path: str | PathLike[str]) -> RadarMap:
         SafetensorError,
         KeyError,
         TypeError,
+        OverflowError,
         RuntimeError,
         AttributeError,
         RecursionError,
@@ -123,6 +126,9 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
     if description["intensity_scale"] is not None:
         low, high = description["intensity_scale"]
         scale = IntensityScale(float(low), float(high))
+        if not -math.inf < scale.low < scale.high < math.inf:
+            msg = f"the intensity scale is {low} to {high}"
+            raise ValueError(msg)
     field = Field(leaf_keys.numpy().astype(np.uint64), config, with_intensity=scale is not None)
     state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
     for name, tensor in state.items():
@@ -133,7 +139,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
     field.requires_grad_(False)
     return RadarMap(
         field=field,
-        origin=origin.numpy(),
+        origin=origin.numpy().copy(),  # the tensor is a view of the file, which may change or go
         intensity_scale=scale,
         config=config,
         report=dict(description["report"]),

@@ -26,6 +26,12 @@ _Result = TypeVar("_Result")
 _lock = threading.Lock()
 _users = 0
 _threads_before = 0
+_blocks = threading.local()  # .depth: blocks that this thread is in
+
+
+def _use_one_thread() -> None:
+    torch.get_num_threads()  # a thread's first call of anything else would undo the next line
+    torch.set_num_threads(1)
 
 
 def resolve_num_threads(num_threads: int) -> int:
@@ -37,8 +43,9 @@ def resolve_num_threads(num_threads: int) -> int:
 class Workers:
     """`num_threads` threads for the time of a ``with`` block.
 
-    PyTorch's number of threads is one for the whole process, so it is set to 1 by the first block that is entered and
-    restored by the last that is left, in whichever threads these run.
+    PyTorch's number of threads is each thread's own, and a new thread begins with what was set last anywhere. So every
+    thread's outermost block sets 1 and restores, and a thread that meets PyTorch first while another is in a block
+    takes over the number from before that block.
     """
 
     def __init__(self, num_threads: int = 0) -> None:
@@ -48,14 +55,15 @@ class Workers:
     def __enter__(self) -> Self:
         global _users, _threads_before  # noqa: PLW0603 - there is one PyTorch
         with _lock:
+            depth = getattr(_blocks, "depth", 0)
             if _users == 0:
                 _threads_before = torch.get_num_threads()
-                torch.set_num_threads(1)
+            if depth == 0:
+                _blocks.threads_before = _threads_before
+                _use_one_thread()
+            _blocks.depth = depth + 1
             _users += 1
-        # Threads are started anew for each block, so that a process may fork between two.
-        self._pool = ThreadPoolExecutor(
-            self.num_threads, "radarsdf", initializer=torch.set_num_threads, initargs=(1,)
-        )
+        self._pool = ThreadPoolExecutor(self.num_threads, "radarsdf", initializer=_use_one_thread)
         return self
 
     def __exit__(
@@ -66,8 +74,9 @@ class Workers:
         self._pool.shutdown(cancel_futures=True)
         with _lock:
             _users -= 1
-            if _users == 0:
-                torch.set_num_threads(_threads_before)
+            _blocks.depth -= 1
+            if _blocks.depth == 0:
+                torch.set_num_threads(_blocks.threads_before)
 
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
         """Like the built-in, in order, the items on different threads. Grad mode is each thread's own."""

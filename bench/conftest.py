@@ -1,0 +1,100 @@
+"""Data that several benches share: made once, fixed by seeds, realistic in how memory is hit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from radarsdf._core import CellSet, VertexTable, cell_keys
+
+LEAF_M = 0.2
+NUM_LEVELS = 3
+FEATURE_DIM = 8
+PLANES = ((0, 1), (0, 2), (1, 2))
+_BIAS = 1 << 20  # of the table's lattice coordinates
+
+
+def surface_points(count, seed=0, half_m=24.0, dtype=np.float32):
+    """Rolling ground with two walls, and the noise of a radar's returns."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-half_m, half_m, (2, count))
+    z = 0.8 * np.sin(0.3 * x) + 0.5 * np.cos(0.2 * y)
+    wall = rng.random(count) < 0.2
+    z = np.where(wall, rng.uniform(0, 5, count), z)
+    x = np.where(wall & (y > 0), half_m / 2 + 0 * x, x)
+    y = np.where(wall & (y <= 0), half_m / 3 + 0 * y, y)
+    points = np.column_stack([x, y, z]) + rng.uniform(-0.25, 0.25, (count, 3))
+    return points.astype(dtype)
+
+
+def _spread(values):
+    """Bits of non-negative integers, three apart."""
+    out = np.zeros(values.shape, np.uint64)
+    for bit in range(21):
+        out |= ((values >> bit & 1).astype(np.uint64)) << np.uint64(3 * bit)
+    return out
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A table, and the rows and weights that plain NumPy finds for its points."""
+
+    table: VertexTable
+    features: torch.Tensor
+
+    def rows_and_weights(self, points):
+        """(N, levels, 12) rows and weights: levels, planes, vertices numbered as the table documents it."""
+        leaf = self.table.leaf_cells().astype(np.int64) + _BIAS
+        u = points.astype(np.float32) * np.float32(1 / LEAF_M)
+        cell = np.floor(u).astype(np.int64) + _BIAS
+        fraction_of_leaf = u.astype(np.float64) + _BIAS
+        rows, weights, first = [], [], 0
+        for level in range(NUM_LEVELS):
+            cells, own = np.unique(leaf >> level, axis=0), cell >> level
+            fraction = fraction_of_leaf / 2**level - own
+            for axes in PLANES:
+                corners = [(i, j) for j in (0, 1) for i in (0, 1)]
+                keys = [self._key(cells, axes, corner) for corner in corners]
+                vertices = np.unique(np.concatenate(keys))
+                for corner in corners:
+                    rows.append(first + np.searchsorted(vertices, self._key(own, axes, corner)))
+                    factors = [
+                        fraction[:, a] if c else 1 - fraction[:, a] for a, c in zip(axes, corner, strict=True)
+                    ]
+                    weights.append(factors[0] * factors[1])
+                first += len(vertices)
+        assert first == self.table.num_rows
+        shape = (-1, NUM_LEVELS, 12)
+        return np.stack(rows, 1).reshape(shape), np.stack(weights, 1).astype(np.float32).reshape(shape)
+
+    @staticmethod
+    def _key(cells, axes, corner):
+        a, b = ((cells[:, axis] + step).astype(np.uint64) for axis, step in zip(axes, corner, strict=True))
+        return _spread(a) << np.uint64(axes[0]) | _spread(b) << np.uint64(axes[1])
+
+
+@pytest.fixture(scope="session")
+def surface():
+    cells = CellSet(LEAF_M)
+    cells.insert(surface_points(1_500_000))
+    keys = cells.sorted_keys()
+    assert 1.5e5 < len(keys) < 2.5e5
+    table = VertexTable(keys, LEAF_M, NUM_LEVELS)
+    generator = torch.Generator().manual_seed(0)
+    return Surface(table, torch.randn(table.num_rows, FEATURE_DIM, generator=generator))
+
+
+@pytest.fixture(scope="session", params=[8192, 262144])
+def batch(request, surface):
+    """Points inside the surface's cells in the order of a training batch (Morton), and what NumPy says of them."""
+    points = surface_points(1_500_000)[: request.param]
+    points = np.ascontiguousarray(points[np.argsort(cell_keys(points, LEAF_M), kind="stable")])
+    rows, weights = surface.rows_and_weights(points)
+    features = surface.features.numpy().astype(np.float64)
+    expected = sum(
+        (weights[:, :, k, None].astype(np.float64) * features[rows[:, :, k]]).sum() for k in range(12)
+    )
+    absolute = np.sqrt((weights.astype(np.float64) ** 2).sum() * FEATURE_DIM)
+    return torch.from_numpy(points), torch.from_numpy(rows), torch.from_numpy(weights), expected, absolute

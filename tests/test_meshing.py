@@ -1,0 +1,311 @@
+"""Meshes of the plane z = 0 and the wall x = 20: where they are, which way they face, and where they end."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf.isosurface import mesh_components
+from radarsdf.map import RadarMap
+from radarsdf.meshing import _corner_distances, _occupied_voxels
+from radarsdf.picture import intensity_colors
+
+from .conftest import ground_and_wall
+from .mesh_checks import has_single_cycle_links, single_edges
+
+UTM = np.array([5e5, 5.4e6, 300.0])
+SENSOR = np.array([3.0, 0.0, 1.5])
+LEAF_M = 0.2
+
+
+def with_changes(radar_map, *, origin=(0, 0, 0), **settings):
+    return RadarMap(
+        field=radar_map.field,
+        origin=radar_map.origin + np.asarray(origin),
+        intensity_scale=radar_map.intensity_scale,
+        config=dataclasses.replace(radar_map.config, **settings),
+        report={},
+    )
+
+
+@pytest.fixture(scope="module")
+def mesh(sharp_map):
+    return sharp_map.mesh()
+
+
+def surface_distance(vertices):
+    return np.minimum(np.abs(vertices[:, 2]), np.abs(vertices[:, 0] - 20))
+
+
+def inside(mesh):
+    """Triangles well within what the sensor saw, away from the corner of plane and wall."""
+    x, y, z = mesh.triangles_center.T
+    seen = (np.abs(y) < 5) & (x > 9) & (x < 21) & (z < 3.5)
+    return seen & ~((x > 19.2) & (z < 0.8))
+
+
+def test_vertices_lie_on_the_surface(mesh):
+    centres = mesh.triangles_center[inside(mesh)]
+    assert len(centres) > 10_000
+    # Noise of 2 cm on the returns.
+    assert np.median(surface_distance(centres)) < 0.02
+    assert np.quantile(surface_distance(centres), 0.9) < 0.1
+
+
+def test_the_surface_is_all_there(mesh):
+    x, y = np.meshgrid(np.arange(9, 19, 0.25), np.arange(-5, 5, 0.25))
+    y_wall, z_wall = np.meshgrid(np.arange(-5, 5, 0.25), np.arange(0.8, 3.5, 0.25))
+    truth = np.concatenate(
+        [
+            np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1),
+            np.stack([20 + 0 * y_wall.ravel(), y_wall.ravel(), z_wall.ravel()], 1),
+        ]
+    )
+    nearest = [np.min(np.linalg.norm(mesh.vertices - point, axis=1)) for point in truth]
+    assert np.mean(np.array(nearest) < 0.15) > 0.97
+
+
+def test_triangles_face_free_space(mesh):
+    x, _, z = mesh.triangles_center.T
+    ground, wall = inside(mesh) & (x < 19), inside(mesh) & (z > 1)
+    area = mesh.area_faces
+    # Towards the sensor: up from the ground, back from the wall.
+    assert np.average(mesh.face_normals[ground, 2] > 0.7, weights=area[ground]) > 0.95
+    assert np.average(mesh.face_normals[wall, 0] < -0.7, weights=area[wall]) > 0.95
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
+def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, voxel_size):
+    mesh = sharp_map.mesh(voxel_size)
+    assert len(mesh.faces) > 0
+    # Vertices may lie on the very border, the middle of a triangle does not.
+    assert sharp_map.observed(mesh.triangles_center).mean() > 0.9999
+    towards_middle = np.repeat(mesh.triangles_center, 3, axis=0) - mesh.triangles.reshape(-1, 3)
+    assert sharp_map.observed(mesh.triangles.reshape(-1, 3) + 0.01 * towards_middle).mean() > 0.999
+
+
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.15, 0.2, 0.3])
+def test_any_voxel_size_gives_the_same_surface(sharp_map, voxel_size):
+    mesh = sharp_map.mesh(voxel_size)
+    centres = mesh.triangles_center[inside(mesh)]
+    assert np.median(surface_distance(centres)) < 0.03
+    ground = (np.abs(mesh.triangles_center[:, 1]) < 5) & inside(mesh) & (mesh.triangles_center[:, 0] < 19)
+    projected = (mesh.area_faces * np.abs(mesh.face_normals[:, 2]))[ground].sum()
+    # x from 9 to 19 and y from -5 to 5: nothing is missing, and not much doubled.
+    assert 95 < projected < 125
+    # Never further out than a voxel from what was observed.
+    nearest = np.clip(mesh.vertices, *sharp_map_bounds(sharp_map))
+    assert np.abs(mesh.vertices - nearest).max() <= voxel_size + 1e-6
+
+
+def sharp_map_bounds(radar_map):
+    cells = radar_map.field.cells.table.leaf_cells()
+    return cells.min(axis=0) * LEAF_M + radar_map.origin, (cells.max(axis=0) + 1) * LEAF_M + radar_map.origin
+
+
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.15, 0.2, 0.3])
+def test_meshes_are_manifold(sharp_map, voxel_size):
+    mesh = with_changes(sharp_map, min_component_triangles=0).mesh(voxel_size)
+    border = single_edges(mesh.faces)  # fails where an edge has more than two triangles or two that disagree
+    assert mesh.area_faces.min() > 0
+    fans = has_single_cycle_links(mesh.faces, len(mesh.vertices))
+    fans[border] = True  # two open fans may touch where the cells end
+    assert fans.all()
+
+
+def test_meshes_are_open_only_where_the_occupied_region_ends(sharp_map):
+    voxel_size = 0.1
+    mesh = with_changes(sharp_map, min_component_triangles=0).mesh(voxel_size)
+    edges = single_edges(mesh.faces)
+    assert len(edges) > 0
+    voxels = {tuple(v) for v in _occupied_voxels(sharp_map, voxel_size).tolist()}
+    ends = (np.asarray(mesh.vertices) - sharp_map.origin)[edges] / voxel_size
+    for a, b in ends:
+        flat = [i for i in range(3) if abs(a[i] - round(a[i])) < 1e-6 and abs(b[i] - a[i]) < 1e-6]
+        middle = (a + b) / 2
+        borders = []
+        for axis in flat:
+            sides = []
+            for step in (-0.5, 0.5):
+                point = middle.copy()
+                point[axis] = round(a[axis]) + step
+                sides.append(tuple(np.floor(point).astype(int).tolist()) in voxels)
+            borders.append(sides[0] != sides[1])
+        assert any(borders)
+
+
+def test_two_meshes_of_one_map_are_the_same_bits(sharp_map):
+    meshes = [sharp_map.mesh(0.1) for _ in range(6)]
+    for mesh in meshes[1:]:
+        np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
+        np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_number_of_threads_changes_nothing_but_rounding(sharp_map, mesh, threads):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        other = sharp_map.mesh()
+    finally:
+        torch.set_num_threads(before)
+    assert other.vertices.shape == mesh.vertices.shape
+    np.testing.assert_allclose(other.vertices, mesh.vertices, atol=1e-4)
+
+
+def test_a_utm_origin_gives_the_same_mesh_moved(sharp_map, mesh):
+    far = with_changes(sharp_map, origin=UTM).mesh()
+    np.testing.assert_array_equal(far.faces, mesh.faces)
+    np.testing.assert_allclose(far.vertices - UTM, mesh.vertices, atol=2e-9)  # what float64 has left at 5.4e6
+
+
+@pytest.mark.parametrize("offset", [np.zeros(3), UTM])
+def test_a_box_in_the_world_frame(sharp_map, offset):
+    far = with_changes(sharp_map, origin=offset, min_component_triangles=0)
+    box = np.array([[10.0, -2, -1], [15, 2, 1]]) + offset
+    cropped = far.mesh(box=box)
+    # Voxels whose centres lie inside reach out by half a voxel.
+    assert (cropped.vertices >= box[0] - 0.05 - 1e-6).all()
+    assert (cropped.vertices <= box[1] + 0.05 + 1e-6).all()
+    whole = far.mesh()
+    inner = ((whole.triangles >= box[0] + 0.06) & (whole.triangles <= box[1] - 0.06)).all(axis=(1, 2))
+    kept = ((cropped.triangles >= box[0] + 0.06) & (cropped.triangles <= box[1] - 0.06)).all(axis=(1, 2))
+    assert inner.sum() == kept.sum() > 1000
+    np.testing.assert_allclose(np.sort(whole.area_faces[inner]), np.sort(cropped.area_faces[kept]), atol=1e-4)
+
+
+def test_small_components_are_dropped():
+    few = ground_and_wall(scans=2, returns_per_scan=160)
+    config = radarsdf.FitConfig(sdf_iterations=60, batch_size=1024, min_component_triangles=0)
+    patches = radarsdf.fit(few.points, few.poses, config=config, progress=False)
+    whole = patches.mesh()
+    labels, sizes = mesh_components(whole.faces.astype(np.int32), len(whole.vertices))
+    assert sizes.min() < 50 < sizes.max()
+    cut = with_changes(patches, min_component_triangles=50).mesh()
+    kept = mesh_components(cut.faces.astype(np.int32), len(cut.vertices))[1]
+    assert kept.tolist() == sizes[sizes >= 50].tolist()
+    # No vertex is left over, and none is renumbered to another place.
+    np.testing.assert_array_equal(np.unique(cut.faces), np.arange(len(cut.vertices)))
+    np.testing.assert_array_equal(cut.triangles, whole.triangles[sizes[labels] >= 50])
+
+
+def test_a_viewpoint_gives_intensities_and_colours(sharp_map, mesh):
+    seen = sharp_map.mesh(viewpoint=SENSOR)
+    np.testing.assert_array_equal(seen.vertices, mesh.vertices)
+    intensity = seen.vertex_attributes["intensity"]
+    np.testing.assert_allclose(intensity, sharp_map.intensity(np.asarray(seen.vertices), SENSOR), atol=1e-4)
+    scale = sharp_map.intensity_scale
+    np.testing.assert_array_equal(
+        seen.visual.vertex_colors, intensity_colors(intensity, scale.low, scale.high)
+    )
+    x, _, z = seen.vertices.T
+    on_wall = (np.abs(x - 20) < 0.1) & (z > 1) & (z < 3)
+    expected = 100 - 40 * np.log10(np.linalg.norm(seen.vertices[on_wall] - SENSOR, axis=1))
+    assert np.median(np.abs(intensity[on_wall] - expected)) < 1.5
+    assert "intensity" not in mesh.vertex_attributes
+
+
+def test_a_mesh_survives_its_file(sharp_map, tmp_path):
+    import trimesh  # noqa: PLC0415
+
+    seen = sharp_map.mesh(0.2, viewpoint=SENSOR)
+    seen.export(tmp_path / "mesh.ply")
+    back = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    np.testing.assert_array_equal(back.faces, seen.faces)
+    np.testing.assert_allclose(back.vertices, seen.vertices, atol=1e-5)
+    np.testing.assert_array_equal(back.visual.vertex_colors, seen.visual.vertex_colors)
+    assert b"intensity" in (tmp_path / "mesh.ply").read_bytes()[:1000]
+
+
+@pytest.mark.parametrize("viewpoint", [None, SENSOR])
+def test_where_there_is_no_surface_the_mesh_is_empty(sharp_map, viewpoint):
+    empty = sharp_map.mesh(box=[[500, 500, 500], [501, 501, 501]], viewpoint=viewpoint)
+    assert len(empty.vertices) == len(empty.faces) == 0
+    none = with_changes(sharp_map, min_component_triangles=10**9).mesh(0.2, viewpoint=viewpoint)
+    assert len(none.vertices) == len(none.faces) == 0
+
+
+@pytest.mark.parametrize("voxel_size", [0, -0.1, np.nan, np.inf])
+def test_voxel_sizes_that_make_no_sense(sharp_map, voxel_size):
+    with pytest.raises(ValueError, match="voxel_size must be positive"):
+        sharp_map.mesh(voxel_size)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        [[0, 0, 0]],
+        [0, 0, 0, 1, 1, 1],
+        [[1, 0, 0], [0, 1, 1]],
+        [[0, 0, 0], [0, 1, 1]],
+        [[np.nan] * 3, [1] * 3],
+    ],
+)
+def test_boxes_that_make_no_sense(sharp_map, box):
+    with pytest.raises(ValueError, match="box must be"):
+        sharp_map.mesh(box=box)
+
+
+@pytest.mark.parametrize("viewpoint", [[1, 2], [[1, 2, 3]], [np.nan, 0, 0], 3.0])
+def test_viewpoints_that_make_no_sense(sharp_map, viewpoint):
+    with pytest.raises(ValueError, match="viewpoint must be one position"):
+        sharp_map.mesh(0.2, viewpoint=viewpoint)
+
+
+def test_a_viewpoint_needs_intensities(scene):
+    config = radarsdf.FitConfig(sdf_iterations=1, batch_size=64)
+    bare = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
+    with pytest.raises(ValueError, match="fitted without"):
+        bare.mesh(viewpoint=SENSOR)
+
+
+def lattice(radar_map, voxel_size):
+    voxels = _occupied_voxels(radar_map, voxel_size)
+    return radarsdf.isosurface.sparse_lattice(voxels)
+
+
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
+def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
+    voxels, corners, voxel_corners = lattice(sharp_map, voxel_size)
+    values = _corner_distances(sharp_map, voxel_size, voxels, corners, voxel_corners, False)
+    centres = (voxels + 0.5) * voxel_size
+    inner = corners[voxel_corners] * voxel_size
+    inner = inner + 0.01 * (centres[:, None] - inner)
+    nearby = sharp_map.sdf(inner.reshape(-1, 3) + sharp_map.origin).reshape(-1, 8)
+    jump = np.abs(values[voxel_corners] - nearby)
+    # Every voxel sees at its corners what the map says just inside of it. Without features the distance would be
+    # that of free space, decimetres off.
+    assert np.quantile(jump, 0.999) < 0.02
+    assert sharp_map.field.cells.occupied(torch.from_numpy(inner.reshape(-1, 3).astype(np.float32))).all()
+
+
+def test_occupied_voxels_fill_the_cells(sharp_map):
+    cells = {tuple(c) for c in sharp_map.field.cells.table.leaf_cells().tolist()}
+    for parts in (1, 2, 4):
+        voxels = _occupied_voxels(sharp_map, LEAF_M / parts)
+        assert len(np.unique(voxels, axis=0)) == len(cells) * parts**3
+        assert {tuple(v) for v in np.unique(voxels // parts, axis=0).tolist()} == cells
+
+
+@pytest.mark.parametrize("voxel_size", [0.07, 0.15, 0.3, 0.45])
+def test_uneven_voxels_cover_the_cells_and_little_more(sharp_map, voxel_size):
+    cells = sharp_map.field.cells.table.leaf_cells()
+    voxels = np.unique(_occupied_voxels(sharp_map, voxel_size), axis=0)
+    known = {tuple(v) for v in voxels.tolist()}
+    # The middle of each cell is covered; a hair to either side, as it may lie on a face between two voxels.
+    for middle in (cells + 0.5) * LEAF_M / voxel_size:
+        sides = itertools.product(*[{math.floor(m - 1e-6), math.floor(m + 1e-6)} for m in middle])
+        assert any(side in known for side in sides)
+    # Each voxel overlaps some occupied cell.
+    occupied = {tuple(c) for c in cells.tolist()}
+    low = np.floor(voxels * voxel_size / LEAF_M + 1e-6).astype(int)
+    high = np.ceil((voxels + 1) * voxel_size / LEAF_M - 1e-6).astype(int)
+    for a, b in zip(low.tolist(), high.tolist(), strict=True):
+        touched = ((x, y, z) for x in range(a[0], b[0]) for y in range(a[1], b[1]) for z in range(a[2], b[2]))
+        assert any(cell in occupied for cell in touched)

@@ -1,0 +1,162 @@
+"""The networks' inputs and outputs, and which parameters which loss may reach."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from radarsdf import FitConfig
+from radarsdf._core import CellSet
+from radarsdf.field import Field
+from radarsdf.losses import intensity_loss, sdf_loss
+from radarsdf.networks import IntensityNetwork, SDFNetwork
+
+BARE = FitConfig(sdf_input=False, view_direction=False, log_range=False)
+
+
+def inputs(config, count=20, encoding_dim=10):
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    return {
+        "encoding": normal(count, encoding_dim),
+        "logit": normal(count),
+        "geometry_feature": normal(count, config.geometry_feature_dim),
+        "normals": torch.nn.functional.normalize(normal(count, 3), dim=1) if config.normals else None,
+        "directions": torch.nn.functional.normalize(normal(count, 3), dim=1),
+        "ranges_m": 5 + 10 * torch.rand(count, generator=generator),
+    }
+
+
+def make_field(config, seed=0):
+    torch.manual_seed(seed)
+    points = np.random.default_rng(seed).uniform(-1, 1, (2000, 3)).astype(np.float32)
+    cells = CellSet(config.leaf_size_m)
+    cells.insert(points)
+    field = Field(cells.sorted_keys(), config, with_intensity=True)
+    field.cells.initialise(1.0)
+    return field, torch.from_numpy(points[:200])
+
+
+def views(points):
+    rays = points - torch.tensor([0.0, 0.0, 8.0])
+    return rays / rays.norm(dim=1, keepdim=True), rays.norm(dim=1)
+
+
+@pytest.mark.parametrize("geometry_feature_dim", [0, 15])
+def test_sdf_network(geometry_feature_dim):
+    network = SDFNetwork(10, FitConfig(sdf_hidden=(7, 5), geometry_feature_dim=geometry_feature_dim))
+    logit, feature = network(torch.randn(4, 10))
+    assert logit.shape == (4,)
+    assert feature.shape == (4, geometry_feature_dim)
+    widths = [tuple(m.weight.shape) for m in network.layers if isinstance(m, torch.nn.Linear)]
+    assert widths == [(7, 10), (5, 7), (1 + geometry_feature_dim, 5)]
+
+
+def test_the_logit_has_both_signs():
+    # An activation behind the last layer would leave one side of the surface without a value.
+    logit, _ = SDFNetwork(10, FitConfig())(torch.randn(2000, 10) * 10)
+    assert logit.min() < 0 < logit.max()
+
+
+@pytest.mark.parametrize(
+    ("setting", "arguments", "width"),
+    [
+        ({"sdf_input": True}, {"logit"}, 1),
+        ({"geometry_feature_dim": 15}, {"geometry_feature"}, 15),
+        ({"normals": True}, {"normals"}, 3),
+        ({"view_direction": True}, {"directions"}, 16),
+        ({"log_range": True}, {"ranges_m"}, 1),
+    ],
+)
+def test_the_intensity_network_sees_what_it_is_told_to(setting, arguments, width):
+    config = dataclasses.replace(BARE, **setting)
+    torch.manual_seed(0)
+    network = IntensityNetwork(10, config)
+    assert network.layers[0].in_features == 10 + width
+    given = inputs(config)
+    before = network(**given)
+    assert before.shape == (20,)
+    for name, value in given.items():
+        if value is None or value.numel() == 0:
+            continue
+        changed = given | {name: value.roll(1, 0)}
+        seen = name in arguments | {"encoding"}
+        assert torch.equal(network(**changed), before) != seen, name
+
+
+def test_range_enters_as_its_logarithm():
+    config = dataclasses.replace(BARE, log_range=True, intensity_hidden=(1,))
+    network = IntensityNetwork(1, config)
+    with torch.no_grad():  # the identity of log10(range / 10 m) + 5
+        for layer in (network.layers[0], network.layers[2]):
+            layer.weight.fill_(1)
+            layer.bias.fill_(0)
+        network.layers[0].weight[0, 0] = 0
+        network.layers[0].bias.fill_(5)
+    given = inputs(config, 4, 1) | {"ranges_m": torch.tensor([1.0, 10.0, 100.0, 0.0])}
+    np.testing.assert_allclose(network(**given).detach(), [4, 5, 6, 1], atol=1e-6)
+
+
+def test_normals_are_the_normalised_gradient():
+    config = FitConfig(normals=True, sdf_hidden=(8,), intensity_hidden=(8,))
+    field, points = make_field(config)
+    seen = []
+    field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[3]))
+    field.intensity(points, *views(points))
+    x = points.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(field.logit(x).sum(), x)
+    np.testing.assert_allclose(seen[0], gradient / gradient.norm(dim=1, keepdim=True), atol=1e-5)
+
+
+@pytest.mark.parametrize("normals", [False, True])
+@pytest.mark.parametrize("geometry_frozen", [False, True])
+def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geometry_frozen):
+    field, points = make_field(FitConfig(normals=normals, geometry_feature_dim=3))
+    field.intensity(points, *views(points), geometry_frozen=geometry_frozen).sum().backward()
+    geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
+    assert all(p.grad is not None and p.grad.any() for p in field.intensity_network.parameters())
+    assert any(p.grad is not None and bool(p.grad.any()) for p in geometry) != geometry_frozen
+
+
+def test_the_second_derivative_through_the_normals_is_right():
+    # Double precision and smooth: no input but the normal depends on the features.
+    config = dataclasses.replace(BARE, normals=True, sdf_hidden=(6,), intensity_hidden=(6,), fourier_count=2)
+    field, points = make_field(config)
+    field = field.double()
+    points = points[:8].double()
+    directions, ranges_m = views(points)
+    field.intensity(points, directions, ranges_m, geometry_frozen=False).sum().backward()
+    analytic = field.cells.features.grad
+    rows = analytic.abs().sum(1).argsort(descending=True)[:5]
+    step = 1e-6
+    for row in rows.tolist():
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                field.cells.features[row, 2] += sign * step
+            values.append(float(field.intensity(points, directions, ranges_m).sum().detach()))
+            with torch.no_grad():
+                field.cells.features[row, 2] -= sign * step
+        assert (values[0] - values[1]) / (2 * step) == pytest.approx(float(analytic[row, 2]), abs=1e-6)
+
+
+def test_the_sdf_loss_is_lowest_where_the_logit_is_the_label():
+    sdf_m = torch.linspace(-0.3, 0.3, 13)
+    logit = (sdf_m / 0.1).requires_grad_()
+    loss = sdf_loss(logit, sdf_m, 0.1)
+    (gradient,) = torch.autograd.grad(loss, logit)
+    assert gradient.abs().max() < 1e-7
+    # Bits of the entropy of sigmoid(label / sigma): what no prediction can go below.
+    p = torch.sigmoid(sdf_m / 0.1)
+    entropy = -(p * p.log() + (1 - p) * (1 - p).log()).mean()
+    assert loss.item() == pytest.approx(entropy.item(), rel=1e-5)
+    assert sdf_loss(-logit, sdf_m, 0.1) > loss
+
+
+def test_the_intensity_loss_is_the_mean_absolute_error():
+    assert intensity_loss(torch.tensor([0.0, 1.0, 0.5]), torch.tensor([0.5, 1.0, 0.25])).item() == 0.25

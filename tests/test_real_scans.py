@@ -1,0 +1,73 @@
+"""The whole job on scans of a real automotive radar, where they are at hand; their licence keeps them out of here."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import radarsdf
+import trimesh
+from radarsdf import FitConfig
+from radarsdf.evaluation import KNNIntensity, holdout, intensity_metrics, surface_metrics
+from radarsdf.readers import read_scans
+from radarsdf.scans import prepare
+from scipy.spatial import cKDTree
+
+DATA = os.environ.get("RADARSDF_DATA")
+SCENES = ["r0144_0167", "r0009_0024"]
+
+pytestmark = pytest.mark.skipif(
+    DATA is None,
+    reason="RADARSDF_DATA does not name a folder with astyx/*.npz, real scans with lidar and poses",
+)
+
+
+def rays_of(scans):
+    """World points, sensor positions and intensities of the returns between 2.5 and 60 m."""
+    rays = prepare(scans.points, scans.poses, scans.intensities, min_range_m=2.5, max_range_m=60.0)
+    points = rays.points.astype(np.float64) + rays.origin
+    return points, points - rays.directions.astype(np.float64) * rays.ranges_m[:, None], rays.intensities
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def job(request):
+    path = Path(DATA or "") / "astyx" / f"{request.param}.npz"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    scans = read_scans(path)
+    train, test = (scans.select(frames) for frames in holdout(len(scans.points), 5))
+    config = dataclasses.replace(FitConfig(), max_range_m=60.0)
+    radar_map = radarsdf.fit(train.points, train.poses, train.intensities, config=config, progress=False)
+    return radar_map, train, test
+
+
+def test_held_out_intensities_are_better_than_the_neighbours(job):
+    radar_map, train, test = job
+    x, sensors, measured = rays_of(test)
+    ours = intensity_metrics(radar_map.intensity(x, sensors), measured)
+    neighbours = intensity_metrics(KNNIntensity(*rays_of(train)).predict(x, sensors), measured)
+    assert ours["mae"] < neighbours["mae"]
+
+
+def test_the_mesh_covers_what_radar_and_lidar_saw(job, tmp_path):
+    radar_map, train, test = job
+    viewpoint = train.poses[len(train.poses) // 2, :3, 3]
+    extracted = radar_map.mesh(viewpoint=viewpoint, progress=False)
+    assert len(extracted.faces) > 1000
+    extracted.export(tmp_path / "mesh.ply")
+    mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    assert len(mesh.faces) == len(extracted.faces)
+    assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
+    # Lidar sees all round; only what lies within 1 m of a static return can be asked of a radar map.
+    returns = np.concatenate([rays_of(scans)[0] for scans in (train, test)])
+    lidar = train.ground_truth
+    seen = lidar[cKDTree(returns).query(lidar, distance_upper_bound=1.0)[0] <= 1.0]
+    in_place = surface_metrics(mesh, seen, samples=1_000_000)["completion_ratio"]
+    # The same mesh put a metre aside covers what a mesh of this size covers by chance.
+    for aside in ([1.0, 0, 0], [0, 1.0, 0]):
+        moved = mesh.copy()
+        moved.vertices = moved.vertices + aside
+        assert in_place > 1.5 * surface_metrics(moved, seen, samples=1_000_000)["completion_ratio"]

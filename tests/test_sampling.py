@@ -1,0 +1,181 @@
+"""Samples along rays: labels are geometry, and every ray has its turn."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from radarsdf import FitConfig
+from radarsdf.sampling import RaySampler
+from radarsdf.scans import prepare
+
+from .conftest import pose
+
+NUM_RAYS = 1000
+
+
+@pytest.fixture(scope="module")
+def rays():
+    rng = np.random.default_rng(0)
+    points = [rng.normal(size=(NUM_RAYS // 4, 3)) * [20, 20, 2] + 0.5 for _ in range(4)]
+    return prepare(points, np.stack([pose([10.0 * i, i, 1], 0.3 * i) for i in range(4)]))
+
+
+def sampler(rays, batch_size=256, seed=0, **settings):
+    config = FitConfig(**settings)
+    return RaySampler(rays, config, batch_size, torch.Generator().manual_seed(seed))
+
+
+def sensors_of(rays, samples):
+    index = samples.rays.numpy()
+    points = rays.points[index].astype(np.float64)
+    return points, points - rays.directions[index].astype(np.float64) * rays.ranges_m[index, None]
+
+
+DRAWS = {"batch": RaySampler.batch, "spread": lambda draw: draw.spread(256)}
+
+
+@pytest.mark.parametrize("kind", DRAWS)
+def test_labels_are_the_signed_distance_to_the_return(rays, kind):
+    samples = DRAWS[kind](sampler(rays, cross_range_noise_rad=0.0))
+    returns, sensors = sensors_of(rays, samples)
+    points, sdf_m = samples.points.numpy().astype(np.float64), samples.sdf_m.numpy()
+    np.testing.assert_allclose(np.linalg.norm(points - returns, axis=1), np.abs(sdf_m), atol=2e-5)
+    # Positive between sensor and return: the sample is nearer to the sensor by just so much.
+    to_sample, to_return = (np.linalg.norm(p - sensors, axis=1) for p in (points, returns))
+    np.testing.assert_allclose(to_return - to_sample, sdf_m, atol=2e-5)
+    assert (sdf_m > 0).any()
+    assert (sdf_m < 0).any()
+
+
+def test_ranges_of_the_samples(rays):
+    config = FitConfig(near_band_m=0.25, free_from=0.4, free_beyond_m=0.6)
+    draw = RaySampler(rays, config, 512, torch.Generator().manual_seed(0))
+    near, free, lowest_share = [], [], []
+    for _ in range(40):
+        samples = draw.batch()
+        range_m = torch.from_numpy(rays.ranges_m)[samples.rays][samples.num_near :]
+        near.append(samples.sdf_m[: samples.num_near])
+        from_sensor = range_m - samples.sdf_m[samples.num_near :]
+        free.append((from_sensor - 0.4 * range_m) / (0.6 * range_m + 0.6))
+        lowest_share.append((from_sensor / range_m).min())
+    # Uniform over the whole of each interval, and not beyond.
+    near, free = torch.cat(near) / 0.25, torch.cat(free)
+    assert -1 <= near.min() < -0.99
+    assert 0.99 < near.max() <= 1
+    assert -1e-5 <= free.min() < 0.01
+    assert 0.99 < free.max() <= 1 + 1e-5
+    assert abs(near.mean()) < 0.03
+    assert near.var().item() == pytest.approx(1 / 3, rel=0.05)
+    assert free.mean().item() == pytest.approx(0.5, abs=0.02)
+    assert free.var().item() == pytest.approx(1 / 12, rel=0.05)
+    assert min(lowest_share) >= 0.4 - 1e-5
+
+
+@pytest.mark.parametrize("batch_size", [100, 128, 1000])
+def test_each_ray_is_seen_equally_often(rays, batch_size):
+    draw = sampler(rays, batch_size, near_samples=1, free_samples=1)
+    seen = np.zeros((2, NUM_RAYS), int)
+    batches = 4 * NUM_RAYS * 2 // batch_size
+    for _ in range(batches):
+        samples = draw.batch()
+        for kind, part in enumerate((samples.rays[: samples.num_near], samples.rays[samples.num_near :])):
+            np.add.at(seen[kind], part.numpy(), 1)
+    assert seen.sum() == batches * batch_size
+    # Whole passes, and the begun one.
+    whole = batches * (batch_size // 2) // NUM_RAYS
+    assert set(np.unique(seen)) <= {whole, whole + 1}
+
+
+def test_spread_sees_each_ray_equally_often(rays):
+    draw = sampler(rays, 300)
+    seen = np.zeros(NUM_RAYS, int)
+    for _ in range(10):
+        samples = draw.spread(300)
+        assert samples.num_near == len(samples.points) == 300
+        assert samples.sdf_m.abs().max() <= FitConfig().near_band_m
+        np.add.at(seen, samples.rays.numpy(), 1)
+    assert (seen == 3).all()
+
+
+def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
+    samples = sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS)
+    index = samples.rays.numpy()
+    offset = samples.points.numpy() - rays.points[index]
+    along = (offset * rays.directions[index]).sum(axis=1)
+    across = offset - along[:, None] * rays.directions[index]
+    angle_rad = np.linalg.norm(across, axis=1) / rays.ranges_m[index]
+    assert np.sqrt((angle_rad**2).mean() / 2) == pytest.approx(0.02, rel=0.02)  # two axes across the beam
+
+
+def test_passes_take_the_rays_in_different_orders(rays):
+    draw = sampler(rays, NUM_RAYS, near_samples=1, free_samples=1)
+    first, second = draw.batch().rays[: NUM_RAYS // 2], draw.batch().rays[: NUM_RAYS // 2]
+    third = draw.batch().rays[: NUM_RAYS // 2]
+    assert set(first.tolist()).isdisjoint(second.tolist())
+    assert set(third.tolist()) not in (set(first.tolist()), set(second.tolist()))
+
+
+@pytest.mark.parametrize(
+    ("near_samples", "free_samples", "num_near"),
+    [(6, 6, 120), (6, 2, 180), (1, 5, 40), (3, 0, 240), (1, 500, 1)],
+)
+def test_shares_of_near_and_free_samples(rays, near_samples, free_samples, num_near):
+    samples = sampler(rays, 240, near_samples=near_samples, free_samples=free_samples).batch()
+    assert samples.num_near == num_near
+    assert samples.points.shape == (240, 3)
+    assert samples.points.dtype == samples.sdf_m.dtype == torch.float32
+    assert samples.rays.shape == samples.sdf_m.shape == (240,)
+    # No kind is drawn from a corner of the scene: rays come in the order of space, and each kind has their spread.
+    for part in (samples.rays[:num_near], samples.rays[num_near:]):
+        if len(part) >= 40:
+            x = rays.points[part.numpy(), 0]
+            assert np.ptp(x) > 0.6 * np.ptp(rays.points[:, 0])
+
+
+def test_the_rarer_kind_reaches_every_ray_in_the_long_run(rays):
+    draw = sampler(rays, 240, near_samples=5, free_samples=1)
+    free = torch.cat([(s := draw.batch()).rays[s.num_near :] for _ in range(400)])
+    assert len(torch.unique(free)) > 0.99 * NUM_RAYS
+
+
+def test_a_batch_larger_than_the_scene(rays):
+    few = rays.every(250, 0)
+    samples = sampler(few, 100, near_samples=1, free_samples=1).batch()
+    assert sorted(torch.bincount(samples.rays[:50], minlength=4).tolist()) == [12, 12, 13, 13]
+    assert len(sampler(few, 1).batch().points) == 1
+
+
+def test_the_generator_decides_alone(rays):
+    torch.manual_seed(0)
+    state = torch.get_rng_state()
+    one, two, other = sampler(rays), sampler(rays), sampler(rays, seed=1)
+    for kind in ("batch", "spread", "batch"):
+        a, b, c = (DRAWS[kind](s) for s in (one, two, other))
+        assert torch.equal(a.points, b.points)
+        assert torch.equal(a.rays, b.rays)
+        assert not torch.equal(a.points, c.points)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_memory_does_not_grow_with_the_samples(rays):
+    def bytes_held(draw):
+        draw.batch()
+        arrays = [v for v in vars(draw).values() if isinstance(v, (torch.Tensor, np.ndarray))]
+        return sum(a.nbytes for a in arrays)
+
+    few, many = (bytes_held(sampler(rays, near_samples=n, free_samples=n)) for n in (1, 1000))
+    assert few == many
+    assert many <= 64 * NUM_RAYS
+
+
+def test_neighbours_in_a_batch_are_neighbours_in_space(rays):
+    dense = dataclasses.replace(rays, points=rays.points * np.float32(0.1))
+    samples = sampler(dense, 512, near_samples=1, free_samples=1).spread(512)
+    steps = np.linalg.norm(np.diff(dense.points[samples.rays.numpy()], axis=0), axis=1)
+    shuffled = np.linalg.norm(
+        np.diff(dense.points[np.random.default_rng(0).permutation(NUM_RAYS)], axis=0), axis=1
+    )
+    assert np.median(steps) < 0.5 * np.median(shuffled)

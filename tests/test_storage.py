@@ -1,0 +1,299 @@
+"""A map's file: whole or not at all, and the same bits again."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pickle
+import stat
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig, storage
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+QUICK = FitConfig(sdf_iterations=60, intensity_iterations=8, batch_size=1024, min_component_triangles=0)
+SENSOR = np.array([0.5, 0.0, 1.5])
+
+
+def fitted(scene, *, with_intensity=True, **changes):
+    intensities = scene.intensities if with_intensity else None
+    config = dataclasses.replace(QUICK, **changes)
+    return radarsdf.fit(scene.points, scene.poses, intensities, config=config, progress=False)
+
+
+@pytest.fixture(scope="module")
+def saved(scene, tmp_path_factory):
+    """A map, its file, and the file's parts."""
+    radar_map = fitted(scene)
+    path = tmp_path_factory.mktemp("map") / "map.safetensors"
+    radar_map.save(path)
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        metadata = file.metadata()
+    return radar_map, path, tensors, metadata
+
+
+def write(path, tensors, metadata):
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path, metadata)
+    return path
+
+
+def with_description(metadata, change):
+    description = json.loads(metadata["description"])
+    change(description)
+    return metadata | {"description": json.dumps(description)}
+
+
+@pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
+@pytest.mark.parametrize("with_intensity", [True, False])
+def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity):
+    before = fitted(
+        scene,
+        with_intensity=with_intensity,
+        encoding=encoding,
+        normals=True,
+        geometry_feature_dim=4,
+        sdf_hidden=(16,),
+        num_levels=2,
+        max_range_m=70.0,
+    )
+    path = tmp_path / "map.safetensors"
+    before.save(path)
+    after = radarsdf.load(path)
+
+    x = np.random.default_rng(0).uniform([8, -5, -1], [20.5, 5, 2], (12_000, 3))
+    np.testing.assert_array_equal(after.sdf(x), before.sdf(x))
+    np.testing.assert_array_equal(after.gradient(x), before.gradient(x))
+    np.testing.assert_array_equal(after.observed(x), before.observed(x))
+    meshes = [m.mesh(0.2, viewpoint=SENSOR if with_intensity else None) for m in (before, after)]
+    assert len(meshes[0].faces) > 0
+    np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)
+    np.testing.assert_array_equal(meshes[0].faces, meshes[1].faces)
+    if with_intensity:
+        np.testing.assert_array_equal(after.intensity(x, SENSOR), before.intensity(x, SENSOR))
+        np.testing.assert_array_equal(*(m.vertex_attributes["intensity"] for m in meshes))
+
+    assert after.config == before.config
+    assert isinstance(after.config.sdf_hidden, tuple)
+    np.testing.assert_array_equal(after.origin, before.origin)
+    assert after.origin.dtype == np.float64
+    assert after.intensity_scale == before.intensity_scale
+    assert after.has_intensity == with_intensity
+    assert after.report == before.report
+    assert (after.nbytes, repr(after)) == (before.nbytes, repr(before))
+
+
+def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
+    _, path, _, _ = saved
+    copy = tmp_path / "map.safetensors"
+    copy.write_bytes(path.read_bytes())
+    radar_map = radarsdf.load(copy)
+    expected = radar_map.sdf(np.zeros((1, 3)))
+    copy.write_bytes(b"\0" * len(path.read_bytes()))
+    assert radar_map.sdf(np.zeros((1, 3))) == expected
+    assert not any(p.requires_grad for p in radar_map.field.parameters())
+
+
+def test_the_file_is_plain_safetensors_with_units(saved):
+    _, path, tensors, metadata = saved
+    assert metadata["format"] == "radarsdf.map"
+    assert metadata["format_version"] == "1"
+    assert "positive in free space" in metadata["units"]
+    assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
+    with path.open("rb") as file:
+        start = file.read(2)
+    assert start != pickle.PROTO + b"\x04"
+    assert start != b"PK"  # what torch.save writes: a zip of pickles
+
+
+def test_loading_unpickles_nothing(saved, monkeypatch):
+    def refuse(*_, **__):
+        pytest.fail("the loader unpickles")
+
+    monkeypatch.setattr(pickle, "load", refuse)
+    monkeypatch.setattr(pickle, "loads", refuse)
+    monkeypatch.setattr(torch, "load", refuse)
+    radarsdf.load(saved[1])
+
+
+@pytest.mark.parametrize("keep", [0, 1, 7, 8, 9, 500, 0.5, 0.99, -1])
+def test_truncated_files(saved, tmp_path, keep):
+    data = saved[1].read_bytes()
+    path = tmp_path / "cut.safetensors"
+    path.write_bytes(data[: int(len(data) * keep) if isinstance(keep, float) else keep])
+    with pytest.raises(ValueError, match=r"cut\.safetensors is not a whole radarsdf map"):
+        radarsdf.load(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"\xff" * 64, b"PK\x03\x04" + b"\0" * 60, b"ply\nformat ascii 1.0\n", b"\x80\x04N."]
+)
+def test_garbage(tmp_path, content):
+    path = tmp_path / "garbage.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"garbage\.safetensors is not a whole radarsdf map"):
+        radarsdf.load(path)
+
+
+def test_files_of_other_programs(tmp_path):
+    for metadata in (None, {"format": "pt"}, {"format": "radarsdf.mesh", "format_version": "1"}):
+        save_file({"weight": torch.zeros(3)}, tmp_path / "other.safetensors", metadata)
+        with pytest.raises(ValueError, match="is not a radarsdf map"):
+            radarsdf.load(tmp_path / "other.safetensors")
+
+
+@pytest.mark.parametrize("version", ["2", "10", "", "1.5", "-1", "one"])
+def test_other_versions(saved, tmp_path, version):
+    _, _, tensors, metadata = saved
+    path = write(tmp_path / "new.safetensors", tensors, metadata | {"format_version": version})
+    with pytest.raises(ValueError, match="format version"):
+        radarsdf.load(path)
+
+
+def test_files_that_are_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        radarsdf.load(tmp_path / "nothing.safetensors")
+    with pytest.raises(OSError, match=str(tmp_path)):
+        radarsdf.load(tmp_path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["field.cells.features", "field.sdf_network.layers.0.weight", "origin"])
+def test_values_that_are_not_finite(saved, tmp_path, name, value):
+    _, _, tensors, metadata = saved
+    damaged = tensors[name].clone()
+    damaged.view(-1)[-1] = value
+    path = write(tmp_path / "nan.safetensors", tensors | {name: damaged}, metadata)
+    with pytest.raises(ValueError, match="finite"):
+        radarsdf.load(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["field.cells.features", "field.sdf_network.layers.2.bias", "origin", "leaf_keys"]
+)
+@pytest.mark.parametrize("fault", ["missing", "longer", "flat", "half"])
+def test_tensors_that_do_not_fit(saved, tmp_path, name, fault):
+    _, _, tensors, metadata = saved
+    changed = dict(tensors)
+    match fault:
+        case "missing":
+            del changed[name]
+        case "longer":
+            changed[name] = torch.cat([tensors[name], tensors[name][-1:]])
+        case "flat":
+            changed[name] = tensors[name].reshape(1, -1)
+        case "half":
+            changed[name] = tensors[name].half()
+    with pytest.raises(ValueError, match=r"."):
+        radarsdf.load(write(tmp_path / "bad.safetensors", changed, metadata))
+
+
+def test_a_tensor_too_many(saved, tmp_path):
+    _, _, tensors, metadata = saved
+    path = write(tmp_path / "more.safetensors", tensors | {"field.extra": torch.zeros(2)}, metadata)
+    with pytest.raises(ValueError, match="extra"):
+        radarsdf.load(path)
+
+
+@pytest.mark.parametrize("keys", [[5, 5], [7, 5], [-1, 3], [2**62]])
+def test_cells_that_cannot_be(saved, tmp_path, keys):
+    _, _, tensors, metadata = saved
+    path = write(tmp_path / "keys.safetensors", tensors | {"leaf_keys": torch.tensor(keys)}, metadata)
+    with pytest.raises(ValueError, match=r"."):
+        radarsdf.load(path)
+
+
+DAMAGE = {
+    "unknown setting": lambda d: d["config"].update(colour="red"),
+    "setting out of range": lambda d: d["config"].update(leaf_size_m=-0.2),
+    "setting of another type": lambda d: d["config"].update(batch_size="many"),
+    "fractional count": lambda d: d["config"].update(num_levels=2.5),
+    "number beyond floats": lambda d: d["config"].update(sigma_m=10**400),
+    "other levels": lambda d: d["config"].update(num_levels=5),
+    "other width": lambda d: d["config"].update(sdf_hidden=[33, 32]),
+    "no config": lambda d: d.pop("config"),
+    "config a list": lambda d: d.update(config=[1, 2]),
+    "no report": lambda d: d.pop("report"),
+    "report a number": lambda d: d.update(report=3),
+    "no scale": lambda d: d.pop("intensity_scale"),
+    "scale of one number": lambda d: d.update(intensity_scale=[1.0]),
+    "scale a word": lambda d: d.update(intensity_scale=["low", "high"]),
+    "scale not a number": lambda d: d.update(intensity_scale=[float("nan"), 1.0]),
+    "scale upside down": lambda d: d.update(intensity_scale=[2.0, 1.0]),
+    "scale beyond floats": lambda d: d.update(intensity_scale=[10**400, 1]),
+    "intensity without weights": lambda d: d.update(intensity_scale=None),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_descriptions_that_do_not_fit(saved, tmp_path, damage):
+    _, _, tensors, metadata = saved
+    path = write(tmp_path / "bad.safetensors", tensors, with_description(metadata, DAMAGE[damage]))
+    with pytest.raises(ValueError, match=r"."):
+        radarsdf.load(path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", "[" * 100_000])
+def test_descriptions_that_are_none(saved, tmp_path, text):
+    _, _, tensors, metadata = saved
+    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+        radarsdf.load(write(tmp_path / "bad.safetensors", tensors, metadata | {"description": text}))
+    without = {k: v for k, v in metadata.items() if k != "description"}
+    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+        radarsdf.load(write(tmp_path / "none.safetensors", tensors, without))
+
+
+@pytest.mark.parametrize("failing", ["fsync", "replace"])
+def test_a_failing_save_leaves_the_old_file_and_nothing_else(saved, tmp_path, monkeypatch, failing):
+    radar_map = saved[0]
+    path = tmp_path / "map.safetensors"
+    path.write_bytes(b"the old map")
+
+    def fail(*_):
+        msg = "no space left on device"
+        raise OSError(msg)
+
+    if failing == "fsync":
+        monkeypatch.setattr(os, "fsync", fail)
+    else:
+        monkeypatch.setattr(storage.Path, "replace", fail)
+    with pytest.raises(OSError, match="no space left"):
+        radar_map.save(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["map.safetensors"]
+    assert path.read_bytes() == b"the old map"
+
+
+def test_saving_where_nothing_can_be_written(saved, tmp_path):
+    radar_map = saved[0]
+    with pytest.raises(OSError, match="absent"):
+        radar_map.save(tmp_path / "absent" / "map.safetensors")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        radar_map.save(tmp_path / "folder")
+    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+    assert not list((tmp_path / "folder").iterdir())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX permissions")
+def test_a_saved_map_has_the_permissions_of_any_new_file(saved, tmp_path):
+    before = os.umask(0o027)
+    try:
+        saved[0].save(tmp_path / "map.safetensors")
+        (tmp_path / "other").write_bytes(b"")
+    finally:
+        os.umask(before)
+    modes = [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("map.safetensors", "other")]
+    assert modes == [0o640, 0o640]
+
+
+def test_saving_overwrites_and_takes_strings(saved, tmp_path):
+    path = str(tmp_path / "map.safetensors")
+    for _ in range(2):
+        saved[0].save(path)
+    assert os.listdir(tmp_path) == ["map.safetensors"]  # noqa: PTH208 - a string is the point
+    assert repr(radarsdf.load(path)) == repr(saved[0])

@@ -1,0 +1,177 @@
+"""Worker threads: PyTorch's settings come back, order stays, and fits beside each other do not mix."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
+from radarsdf.threads import Workers, resolve_num_threads
+
+QUICK = FitConfig(sdf_iterations=20, intensity_iterations=20, batch_size=1024, num_threads=2)
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    """As if there were two processors, whatever there is; and a test that fails must not spoil the next."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_torch_has_one_thread_inside_and_its_own_number_after():
+    with Workers(3) as workers:
+        assert torch.get_num_threads() == 1
+        assert set(workers.map(lambda _: torch.get_num_threads(), range(8))) == {1}
+    assert torch.get_num_threads() == 2
+
+
+def test_an_error_in_the_block_restores_too():
+    with pytest.raises(KeyError), Workers(2):
+        raise KeyError
+    assert torch.get_num_threads() == 2
+
+
+def test_an_error_on_a_worker_arrives_and_restores():
+    def fail(item):
+        if item == 5:
+            msg = "item 5"
+            raise LookupError(msg)
+        return item
+
+    for threads in (1, 2):
+        with Workers(threads) as workers, pytest.raises(LookupError, match="item 5"):
+            list(workers.map(fail, range(100)))
+        assert torch.get_num_threads() == 2
+
+
+def test_blocks_nest():
+    with Workers(2):
+        with Workers() as inner:
+            assert inner.num_threads == 2  # not the 1 that the outer block has set
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 2
+    with pytest.raises(KeyError), Workers(2), Workers(2):
+        raise KeyError
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize("first_in_is_first_out", [True, False])
+def test_blocks_of_several_threads(first_in_is_first_out):
+    entered, leave = threading.Event(), threading.Event()
+    seen = {}
+
+    def other():
+        torch.set_num_threads(2)
+        with Workers(0) as workers:
+            seen["workers"] = workers.num_threads
+            entered.set()
+            leave.wait(10)
+            seen["inside"] = torch.get_num_threads()
+        seen["after"] = torch.get_num_threads()
+
+    thread = threading.Thread(target=other)
+    try:
+        with Workers(2):
+            thread.start()
+            assert entered.wait(10)
+            if not first_in_is_first_out:
+                leave.set()
+                thread.join()
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2
+    finally:
+        leave.set()
+        thread.join()
+    assert seen == {"workers": 2, "inside": 1, "after": 2}
+    # PyTorch's number is each thread's own: it must be back in all of them.
+    assert torch.get_num_threads() == 2
+    fresh = []
+    thread = threading.Thread(target=lambda: fresh.append(torch.get_num_threads()))
+    thread.start()
+    thread.join()
+    assert fresh == [2]
+
+
+def test_a_thread_that_first_meets_torch_inside_a_block():
+    # A thread takes over the number that was set last, here the block's 1; its own blocks must not believe it.
+    found = []
+
+    def newcomer():
+        found.append(Workers().num_threads)
+
+    with Workers(2):
+        thread = threading.Thread(target=newcomer)
+        thread.start()
+        thread.join()
+    assert found == [2]
+
+
+def test_many_blocks_at_once():
+    def work():
+        for _ in range(30):
+            with Workers(2) as workers:
+                assert list(workers.map(abs, [-1, -2, -3])) == [1, 2, 3]
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize("num_threads", [1, 2, 5])
+def test_results_keep_the_order_of_the_items(num_threads):
+    def late_first(item):
+        time.sleep(0.01 * (5 - item))
+        return item, threading.current_thread().name
+
+    with Workers(num_threads) as workers:
+        results = list(workers.map(late_first, range(5)))
+        assert list(workers.map(str, [])) == []
+        assert list(workers.map(str, [7])) == ["7"]
+    assert [item for item, _ in results] == list(range(5))
+    assert len({name for _, name in results}) == num_threads
+
+
+def test_grad_mode_is_each_threads_own():
+    with torch.no_grad(), Workers(2) as workers:
+        assert list(workers.map(lambda _: torch.is_grad_enabled(), range(2))) == [True, True]
+
+
+def test_zero_threads_are_as_many_as_torch_has():
+    assert resolve_num_threads(0) == 2
+    assert resolve_num_threads(7) == 7
+    with Workers(5):
+        assert resolve_num_threads(0) == 2
+
+
+def fitted(scene, seed):
+    config = FitConfig(**(QUICK.to_dict() | {"seed": seed}))
+    return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+
+
+def test_fits_at_once_give_the_bits_of_fits_in_turn(scene):
+    in_turn = [fitted(scene, seed) for seed in (0, 1)]
+    at_once = [None, None]
+    start = threading.Barrier(2)
+
+    def work(seed):
+        start.wait()
+        at_once[seed] = fitted(scene, seed)
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for one, other in zip(in_turn, at_once, strict=True):
+        for name, value in one.field.state_dict().items():
+            assert torch.equal(value, other.field.state_dict()[name]), name
+    assert torch.get_num_threads() == 2
