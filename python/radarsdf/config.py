@@ -12,31 +12,21 @@ MAX_FREQUENCIES = 24
 MAX_THREADS = 1024
 
 
-_KINDS: dict[str, tuple[type, ...]] = {
-    "bool": (bool,),
-    "int": (int,),
-    "float": (int, float),
-    "tuple[int, ...]": (int,),
-}
-
-
-def _check_type(name: str, value: Any, annotation: str) -> None:
+def _has_type(value: Any, annotation: str) -> bool:
     """Settings come from the command line and from files, and a word for a number should not surface in a kernel."""
-    annotation, _, optional = annotation.partition(" | ")
-    if annotation not in _KINDS or (optional and value is None):
-        return
-    kinds = _KINDS[annotation]
-    items = value if annotation.startswith("tuple") and isinstance(value, tuple) else (value,)
-    right = isinstance(value, tuple) == annotation.startswith("tuple") and all(
-        # True is an int to Python; and 10^400 one that no float holds.
-        isinstance(item, kinds)
-        and isinstance(item, bool) == (kinds == (bool,))
-        and not 2**1023 < item < math.inf
-        for item in items
-    )
-    if not right:
-        msg = f"{name} must be {annotation}{optional and ' or None'}, not {value!r:.50}"
-        raise ValueError(msg)
+    if annotation.endswith(" | None"):
+        return value is None or _has_type(value, annotation.removesuffix(" | None"))
+    match annotation:
+        case "bool":
+            return isinstance(value, bool)
+        case "int":
+            return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
+        case "float":
+            return isinstance(value, float) or _has_type(value, "int")
+        case "tuple[int, ...]":
+            return isinstance(value, tuple) and all(_has_type(item, "int") for item in value)
+        case _:
+            return True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +151,9 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            _check_type(field.name, getattr(self, field.name), str(field.type))
+            if not _has_type(value := getattr(self, field.name), str(field.type)):
+                msg = f"{field.name} must be {field.type}, not {value!r:.50}"
+                raise ValueError(msg)
         positive = {
             "leaf_size_m": self.leaf_size_m,
             "feature_std": self.feature_std,

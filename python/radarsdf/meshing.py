@@ -123,18 +123,19 @@ def _corner_distances(
     field = radar_map.field
     corner_points = corners.astype(np.float32) * np.float32(voxel_size)
     points = corner_points.copy()
+    outside = ~evaluate(field.cells.occupied, torch.from_numpy(points)).numpy()
     for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
-        outside = ~evaluate(field.cells.occupied, torch.from_numpy(points)).numpy()
         voxel, corner = np.nonzero(outside[voxel_corners])
-        if len(voxel) == 0:
-            break
         moved = voxel_corners[voxel, corner]  # a corner of several voxels several times: the last one counts
         centres = (voxels[voxel].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
         points[moved] = corner_points[moved] + np.float32(share) * (centres - corner_points[moved])
-    values = evaluate(
+        outside[moved] = ~evaluate(field.cells.occupied, torch.from_numpy(points[moved])).numpy()
+    way_m = np.linalg.norm(points - corner_points, axis=1).astype(np.float32)
+    values: NDArray[np.float32] = evaluate(
         radar_map.local_sdf, torch.from_numpy(points), description="mesh", progress=progress
     ).numpy()
-    return values + np.sign(values) * np.linalg.norm(points - corner_points, axis=1)
+    values += np.copysign(way_m, values)
+    return values
 
 
 def _without_small_components(
