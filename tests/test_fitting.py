@@ -129,6 +129,23 @@ def test_frozen_geometry_does_not_move(scene):
     assert not torch.equal(*weights)
 
 
+def test_each_stage_of_the_schedule_begins_at_the_full_rate(scene):
+    # A joint fit's second stage once inherited the rate that the first had let fall to nothing.
+    config = dataclasses.replace(QUICK, joint=True, intensity_iterations=20)
+    after_first, after_second = (
+        radarsdf.fit(
+            scene.points,
+            scene.poses,
+            scene.intensities,
+            config=dataclasses.replace(config, intensity_iterations=n),
+        )
+        .field.intensity_network.layers[0]
+        .weight
+        for n in (20, 40)
+    )
+    assert (after_second - after_first).abs().max() > config.intensity_learning_rate
+
+
 class TestBadInput:
     """One clear ValueError each, before any work."""
 
@@ -201,7 +218,8 @@ class TestBadInput:
             ("near_samples", 0),
             ("free_from", 1.0),
         ]
-        + [("encoding", "tree"), ("sdf_hidden", ()), ("batch_size", -1), ("max_range_m", 1.0)],
+        + [("encoding", "tree"), ("sdf_hidden", ()), ("batch_size", -1), ("max_range_m", 1.0)]
+        + [("seed", -1), ("seed", 2**60)],
     )
     def test_settings_that_make_no_sense(self, name, value):
         with pytest.raises(ValueError, match=r"."):

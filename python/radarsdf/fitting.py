@@ -91,6 +91,7 @@ def fit(
         training.run(progress)
         clock.lap("training_s")
     field.requires_grad_(False)
+    field.zero_grad(set_to_none=True)  # the last gradient is as large as the map
     report = {
         "returns": sum(len(np.asarray(scan)) for scan in points),
         "returns_used": len(rays),
@@ -221,10 +222,8 @@ class _Training:
             unit="it",
             disable=None if progress is None else not progress,
         ) as bar:
-            geometry = _adam(
-                [*field.cells.parameters(), *field.sdf_network.parameters()], config.learning_rate, config
-            )
-            adams = [geometry]
+            geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
+            adams = [_adam(geometry, config.learning_rate, config)]
             if reflectance is not None:
                 reflectance_adam = _adam(reflectance.parameters(), config.intensity_learning_rate, config)
                 if joint:
@@ -245,7 +244,6 @@ class _Training:
         bar: Any,
     ) -> None:
         parameters = [p for adam in adams for group in adam.param_groups for p in group["params"]]
-        rates = [adam.param_groups[0]["lr"] for adam in adams]
 
         def loss_and_gradients(shard: _Shard) -> tuple[Tensor, tuple[Tensor, ...]]:
             loss = loss_of(shard) / len(self._shards)
@@ -253,8 +251,12 @@ class _Training:
 
         for i in range(iterations):
             if self._config.cosine_schedule:
-                for adam, rate in zip(adams, rates, strict=True):
-                    adam.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * i / iterations))
+                for (
+                    adam
+                ) in adams:  # from the full rate on in each stage, also for one that has been through another
+                    adam.param_groups[0]["lr"] = (
+                        adam.defaults["lr"] * 0.5 * (1 + math.cos(math.pi * i / iterations))
+                    )
             losses, gradients = zip(*self._workers.map(loss_and_gradients, self._shards), strict=True)
             for parameter, *parts in zip(parameters, *gradients, strict=True):
                 parameter.grad = functools.reduce(Tensor.add_, parts)
