@@ -137,5 +137,8 @@ def test_training_step(benchmark, batch_size):
 
     with Workers(1):
         before = step()
-        after = benchmark.pedantic(step, rounds=100, warmup_rounds=5)
+        benchmark.pedantic(step, rounds=100, warmup_rounds=5)
+        after = [step() for _ in range(60)][
+            -1
+        ]  # enough to learn something where nothing is timed and there is one round
     assert after < 0.8 * before
