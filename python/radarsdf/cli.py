@@ -190,6 +190,9 @@ def _mesh(options: argparse.Namespace) -> None:
     mesh = radar_map.mesh(
         options.voxel, box=_box(options), viewpoint=options.viewpoint, progress=_progress(options)
     )
+    if len(mesh.faces) == 0:
+        msg = f"{options.map} has no surface here: nothing written"
+        raise ValueError(msg)
     mesh.export(options.out)
     print(f"{len(mesh.vertices)} vertices and {len(mesh.faces)} triangles written to {options.out}")
     if options.picture:

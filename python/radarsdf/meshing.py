@@ -58,9 +58,7 @@ def extract_mesh(
     if not (math.isfinite(voxel_size) and voxel_size > 0):
         msg = f"voxel_size must be positive and finite, not {voxel_size}"
         raise ValueError(msg)
-    if viewpoint is not None and not radar_map.has_intensity:
-        msg = "a viewpoint needs a map with intensities, and this one was fitted without"
-        raise ValueError(msg)
+    sensor_position = None if viewpoint is None else _check_viewpoint(radar_map, viewpoint)
     voxels = _occupied_voxels(radar_map, voxel_size)
     if box is not None:
         lower, upper = _check_box(box) - radar_map.origin
@@ -74,14 +72,25 @@ def extract_mesh(
     )
     vertices, faces = _without_small_components(vertices, faces, radar_map.config.min_component_triangles)
     mesh = trimesh.Trimesh(vertices + radar_map.origin, faces, process=False)
-    if viewpoint is not None:
-        intensity = _viewed_intensity(radar_map, np.asarray(mesh.vertices), viewpoint)
+    if sensor_position is not None:
+        intensity = radar_map.intensity(np.asarray(mesh.vertices), sensor_position).astype(np.float32)
         mesh.vertex_attributes["intensity"] = intensity
         scale = radar_map.intensity_scale
         assert scale is not None
         colors = intensity_colors(intensity, scale.low, scale.high)
         mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
     return mesh
+
+
+def _check_viewpoint(radar_map: RadarMap, viewpoint: ArrayLike) -> NDArray[np.float64]:
+    if not radar_map.has_intensity:
+        msg = "a viewpoint needs a map with intensities, and this one was fitted without"
+        raise ValueError(msg)
+    sensor_position = np.asarray(viewpoint, np.float64)
+    if sensor_position.shape != (3,) or not np.isfinite(sensor_position).all():
+        msg = "viewpoint must be one position (3,)"
+        raise ValueError(msg)
+    return sensor_position
 
 
 def _check_box(box: ArrayLike) -> NDArray[np.float64]:
@@ -147,13 +156,3 @@ def _without_small_components(
     used[faces] = True
     renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
     return vertices[used], renumbered[faces]
-
-
-def _viewed_intensity(
-    radar_map: RadarMap, vertices: NDArray[np.float64], viewpoint: ArrayLike
-) -> NDArray[np.float32]:
-    sensor_position = np.asarray(viewpoint, np.float64)
-    if sensor_position.shape != (3,) or not np.isfinite(sensor_position).all():
-        msg = "viewpoint must be one position (3,)"
-        raise ValueError(msg)
-    return radar_map.intensity(vertices, sensor_position).astype(np.float32)
