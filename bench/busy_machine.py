@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """How much a busy process beside it slows a fit down: `python bench/busy_machine.py`.
 
 Each row is a fit in a fresh process, once alone and once beside a process that keeps one core busy. Its fair share of

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Data that several benches share: made once, fixed by seeds, realistic in how memory is hit."""
 
 from __future__ import annotations

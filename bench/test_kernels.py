@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The kernels of encoding and training against the same computation in plain PyTorch.
 
 Each case asserts a checksum from NumPy in double precision, so that a wrong answer cannot win. Ratios within a group

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Marching cubes against its peers on the same float32 samples, one thread unless the case says otherwise.
 
 Each case checks the number of triangles or the area of its mesh, so that a wrong answer cannot win. The peers keep

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Scenes that several tests share: small, analytic, made once."""
 
 from __future__ import annotations

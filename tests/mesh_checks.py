@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Fields with known level sets, and what can be measured on a mesh."""
 
 import itertools

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The command line, in process but for one call: what it writes, prints and refuses."""
 
 from __future__ import annotations

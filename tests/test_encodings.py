@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The encodings as modules: what each block of numbers is, and where features are and are not."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """A fit finds the surface and the intensities of an analytic scene, says no to bad input, and repeats itself."""
 
 from __future__ import annotations

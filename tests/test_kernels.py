@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The compiled kernels against plain references, their gradients, and what they promise about bits and threads."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """A map answers in kind, in any chunks and from any thread."""
 
 from __future__ import annotations

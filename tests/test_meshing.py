@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Meshes of the plane z = 0 and the wall x = 20: where they are, which way they face, and where they end."""
 
 from __future__ import annotations

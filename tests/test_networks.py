@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The networks' inputs and outputs, and which parameters which loss may reach."""
 
 from __future__ import annotations

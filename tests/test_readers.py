@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Scan files: what is read, what is left out, and what is refused."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The whole job on scans of a real automotive radar, where they are at hand; their licence keeps them out of here."""
 
 from __future__ import annotations

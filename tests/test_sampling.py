@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Samples along rays: labels are geometry, and every ray has its turn."""
 
 from __future__ import annotations

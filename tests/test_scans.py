@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Preparation: from sensor frames to rays of one local frame."""
 
 from __future__ import annotations

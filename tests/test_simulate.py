@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The simulator against its own claims: exact geometry, the radar equation, and labels that tell the truth."""
 
 from __future__ import annotations

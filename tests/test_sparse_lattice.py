@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The lattice of a set of cells, and the checks of what is extracted from it."""
 
 import itertools

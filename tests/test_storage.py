@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """A map's file: whole or not at all, and the same bits again."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Worker threads: PyTorch's settings come back, order stays, and fits beside each other do not mix."""
 
 from __future__ import annotations

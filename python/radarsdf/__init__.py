@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """From 3D radar scans with known poses to a surface and a reflectance map, on a CPU."""
 
 import importlib

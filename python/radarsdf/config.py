@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Every choice of a fit, with its unit and its source."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Encodings of positions and directions as modules: what the networks see instead of coordinates."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The learnt field: encodings and networks together, in the local frame and in scaled intensities."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """From scans with poses to a map: the training loop."""
 
 from __future__ import annotations

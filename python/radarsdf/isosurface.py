@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Triangle meshes of the level sets of sampled fields.
 
 All functions here give results that do not depend on the number of threads. Lattice corners, wherever eight of

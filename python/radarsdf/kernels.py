@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Autograd functions over the compiled core.
 
 Each is a :class:`torch.autograd.Function` rather than a ``torch.library`` operator: measured at 16, 1024 and 8192

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """The map that a fit gives: signed distance, gradient, intensity, mesh, and its file."""
 
 from __future__ import annotations

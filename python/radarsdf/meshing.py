@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """From a map to triangles: where to look for the surface, its vertices, and what they carry."""
 
 from __future__ import annotations

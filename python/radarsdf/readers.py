@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Scans from files. One function a format; all return :class:`Scans`."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Samples along rays with their labels, drawn as they are needed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Radar scans as a fit needs them: checked, in one local frame, as rays."""
 
 from __future__ import annotations

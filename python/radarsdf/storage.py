@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """One safetensors file with everything that a map is: cells, features, weights, origin, units, configuration."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Threads that each run whole pieces of work, with PyTorch's own threads off.
 
 PyTorch splits every single operation over OpenMP's threads, which spin while they wait for each other. Beside another

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Radar scans of made-up worlds whose true surface is known.
 
 `SCENES` has the ready-made ones by name; `simulate` scans a `Scene` of your own with a `RadarSensor`.

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """What a surface does to a radar wave: how much comes back, from which angles, and how much it flickers."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Solids that a ray can hit exactly: boxes, vertical cylinders and trihedral corner reflectors.
 
 World frame: z up, metres. Signed distances are positive in free space, negative inside a solid.

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """A radar that obeys the radar equation: noisy in angle, blind below its threshold, fooled by mirrors."""
 
 from __future__ import annotations

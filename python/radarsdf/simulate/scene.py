@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """A world of ground and solids: exact ray hits, exact distances, and the echo of every hit."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Drive a radar through a scene, and a lidar after it for the truth."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Building site: puts houses, walls, cars and poles on the ground where there is still room."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Ground as a smooth height field made of a few plane waves: rays, normals and distances come from one formula."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Smooth poses along a path: a vehicle that pitches, rolls and bounces a little."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
 """Three worlds, each a function of a seed: a lane among buildings, a sports court, a reflector on a wall."""
 
 from __future__ import annotations
