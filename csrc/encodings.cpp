@@ -15,34 +15,19 @@ namespace {
 // A thread is woken for about 50 us of work: waking one costs a few.
 constexpr std::int64_t kMinPoints = 512;
 
-template <typename T>
-const InterpolationKernels<T>& kernels_for(const VertexTable& table) {
+// The copy of a kernel for the instruction set in use. A macro, since the copies are one name in three namespaces.
 #ifdef RADARSDF_X86_VARIANTS
-  switch (instruction_set()) {
-    case InstructionSet::kAvx512:
-      return avx512::interpolation_kernels<T>(table.encoding());
-    case InstructionSet::kAvx2:
-      return avx2::interpolation_kernels<T>(table.encoding());
-    default:
-      break;
-  }
+#define RADARSDF_KERNEL(name)                                  \
+  (instruction_set() == InstructionSet::kAvx512 ? avx512::name \
+   : instruction_set() == InstructionSet::kAvx2 ? avx2::name   \
+                                                : baseline::name)
+#else
+#define RADARSDF_KERNEL(name) baseline::name
 #endif
-  return baseline::interpolation_kernels<T>(table.encoding());
-}
 
 template <typename T>
-FourierKernel<T> fourier_kernel() {
-#ifdef RADARSDF_X86_VARIANTS
-  switch (instruction_set()) {
-    case InstructionSet::kAvx512:
-      return avx512::fourier_kernel<T>();
-    case InstructionSet::kAvx2:
-      return avx2::fourier_kernel<T>();
-    default:
-      break;
-  }
-#endif
-  return baseline::fourier_kernel<T>();
+const InterpolationKernels<T>& kernels_for(const VertexTable& table) {
+  return RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
 }
 
 template <typename T>
@@ -113,7 +98,7 @@ void coordinate_gradient(const VertexTable& table, const T* features, const Poin
 template <typename T>
 void fourier(const T* points, std::int64_t count, double half_width_m, int first_frequency, int num_frequencies, T* out,
              std::int64_t stride, int num_threads) {
-  const FourierKernel<T> kernel = fourier_kernel<T>();
+  const FourierKernel<T> kernel = RADARSDF_KERNEL(fourier_kernel<T>)();
   parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
     kernel.encode(points, static_cast<T>(1.0 / half_width_m), first_frequency, num_frequencies, out, stride, begin,
                   end);

@@ -130,7 +130,10 @@ class RadarMap:
     @overload
     def gradient(self, x: ArrayLike) -> NDArray[Any]: ...
     def gradient(self, x: Any) -> Any:
-        """Gradient of the signed distance at x (N, 3), world, m: (N, 3), towards free space, about unit length."""
+        """Gradient of :meth:`sdf` at x (N, 3), world, m: (N, 3), towards free space.
+
+        Of about unit length where rays met the surface head on, longer where they grazed it.
+        """
         points, answer = self._local(x)
 
         def gradient(chunk: Tensor) -> Tensor:

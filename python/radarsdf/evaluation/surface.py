@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from radarsdf._core import cell_keys
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -276,12 +278,7 @@ def _sample_blocks(
 def _morton_order(points: _Points) -> NDArray[np.intp]:
     """Order points along a curve that keeps neighbours together (ten bits an axis, interleaved)."""
     low, extent = points.min(axis=0), np.ptp(points, axis=0).max()
-    cells = ((points - low) * (1023.0 / extent if extent > 0 else 0.0)).astype(np.int64)
-    code = np.zeros(len(points), dtype=np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    return np.argsort(cell_keys(points - low, max(float(extent), 1e-9) / 1023), kind="stable")
 
 
 def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -> None:
