@@ -17,6 +17,8 @@ from radarsdf.scans import prepare
 from radarsdf.simulate import SCENES, Simulation
 from scipy.spatial import cKDTree
 
+from .folders import is_posed_folder, is_snail_radar, read_posed_folder, read_snail_radar
+
 SEEN_BY_RADAR_M = 1.0
 """Lidar sees all round: a lidar point further than this from every return says nothing about a radar map."""
 
@@ -115,7 +117,11 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
 
         - the name of a simulated scene, of `radarsdf.simulate.SCENES`;
         - an ``.npz`` file as :func:`radarsdf.readers.read_scans` reads it: only static returns are used, and of the
-          lidar points those within 1 m of a return that is 2.5 to 60 m from its sensor.
+          lidar points those within 1 m of a return that is 2.5 to 60 m from its sensor;
+        - a folder as :func:`.folders.read_posed_folder` reads it: recordings of Viking Hill, exported from ROS bags;
+        - a sequence of SNAIL-Radar as :func:`.folders.read_snail_radar` reads it.
+
+        The ground truth of a folder is all of it: `box` is for cutting it.
     frames : int, optional
         How many: a simulated scene has so many along its whole path, a recorded one the first so many.
     seed : int
@@ -138,10 +144,16 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
         scene = _simulated(SCENES[spec](seed=seed, frames=frames))
     elif Path(spec).is_file() and Path(spec).suffix == ".npz":
         scene = _file(Path(spec), frames)
+    elif is_snail_radar(Path(spec)):
+        scene = _recorded(Path(spec).resolve().name, read_snail_radar(Path(spec), frames), frames)
+        scene = dataclasses.replace(scene, min_range_m=_MIN_RANGE_OCULII_M)
+    elif is_posed_folder(Path(spec)):
+        scene = _recorded(Path(spec).resolve().name, read_posed_folder(Path(spec), frames), frames)
     else:
         msg = (
-            f"no scene {spec!r}: expected a simulated scene ({', '.join(sorted(SCENES))}) "
-            "or an .npz file of scans"
+            f"no scene {spec!r}: expected a simulated scene ({', '.join(sorted(SCENES))}), an .npz file of scans, "
+            "a folder with radar/*.pcd and poses.txt (ROS bags, such as Viking Hill's, must be exported to one) or "
+            "a sequence of SNAIL-Radar with eagleg7/enhanced/*.pcd and utm50r_T_xt32.txt"
         )
         raise ValueError(msg)
     return scene if box is None else dataclasses.replace(scene, box=_corners(box))

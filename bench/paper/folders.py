@@ -1,0 +1,293 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans from folders: a plain one with poses, and a sequence of SNAIL-Radar.
+
+Frames: every sensor's points are in its own frame, in metres. `T_a_b` takes points of frame b to frame a, and so does a
+file `a_T_b.txt`. Nothing is levelled, shifted or turned beyond that: a world in UTM stays in UTM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from radarsdf._core import cell_keys
+from radarsdf.readers import Scans
+from radarsdf.scans import check_poses
+
+from .pcd import read_pcd
+from .trajectory import Trajectory, read_table, read_trajectory
+
+MAX_GAP_S = 0.5
+"""Over a longer time without a pose, no pose is made up."""
+
+INTENSITY_FIELDS = ("power", "Power", "intensity", "rcs")
+"""The first of these fields that the scans have is the intensity: Hugin radars call it power, Oculii ones Power."""
+
+# The calibration of SNAIL-Radar's rig, for sequences that bring no files of their own. The body's axes point forward,
+# left and up; its origin is the lidar's. Source: matlab/Body_T_Xt32.m and Body_T_Oculii.m ("refined"), multiplied out,
+# of github.com/snail-radar/dataset_tools, commit 2f82c2c; the same as in its python/view_radar_lidar.py.
+_BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+_BODY_T_OCULII = np.array(
+    [
+        [0.999756831, 0.020010494, -0.009265982, 0.07],
+        [-0.019750133, 0.999429818, 0.027385610, 0.0],
+        [0.009808698, -0.027195946, 0.999581997, -0.115],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+_LIDAR_RANGE_M = (1.0, 60.0)  # nearer is the platform and who carries it, further is out of the radar's reach
+_LIDAR_CELL_M = (
+    0.05  # one lidar point a cell: otherwise most would lie on the ground where the platform stood
+)
+_LIDAR_BATCH = 50  # scans between two thinnings, which bounds the memory
+_MAX_SWEEP_S = 1.0  # a point's time further than this from its scan's is in another clock
+
+
+def is_snail_radar(folder: Path) -> bool:
+    """Whether the folder is a sequence of SNAIL-Radar with clouds of its Oculii radar."""
+    return (folder / "eagleg7" / "enhanced").is_dir()
+
+
+def is_posed_folder(folder: Path) -> bool:
+    """Whether the folder is one that :func:`read_posed_folder` reads."""
+    return (folder / "radar").is_dir() and (folder / "poses.txt").is_file()
+
+
+def read_posed_folder(folder: Path, frames: int | None = None) -> Scans:
+    """Reads a plain folder of scans with poses, such as a ROS bag exported.
+
+    ::
+
+        radar/1717252210.123456.pcd   one a scan, named by its time, s
+        poses.txt                     lines of: time x y z qx qy qz qw (TUM), T_world_base
+        base_T_radar.txt              optional: 4 x 4, where poses are those of another frame than the radar's
+        lidar.pcd or lidar.ply        optional: the ground truth, world, m
+
+    The recordings of Viking Hill (Hugin A3; ROS bags) become such a folder when each message of
+    ``/hugin_raf_1/radar_data`` is a PCD file with the fields x, y, z and power, ``/icp_odom`` (poses of base_link in
+    map) is ``poses.txt``, the radar's mounting from the data set's calibration is ``base_T_radar.txt`` and a reference
+    map, ``*_map_subsampled.pcd``, which is in the same map frame, is ``lidar.pcd``.
+
+    Parameters
+    ----------
+    folder : Path
+        As above. Returns that are not finite and scans without a return are left out, and scans from before the
+        first pose or after the last one.
+    frames : int, optional
+        Read the first so many scans only.
+
+    Returns
+    -------
+    Scans
+        Points float32, radar frame, m; poses T_world_radar; intensities by `INTENSITY_FIELDS`, None where the scans
+        have none of them; ground truth (M, 3) float64, or None.
+
+    Raises
+    ------
+    ValueError
+        If files are missing, damaged or do not fit together, or there is no pose for `MAX_GAP_S` around a scan.
+    OSError
+        If a file cannot be read.
+    """
+    trajectory = read_trajectory(folder / "poses.txt")
+    T_base_radar = _transform(folder / "base_T_radar.txt", np.eye(4))
+    scans, _ = _read_radar(folder / "radar", trajectory, T_base_radar, frames)
+    return Scans(scans.points, scans.poses, scans.intensities, _read_lidar_map(folder))
+
+
+def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
+    """Reads a sequence of SNAIL-Radar: the enhanced clouds of the Oculii Eagle, and the lidar as ground truth.
+
+    ::
+
+        eagleg7/enhanced/1706001766.577286344.pcd   Oculii frame (forward, left, up); intensity: Power
+        utm50r_T_xt32.txt                           time x y z qx qy qz qw: the full trajectory of the lidar
+        xt32/1706001766.715735580.pcd               optional: lidar frame (left, back, up)
+        body_T_oculii.txt, body_T_xt32.txt          optional: 4 x 4, in place of the published calibration
+        lidar.pcd or lidar.ply                      optional: a ground truth in place of xt32, UTM zone 50R, m
+
+    The data set has ``utm50r_T_xt32.txt`` in a folder of its own, ``full_trajs/<date>/<sequence>``: copy it. Only x, y
+    and z of the radar are used; its angles are in the radar's native frame (right, down, forward). The sequence's
+    ``tf_static.launch`` is not read.
+
+    Parameters
+    ----------
+    folder : Path
+        As above; scans and returns are left out as in :func:`read_posed_folder`.
+    frames : int, optional
+        Read the first so many scans only, and the lidar from the first to the last of them.
+
+    Returns
+    -------
+    Scans
+        As of :func:`read_posed_folder`; the world is UTM zone 50R. Of the lidar, points 1 to 60 m away, each moved with
+        the pose at its own time where the files have it, and at most one in a cell of 5 cm.
+
+    Raises
+    ------
+    ValueError, OSError
+        As :func:`read_posed_folder`.
+    """
+    if not (folder / "utm50r_T_xt32.txt").is_file():
+        msg = f"{folder} lacks utm50r_T_xt32.txt, which the data set has in full_trajs/<date>/<sequence>: copy it here"
+        raise ValueError(msg)
+    trajectory = read_trajectory(folder / "utm50r_T_xt32.txt")
+    T_body_xt32 = _transform(folder / "body_T_xt32.txt", _BODY_T_XT32)
+    T_body_oculii = _transform(folder / "body_T_oculii.txt", _BODY_T_OCULII)
+    radar = folder / "eagleg7" / "enhanced"
+    scans, times_s = _read_radar(radar, trajectory, np.linalg.inv(T_body_xt32) @ T_body_oculii, frames)
+    ground_truth = _read_lidar_map(folder)
+    if ground_truth is None and (folder / "xt32").is_dir():
+        ground_truth = _read_lidar_scans(folder / "xt32", trajectory, times_s[0], times_s[-1])
+    return Scans(scans.points, scans.poses, scans.intensities, ground_truth)
+
+
+def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
+    """The PCD files of a folder with their times, s, in the order of time."""
+    files = []
+    for path in folder.glob("*.pcd"):
+        try:
+            time_s = float(path.stem)
+        except ValueError:
+            time_s = np.nan
+        if not np.isfinite(time_s):
+            msg = f"{path} is not named by its time in seconds"
+            raise ValueError(msg)
+        files.append((time_s, path))
+    return sorted(files)
+
+
+def _read_radar(
+    folder: Path, trajectory: Trajectory, T_base_radar: NDArray[np.float64], frames: int | None
+) -> tuple[Scans, NDArray[np.float64]]:
+    """Scans without ground truth, and their times, (F,) s."""
+    files = _stamped_files(folder)
+    if not files:
+        msg = f"{folder} holds no .pcd files"
+        raise ValueError(msg)
+    covered = trajectory.covers(np.array([time_s for time_s, _ in files]))
+    if not covered.any():
+        msg = f"no scan of {folder}, {files[0][0]} to {files[-1][0]} s, lies within the poses, {trajectory.span()}"
+        raise ValueError(msg)
+    times_s: list[float] = []
+    points: list[NDArray[Any]] = []
+    intensities: list[NDArray[Any]] = []
+    field = None
+    for (time_s, path), inside in zip(files, covered, strict=True):
+        if len(points) == frames:
+            break
+        if not inside:
+            continue
+        columns = read_pcd(path)
+        if not points:
+            field = next((name for name in INTENSITY_FIELDS if name in columns), None)
+        xyz = _xyz(columns, path)
+        if field is None:
+            values = np.zeros(len(xyz))
+        elif field in columns:
+            values = columns[field]
+        else:
+            msg = f"{path} lacks the field {field}, which other scans have"
+            raise ValueError(msg)
+        finite = np.isfinite(xyz).all(axis=1) & np.isfinite(values)
+        if finite.any():
+            times_s.append(time_s)
+            points.append(xyz[finite].astype(np.float32))
+            intensities.append(values[finite].astype(np.float32))
+    if not points:
+        msg = f"the scans of {folder} hold no returns"
+        raise ValueError(msg)
+    times = np.array(times_s)
+    poses = trajectory.poses(times, MAX_GAP_S) @ T_base_radar
+    return Scans(points, poses, None if field is None else intensities), times
+
+
+def _read_lidar_map(folder: Path) -> NDArray[np.float64] | None:
+    """``lidar.pcd`` or ``lidar.ply``, (M, 3) world, m, or None where there is neither."""
+    if (path := folder / "lidar.pcd").is_file():
+        points = _xyz(read_pcd(path), path)
+    elif (path := folder / "lidar.ply").is_file():
+        points = _read_ply(path)
+    else:
+        return None
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        msg = f"{path} holds no points"
+        raise ValueError(msg)
+    return points
+
+
+def _read_ply(path: Path) -> NDArray[np.float64]:
+    try:
+        vertices = getattr(trimesh.load(path, process=False), "vertices", np.zeros((0, 3)))
+        return np.asarray(vertices, np.float64)
+    except OSError:
+        raise
+    except Exception as error:  # what trimesh raises depends on where a damaged file breaks off
+        msg = f"{path} is not a whole PLY file of points: {error}"
+        raise ValueError(msg) from error
+
+
+def _read_lidar_scans(
+    folder: Path, trajectory: Trajectory, first_s: float, last_s: float
+) -> NDArray[np.float64] | None:
+    """All lidar scans of a span of time in one cloud, (M, 3) world, m, thinned out."""
+    origin = trajectory.positions[0]  # keys are of cells near it: UTM coordinates would be out of their range
+    found = [np.zeros((0, 3))]
+    for count, world in enumerate(_lidar_scans(folder, trajectory, first_s, last_s), 1):
+        found.append(_thin(world - origin))
+        if count % _LIDAR_BATCH == 0:
+            found = [_thin(np.concatenate(found))]
+    points = _thin(np.concatenate(found)) + origin
+    return points if len(points) else None
+
+
+def _lidar_scans(
+    folder: Path, trajectory: Trajectory, first_s: float, last_s: float
+) -> Iterator[NDArray[np.float64]]:
+    for time_s, path in _stamped_files(folder):
+        if not first_s <= time_s <= last_s:
+            continue
+        columns = read_pcd(path)
+        xyz = _xyz(columns, path)
+        times_s = columns.get("timestamp", np.full(len(xyz), time_s)).astype(np.float64)
+        ranges_m = np.linalg.norm(xyz, axis=1)
+        used = (ranges_m >= _LIDAR_RANGE_M[0]) & (ranges_m <= _LIDAR_RANGE_M[1]) & np.isfinite(times_s)
+        if (np.abs(times_s[used] - time_s) > _MAX_SWEEP_S).any():
+            msg = f"{path}: the times of its points are not within {_MAX_SWEEP_S} s of its own"
+            raise ValueError(msg)
+        used &= trajectory.covers(times_s)
+        yield trajectory.move(xyz[used], times_s[used], MAX_GAP_S)
+
+
+def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The first point in each cell."""
+    _, first = np.unique(cell_keys(points, _LIDAR_CELL_M), return_index=True)
+    kept: NDArray[np.float64] = points[np.sort(first)]
+    return kept
+
+
+def _xyz(columns: dict[str, NDArray[Any]], path: Path) -> NDArray[np.float64]:
+    if missing := [name for name in "xyz" if name not in columns]:
+        msg = f"{path} lacks the fields {', '.join(missing)}: it has {', '.join(columns)}"
+        raise ValueError(msg)
+    return np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1)
+
+
+def _transform(path: Path, default: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A 4 x 4 rigid transform from a text file, or the default where there is no file."""
+    if not path.is_file():
+        return default
+    matrix = read_table(path, 4)
+    try:
+        poses = check_poses(matrix[None], 1)
+    except ValueError as error:
+        msg = f"{path} does not hold a rigid transform, 4 x 4: {error}"
+        raise ValueError(msg) from error
+    transform: NDArray[np.float64] = poses[0]
+    return transform

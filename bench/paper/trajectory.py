@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Poses at times, and poses between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+_MAX_NORM_ERROR = (
+    1e-2  # of a quaternion: one written with three digits passes, another kind of rotation does not
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses T_world_base of a moving frame, P of them."""
+
+    times_s: NDArray[np.float64]
+    """(P,) ascending, s."""
+    positions: NDArray[np.float64]
+    """(P, 3) world, m."""
+    rotations: Rotation
+    """P rotations R_world_base."""
+
+    def span(self) -> str:
+        """First and last time, for messages."""
+        return f"{self.times_s[0]} to {self.times_s[-1]} s"
+
+    def covers(self, times_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which times, (N,) s, lie between the first pose and the last."""
+        inside: NDArray[np.bool_] = (times_s >= self.times_s[0]) & (times_s <= self.times_s[-1])
+        return inside
+
+    def poses(self, times_s: NDArray[np.float64], max_gap_s: float) -> NDArray[np.float64]:
+        """(N, 4, 4) T_world_base at the times (N,), s: position linear, rotation spherical in between.
+
+        Raises
+        ------
+        ValueError
+            If a time is not covered, or the poses before and after it are more than `max_gap_s` apart.
+        """
+        rotations, positions = self._at(times_s, max_gap_s)
+        poses = np.tile(np.eye(4), (len(times_s), 1, 1))
+        poses[:, :3, :3] = rotations.as_matrix()
+        poses[:, :3, 3] = positions
+        return poses
+
+    def move(
+        self, points: NDArray[np.float64], times_s: NDArray[np.float64], max_gap_s: float
+    ) -> NDArray[np.float64]:
+        """Points (N, 3) of the moving frame, each at its own time (N,) s, to the world; errors as `poses`."""
+        if len(points) == 0:
+            return points
+        rotations, positions = self._at(times_s, max_gap_s)
+        moved: NDArray[np.float64] = rotations.apply(points) + positions
+        return moved
+
+    def _at(self, times_s: NDArray[np.float64], max_gap_s: float) -> tuple[Rotation, NDArray[np.float64]]:
+        if not self.covers(times_s).all():
+            msg = f"no pose at {times_s[~self.covers(times_s)][0]} s: the poses are of {self.span()}"
+            raise ValueError(msg)
+        after = np.searchsorted(self.times_s, times_s)  # the first pose that is not earlier
+        before = np.where(self.times_s[after] == times_s, after, after - 1)
+        gaps_s = self.times_s[after] - self.times_s[before]
+        if (gaps_s > max_gap_s).any():
+            worst = int(np.argmax(gaps_s))
+            msg = (
+                f"no pose near {times_s[worst]} s: the poses before and after it are {gaps_s[worst]:.3f} s apart, "
+                f"more than {max_gap_s} s"
+            )
+            raise ValueError(msg)
+        positions = [np.interp(times_s, self.times_s, self.positions[:, axis]) for axis in range(3)]
+        return Slerp(self.times_s, self.rotations)(times_s), np.stack(positions, axis=1)
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Reads poses in TUM's form: lines of ``time x y z qx qy qz qw``, s and m, and comments after ``#``.
+
+    Raises
+    ------
+    ValueError
+        If the file is not such a one, has fewer than two poses, times that do not ascend or quaternions that are not
+        of unit length.
+    OSError
+        If it cannot be read.
+    """
+    table = read_table(path, 8)
+    if len(table) < 2 or not (np.diff(table[:, 0]) > 0).all():
+        msg = f"{path} must hold at least two poses, in the order of their times"
+        raise ValueError(msg)
+    if (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > _MAX_NORM_ERROR).any():
+        msg = f"{path}: the last four columns are not unit quaternions qx qy qz qw"
+        raise ValueError(msg)
+    return Trajectory(table[:, 0], table[:, 1:4], Rotation.from_quat(table[:, 4:]))
+
+
+def read_table(path: Path, columns: int) -> NDArray[np.float64]:
+    """A text file of finite numbers, (R, columns) float64; a ValueError if it is something else."""
+    try:
+        lines = [line.partition("#")[0] for line in path.read_text("utf-8").splitlines()]
+        table = np.array([line.split() for line in lines if line.strip()], np.float64)
+    except ValueError as error:
+        msg = f"{path} is not a table of {columns} columns of numbers: {error}"
+        raise ValueError(msg) from error
+    if table.ndim != 2 or table.shape[1] != columns or not np.isfinite(table).all():
+        msg = f"{path} is not a table of {columns} columns of finite numbers"
+        raise ValueError(msg)
+    return table
