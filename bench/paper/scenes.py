@@ -75,6 +75,10 @@ class Scene:
             raise ValueError(msg)
         return self._select(np.arange(0, len(self), n))
 
+    def without_intensities(self) -> Scene:
+        """The geometry only."""
+        return dataclasses.replace(self, intensities=None)
+
     def split(self) -> tuple[Scene, Scene]:
         """The frames to fit, and the held-out ones: the first and then every `holdout_every`-th.
 

@@ -33,6 +33,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "free_beyond_m": _FROM_0,
     "cross_range_noise_rad": _FROM_0,
     "sigma_m": _POSITIVE,
+    "sdf_loss_weight": _FROM_0,
     "batch_size": _FROM_1,
     "sdf_iterations": _FROM_1,
     "sdf_passes": _POSITIVE,
@@ -143,6 +144,9 @@ class FitConfig:
     # Losses
     sigma_m: float = 0.15
     """Scale of the sigmoid that turns distances into occupancy, m (3QFP: 0.55 · 0.05; measured for radar: 0.1 to 0.2)."""
+    sdf_loss_weight: float = 1.0
+    """Weight of the SDF's loss beside that of the intensity in a joint fit (3QFPI: equal weights). With 0, features and
+    intensity network learn from intensities alone, and there is no surface: for ablations."""
     intensity_in_free_space: bool = False
     """Whether free-space samples are labelled with the lowest intensity (3QFPI: yes; measured: 10 to 25 % worse)."""
 

@@ -160,7 +160,7 @@ class _Shard:
     def joint_loss(self) -> Tensor:
         samples = self._sampler.batch()
         loss = sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
-        return loss + self._intensity_loss(samples, geometry_frozen=False)
+        return self._config.sdf_loss_weight * loss + self._intensity_loss(samples, geometry_frozen=False)
 
     def reflectance_loss(self) -> Tensor:
         if self._config.intensity_in_free_space:

@@ -7,7 +7,7 @@ Nothing here knows how a map was made, so that meshes and predictions of other p
 
 from ._report import format_metrics
 from .intensity import INTENSITY_PROTOCOL, IntensityMetrics, KNNIntensity, holdout, intensity_metrics
-from .surface import PROTOCOL, SurfaceMetrics, gamma_from_moments, surface_metrics
+from .surface import PROTOCOL, SurfaceMetrics, adjacent_angles, gamma_from_moments, surface_metrics
 
 __all__ = [
     "INTENSITY_PROTOCOL",
@@ -15,6 +15,7 @@ __all__ = [
     "IntensityMetrics",
     "KNNIntensity",
     "SurfaceMetrics",
+    "adjacent_angles",
     "format_metrics",
     "gamma_from_moments",
     "holdout",

@@ -132,7 +132,7 @@ def surface_metrics(
     origin = points.mean(axis=0)
     points = points - origin
     vertices = _check_points(mesh.vertices, "mesh.vertices") - origin
-    faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
+    faces = _faces(mesh)
     if corners is not None:
         corners = corners - origin
 
@@ -159,7 +159,7 @@ def surface_metrics(
     accuracy_ratio = right_kept / kept if kept else 0.0
     precision = right / total
     completion_ratio = float(np.mean(completion < threshold_m))
-    angles = _adjacent_angles(vertices, faces, corners)
+    angles = _angles(vertices, faces, corners)
     shape, mean, variance = gamma_from_moments(angles)
     return SurfaceMetrics(
         protocol=PROTOCOL,
@@ -185,6 +185,34 @@ def surface_metrics(
         truncation_m=truncation_m,
         box=None if box is None else np.asarray(box, dtype=np.float64).tolist(),
     )
+
+
+def adjacent_angles(mesh: trimesh.Trimesh, *, box: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Angles between the triangles on both sides of an edge: the histogram that the paper shows.
+
+    Parameters
+    ----------
+    mesh
+        As of `surface_metrics`.
+    box
+        (2, 3) lower and upper corner, world frame; only edges with their midpoint in it count. None takes all.
+
+    Returns
+    -------
+    (E,) float64
+        Radians: 0 where two triangles continue each other, π where they fold. Edges of one or more than two triangles
+        have no angle.
+
+    Raises
+    ------
+    ValueError
+        If a vertex is not finite or the box has a wrong shape.
+    """
+    vertices, faces = _check_points(mesh.vertices, "mesh.vertices"), _faces(mesh)
+    if len(faces) == 0:
+        return np.zeros(0)
+    origin = vertices.mean(axis=0)
+    return _angles(vertices - origin, faces, None if box is None else _check_box(box) - origin)
 
 
 def gamma_from_moments(angles_rad: ArrayLike) -> tuple[float | None, float | None, float | None]:
@@ -236,6 +264,10 @@ def _check_box(box: ArrayLike) -> _Points:
         msg = "box must be (2, 3): a lower corner and an upper one above it"
         raise ValueError(msg)
     return corners
+
+
+def _faces(mesh: trimesh.Trimesh) -> NDArray[np.int64]:
+    return np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
 
 
 def _in_box(points: _Points, corners: _Points | None) -> _Points:
@@ -295,8 +327,8 @@ def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -
     shortest[candidates] = np.minimum(shortest[candidates], distance)
 
 
-def _adjacent_angles(vertices: _Points, faces: NDArray[np.int64], corners: _Points | None) -> _Points:
-    """Angles between triangles with a common edge; edges of one or more than two triangles have none."""
+def _angles(vertices: _Points, faces: NDArray[np.int64], corners: _Points | None) -> _Points:
+    """See `adjacent_angles`; vertices near the origin."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     has_area = np.linalg.norm(normals, axis=1) > 0  # without it, a triangle has no direction

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The paper's experiments, one command each: `python -m bench.paper EXPERIMENT [SCENE ...]`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from bench.peers.interface import PEERS
+
+from . import ablation, angles, intensity, map_size, sparse, surface, views
+from .experiment import Experiment, Options, Row
+from .report import provenance, write_json
+from .scenes import load_scene
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "surface": surface.EXPERIMENT,
+    "intensity": intensity.EXPERIMENT,
+    "ablation": ablation.EXPERIMENT,
+    "sparse": sparse.EXPERIMENT,
+    "map-size": map_size.EXPERIMENT,
+    "angles": angles.EXPERIMENT,
+    "views": views.EXPERIMENT,
+}
+_QUICK_FRAMES = 4
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one experiment; write its table, numbers and plot, and print the table."""
+    parser = _parser()
+    words = parser.parse_args(arguments)
+    experiment = EXPERIMENTS[words.experiment]
+    if unknown := sorted(set(words.peers) - set(PEERS)):
+        parser.error(f"no peers {', '.join(unknown)}: there are {', '.join(PEERS)}")
+    quick = words.quick
+    options = Options(
+        quick=quick,
+        repetitions=words.repetitions or (2 if quick else experiment.repetitions),
+        samples=words.samples or (100_000 if quick else 10_000_000),
+        bases=tuple(words.base or experiment.bases),
+        peers=tuple(words.peers or PEERS),
+    )
+    frames = words.frames or (_QUICK_FRAMES if quick else None)
+    box = None if words.box is None else np.reshape(words.box, (2, 3))
+    try:
+        scenes = [
+            load_scene(spec, frames=frames, seed=words.scene_seed, box=box)
+            for spec in words.scenes or experiment.scenes
+        ]
+    except (ValueError, OSError) as error:
+        sys.exit(str(error))
+    tasks = [task for scene in scenes for task in experiment.tasks(scene, options)]
+    words.out.mkdir(parents=True, exist_ok=True)
+    stem = words.out / words.experiment
+    rows: list[Row] = []
+    made = provenance()
+    with tqdm(tasks, unit="task") as bar:
+        for task in bar:
+            bar.set_description(task.label)
+            rows += task.run()
+            # After each task, so that an interrupted run of hours leaves what it has.
+            write_json(stem.with_suffix(".json"), {"experiment": words.experiment, **made, "rows": rows})
+    heading = f"## {experiment.title}" + (", a quick run whose numbers mean nothing" if quick else "")
+    origin = f"`{made['command']}`, commit {made['commit']}, {made['processor']}, {made['threads']} threads"
+    table = "\n\n".join(
+        [heading, experiment.table(rows), f"{origin}; protocols {', '.join(made['protocols'])}.\n"]
+    )
+    stem.with_suffix(".md").write_text(table, encoding="utf-8")
+    experiment.plot(rows, stem.with_suffix(".png"))
+    print(table)
+    print(f"written: {', '.join(str(stem.with_suffix(suffix)) for suffix in ('.md', '.json', '.png'))}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m bench.paper", description=__doc__)
+    parser.add_argument("experiment", choices=EXPERIMENTS)
+    parser.add_argument(
+        "scenes",
+        nargs="*",
+        metavar="SCENE",
+        help="simulated scenes by name, .npz files, folders; see bench/README.md",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("bench_results"), help="folder; default: bench_results"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="only see that everything runs, in a minute or so"
+    )
+    parser.add_argument("--repetitions", type=int, help="with another seed each; default: as in the paper")
+    parser.add_argument("--samples", type=int, help="points on a mesh; default: 10000000")
+    parser.add_argument("--frames", type=int, help="of each scene; default: all")
+    parser.add_argument("--scene-seed", type=int, default=0, help="of simulated scenes; default: 0")
+    parser.add_argument("--peers", nargs="+", default=[], metavar="PEER", help=f"default: {', '.join(PEERS)}")
+    parser.add_argument(
+        "--base", nargs="+", choices=("default", "paper"), help="configurations of this package"
+    )
+    parser.add_argument(
+        "--box",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="to evaluate, world, m",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Histogram of the angles between adjacent triangles, of all methods (figure)."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from radarsdf.evaluation import adjacent_angles, gamma_from_moments
+
+from .experiment import Experiment, Options, Row, Task, groups
+from .report import figure, markdown
+from .scenes import Scene
+
+_BINS = np.linspace(0, np.pi, 181)
+
+
+def tasks(scene: Scene, options: Options) -> list[Task]:
+    """One for each peer."""
+    return [Task(f"{scene.name}: {name}", partial(_rows, scene, name, options)) for name in options.peers]
+
+
+def _rows(scene: Scene, name: str, options: Options) -> list[Row]:
+    row: Row = {"scene": scene.name, "method": name}
+    result = options.reconstruct(name, scene)
+    if result.mesh is None:
+        return [row | {"why_not": result.why_not}]
+    angles = adjacent_angles(result.mesh, box=scene.box)
+    if len(angles) == 0:
+        return [row | {"why_not": "no two triangles share an edge"}]
+    shape, mean, variance = gamma_from_moments(angles)
+    row |= {"gamma_shape": shape, "gamma_mean": mean, "gamma_variance": variance}
+    row["below_5_degrees"] = float(np.mean(angles < np.deg2rad(5)))
+    return [row | {"histogram": np.histogram(angles, _BINS)[0] / len(angles)}]
+
+
+def table(rows: list[Row]) -> str:
+    """The Gamma distributions, and the share of edges across which the surface goes straight on."""
+    cells = [
+        [row["scene"], row["method"], *_numbers(row)] if not row.get("why_not")
+        else [row["scene"], f"{row['method']}: {row['why_not']}", "–", "–", "–", "–"]
+        for row in rows
+    ]  # fmt: skip
+    return markdown(["scene", "method", "below 5°, %", "Gamma shape", "mean, rad", "variance"], cells)
+
+
+def _numbers(row: Row) -> list[str]:
+    shape = "–" if row["gamma_shape"] is None else f"{row['gamma_shape']:.2f}"
+    below = f"{100 * row['below_5_degrees']:.1f}"
+    return [below, shape, f"{row['gamma_mean']:.3f}", f"{row['gamma_variance']:.3f}"]
+
+
+def plot(rows: list[Row], path: Path) -> None:
+    """Outlines of the histograms."""
+    scenes = groups([row for row in rows if "histogram" in row], "scene")
+    with figure(path, columns=max(1, len(scenes))) as axes:
+        for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
+            for row in own:
+                ax.stairs(100 * np.asarray(row["histogram"]), np.rad2deg(_BINS), label=row["method"])
+            ax.set(title=scene, xlim=(0, 90), xlabel="angle between triangles, °", ylabel="share of edges, %")
+            ax.set_yscale("log")
+
+
+EXPERIMENT = Experiment("Angles between adjacent triangles", ("hugin", "oculii", "wall"), tasks, table, plot)

@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Surface quality of all methods (Table I), with time and memory beside it."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from .experiment import Experiment, Options, Row, Task, groups
+from .report import best_in_bold, figure, markdown
+from .scenes import Scene
+
+# Key, heading, factor to the unit of the heading, digits, and whether more is better (None: neither).
+_COLUMNS = (
+    ("accuracy_error_m", "acc. error, cm", 100, 2, False),
+    ("accuracy_ratio", "acc. ratio, %", 100, 2, True),
+    ("outlier_ratio", "outliers, %", 100, 2, False),
+    ("completion_error_m", "compl. error, cm", 100, 2, False),
+    ("completion_ratio", "compl. ratio, %", 100, 2, True),
+    ("f_score", "F-score, %", 100, 2, True),
+    ("f_score_all", "F, nothing discarded, %", 100, 2, True),
+    ("gamma_shape", "Gamma shape", 1, 2, None),
+    ("gamma_mean", "mean, rad", 1, 3, False),
+    ("gamma_variance", "variance", 1, 3, False),
+    ("seconds", "time, s", 1, 1, False),
+    ("peak_bytes", "peak memory, MB", 1e-6, 0, False),
+)
+
+
+def tasks(scene: Scene, options: Options) -> list[Task]:
+    """One for each peer."""
+    return [Task(f"{scene.name}: {name}", partial(_rows, scene, name, options)) for name in options.peers]
+
+
+def _rows(scene: Scene, name: str, options: Options) -> list[Row]:
+    row = {"scene": scene.name, "method": name, "returns": sum(map(len, scene.points))}
+    return [row | options.measure(name, scene)]
+
+
+def table(rows: list[Row]) -> str:
+    """A table for each scene; the best of a column in bold."""
+    parts = []
+    for (scene,), own in groups(rows, "scene").items():
+        columns = [[row["method"] for row in own]]
+        for key, _, factor, digits, highest in _COLUMNS:
+            values = [row.get(key) for row in own]
+            cells = ["–" if value is None else f"{value * factor:.{digits}f}" for value in values]
+            columns.append(cells if highest is None else best_in_bold(cells, values, highest=highest))
+        header = ["method", *(heading for _, heading, *_ in _COLUMNS)]
+        text = markdown(header, list(zip(*columns, strict=True)))
+        missing = [f"- {row['method']} is missing: {row['why_not']}" for row in own if row.get("why_not")]
+        parts.append("\n".join([f"### {scene}, {own[0]['returns']:,} returns", "", text, *missing]))
+    return "\n\n".join(parts)
+
+
+def plot(rows: list[Row], path: Path) -> None:
+    """F-score with nothing discarded over time: whatever time one has, what is the best surface in it?"""
+    scenes = groups([row for row in rows if "f_score_all" in row], "scene")
+    with figure(path, columns=max(1, len(scenes))) as axes:
+        for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
+            _scatter(ax, own)
+            ax.set(title=scene, xscale="log", xlabel="time, s", ylabel="F-score, nothing discarded, %")
+
+
+def _scatter(ax: Any, rows: list[Row]) -> None:
+    for row in rows:
+        ours = row["method"].startswith("radarsdf")
+        x, y = row["seconds"], 100 * row["f_score_all"]
+        ax.plot(x, y, "*" if ours else "o", color="tab:red" if ours else "tab:blue")
+        ax.annotate(row["method"], (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7)
+    ax.grid(alpha=0.3)
+
+
+EXPERIMENT = Experiment("Surface quality (Table I)", ("hugin", "oculii", "wall"), tasks, table, plot)

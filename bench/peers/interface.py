@@ -1,0 +1,188 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The methods to compare with, and `reconstruct`, which runs one of them.
+
+Nothing of a peer is imported here: each runs in a child process (see `child`), and where it cannot run the result says
+why, so that it stays in the tables.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+ROOT = Path(__file__).resolve().parents[2]
+VDBFUSION_ENVIRONMENT = ROOT / "build" / "peers" / "vdbfusion"
+INSTALL = {
+    "open3d": "pip install '.[peers]', on Debian after apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1",
+    "vdbfusion": "python -m bench.peers.install, with a CPython of 3.8 to 3.10 at hand",
+}
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A method with its settings."""
+
+    name: str
+    """As the tables call it."""
+    method: str
+    """`module:function` in this package."""
+    options: dict[str, Any]
+    """Keywords of the function; the paper's values."""
+    needs: str = ""
+    """What has to be importable besides NumPy."""
+    intensities: bool = False
+    """Whether it is given the intensities."""
+
+    def with_changes(self, **changes: Any) -> Peer:
+        """The same fit of ours with other settings; other methods are returned as they are."""
+        if "changes" not in self.options:
+            return self
+        return replace(self, options=self.options | {"changes": self.options["changes"] | changes})
+
+
+def _fit(name: str, base: str, *, intensities: bool = False, **changes: Any) -> Peer:
+    options = {"base": base, "changes": changes}
+    return Peer(name, "radarsdf_fits:radarsdf_fit", options, needs="radarsdf", intensities=intensities)
+
+
+PEERS = {
+    peer.name: peer
+    for peer in (
+        Peer("α-shapes", "open3d_meshes:alpha_shapes", {"alpha_m": 0.2}, "open3d"),
+        Peer("BPA", "open3d_meshes:ball_pivoting", {"radius_m": 0.1}, "open3d"),
+        Peer("Poisson", "open3d_meshes:poisson", {"depth": 12}, "open3d"),
+        Peer("VDBFusion", "vdbfusion_tsdf:vdbfusion", {"voxel_m": 0.2}, "vdbfusion"),
+        # SHINE-Mapping's representation and 3QFP in this package, at the learning rate that both publish.
+        _fit("SHINE (octree)", "paper", encoding="octree", fourier_count=0, learning_rate=1e-2),
+        _fit("3QFP", "paper", learning_rate=1e-2),
+        _fit("3QFPI", "paper", intensities=True),
+        _fit("radarsdf, octree", "default", encoding="octree"),
+        _fit("radarsdf", "default"),
+        _fit("radarsdf, intensities", "default", intensities=True),
+    )
+}
+"""By name, in the order of the paper's Table I; those of this package last."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What a peer made of some scans, or why it made nothing."""
+
+    mesh: trimesh.Trimesh | None
+    why_not: str = ""
+    seconds: float | None = None
+    """Wall time from returns in memory to triangles in memory; imports and files are not counted."""
+    peak_bytes: int | None = None
+    """Largest resident memory of its process, interpreter and libraries included."""
+    map_bytes: int | None = None
+    """Of the map that the mesh was made of, where there is one."""
+
+
+def reconstruct(
+    peer: Peer,
+    points: list[np.ndarray],
+    poses: np.ndarray,
+    intensities: list[np.ndarray] | None = None,
+    *,
+    min_range_m: float = 2.5,
+    max_range_m: float | None = None,
+    timeout_s: float = 3600.0,
+) -> Reconstruction:
+    """Run a peer on scans.
+
+    Parameters
+    ----------
+    peer
+        One of `PEERS`.
+    points
+        F arrays (N_i, 3), sensor frame, m.
+    poses
+        (F, 4, 4) T_world_sensor.
+    intensities
+        F arrays (N_i,), sensor units; given to those peers that use them.
+    min_range_m, max_range_m
+        Nearer and farther returns are dropped, for all peers alike.
+    timeout_s
+        After this, the peer is stopped and has no result.
+    """
+    python, why_not = _interpreter(peer.needs)
+    if python is None:
+        return Reconstruction(None, why_not)
+    frame = np.repeat(np.arange(len(points)), [len(p) for p in points])
+    sensor_points = np.concatenate([np.asarray(p, np.float32).reshape(-1, 3) for p in points])
+    range_m = np.linalg.norm(sensor_points, axis=1)
+    kept = (range_m >= min_range_m) & (range_m <= (np.inf if max_range_m is None else max_range_m))
+    # Peers that compute in float32 are not to suffer from UTM coordinates.
+    origin = poses[0, :3, 3].copy()
+    local_poses = poses.copy()
+    local_poses[:, :3, 3] -= origin
+    if not kept.any():
+        return Reconstruction(None, "no returns within the ranges")
+    used, frame = np.unique(frame[kept], return_inverse=True)  # a scan may have lost its returns
+    arrays = {"points": sensor_points[kept], "frame": frame, "poses": local_poses[used]}
+    if peer.intensities and intensities is not None:
+        arrays["intensities"] = np.concatenate(intensities)[kept]
+    options = dict(peer.options)
+    if "changes" in options:
+        options["changes"] = {"min_range_m": 0.0} | options["changes"]  # the ranges are cut already
+    with tempfile.TemporaryDirectory() as folder:
+        scans_path, result_path = Path(folder) / "scans.npz", Path(folder) / "result.npz"
+        np.savez(scans_path, **arrays)
+        command = [python, "-m", "bench.peers.child", peer.method, json.dumps(options)]
+        try:
+            done = subprocess.run(
+                [*command, str(scans_path), str(result_path)],
+                cwd=ROOT,
+                capture_output=True,
+                text=True,
+                timeout=timeout_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return Reconstruction(None, f"no result after {timeout_s:.0f} s")
+        if done.returncode != 0:
+            return Reconstruction(None, _reason(done))
+        with np.load(result_path) as result:
+            vertices, faces = result["vertices"] + origin, result["faces"]
+            seconds, peak, map_bytes = (result[k].item() for k in ("seconds", "peak_bytes", "map_bytes"))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if len(faces) == 0:
+        return Reconstruction(None, "it made no triangles", seconds)
+    return Reconstruction(mesh, "", seconds, *(None if size < 0 else size for size in (peak, map_bytes)))
+
+
+@cache
+def _interpreter(needs: str) -> tuple[str | None, str]:
+    """A Python that can import `needs`, or why there is none."""
+    candidates = [sys.executable]
+    if needs == "vdbfusion":
+        candidates += [str(VDBFUSION_ENVIRONMENT / "bin" / "python")]
+    why_not = ""
+    for python in candidates:
+        if not Path(python).exists():
+            continue
+        done = subprocess.run(
+            [python, "-c", f"import {needs}"], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        if done.returncode == 0:
+            return python, ""
+        why_not = _reason(done)
+    hint = INSTALL.get(needs)
+    return None, f"{why_not} ({hint})" if hint else why_not
+
+
+def _reason(done: subprocess.CompletedProcess[str]) -> str:
+    if done.returncode < 0:
+        return f"killed by signal {-done.returncode}" + (" (out of memory?)" if done.returncode == -9 else "")
+    lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+    return lines[-1]

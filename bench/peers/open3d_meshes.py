@@ -1,0 +1,49 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""α-shapes, ball pivoting and Poisson reconstruction through Open3D, on the union of all returns."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+from .child import ScanArrays
+
+Mesh = tuple[np.ndarray, np.ndarray, None]  # vertices, faces; none of these methods has a map besides
+
+_NORMAL_NEIGHBOURS = 30  # Open3D's default
+
+
+def alpha_shapes(scans: ScanArrays, alpha_m: float) -> Mesh:
+    """Faces of the Delaunay tetrahedra with a circumscribed ball below `alpha_m` (Edelsbrunner, Kirkpatrick, Seidel)."""
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scans.world()))
+    return _arrays(o3d.geometry.TriangleMesh.create_from_point_cloud_alpha_shape(cloud, alpha_m))
+
+
+def ball_pivoting(scans: ScanArrays, radius_m: float) -> Mesh:
+    """Triangles that a rolling ball of `radius_m` comes to rest on (Bernardini et al.)."""
+    cloud = _with_normals(scans)
+    radii = o3d.utility.DoubleVector([radius_m])
+    return _arrays(o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii))
+
+
+def poisson(scans: ScanArrays, depth: int) -> Mesh:
+    """Screened Poisson reconstruction on an octree of `depth` levels (Kazhdan, Hoppe)."""
+    return _arrays(
+        o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(_with_normals(scans), depth=depth)[0]
+    )
+
+
+def _with_normals(scans: ScanArrays) -> o3d.geometry.PointCloud:
+    """Normals of the neighbours' plane, turned towards the sensor that saw the point."""
+    world = scans.world()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(world))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
+    normals = np.asarray(cloud.normals)
+    away = np.einsum("ij,ij->i", normals, scans.sensors() - world) < 0
+    cloud.normals = o3d.utility.Vector3dVector(np.where(away[:, None], -normals, normals))
+    return cloud
+
+
+def _arrays(mesh: o3d.geometry.TriangleMesh) -> Mesh:
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles), None

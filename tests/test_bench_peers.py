@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Peers run in processes of their own, alike for all, and say why they cannot."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+
+import numpy as np
+import pytest
+import radarsdf
+
+from bench.peers.interface import PEERS, Peer, reconstruct
+
+OURS = PEERS["radarsdf"].with_changes(sdf_iterations=60, min_component_triangles=20)
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return radarsdf.simulate.wall(frames=3)
+
+
+def test_the_paper_s_methods_are_there_in_its_order():
+    assert list(PEERS)[:5] == ["α-shapes", "BPA", "Poisson", "VDBFusion", "SHINE (octree)"]
+
+
+def test_far_from_the_origin_the_same_mesh_comes_out_there(scans):
+    here = reconstruct(OURS, scans.points, scans.poses)
+    poses = scans.poses.copy()
+    shift = np.array([5e5, 5.4e6, 100.0])
+    poses[:, :3, 3] += shift
+    there = reconstruct(OURS, scans.points, poses)
+    assert here.mesh is not None
+    assert there.mesh is not None
+    assert here.map_bytes == there.map_bytes
+    # Poses rounded at 1e-9 m are enough for a training to take other turns.
+    assert len(there.mesh.faces) == pytest.approx(len(here.mesh.faces), rel=0.02)
+    np.testing.assert_allclose(there.mesh.bounds - shift, here.mesh.bounds, atol=0.2)
+    assert here.seconds > 0
+    assert here.peak_bytes > 50e6
+
+
+def test_ranges_are_cut_for_all(scans):
+    done = reconstruct(OURS, scans.points, scans.poses, min_range_m=50.0)
+    assert done.mesh is None
+    assert done.why_not == "no returns within the ranges"
+
+
+def test_a_scan_without_returns_in_range_is_left_out(scans):
+    points = [np.zeros((4, 3), np.float32), *scans.points[1:]]
+    done = reconstruct(OURS, points, scans.poses)
+    assert done.mesh is not None, done.why_not
+
+
+@pytest.mark.parametrize(
+    ("peer", "why_not"),
+    [
+        (
+            Peer("absent", "child:main", {}, needs="no_such_module_at_all"),
+            "No module named 'no_such_module_at_all'",
+        ),
+        (
+            Peer("broken", "no_such_method:run", {}, needs="numpy"),
+            "No module named 'bench.peers.no_such_method'",
+        ),
+        (dataclasses.replace(OURS, options={"nonsense": 1}), "unexpected keyword argument 'nonsense'"),
+    ],
+)
+def test_a_peer_that_cannot_run_says_why(scans, peer, why_not):
+    done = reconstruct(peer, scans.points, scans.poses)
+    assert done.mesh is None
+    assert why_not in done.why_not
+
+
+def test_a_peer_that_takes_too_long_is_stopped(scans):
+    done = reconstruct(OURS, scans.points, scans.poses, timeout_s=0.01)
+    assert done.mesh is None
+    assert "no result after" in done.why_not
+
+
+@pytest.mark.parametrize("name", ["α-shapes", "BPA", "VDBFusion"])
+def test_the_surface_is_where_the_returns_are(scans, name):
+    peer = PEERS[name]
+    done = reconstruct(peer, scans.points, scans.poses)
+    if done.mesh is None and (
+        importlib.util.find_spec(peer.needs) is None or "import" in done.why_not.lower()
+    ):
+        pytest.skip(f"{name}: {done.why_not}")
+    assert done.mesh is not None, done.why_not
+    distance_m = scans.scene.distance(done.mesh.triangles_center)
+    assert np.median(np.abs(distance_m)) < 0.15
+    assert (done.map_bytes is not None) == (name == "VDBFusion")
