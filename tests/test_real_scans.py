@@ -30,8 +30,7 @@ pytestmark = pytest.mark.skipif(
 def rays_of(scans):
     """World points, sensor positions and intensities of the returns between 2.5 and 60 m."""
     rays = prepare(scans.points, scans.poses, scans.intensities, min_range_m=2.5, max_range_m=60.0)
-    points = rays.points.astype(np.float64) + rays.origin
-    return points, points - rays.directions.astype(np.float64) * rays.ranges_m[:, None], rays.intensities
+    return *rays.in_world(), rays.intensities
 
 
 @pytest.fixture(scope="module", params=SCENES)

@@ -36,10 +36,11 @@ def test_rays_lead_from_the_sensors_to_the_returns():
     points, poses = scans()
     rays = prepare(points, poses)
     np.testing.assert_allclose(rays.origin, poses[:, :3, 3].mean(axis=0))
-    np.testing.assert_allclose(rays.points + rays.origin, world(points, poses), atol=1e-5)
-    sensors = np.repeat(poses[:, :3, 3], [len(p) for p in points], axis=0)
-    back = rays.points.astype(float) - rays.directions.astype(float) * rays.ranges_m[:, None]
-    np.testing.assert_allclose(back + rays.origin, sensors, atol=2e-5)
+    returns_world, sensors_world = rays.in_world()
+    np.testing.assert_allclose(returns_world, world(points, poses), atol=1e-5)
+    np.testing.assert_allclose(
+        sensors_world, np.repeat(poses[:, :3, 3], [len(p) for p in points], axis=0), atol=2e-5
+    )
     np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(rays.ranges_m, np.linalg.norm(np.concatenate(points), axis=1), rtol=1e-6)
     np.testing.assert_array_equal(rays.scans, np.repeat(np.arange(7), [len(p) for p in points]))

@@ -109,9 +109,8 @@ def world_returns(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         min_range_m=scene.min_range_m,
         max_range_m=scene.max_range_m,
     )
-    points = rays.points.astype(np.float64) + rays.origin
     assert rays.intensities is not None
-    return points, points - rays.directions.astype(np.float64) * rays.ranges_m[:, None], rays.intensities
+    return *rays.in_world(), rays.intensities
 
 
 def groups(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:

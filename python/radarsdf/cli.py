@@ -241,8 +241,7 @@ def _world(scans: Scans, config: FitConfig) -> tuple[Any, Any, Any]:
         min_range_m=config.min_range_m,
         max_range_m=config.max_range_m,
     )
-    points = rays.points.astype(np.float64) + rays.origin
-    return points, points - rays.directions.astype(np.float64) * rays.ranges_m[:, None], rays.intensities
+    return *rays.in_world(), rays.intensities
 
 
 def _print_intensity_errors(radar_map: RadarMap, test: Scans, train: Scans) -> None:

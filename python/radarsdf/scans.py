@@ -49,6 +49,11 @@ class Rays:
             scans=self.scans[part],
         )
 
+    def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns and the positions of the sensor that saw each, (N, 3) and (N, 3), world, m."""
+        points = self.points.astype(np.float64) + self.origin
+        return points, points - self.directions.astype(np.float64) * self.ranges_m[:, None]
+
     def along(self, offsets_m: ArrayLike, chunk: int = 1 << 20) -> Iterator[NDArray[np.float32]]:
         """Points at fixed offsets along every ray, behind the return where positive, in chunks of (M, 3), local, m."""
         offsets = np.asarray(offsets_m, np.float32)
