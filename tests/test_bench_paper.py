@@ -46,7 +46,11 @@ def run(tmp_path, *words):
 
 @pytest.mark.usefixtures("peers")
 def test_surface(tmp_path):
-    table, values = run(tmp_path, "surface", "wall", "--peers", "BPA", "Poisson")
+    table, values = run(tmp_path, "surface", "wall", "--peers", "BPA", "Poisson", "--meshes")
+    assert sorted(path.name for path in (tmp_path / "meshes").iterdir()) == [
+        "wall, 4 frames, BPA.ply",
+        "wall, 4 frames, BPA.png",
+    ]
     ball, poisson = values["rows"]
     assert ball["seconds"] == 5.0
     assert 0 <= ball["f_score"] <= 1

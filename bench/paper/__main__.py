@@ -44,6 +44,7 @@ def main(arguments: list[str] | None = None) -> None:
         samples=words.samples or (100_000 if quick else 10_000_000),
         bases=tuple(words.base or experiment.bases),
         peers=tuple(words.peers or PEERS),
+        meshes=words.out / "meshes" if words.meshes else None,
     )
     frames = words.frames or (_QUICK_FRAMES if quick else None)
     box = None if words.box is None else np.reshape(words.box, (2, 3))
@@ -55,7 +56,7 @@ def main(arguments: list[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         sys.exit(str(error))
     tasks = [task for scene in scenes for task in experiment.tasks(scene, options)]
-    words.out.mkdir(parents=True, exist_ok=True)
+    (options.meshes or words.out).mkdir(parents=True, exist_ok=True)
     stem = words.out / words.experiment
     rows: list[Row] = []
     made = provenance()
@@ -93,6 +94,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--repetitions", type=int, help="with another seed each; default: as in the paper")
     parser.add_argument("--samples", type=int, help="points on a mesh; default: 10000000")
+    parser.add_argument(
+        "--meshes", action="store_true", help="surface, sparse: also write each mesh and a picture of it"
+    )
     parser.add_argument("--frames", type=int, help="of each scene; default: all")
     parser.add_argument("--scene-seed", type=int, default=0, help="of simulated scenes; default: 0")
     parser.add_argument("--peers", nargs="+", default=[], metavar="PEER", help=f"default: {', '.join(PEERS)}")

@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 import radarsdf
+import trimesh
 from radarsdf import FitConfig, RadarMap
 from radarsdf.evaluation import surface_metrics
+from radarsdf.picture import save_picture
 
 from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
 
@@ -35,6 +37,8 @@ class Options:
     """Configurations of this package: "default", "paper"."""
     peers: tuple[str, ...]
     """Names of `PEERS`."""
+    meshes: Path | None = None
+    """Folder for the meshes of `measure` and pictures of them."""
 
     def config(self, base: str, scene: Scene, **changes: Any) -> FitConfig:
         """A configuration with the scene's ranges."""
@@ -65,6 +69,10 @@ class Options:
         row: Row = {"seconds": result.seconds, "peak_bytes": result.peak_bytes, "map_bytes": result.map_bytes}
         if result.mesh is None:
             return row | {"why_not": result.why_not}
+        if self.meshes is not None:
+            stem = self.meshes / f"{scene.name}, {len(scene)} frames, {name}"
+            result.mesh.export(f"{stem}.ply")
+            save_picture(f"{stem}.png", _cropped(result.mesh, scene.ground_truth))
         try:
             metrics = surface_metrics(result.mesh, scene.ground_truth, box=scene.box, samples=self.samples)
         except ValueError as error:  # nothing of it in the box
@@ -93,6 +101,13 @@ class Experiment:
     repetitions: int = 1
     """As in the paper."""
     bases: tuple[str, ...] = ("default", "paper")
+
+
+def _cropped(mesh: trimesh.Trimesh, ground_truth: np.ndarray) -> trimesh.Trimesh:
+    """What lies within the bounds of the ground truth, or else all: sheets far outside would shrink the rest."""
+    middle = mesh.triangles_center
+    inside = ((middle >= ground_truth.min(axis=0)) & (middle <= ground_truth.max(axis=0))).all(axis=1)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[inside if inside.any() else slice(None)], process=False)
 
 
 def fit(scene: Scene, config: FitConfig) -> RadarMap:
