@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
+from radarsdf.sampling import RaySampler
 
 from .conftest import ground_and_wall
 
@@ -118,7 +120,8 @@ def test_every_input_of_the_intensity_network_runs(scene, encoding, joint):
 
 
 def test_frozen_geometry_does_not_move(scene):
-    config = dataclasses.replace(QUICK, joint=True)
+    # Without dropout, which depends on the number of iterations and reaches the joint beginning.
+    config = dataclasses.replace(QUICK, joint=True, feature_dropout=0.0, fourier_dropout=0.0)
     frozen = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     longer = radarsdf.fit(
         scene.points,
@@ -129,6 +132,36 @@ def test_frozen_geometry_does_not_move(scene):
     assert torch.equal(frozen.field.cells.features, longer.field.cells.features)
     weights = [m.field.intensity_network.layers[0].weight for m in (frozen, longer)]
     assert not torch.equal(*weights)
+
+
+def test_the_more_often_samples_are_seen_the_more_is_hidden(scene, monkeypatch):
+    shares = []
+    kept = RaySampler.kept
+
+    def record(sampler, rows, columns, dropout):
+        shares.append(dropout)
+        return kept(sampler, rows, columns, dropout)
+
+    monkeypatch.setattr(RaySampler, "kept", record)
+    samples = FitConfig().near_samples * sum(map(len, scene.points))
+    for passes in (1, 3, 27):
+        shares.clear()
+        config = dataclasses.replace(
+            QUICK,
+            intensity_batch_size=256,
+            intensity_iterations=math.ceil(passes * samples / 256),
+            sdf_iterations=1,
+            feature_dropout=0.8,
+            fourier_dropout=0.4,
+        )
+        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
+        expected = passes / (passes + 3)
+        assert min(shares) == pytest.approx(0.4 * expected, rel=0.01)
+        assert max(shares) == pytest.approx(0.8 * expected, rel=0.01)
+    shares.clear()
+    published = dataclasses.replace(QUICK, feature_dropout=0.0, fourier_dropout=0.0)
+    radarsdf.fit(scene.points, scene.poses, scene.intensities, config=published)
+    assert not shares
 
 
 def test_each_stage_of_the_schedule_begins_at_the_full_rate(scene):
@@ -243,6 +276,7 @@ def test_paper_configuration_is_the_published_one():
     assert (paper.near_samples, paper.free_samples, paper.batch_size) == (6, 6, 8192)
     assert (paper.sdf_iterations, paper.intensity_iterations, paper.learning_rate) == (1000, 4000, 1e-3)
     assert (paper.geometry_feature_dim, paper.normals, paper.log_range) == (15, True, False)
+    assert (paper.feature_dropout, paper.fourier_dropout, paper.cross_range_noise_rad) == (0, 0, 0)
     assert (paper.joint, paper.intensity_in_free_space, paper.accumulate_frames) == (True, True, 5)
     assert FitConfig.from_dict(paper.to_dict()) == paper
     with pytest.raises(ValueError, match="unknown settings: colour"):

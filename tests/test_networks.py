@@ -115,6 +115,21 @@ def test_normals_are_the_normalised_gradient():
     np.testing.assert_allclose(seen[0], gradient / gradient.norm(dim=1, keepdim=True), atol=1e-5)
 
 
+@pytest.mark.parametrize("geometry_frozen", [False, True])
+def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_frozen):
+    field, points = make_field(dataclasses.replace(BARE, sdf_input=True))
+    seen = []
+    field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[:2]))
+    factors = torch.ones(len(points), field.cells.dim + field.fourier.dim)
+    factors[:, ::2] = 0
+    factors[:, 1::2] = 3
+    for given in (None, factors):
+        field.intensity(points, *views(points), geometry_frozen=geometry_frozen, encoding_factors=given)
+    (encoding, logit), (hidden, logit_with_dropout) = seen
+    assert torch.equal(hidden, encoding * factors)
+    assert torch.equal(logit, logit_with_dropout)
+
+
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("geometry_frozen", [False, True])
 def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geometry_frozen):

@@ -181,3 +181,24 @@ def test_neighbours_in_a_batch_are_neighbours_in_space(rays):
         np.diff(dense.points[np.random.default_rng(0).permutation(NUM_RAYS)], axis=0), axis=1
     )
     assert np.median(steps) < 0.5 * np.median(shuffled)
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.3, 0.85])
+def test_dropout_zeroes_its_share_and_keeps_the_mean(rays, dropout):
+    state = torch.get_rng_state()
+    factors = sampler(rays).kept(999, 21, dropout)
+    assert factors.shape == (999, 21)
+    assert factors.dtype == torch.float32
+    assert abs(float((factors == 0).float().mean()) - dropout) < 0.015
+    assert abs(float(factors.mean()) - 1) < 0.05
+    assert len(factors.unique()) == (1 if dropout == 0 else 2)
+    assert torch.equal(factors, sampler(rays).kept(999, 21, dropout))
+    assert not torch.equal(factors, sampler(rays, seed=1).kept(999, 21, dropout)) or dropout == 0
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_dropout_hides_no_column_or_row_more_than_another(rays):
+    # The factors are cut from 64-bit words: each byte of a word has to do.
+    hidden = (sampler(rays).kept(8000, 8, 0.5) == 0).double()
+    assert (hidden.mean(0) - 0.5).abs().max() < 0.03
+    assert torch.corrcoef(hidden.T).fill_diagonal_(0).abs().max() < 0.06

@@ -51,11 +51,18 @@ class Field(nn.Module):
         return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
 
     def intensity(
-        self, points: Tensor, directions: Tensor, ranges_m: Tensor, *, geometry_frozen: bool = True
+        self,
+        points: Tensor,
+        directions: Tensor,
+        ranges_m: Tensor,
+        *,
+        geometry_frozen: bool = True,
+        encoding_factors: Tensor | None = None,
     ) -> Tensor:
         """Scaled intensity (N,); arguments as of :class:`~radarsdf.networks.IntensityNetwork`.
 
-        With `geometry_frozen`, no gradient reaches features and SDF network, and none of their graph is kept.
+        With `geometry_frozen`, no gradient reaches features and SDF network, and none of their graph is kept. What the
+        intensity network sees of the encoding is multiplied by `encoding_factors` (N, D): dropout.
         """
         network = self.intensity_network
         assert network is not None
@@ -71,4 +78,6 @@ class Field(nn.Module):
                 normals = functional.normalize(gradient, dim=1)
         if geometry_frozen:
             encoding, logit, geometry_feature = encoding.detach(), logit.detach(), geometry_feature.detach()
+        if encoding_factors is not None:
+            encoding = encoding * encoding_factors
         return network(encoding, logit, geometry_feature, normals, directions, ranges_m)  # type: ignore[no-any-return]
