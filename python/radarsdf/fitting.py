@@ -24,6 +24,7 @@ from radarsdf.losses import intensity_loss, sdf_loss
 from radarsdf.map import IntensityScale, RadarMap
 from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays, prepare
+from radarsdf.surfels import Surfels, support_of
 from radarsdf.threads import Workers
 
 _global_generator = threading.Lock()
@@ -86,24 +87,46 @@ def fit(
     )
     clock.lap("prepare_s")
     with Workers(config.num_threads) as workers:
+        sensed = {"ghosts": 0}
+        if config.drop_ghosts:
+            surfels = Surfels.of(rays)
+            noise = surfels.noise(rays)
+            ghosts = surfels.ghosts(rays, noise, workers.num_threads)
+            rays = rays.select(~ghosts)
+            sensed = {
+                "ghosts": int(ghosts.sum()),
+                "noise_range_m": noise.range_m,
+                "noise_angle_rad": noise.angle_rad,
+            }
+            clock.lap("ghosts_s")
         field = _new_field(rays, config, workers.num_threads)
         clock.lap("occupied_cells_s")
         scale = IntensityScale.of(rays.intensities)
         training = _Training(field, rays, scale, config, workers)
         training.run(progress)
         clock.lap("training_s")
+        support = support_of(rays.points, field.cells.table.leaf_keys(), config.leaf_size_m)
+        clock.lap("support_s")
     field.requires_grad_(False)
     field.zero_grad(set_to_none=True)  # the last gradient is as large as the map
     report = {
         "returns": sum(len(np.asarray(scan)) for scan in points),
         "returns_used": len(rays),
+        **sensed,
         "leaf_cells": len(field.cells.table.leaf_keys()),
         "vertices": field.cells.table.num_rows,
         "iterations": training.iterations,
         "losses": training.losses,
         **clock.laps,
     }
-    return RadarMap(field=field, origin=rays.origin, intensity_scale=scale, config=config, report=report)
+    return RadarMap(
+        field=field,
+        origin=rays.origin,
+        intensity_scale=scale,
+        config=config,
+        report=report,
+        support=support,
+    )
 
 
 def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
