@@ -60,9 +60,9 @@ SurfelMap::SurfelMap(const std::uint64_t* keys, const Surfel* surfels, std::int6
   for (std::int64_t i = 0; i < count; ++i) cells_.insert(keys[i], static_cast<std::int32_t>(i));
 }
 
-void SurfelMap::first_crossings(const float* points, const float* directions, const float* ranges_m,
-                                std::int64_t count, BeamNoise noise, float margin_m, float sigmas,
-                                std::int32_t* crossed, int num_threads) const {
+void SurfelMap::first_crossings(const float* points, const float* directions, const float* ranges_m, std::int64_t count,
+                                BeamNoise noise, float margin_m, float sigmas, std::int32_t* crossed,
+                                int num_threads) const {
   const FlatMapView cells = cells_.view();
   const double slack_m = kSlack * cell_size_m_;
   const double limit_m = (kAxisBias - 1) * cell_size_m_;  // NaN fails the comparison too

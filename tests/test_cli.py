@@ -19,7 +19,7 @@ from radarsdf.readers import Scans, write_scans
 
 FAST = [
     "--set",
-    "sdf_iterations=40",
+    "sdf_iterations=100",
     "--set",
     "intensity_iterations=20",
     "--set",

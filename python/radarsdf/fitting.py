@@ -87,17 +87,11 @@ def fit(
     )
     clock.lap("prepare_s")
     with Workers(config.num_threads) as workers:
-        sensed = {"ghosts": 0}
+        num_ghosts = 0
         if config.drop_ghosts:
-            surfels = Surfels.of(rays)
-            noise = surfels.noise(rays)
-            ghosts = surfels.ghosts(rays, noise, workers.num_threads)
-            rays = rays.select(~ghosts)
-            sensed = {
-                "ghosts": int(ghosts.sum()),
-                "noise_range_m": noise.range_m,
-                "noise_angle_rad": noise.angle_rad,
-            }
+            is_ghost = Surfels.of(rays).ghosts(rays, workers.num_threads)
+            num_ghosts = int(is_ghost.sum())
+            rays = rays.select(~is_ghost)
             clock.lap("ghosts_s")
         field = _new_field(rays, config, workers.num_threads)
         clock.lap("occupied_cells_s")
@@ -112,7 +106,7 @@ def fit(
     report = {
         "returns": sum(len(np.asarray(scan)) for scan in points),
         "returns_used": len(rays),
-        **sensed,
+        "ghosts": num_ghosts,
         "leaf_cells": len(field.cells.table.leaf_keys()),
         "vertices": field.cells.table.num_rows,
         "iterations": training.iterations,

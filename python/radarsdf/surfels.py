@@ -67,8 +67,10 @@ class Surfels:
         columns = [np.ones(len(points)), *points.T]
         columns += [points[:, i] * points[:, j] for i in range(3) for j in range(i, 3)]
         columns += [*rays.directions.T]
-        moments = np.stack([np.bincount(cell_of_ray, column, len(keys)) for column in columns], 1)
-        counts = moments[:, 0].copy()
+        moments = np.stack(
+            [np.bincount(cell_of_ray, column, len(keys)).astype(np.float64) for column in columns], 1
+        )
+        counts = moments[:, 0]
         moments = _sum_round(moments, neighbours, weighted=True)
         support = moments[:, 0]
         centres = moments[:, 1:4] / support[:, None]
@@ -108,9 +110,7 @@ class Surfels:
         if np.count_nonzero(flat) < 100:
             return BeamNoise(*np.sqrt(sigma2).tolist())
         cell, range_m = self.cell_of_ray[flat], rays.ranges_m[flat].astype(np.float64)
-        residual2 = (
-            np.einsum("ni,ni->n", rays.points[flat] - self.centres[cell], self.normals[cell]) ** 2
-        )
+        residual2 = np.einsum("ni,ni->n", rays.points[flat] - self.centres[cell], self.normals[cell]) ** 2
         cosine2 = np.einsum("ni,ni->n", rays.directions[flat], self.normals[cell]) ** 2
         parts = np.stack([cosine2, range_m**2 * (1 - cosine2)], 1)
         for _ in range(10):  # weights of the last round's variances; what is far outside does not count
@@ -121,12 +121,13 @@ class Surfels:
             sigma2 = 1.05 * np.maximum(solution, [1e-4, 1e-6])  # 1.05: a normal distribution beyond the limit
         return BeamNoise(*np.sqrt(sigma2).tolist())
 
-    def ghosts(self, rays: Rays, noise: BeamNoise, num_threads: int = 0) -> NDArray[np.bool_]:
+    def ghosts(self, rays: Rays, num_threads: int = 0) -> NDArray[np.bool_]:
         """(N,) whether a return is among those behind a surface that their own rays passed through.
 
         A radar sees by way of a mirror, and places what it sees straight on, behind the mirror. Such returns agree
         with each other from every position, so that neither their number nor what other rays passed betrays them.
         """
+        noise = self.noise(rays)
         table = np.concatenate([self.centres, self.normals, np.sqrt(self.variances[:, :1])], 1)
         table = table.astype(np.float32)
 
