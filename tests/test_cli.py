@@ -93,7 +93,7 @@ def test_fit_mesh_eval_chain(scans_file, map_file, tmp_path, capsys):
     assert png.stat().st_size > 1000
     sure = tmp_path / "sure.ply"
     command = ["mesh", str(map_file), "-o", str(sure), "--voxel", "0.2", *box, "--quiet"]
-    assert main([*command, "--min-confidence", "0.5"]) == 0
+    assert main([*command, "--min-confidence", "0.2"]) == 0
     assert 0 < len(trimesh.load_mesh(sure, process=False).faces) < len(mesh.faces)
     assert main([*command, "--min-confidence", "2"]) == 1
     capsys.readouterr()

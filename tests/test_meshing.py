@@ -124,7 +124,7 @@ def test_meshes_are_manifold(sharp_map, voxel_size):
 
 def test_meshes_are_open_only_where_the_occupied_region_ends(sharp_map):
     voxel_size = 0.1
-    mesh = with_changes(sharp_map, min_component_triangles=0).mesh(voxel_size)
+    mesh = with_changes(sharp_map, min_component_triangles=0, min_support=0.0).mesh(voxel_size)
     edges = single_edges(mesh.faces)
     assert len(edges) > 0
     voxels = {tuple(v) for v in _occupied_voxels(sharp_map, voxel_size).tolist()}
