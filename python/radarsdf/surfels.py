@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +65,13 @@ class Surfels:
         keys, cell_of_ray = np.unique(all_keys, return_inverse=True)
         neighbours = _neighbours(_lattice(keys))
         points = rays.points.astype(np.float64)
-        columns = [np.ones(len(points)), *points.T]
-        columns += [points[:, i] * points[:, j] for i in range(3) for j in range(i, 3)]
-        columns += [*rays.directions.T]
+        upper = [(i, j) for i in range(3) for j in range(i, 3)]
+        columns = itertools.chain(  # one at a time: all at once are a gigabyte for ten million returns
+            (np.ones(len(points)),),
+            points.T,
+            (points[:, i] * points[:, j] for i, j in upper),
+            rays.directions.T,
+        )
         moments = np.stack(
             [np.bincount(cell_of_ray, column, len(keys)).astype(np.float64) for column in columns], 1
         )
@@ -75,7 +80,7 @@ class Surfels:
         support = moments[:, 0]
         centres = moments[:, 1:4] / support[:, None]
         covariance = np.empty((len(keys), 3, 3))
-        for column, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), start=4):
+        for column, (i, j) in enumerate(upper, start=4):
             covariance[:, i, j] = covariance[:, j, i] = (
                 moments[:, column] / support - centres[:, i] * centres[:, j]
             )
