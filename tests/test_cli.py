@@ -61,7 +61,8 @@ def fails(capsys, arguments, folder=None):
 
 def test_demo_writes_everything_and_prints_the_errors(tmp_path, capsys):
     out = tmp_path / "demo"
-    command = ["demo", "--frames", "4", "--out", str(out), *FAST, "--set", "min_component_triangles=20"]
+    settings = ["--set", "min_component_triangles=20", "--set", "sdf_iterations=100"]
+    command = ["demo", "--frames", "4", "--out", str(out), *FAST, *settings]
     assert main(command) == 0
     printed = capsys.readouterr()
     assert files(out) == ["map.safetensors", "mesh.ply", "picture.png", "scans.npz"]
@@ -69,7 +70,7 @@ def test_demo_writes_everything_and_prints_the_errors(tmp_path, capsys):
         assert word in printed.out
     assert printed.err == ""
     radar_map = radarsdf.load(out / "map.safetensors")
-    assert radar_map.config.sdf_iterations == 40
+    assert radar_map.config.sdf_iterations == 100
     mesh = trimesh.load_mesh(out / "mesh.ply", process=False)
     assert len(mesh.faces) > 0
     assert (out / "picture.png").read_bytes().startswith(b"\x89PNG")
@@ -90,6 +91,12 @@ def test_fit_mesh_eval_chain(scans_file, map_file, tmp_path, capsys):
     assert (mesh.bounds[0] >= [8.9, -4.1, -1.1]).all()
     assert (mesh.bounds[1] <= [18.1, 4.1, 1.1]).all()
     assert png.stat().st_size > 1000
+    sure = tmp_path / "sure.ply"
+    command = ["mesh", str(map_file), "-o", str(sure), "--voxel", "0.2", *box, "--quiet"]
+    assert main([*command, "--min-confidence", "0.2"]) == 0
+    assert 0 < len(trimesh.load_mesh(sure, process=False).faces) < len(mesh.faces)
+    assert main([*command, "--min-confidence", "2"]) == 1
+    capsys.readouterr()
 
     for what in (ply, map_file):
         assert main(["eval", str(what), str(scans_file), "--samples", "20000", *box]) == 0

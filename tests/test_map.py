@@ -280,3 +280,19 @@ def test_intensity_scale():
     np.testing.assert_allclose(scale.to_unit(values), [0, 0.5, 1])
     np.testing.assert_allclose(scale.to_sensor(torch.from_numpy(scale.to_unit(values))), values)
     assert IntensityScale.of(None) is None
+
+
+def test_confidence_is_that_of_the_returns_round_a_point(sharp_map, scene):
+    returns = np.concatenate(
+        [p @ T[:3, :3].T + T[:3, 3] for p, T in zip(scene.points, scene.poses, strict=True)]
+    )
+    confidence = sharp_map.confidence(returns)
+    assert confidence.dtype == np.float64
+    assert (confidence > 0).all()
+    assert (confidence < 1).all()
+    near = np.abs(returns[:, None] - returns[None, :300]).max(axis=2) < 0.3  # 27 cells of 0.2 m, centred
+    assert np.corrcoef(near.sum(axis=0), confidence[:300] / (1 - confidence[:300]))[0, 1] > 0.8
+    assert (sharp_map.confidence(returns + [0, 0, 50.0]) == 0).all()
+    # Continuous: no step from one cell to the next.
+    line = np.linspace(returns[0] - 0.5, returns[0] + 0.5, 2001)
+    assert np.abs(np.diff(sharp_map.confidence(line))).max() < 0.02

@@ -32,6 +32,7 @@ def with_changes(radar_map, *, origin=(0, 0, 0), **settings):
         intensity_scale=radar_map.intensity_scale,
         config=dataclasses.replace(radar_map.config, **settings),
         report={},
+        support=radar_map.support,
     )
 
 
@@ -123,7 +124,7 @@ def test_meshes_are_manifold(sharp_map, voxel_size):
 
 def test_meshes_are_open_only_where_the_occupied_region_ends(sharp_map):
     voxel_size = 0.1
-    mesh = with_changes(sharp_map, min_component_triangles=0).mesh(voxel_size)
+    mesh = with_changes(sharp_map, min_component_triangles=0, min_support=0.0).mesh(voxel_size)
     edges = single_edges(mesh.faces)
     assert len(edges) > 0
     voxels = {tuple(v) for v in _occupied_voxels(sharp_map, voxel_size).tolist()}
@@ -311,3 +312,35 @@ def test_uneven_voxels_cover_the_cells_and_little_more(sharp_map, voxel_size):
     for a, b in zip(low.tolist(), high.tolist(), strict=True):
         touched = ((x, y, z) for x in range(a[0], b[0]) for y in range(a[1], b[1]) for z in range(a[2], b[2]))
         assert any(cell in occupied for cell in touched)
+
+
+def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path):
+    confidence = mesh.vertex_attributes["confidence"]
+    assert confidence.dtype == np.float32
+    np.testing.assert_allclose(confidence, sharp_map.confidence(np.asarray(mesh.vertices)), atol=1e-6)
+    assert confidence.min() >= sharp_map.least_confidence > 0
+    mesh.export(tmp_path / "mesh.ply")
+    assert b"property float confidence" in (tmp_path / "mesh.ply").read_bytes()[:1000]
+
+
+def test_less_confident_triangles_are_cut(sharp_map):
+    whole = with_changes(sharp_map, min_support=0.0, min_component_triangles=0)
+    confidence = whole.mesh().vertex_attributes["confidence"]
+    half = float(np.median(confidence))
+    cut = whole.mesh(min_confidence=half)
+    assert 0 < len(cut.vertices) < len(confidence)
+    assert cut.vertex_attributes["confidence"].min() >= half
+    share = 10 * half / (1 - half) / np.median(sharp_map.support[sharp_map.support > 0])
+    same = with_changes(sharp_map, min_support=float(share), min_component_triangles=0).mesh()
+    assert abs(len(same.faces) - len(cut.faces)) <= 0.01 * len(cut.faces)
+    for wrong in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match="min_confidence"):
+            whole.mesh(min_confidence=wrong)
+
+
+def test_a_map_without_support_has_a_mesh_without_confidence(sharp_map):
+    old = with_changes(sharp_map)
+    old.support = None
+    assert "confidence" not in old.mesh().vertex_attributes
+    with pytest.raises(ValueError, match="without confidence"):
+        old.mesh(min_confidence=0.5)

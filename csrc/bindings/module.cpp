@@ -10,4 +10,5 @@ PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   radarsdf::bind_vertex_table(m);
   radarsdf::bind_encodings(m);
   radarsdf::bind_marching_cubes(m);
+  radarsdf::bind_surface_crossings(m);
 }

@@ -12,6 +12,7 @@ import typing
 __all__: list[str] = [
     "CellSet",
     "Encoding",
+    "SurfelMap",
     "VertexTable",
     "available_instruction_sets",
     "cell_keys",
@@ -248,6 +249,34 @@ class VertexTable:
     def num_levels(self) -> int: ...
     @property
     def num_rows(self) -> int: ...
+
+class SurfelMap:
+    """
+    Pieces of plane in cells, and the rays that pass through them.
+    """
+    def __init__(
+        self,
+        keys: numpy.typing.NDArray[numpy.uint64],
+        surfels: numpy.typing.NDArray[numpy.float32],
+        cell_size_m: typing.SupportsFloat | typing.SupportsIndex,
+    ) -> None:
+        """
+        `keys` (M,) uint64 of `cell_keys`, each once; `surfels` (M, 7) float32: centre, normal towards the sensors, standard deviation of the returns across the plane; local frame, m.
+        """
+    def first_crossings(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        directions: numpy.typing.NDArray[numpy.float32],
+        ranges_m: numpy.typing.NDArray[numpy.float32],
+        sigma_range_m: typing.SupportsFloat | typing.SupportsIndex,
+        sigma_angle_rad: typing.SupportsFloat | typing.SupportsIndex,
+        margin_m: typing.SupportsFloat | typing.SupportsIndex,
+        sigmas: typing.SupportsFloat | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.int32]:
+        """
+        For each ray the first surfel that it crosses from the front and ends behind of by more than `margin_m` and `sigmas` standard deviations, -1 where there is none: (N,) int32.
+        """
 
 def available_instruction_sets() -> list[str]:
     """

@@ -77,6 +77,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar=("X", "Y", "Z"),
         help="colour by the intensity seen from here",
     )
+    mesh.add_argument(
+        "--min-confidence", type=float, default=0.0, metavar="C", help="leave out what is less sure, 0 to 1"
+    )
     mesh.add_argument("--picture", type=Path, metavar="PNG", help="draw it, too")
     mesh.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -190,7 +193,11 @@ def _fit(options: argparse.Namespace) -> None:
 def _mesh(options: argparse.Namespace) -> None:
     radar_map = radarsdf.load(options.map)
     mesh = radar_map.mesh(
-        options.voxel, box=_box(options), viewpoint=options.viewpoint, progress=_progress(options)
+        options.voxel,
+        box=_box(options),
+        viewpoint=options.viewpoint,
+        min_confidence=options.min_confidence,
+        progress=_progress(options),
     )
     if len(mesh.faces) == 0:
         msg = f"{options.map} has no surface here: nothing written"

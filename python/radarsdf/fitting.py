@@ -24,6 +24,7 @@ from radarsdf.losses import intensity_loss, sdf_loss
 from radarsdf.map import IntensityScale, RadarMap
 from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays, prepare
+from radarsdf.surfels import Surfels, support_of
 from radarsdf.threads import Workers
 
 _DROPOUT_HALF_PASSES = 3.0  # each sample seen so often: half of the configured dropout
@@ -88,24 +89,40 @@ def fit(
     )
     clock.lap("prepare_s")
     with Workers(config.num_threads) as workers:
+        num_ghosts = 0
+        if config.drop_ghosts:
+            is_ghost = Surfels.of(rays).ghosts(rays, workers.num_threads)
+            num_ghosts = int(is_ghost.sum())
+            rays = rays.select(~is_ghost)
+            clock.lap("ghosts_s")
         field = _new_field(rays, config, workers.num_threads)
         clock.lap("occupied_cells_s")
         scale = IntensityScale.of(rays.intensities)
         training = _Training(field, rays, scale, config, workers)
         training.run(progress)
         clock.lap("training_s")
+        support = support_of(rays.points, field.cells.table.leaf_keys(), config.leaf_size_m)
+        clock.lap("support_s")
     field.requires_grad_(False)
     field.zero_grad(set_to_none=True)  # the last gradient is as large as the map
     report = {
         "returns": sum(len(np.asarray(scan)) for scan in points),
         "returns_used": len(rays),
+        "ghosts": num_ghosts,
         "leaf_cells": len(field.cells.table.leaf_keys()),
         "vertices": field.cells.table.num_rows,
         "iterations": training.iterations,
         "losses": training.losses,
         **clock.laps,
     }
-    return RadarMap(field=field, origin=rays.origin, intensity_scale=scale, config=config, report=report)
+    return RadarMap(
+        field=field,
+        origin=rays.origin,
+        intensity_scale=scale,
+        config=config,
+        report=report,
+        support=support,
+    )
 
 
 def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:

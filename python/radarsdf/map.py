@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from radarsdf._core import cell_keys
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
 from radarsdf.threads import Workers
@@ -22,6 +24,7 @@ from radarsdf.threads import Workers
 if TYPE_CHECKING:
     import trimesh
 
+_HALF_SUPPORT = 10.0  # returns round a cell that are worth a confidence of one half
 _CHUNK = 1 << 13  # points evaluated at a time: hidden layers stay in the second-level cache
 
 
@@ -60,6 +63,9 @@ class RadarMap:
         Range of the training intensities, sensor units; None without a reflectance side.
     report : dict
         Counts, losses and seconds of the fit.
+    support : ndarray or None
+        (C,) uint16, returns in and round each leaf cell, in the order of the cells' keys; None for a map from a file of
+        an earlier version.
     """
 
     def __init__(
@@ -70,11 +76,13 @@ class RadarMap:
         intensity_scale: IntensityScale | None,
         config: FitConfig,
         report: dict[str, Any],
+        support: NDArray[np.uint16] | None = None,
     ) -> None:
         self.origin = origin
         self.config = config
         self.intensity_scale = intensity_scale
         self.report = report
+        self.support = support
         self._field = field
 
     def __repr__(self) -> str:
@@ -92,6 +100,14 @@ class RadarMap:
     def nbytes(self) -> int:
         """Size of features and network weights, bytes: what the paper calls the map's size."""
         return sum(p.numel() * p.element_size() for p in self._field.parameters())
+
+    @property
+    def least_confidence(self) -> float:
+        """What the mesh leaves out: ``config.min_support`` of the median support, as a confidence."""
+        if self.support is None or not self.support.any():
+            return 0.0
+        returns = self.config.min_support * float(np.median(self.support[self.support > 0]))
+        return returns / (returns + _HALF_SUPPORT)
 
     @property
     def field(self) -> Field:
@@ -153,6 +169,56 @@ class RadarMap:
         return answer(evaluate(self._field.cells.occupied, points))
 
     @overload
+    def confidence(self, x: Tensor) -> Tensor: ...
+    @overload
+    def confidence(self, x: ArrayLike) -> NDArray[Any]: ...
+    def confidence(self, x: Any) -> Any:
+        """How well the data supports a surface at points.
+
+        Parameters
+        ----------
+        x : (N, 3) array or tensor
+            World, m.
+
+        Returns
+        -------
+        (N,) array or tensor
+            n / (n + 10) for n returns in the 27 leaf cells round the point, interpolated, without those that the fit
+            dropped as ghosts: 0 where there are none, 0.5 at ten, towards 1 with more. It orders places by how far off
+            the surface is likely to be; it is no probability.
+
+        Raises
+        ------
+        ValueError
+            If the map comes from a file of a version that did not store it.
+        """
+        if self.support is None:
+            msg = "this map was saved by an earlier version, without confidence: fit it again"
+            raise ValueError(msg)
+        points, answer = self._local(x)
+        leaf_keys = self._field.cells.table.leaf_keys()
+        leaf_size_m = self._field.cells.table.leaf_size_m
+        support = torch.from_numpy(self.support.astype(np.float32))
+
+        def confidence(chunk: Tensor) -> Tensor:
+            # Trilinear between the centres of cells: a vertex on a cell's face is of both sides.
+            u = chunk / leaf_size_m - 0.5
+            lower = u.floor()
+            share = u - lower
+            returns = torch.zeros(len(chunk))
+            for corner in itertools.product((0.0, 1.0), repeat=3):
+                at = torch.tensor(corner)
+                centres = ((lower + at + 0.5) * leaf_size_m).numpy()
+                keys = cell_keys(centres, leaf_size_m, 1)
+                rows = np.minimum(np.searchsorted(leaf_keys, keys), len(leaf_keys) - 1)
+                known = torch.from_numpy(leaf_keys[rows] == keys)
+                weight = torch.where(at > 0, share, 1 - share).prod(1)
+                returns += weight * torch.where(known, support[torch.from_numpy(rows)], 0.0)
+            return returns / (returns + _HALF_SUPPORT)
+
+        return answer(evaluate(confidence, points))
+
+    @overload
     def intensity(self, x: Tensor, sensor_positions: Tensor) -> Tensor: ...
     @overload
     def intensity(self, x: ArrayLike, sensor_positions: ArrayLike) -> NDArray[Any]: ...
@@ -197,12 +263,20 @@ class RadarMap:
         *,
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
+        min_confidence: float = 0.0,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
         """The surface as triangles; see :func:`radarsdf.meshing.extract_mesh`."""
         from radarsdf.meshing import extract_mesh  # noqa: PLC0415 - meshing is built on the map
 
-        return extract_mesh(self, voxel_size, box=box, viewpoint=viewpoint, progress=progress)
+        return extract_mesh(
+            self,
+            voxel_size,
+            box=box,
+            viewpoint=viewpoint,
+            min_confidence=min_confidence,
+            progress=progress,
+        )
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes the whole map to one safetensors file; :func:`radarsdf.load` reads it back to the same answers."""

@@ -28,6 +28,7 @@ def extract_mesh(
     *,
     box: ArrayLike | None = None,
     viewpoint: ArrayLike | None = None,
+    min_confidence: float = 0.0,
     progress: bool | None = None,
 ) -> trimesh.Trimesh:
     """Marching cubes on the zero level of the signed distance, only where the map is occupied.
@@ -43,20 +44,28 @@ def extract_mesh(
     viewpoint : (3,) array_like, optional
         Sensor position, world, m. The vertices then carry the predicted intensity for it, in sensor units, as
         ``mesh.vertex_attributes["intensity"]``, and colours from dark (low) to bright (high).
+    min_confidence : float
+        In [0, 1]: triangles with a vertex of less confidence are left out, before small components are; so are, in any
+        case, those below :attr:`RadarMap.least_confidence`.
     progress : bool, optional
         Whether to show a progress bar; by default only on a terminal.
 
     Returns
     -------
     trimesh.Trimesh
-        World frame, m; triangles, and so vertex normals, face free space. Components of fewer triangles than
-        ``config.min_component_triangles`` are left out. Empty where there is no surface.
+        World frame, m; triangles, and so vertex normals, face free space. Components of fewer triangles
+        than ``config.min_component_triangles`` are left out. Empty where there is no surface. The vertices carry
+        :meth:`RadarMap.confidence` as ``mesh.vertex_attributes["confidence"]``, where the map knows it.
 
     Raises
     ------
     ValueError
-        For a voxel size, box or viewpoint that makes no sense, or a viewpoint for a map without intensities.
+        For a voxel size, box, viewpoint or confidence that makes no sense, a viewpoint for a map without intensities,
+        or a confidence for a map that does not know it.
     """
+    if not 0 <= min_confidence <= 1:
+        msg = f"min_confidence must be in [0, 1], not {min_confidence}"
+        raise ValueError(msg)
     if not (math.isfinite(voxel_size) and voxel_size > 0):
         msg = f"voxel_size must be positive and finite, not {voxel_size}"
         raise ValueError(msg)
@@ -72,8 +81,15 @@ def extract_mesh(
     vertices, faces = extract_cells(
         corners, values, voxel_corners, spacing=[voxel_size] * 3, num_threads=num_threads
     )
-    vertices, faces = _without_small_components(vertices, faces, radar_map.config.min_component_triangles)
-    mesh = trimesh.Trimesh(vertices + radar_map.origin, faces, process=False)
+    confidence = None
+    if radar_map.support is not None or min_confidence > 0:
+        confidence = radar_map.confidence(vertices + radar_map.origin).astype(np.float32)
+        least = max(min_confidence, radar_map.least_confidence)
+        faces = faces[(confidence[faces] >= least).all(axis=1)]
+    kept, faces = _without_small_components(len(vertices), faces, radar_map.config.min_component_triangles)
+    mesh = trimesh.Trimesh(vertices[kept] + radar_map.origin, faces, process=False)
+    if confidence is not None:
+        mesh.vertex_attributes["confidence"] = confidence[kept]
     if sensor_position is not None:
         intensity = radar_map.intensity(np.asarray(mesh.vertices), sensor_position).astype(np.float32)
         mesh.vertex_attributes["intensity"] = intensity
@@ -150,11 +166,12 @@ def _corner_distances(
 
 
 def _without_small_components(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32], min_triangles: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    labels, sizes = mesh_components(faces, len(vertices))
+    num_vertices: int, faces: NDArray[np.int32], min_triangles: int
+) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+    """Which vertices (V,) the large components use, and their faces in the numbers of these vertices."""
+    labels, sizes = mesh_components(faces, num_vertices)
     faces = faces[sizes[labels] >= min_triangles] if len(faces) else faces
-    used = np.zeros(len(vertices), bool)
+    used = np.zeros(num_vertices, bool)
     used[faces] = True
     renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return vertices[used], renumbered[faces]
+    return used, renumbered[faces]

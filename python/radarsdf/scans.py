@@ -39,7 +39,10 @@ class Rays:
 
     def every(self, step: int, first: int) -> Rays:
         """Each `step`-th ray from `first` on."""
-        part = slice(first, None, step)
+        return self.select(slice(first, None, step))
+
+    def select(self, part: slice | NDArray[np.bool_]) -> Rays:
+        """Some of the rays."""
         return dataclasses.replace(
             self,
             points=self.points[part],

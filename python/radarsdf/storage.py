@@ -23,7 +23,7 @@ from radarsdf.field import Field
 from radarsdf.map import IntensityScale, RadarMap
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 1: without support
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 
 
@@ -35,6 +35,8 @@ def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
     tensors["origin"] = torch.from_numpy(radar_map.origin)
     # Morton keys use 63 bits, so the cast to the signed integers that every reader knows is lossless.
     tensors["leaf_keys"] = torch.from_numpy(radar_map.field.cells.table.leaf_keys().astype(np.int64))
+    if radar_map.support is not None:
+        tensors["support"] = torch.from_numpy(radar_map.support)
     scale = radar_map.intensity_scale
     description = {
         "config": radar_map.config.to_dict(),
@@ -124,6 +126,10 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
     if leaf_keys.ndim != 1 or leaf_keys.dtype != torch.int64:
         msg = "leaf_keys is not a list of cells"
         raise ValueError(msg)
+    support = tensors.pop("support", None)  # maps of the first format lack it
+    if support is not None and (support.shape != leaf_keys.shape or support.dtype != torch.uint16):
+        msg = "support is not a number of returns for each cell"
+        raise ValueError(msg)
     scale = None
     if description["intensity_scale"] is not None:
         low, high = description["intensity_scale"]
@@ -145,4 +151,5 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
         intensity_scale=scale,
         config=config,
         report=dict(description["report"]),
+        support=None if support is None else support.numpy().copy(),
     )

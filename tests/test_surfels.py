@@ -1,0 +1,198 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Planes through returns: what lies behind them, how noisy the sensor is, how many returns support a place."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf._core import SurfelMap, cell_keys
+from radarsdf.scans import prepare
+from radarsdf.surfels import Surfels, _lattice, support_of
+
+from .conftest import ground_and_wall
+
+CELL_M = 0.4
+
+
+def a_wall(noise_range_m=0.05, noise_angle_rad=0.01, scans=8, returns=1500, ghosts=0):
+    """Scans of the ground and of a wall at x = 15; the last `ghosts` of each lie behind the wall, or below the ground."""
+    rng = np.random.default_rng(0)
+    points, poses, is_ghost = [], [], []
+    for i in range(scans):
+        T_world_sensor = np.eye(4)
+        T_world_sensor[:3, 3] = [0.5 * i, 0.5 * np.sin(i), 1.5]
+        half = returns // 2
+        ground = np.column_stack([rng.uniform(4, 15, half), rng.uniform(-5, 5, half), np.zeros(half)])
+        wall = np.column_stack([np.full(half, 15.0), rng.uniform(-5, 5, half), rng.uniform(0, 4, half)])
+        rays = np.concatenate([ground, wall]) - T_world_sensor[:3, 3]
+        range_m = np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = rays / range_m + noise_angle_rad * rng.normal(size=rays.shape)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        measured = rays * (range_m + noise_range_m * rng.normal(size=range_m.shape))
+        mirrored = measured[-ghosts:] * rng.uniform(1.15, 1.5, (ghosts, 1)) if ghosts else measured[:0]
+        points.append(np.concatenate([measured, mirrored]))
+        is_ghost.append(np.arange(len(points[-1])) >= len(measured))
+        poses.append(T_world_sensor)
+    return points, np.stack(poses), np.concatenate(is_ghost)
+
+
+@pytest.mark.parametrize(("range_m", "angle_rad"), [(0.05, 0.004), (0.05, 0.012), (0.1, 0.008)])
+def test_the_noise_is_found_in_the_data(range_m, angle_rad):
+    points, poses, _ = a_wall(range_m, angle_rad)
+    rays = prepare(points, poses)
+    noise = Surfels.of(rays).noise(rays)
+    assert noise.range_m == pytest.approx(range_m, rel=0.35)
+    assert noise.angle_rad == pytest.approx(angle_rad, rel=0.35)
+
+
+def test_ghosts_are_found_and_the_surface_is_kept():
+    points, poses, is_ghost = a_wall(ghosts=40)
+    rays = prepare(points, poses)
+    surfels = Surfels.of(rays)
+    dropped = surfels.ghosts(rays)
+    assert dropped[is_ghost].mean() > 0.9
+    assert dropped[~is_ghost].mean() < 0.005
+    np.testing.assert_array_equal(dropped, surfels.ghosts(rays, num_threads=1))
+    np.testing.assert_array_equal(dropped, surfels.ghosts(rays, num_threads=3))
+
+
+def test_a_fit_drops_and_counts_them():
+    points, poses, is_ghost = a_wall(ghosts=40)
+    config = FitConfig(sdf_iterations=5, min_range_m=0.0)
+    with_ghosts, without = (
+        radarsdf.fit(points, poses, config=dataclasses.replace(config, drop_ghosts=drop), progress=False)
+        for drop in (False, True)
+    )
+    assert with_ghosts.report["ghosts"] == 0
+    assert without.report["ghosts"] > 0.9 * is_ghost.sum()
+    assert without.report["returns_used"] + without.report["ghosts"] == len(is_ghost)
+    assert not FitConfig.paper().drop_ghosts
+    behind = [[19.0, y, 2.0] for y in np.linspace(-3, 3, 50)]
+    assert without.observed(behind).sum() < with_ghosts.observed(behind).sum()
+
+
+def test_a_hedge_that_rays_pass_is_no_mirror():
+    """A plane that most rays go through: what is behind it is real."""
+    points, poses, _ = a_wall()
+    rng = np.random.default_rng(1)
+    passed = [np.concatenate([p[-750:] * rng.uniform(1.3, 1.9, (750, 1)) for _ in range(5)]) for p in points]
+    rays = prepare([np.concatenate(pair) for pair in zip(points, passed, strict=True)], poses)
+    behind = np.concatenate([np.arange(1500 + 3750) >= 1500] * len(points))
+    assert Surfels.of(rays).ghosts(rays)[behind].mean() < 0.05
+
+
+def test_few_returns_make_no_plane():
+    few = ground_and_wall(scans=2, returns_per_scan=20)
+    rays = prepare(few.points, few.poses)
+    surfels = Surfels.of(rays)
+    assert not surfels.ghosts(rays).any()
+    assert np.isfinite([surfels.noise(rays).range_m, surfels.noise(rays).angle_rad]).all()
+
+
+def one_surfel(normal=(-1.0, 0, 0), thickness_m=0.0):
+    """A plane through (10, 0.2, 0.2)."""
+    centre = np.array([[10.0, 0.2, 0.2]], np.float32)
+    row = np.concatenate([centre, [normal], [[thickness_m]]], 1).astype(np.float32)
+    return SurfelMap(cell_keys(centre, CELL_M), row, CELL_M)
+
+
+def crossed(surfels, sensor, point, noise=(0.01, 0.001), margin_m=0.1, sigmas=2.0):
+    ray = np.asarray(point, np.float64) - sensor
+    range_m = np.linalg.norm(ray)
+    arrays = np.atleast_2d(point), np.atleast_2d(ray / range_m), np.array([range_m])
+    return surfels.first_crossings(*(a.astype(np.float32) for a in arrays), *noise, margin_m, sigmas).tolist()
+
+
+def test_crossings_of_one_surfel():
+    sensor = np.array([0.0, 0.2, 0.2])
+    assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2]) == [0]
+    assert crossed(one_surfel(), sensor, [9.5, 0.2, 0.2]) == [-1]  # ends in front
+    assert crossed(one_surfel(), sensor, [10.1, 0.2, 0.2]) == [-1]  # within the margin
+    assert crossed(one_surfel(), sensor, [11.0, 3.0, 0.2]) == [-1]  # passes beside
+    assert crossed(one_surfel([1, 0, 0]), sensor, [11.0, 0.2, 0.2]) == [-1]  # comes from behind
+    assert crossed(one_surfel(thickness_m=0.5), sensor, [11.0, 0.2, 0.2]) == [
+        -1
+    ]  # within two of its deviations
+    assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.5, 0.0)) == [
+        -1
+    ]  # within two of the sensor's
+    assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.0, 0.5)) == [
+        0
+    ]  # across the beam: no depth
+
+
+@pytest.mark.parametrize("sensor", [[0, 5, 3], [8, -9, 2], [2, 0.2, 0.2], [9.9, 0.25, 9]])
+def test_the_walk_finds_what_a_search_of_all_surfels_finds(sensor):
+    """A row of facing planes: a ray through any of them crosses the first on its way."""
+    x = np.arange(11, 14, CELL_M) + 0.05
+    centres = np.column_stack([x, np.full(len(x), 0.2), np.full(len(x), 0.2)]).astype(np.float32)
+    rows = np.concatenate([centres, np.tile([[-1.0, 0, 0, 0]], (len(x), 1))], 1).astype(np.float32)
+    surfels = SurfelMap(cell_keys(centres, CELL_M), rows, CELL_M)
+    rng = np.random.default_rng(1)
+    targets = np.column_stack([rng.uniform(11, 14, 500), rng.uniform(0.05, 0.35, (500, 2))])
+    rays = targets - sensor
+    points = sensor + rays * 1.6
+    range_m = np.linalg.norm(points - sensor, axis=1)
+    found = surfels.first_crossings(
+        points.astype(np.float32),
+        ((points - sensor) / range_m[:, None]).astype(np.float32),
+        range_m.astype(np.float32),
+        0.0, 0.0, 0.1, 2.0,
+    )  # fmt: skip
+    # Where each ray meets each plane, and whether that is well inside the plane's cell.
+    t = (centres[None, :, 0] - sensor[0]) / rays[:, None, 0]
+    at = np.asarray(sensor) + t[..., None] * rays[:, None]
+    inside = (np.abs(at[..., 1:] - 0.2) < 0.19).all(axis=2) & (points[:, None, 0] > centres[None, :, 0] + 0.2)
+    surely = inside.any(axis=1)
+    assert surely.sum() > 20
+    first = np.argmax(inside, axis=1)
+    assert (found[surely] >= 0).all()
+    assert (found[surely] <= first[surely]).all()  # an earlier one may be met within the slack of its cell
+
+
+def test_rays_beyond_the_lattice_cross_nothing():
+    far = np.array([[1e9, 0, 0]], np.float32)
+    direction = np.array([[1.0, 0, 0]], np.float32)
+    for point, range_m in (
+        (far, 10.0),
+        (far, 1e9),
+        (far * np.nan, 1.0),
+        (np.zeros((1, 3), np.float32), np.nan),
+    ):
+        ranges = np.array([range_m], np.float32)
+        assert one_surfel().first_crossings(point, direction, ranges, 0.1, 0.1, 0.1, 2.0).tolist() == [-1]
+
+
+def test_shapes_are_checked():
+    with pytest.raises(ValueError, match="surfels"):
+        SurfelMap(np.zeros(2, np.uint64), np.zeros((2, 6), np.float32), CELL_M)
+    with pytest.raises(ValueError, match="cell_size_m"):
+        SurfelMap(np.zeros(0, np.uint64), np.zeros((0, 7), np.float32), 0.0)
+    with pytest.raises(ValueError, match="points"):
+        one_surfel().first_crossings(
+            np.zeros((2, 3), np.float32), np.zeros((1, 3), np.float32), np.zeros(1, np.float32), 0, 0, 0, 0
+        )
+
+
+def test_lattice_coordinates_of_keys():
+    cells = np.random.default_rng(0).integers(-500_000, 500_000, (1000, 3))
+    keys = cell_keys((cells + 0.5).astype(np.float64), 1.0)
+    np.testing.assert_array_equal(_lattice(keys), cells)
+
+
+def test_support_counts_the_returns_in_27_cells():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
+    cells = np.floor(points / np.float32(0.2)).astype(int)
+    leaf_keys = np.unique(cell_keys(points, 0.2))
+    expected = [(np.abs(cells - cell).max(axis=1) <= 1).sum() for cell in _lattice(leaf_keys)]
+    support = support_of(points, leaf_keys, 0.2)
+    assert support.dtype == np.uint16
+    np.testing.assert_array_equal(support, expected)
+    crowd = np.full((70_000, 3), 0.1, np.float32)
+    assert support_of(crowd, np.unique(cell_keys(crowd, 0.2)), 0.2).tolist() == [65535]
