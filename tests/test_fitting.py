@@ -281,3 +281,24 @@ def test_paper_configuration_is_the_published_one():
     assert FitConfig.from_dict(paper.to_dict()) == paper
     with pytest.raises(ValueError, match="unknown settings: colour"):
         FitConfig.from_dict({"colour": 1})
+
+
+def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
+    is_ghost = np.concatenate(scene.points)[:, 2] > -0.5  # of the sensor frame: the wall, for once
+    assert 0.1 < is_ghost.mean() < 0.9
+    monkeypatch.setattr("radarsdf.fitting.Surfels.ghosts", lambda *_: is_ghost)
+    drawn_from = []
+    spread = RaySampler.spread
+    monkeypatch.setattr(
+        RaySampler, "spread", lambda self, count: (drawn_from.append(len(self._rays)), spread(self, count))[1]
+    )
+    config = dataclasses.replace(QUICK, joint=False, drop_ghosts=True, num_threads=1)
+    with_ghosts = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
+    assert with_ghosts.report["ghosts"] == is_ghost.sum()
+    assert set(drawn_from) == {len(is_ghost)}
+    kept = np.split(~is_ghost, np.cumsum([len(p) for p in scene.points])[:-1])
+    points = [p[k] for p, k in zip(scene.points, kept, strict=True)]
+    config = dataclasses.replace(config, drop_ghosts=False)
+    without = radarsdf.fit(points, scene.poses, config=config)
+    assert with_ghosts.report["leaf_cells"] == without.report["leaf_cells"]
+    assert with_ghosts.support.tolist() == without.support.tolist()

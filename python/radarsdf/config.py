@@ -198,7 +198,7 @@ class FitConfig:
     """Adam's (3QFP)."""
 
     # Mesh
-    min_support: float = 0.1
+    min_support: float = 0.15
     """The mesh leaves out what fewer returns support than this share of the median (3QFP: 0). A share, since what is much
     for a sparse sensor is little for a dense one."""
     min_component_triangles: int = 30

@@ -89,26 +89,25 @@ def fit(
     )
     clock.lap("prepare_s")
     with Workers(config.num_threads) as workers:
-        num_ghosts = 0
+        is_ghost, surface = None, rays
         if config.drop_ghosts:
             is_ghost = Surfels.of(rays).ghosts(rays, workers.num_threads)
-            num_ghosts = int(is_ghost.sum())
-            rays = rays.select(~is_ghost)
+            surface = rays.select(~is_ghost)
             clock.lap("ghosts_s")
-        field = _new_field(rays, config, workers.num_threads)
+        field = _new_field(surface, config, workers.num_threads)
         clock.lap("occupied_cells_s")
         scale = IntensityScale.of(rays.intensities)
-        training = _Training(field, rays, scale, config, workers)
+        training = _Training(field, rays, is_ghost, scale, config, workers)
         training.run(progress)
         clock.lap("training_s")
-        support = support_of(rays.points, field.cells.table.leaf_keys(), config.leaf_size_m)
+        support = support_of(surface.points, field.cells.table.leaf_keys(), config.leaf_size_m)
         clock.lap("support_s")
     field.requires_grad_(False)
     field.zero_grad(set_to_none=True)  # the last gradient is as large as the map
     report = {
         "returns": sum(len(np.asarray(scan)) for scan in points),
-        "returns_used": len(rays),
-        "ghosts": num_ghosts,
+        "returns_used": len(surface),
+        "ghosts": len(rays) - len(surface),
         "leaf_cells": len(field.cells.table.leaf_keys()),
         "vertices": field.cells.table.num_rows,
         "iterations": training.iterations,
@@ -148,6 +147,25 @@ def _new_field(rays: Rays, config: FitConfig, num_threads: int) -> Field:
     return field
 
 
+class _Source:
+    """Rays to draw samples from, with what the intensity network is to know of them."""
+
+    def __init__(
+        self,
+        rays: Rays,
+        scale: IntensityScale | None,
+        config: FitConfig,
+        batch_size: int,
+        generator: torch.Generator,
+    ) -> None:
+        self.sampler = RaySampler(rays, config, batch_size, generator)
+        self.directions = torch.from_numpy(rays.directions)
+        self.ranges_m = torch.from_numpy(rays.ranges_m)
+        self.intensities = None
+        if scale is not None and rays.intensities is not None:
+            self.intensities = torch.from_numpy(scale.to_unit(rays.intensities))
+
+
 class _Shard:
     """One thread's share of the rays and of each batch: it draws samples and computes gradients."""
 
@@ -155,51 +173,55 @@ class _Shard:
         self,
         field: Field,
         rays: Rays,
+        is_ghost: NDArray[np.bool_] | None,
         scale: IntensityScale | None,
         config: FitConfig,
         part: int,
         parts: int,
         dropout_scale: float,
     ) -> None:
-        rays = rays.every(parts, part)
         self._field = field
         self._config = config
-        self._intensities = None
-        if scale is not None and rays.intensities is not None:
-            self._intensities = torch.from_numpy(scale.to_unit(rays.intensities))
-        self._directions = torch.from_numpy(rays.directions)
-        self._ranges_m = torch.from_numpy(rays.ranges_m)
         generator = torch.Generator().manual_seed(config.seed * MAX_THREADS + part)
-        self._sampler = RaySampler(rays, config, _share(config.batch_size, part, parts), generator)
+
+        def source(returns: Rays) -> _Source:
+            share = _share(config.batch_size, part, parts)
+            return _Source(returns.every(parts, part), scale, config, share, generator)
+
+        self._surface = source(rays if is_ghost is None else rays.select(~is_ghost))
+        # A ghost has an intensity, though no surface: the sensor will see it again.
+        self._returns = self._surface if is_ghost is None or scale is None else source(rays)
         self._dropouts = (dropout_scale * config.feature_dropout, dropout_scale * config.fourier_dropout)
         self._intensity_batch_size = _share(config.intensity_batch_size, part, parts)
 
     def geometry_loss(self) -> Tensor:
-        samples = self._sampler.batch()
+        samples = self._surface.sampler.batch()
         return sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
 
     def joint_loss(self) -> Tensor:
-        samples = self._sampler.batch()
+        samples = self._surface.sampler.batch()
         loss = sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
-        return self._config.sdf_loss_weight * loss + self._intensity_loss(samples, geometry_frozen=False)
+        return self._config.sdf_loss_weight * loss + self._intensity_loss(
+            samples, self._surface, geometry_frozen=False
+        )
 
     def reflectance_loss(self) -> Tensor:
         if self._config.intensity_in_free_space:
-            samples = self._sampler.batch()
+            samples = self._returns.sampler.batch()
         else:
-            samples = self._sampler.spread(self._intensity_batch_size)
-        return self._intensity_loss(samples, geometry_frozen=True)
+            samples = self._returns.sampler.spread(self._intensity_batch_size)
+        return self._intensity_loss(samples, self._returns, geometry_frozen=True)
 
-    def _intensity_loss(self, samples: Samples, *, geometry_frozen: bool) -> Tensor:
-        assert self._intensities is not None
+    def _intensity_loss(self, samples: Samples, source: _Source, *, geometry_frozen: bool) -> Tensor:
+        assert source.intensities is not None
         used = slice(None) if self._config.intensity_in_free_space else slice(samples.num_near)
         rays = samples.rays[used]
-        labels = self._intensities[rays]
+        labels = source.intensities[rays]
         labels[samples.num_near :] = 0  # no return is expected from free space (3QFPI)
         predicted = self._field.intensity(
             samples.points[used],
-            self._directions[rays],
-            self._ranges_m[rays] - samples.sdf_m[used],
+            source.directions[rays],
+            source.ranges_m[rays] - samples.sdf_m[used],
             geometry_frozen=geometry_frozen,
             encoding_factors=self._encoding_factors(len(rays)),
         )
@@ -210,7 +232,7 @@ class _Shard:
         if not any(self._dropouts):
             return None
         dims = (self._field.cells.dim, self._field.fourier.dim)
-        kept = [self._sampler.kept(count, *part) for part in zip(dims, self._dropouts, strict=True)]
+        kept = [self._surface.sampler.kept(count, *part) for part in zip(dims, self._dropouts, strict=True)]
         return torch.cat(kept, 1)
 
 
@@ -222,13 +244,20 @@ class _Training:
     """
 
     def __init__(
-        self, field: Field, rays: Rays, scale: IntensityScale | None, config: FitConfig, workers: Workers
+        self,
+        field: Field,
+        rays: Rays,
+        is_ghost: NDArray[np.bool_] | None,
+        scale: IntensityScale | None,
+        config: FitConfig,
+        workers: Workers,
     ) -> None:
         self._field = field
         self._config = config
         self._workers = workers
-        parts = min(workers.num_threads, len(rays), config.batch_size, config.intensity_batch_size)
-        samples = len(rays) * (config.near_samples + config.free_samples)
+        num_surface = len(rays) - (0 if is_ghost is None else int(is_ghost.sum()))
+        parts = min(workers.num_threads, num_surface, config.batch_size, config.intensity_batch_size)
+        samples = num_surface * (config.near_samples + config.free_samples)
         self._sdf_iterations = config.sdf_iterations or max(
             config.min_sdf_iterations, math.ceil(config.sdf_passes * samples / config.batch_size)
         )
@@ -242,7 +271,7 @@ class _Training:
         passes = self._intensity_iterations * config.intensity_batch_size / samples
         dropout_scale = passes / (passes + _DROPOUT_HALF_PASSES)
         self._shards = [
-            _Shard(field, rays, scale, config, part, parts, dropout_scale) for part in range(parts)
+            _Shard(field, rays, is_ghost, scale, config, part, parts, dropout_scale) for part in range(parts)
         ]
         if scale is None:
             self._intensity_iterations = 0
