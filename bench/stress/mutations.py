@@ -5,9 +5,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 
+_Item = TypeVar("_Item")
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 _WORDS = [
     b"0", b"-1", b"1", b"nan", b"-inf", b"1e308", b"1e999", b"1e-320", b"2147483648", b"4294967296", b"9" * 19, b"9" * 40,
@@ -27,8 +30,12 @@ def boundaries(data: bytes) -> list[int]:
 def mutate(rng: np.random.Generator, data: bytes, others: list[bytes]) -> bytes:
     """One to three random changes."""
     for _ in range(rng.integers(1, 4)):
-        data = _CHANGES[rng.integers(len(_CHANGES))](rng, data, others)
+        data = _one_of(rng, _CHANGES)(rng, data, others)
     return data
+
+
+def _one_of(rng: np.random.Generator, items: Sequence[_Item]) -> _Item:
+    return items[int(rng.integers(len(items)))]
 
 
 def _position(rng: np.random.Generator, data: bytes) -> int:
@@ -36,7 +43,7 @@ def _position(rng: np.random.Generator, data: bytes) -> int:
     size = max(len(data), 1)
     if rng.random() < 0.5:
         return int(rng.integers(size))
-    near = int(min(rng.integers(600), size - 1))
+    near = min(int(rng.integers(600)), size - 1)
     return near if rng.random() < 0.7 else size - 1 - near
 
 
@@ -53,12 +60,13 @@ def _truncate(rng: np.random.Generator, data: bytes, _: list[bytes]) -> bytes:
 
 def _overwrite(rng: np.random.Generator, data: bytes, _: list[bytes]) -> bytes:
     at = _position(rng, data)
-    return data[:at] + rng.bytes(int(rng.integers(1, 9))) + data[at + 8 :]
+    noise: bytes = rng.bytes(int(rng.integers(1, 9)))
+    return data[:at] + noise + data[at + 8 :]
 
 
 def _integer(rng: np.random.Generator, data: bytes, _: list[bytes]) -> bytes:
     at, size = _position(rng, data), int(rng.choice([2, 4, 8]))
-    value = _INTEGERS[rng.integers(len(_INTEGERS))] % 2 ** (8 * size)
+    value = _one_of(rng, _INTEGERS) % 2 ** (8 * size)
     return data[:at] + value.to_bytes(size, "little") + data[at + size :]
 
 
@@ -73,7 +81,7 @@ def _repeat(rng: np.random.Generator, data: bytes, _: list[bytes]) -> bytes:
 
 
 def _splice(rng: np.random.Generator, data: bytes, others: list[bytes]) -> bytes:
-    other = others[rng.integers(len(others))]
+    other = _one_of(rng, others)
     return data[: _position(rng, data)] + other[_position(rng, other) :]
 
 
@@ -82,8 +90,17 @@ def _number(rng: np.random.Generator, data: bytes, _: list[bytes]) -> bytes:
     matches = list(_NUMBER.finditer(data[:20_000]))
     if not matches:
         return data
-    match = matches[rng.integers(len(matches))]
-    return data[: match.start()] + _WORDS[rng.integers(len(_WORDS))] + data[match.end() :]
+    match = _one_of(rng, matches)
+    return data[: match.start()] + _one_of(rng, _WORDS) + data[match.end() :]
 
 
-_CHANGES = [_flip, _truncate, _overwrite, _integer, _cut_out, _repeat, _splice, _number]
+_CHANGES: list[Callable[[np.random.Generator, bytes, list[bytes]], bytes]] = [
+    _flip,
+    _truncate,
+    _overwrite,
+    _integer,
+    _cut_out,
+    _repeat,
+    _splice,
+    _number,
+]

@@ -47,10 +47,8 @@ class Reference:
     """
 
     def __init__(self, leaf_cells: Array, leaf_size_m: float, num_levels: int, encoding: Any) -> None:
-        planes = [(0, 1), (0, 2), (1, 2)]
-        self.groups: list[tuple[int, ...]] = (
-            planes if encoding == _core.Encoding.TRI_QUADTREE else [(0, 1, 2)]
-        )
+        planar = encoding == _core.Encoding.TRI_QUADTREE
+        self.groups: list[tuple[int, ...]] = [(0, 1), (0, 2), (1, 2)] if planar else [(0, 1, 2)]
         self.leaf_size_m = leaf_size_m
         self.levels: list[Level] = []
         self.num_rows = 0

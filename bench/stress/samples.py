@@ -232,7 +232,8 @@ def transforms() -> list[bytes]:
 @functools.cache
 def meshes() -> list[bytes]:
     """PLY files of points, binary and ASCII, and one of a mesh."""
-    cloud: Any = trimesh.PointCloud(np.random.default_rng(2).normal(size=(9, 3)))
+    make_cloud: Any = trimesh.PointCloud
+    cloud = make_cloud(np.random.default_rng(2).normal(size=(9, 3)))
     box: Any = trimesh.creation.box()
     return [
         cloud.export(file_type="ply"),

@@ -29,7 +29,10 @@ _UNITS = "positions and distances in m, world frame; signed distance positive in
 
 
 def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
-    """Writes a map; the old file at `path`, if any, is replaced only once the new one is whole."""
+    """Writes a map; the old file at `path`, if any, is replaced only once the new one is whole.
+
+    A process that is killed meanwhile may leave a hidden file beside it, ``.NAME.`` and 16 hexadecimal digits.
+    """
     tensors: dict[str, Tensor] = {
         f"field.{name}": value for name, value in radar_map.field.state_dict().items()
     }
