@@ -66,7 +66,7 @@ def _overwrite(rng: np.random.Generator, data: bytes, _: list[bytes]) -> bytes:
 
 def _integer(rng: np.random.Generator, data: bytes, _: list[bytes]) -> bytes:
     at, size = _position(rng, data), int(rng.choice([2, 4, 8]))
-    value = _one_of(rng, _INTEGERS) % 2 ** (8 * size)
+    value: int = _one_of(rng, _INTEGERS) % 2 ** (8 * size)
     return data[:at] + value.to_bytes(size, "little") + data[at + size :]
 
 
