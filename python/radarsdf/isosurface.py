@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf import _core
+from radarsdf._checks import real_array
 
 Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
 
@@ -235,7 +236,7 @@ def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[n
     # float32 where it holds every value of the type: it is half of the memory to read
     if np.can_cast(array.dtype, np.float32, "safe"):
         return np.ascontiguousarray(array, dtype=np.float32)
-    return np.ascontiguousarray(array, dtype=np.float64)
+    return np.ascontiguousarray(real_array(array, name))
 
 
 def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
@@ -256,7 +257,7 @@ def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
 def _as_placement(
     spacing: ArrayLike, origin: ArrayLike, extent: tuple[float, ...]
 ) -> tuple[list[float], list[float]]:
-    step, start = np.asarray(spacing, dtype=np.float64), np.asarray(origin, dtype=np.float64)
+    step, start = real_array(spacing, "spacing"), real_array(origin, "origin")
     if step.shape != (3,) or not np.all(np.isfinite(step) & (step > 0)):
         msg = f"spacing must be three finite positive numbers, not {spacing!r}"
         raise ValueError(msg)
@@ -271,7 +272,8 @@ def _as_placement(
 
 
 def _as_level(level: float) -> float:
-    if not np.isfinite(level):
-        msg = f"level must be finite, not {level}"
+    value = real_array(level, "level")
+    if value.shape != () or not np.isfinite(value):
+        msg = f"level must be a finite number, not {level!r:.50}"
         raise ValueError(msg)
-    return float(level)
+    return float(value)
