@@ -10,7 +10,9 @@ namespace radarsdf {
 
 int resolve_num_threads(int num_threads) {
 #ifdef _OPENMP
-  return num_threads > 0 ? num_threads : omp_get_max_threads();
+  // Where the system refuses a thread, OpenMP ends the whole program.
+  constexpr int kMaxThreads = 1024;
+  return num_threads > 0 ? std::min(num_threads, kMaxThreads) : omp_get_max_threads();
 #else
   (void)num_threads;
   return 1;

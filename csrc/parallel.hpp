@@ -11,7 +11,7 @@
 
 namespace radarsdf {
 
-// 0 or less: as many as OpenMP would use (OMP_NUM_THREADS is respected). Never sets a global.
+// 0 or less: as many as OpenMP would use (OMP_NUM_THREADS is respected); at most 1024. Never sets a global.
 int resolve_num_threads(int num_threads);
 
 // Runs task(i) for i in [0, num_tasks) on up to num_threads threads, each task whole on one thread.

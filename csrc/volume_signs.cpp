@@ -60,7 +60,8 @@ T round_down(double level) {
 template <typename T>
 VolumeSigns read_signs(const T* volume, const std::array<int64_t, 3>& shape, const bool* mask, double level,
                        int num_threads) {
-  const auto [nx, ny, nz] = shape;
+  // Not a structured binding: C++17 lets no lambda capture one, which gcc forgives and clang does not.
+  const int64_t nx = shape[0], ny = shape[1], nz = shape[2];
   VolumeSigns signs{shape, BitVolume(shape), {}};
   const T threshold = round_down<T>(level);
   std::vector<std::uint8_t> plane_has_nan(static_cast<size_t>(nx));

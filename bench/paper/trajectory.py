@@ -26,6 +26,8 @@ class Trajectory:
     """(P, 3) world, m."""
     rotations: Rotation
     """P rotations R_world_base."""
+    name: str = "the trajectory"
+    """Where it is from, for messages."""
 
     def span(self) -> str:
         """First and last time, for messages."""
@@ -62,7 +64,7 @@ class Trajectory:
 
     def _at(self, times_s: NDArray[np.float64], max_gap_s: float) -> tuple[Rotation, NDArray[np.float64]]:
         if not self.covers(times_s).all():
-            msg = f"no pose at {times_s[~self.covers(times_s)][0]} s: the poses are of {self.span()}"
+            msg = f"{self.name}: no pose at {times_s[~self.covers(times_s)][0]} s: the poses are of {self.span()}"
             raise ValueError(msg)
         after = np.searchsorted(self.times_s, times_s)  # the first pose that is not earlier
         before = np.where(self.times_s[after] == times_s, after, after - 1)
@@ -70,7 +72,7 @@ class Trajectory:
         if (gaps_s > max_gap_s).any():
             worst = int(np.argmax(gaps_s))
             msg = (
-                f"no pose near {times_s[worst]} s: the poses before and after it are {gaps_s[worst]:.3f} s apart, "
+                f"{self.name}: no pose near {times_s[worst]} s: the poses before and after it are {gaps_s[worst]:.3f} s apart, "
                 f"more than {max_gap_s} s"
             )
             raise ValueError(msg)
@@ -96,7 +98,7 @@ def read_trajectory(path: Path) -> Trajectory:
     if (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > _MAX_NORM_ERROR).any():
         msg = f"{path}: the last four columns are not unit quaternions qx qy qz qw"
         raise ValueError(msg)
-    return Trajectory(table[:, 0], table[:, 1:4], Rotation.from_quat(table[:, 4:]))
+    return Trajectory(table[:, 0], table[:, 1:4], Rotation.from_quat(table[:, 4:]), str(path))
 
 
 def read_table(path: Path, columns: int) -> NDArray[np.float64]:

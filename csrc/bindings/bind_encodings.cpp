@@ -17,7 +17,8 @@ void bind_fixed_encodings(py::module_& m) {
         if (points.ndim() != 2) throw std::invalid_argument("points must have shape (N, 3)");
         check_shape(points, points.shape(0), 3, "points");
         if (!(half_width_m > 0)) throw std::invalid_argument("half_width_m must be positive");
-        if (first_frequency < 0 || num_frequencies < 0 || first_frequency + num_frequencies > kMaxFrequencies) {
+        if (first_frequency < 0 || num_frequencies < 0 || first_frequency > kMaxFrequencies ||
+            num_frequencies > kMaxFrequencies - first_frequency) {
           throw std::invalid_argument("frequencies must lie in [0, " + std::to_string(kMaxFrequencies) + ")");
         }
         check_shape(out, points.shape(0), 6 * num_frequencies, "out");

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf import _core
+from radarsdf._checks import real_array
 
 Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
 
@@ -34,7 +35,8 @@ def marching_cubes(
     A sample is positive if and only if it is greater than `level`, and the triangles' normals point to the positive
     side. The mesh is closed and manifold except where the cells in use end: at the border of the volume, of the
     mask and of NaN samples. No triangle has zero area, even where samples equal the level, since vertices keep 0.1 %
-    of an edge's length away from the samples.
+    of an edge's length away from the samples; provided that float64 resolves such a length at the vertices' positions,
+    that is to about 10^12 times `spacing` from the world's origin. Further out, vertices may coincide.
 
     Parameters
     ----------
@@ -91,9 +93,8 @@ def marching_cubes(
             msg = f"mask must have the shape of volume, {samples.shape}, not {mask.shape}"
             raise ValueError(msg)
         mask = np.ascontiguousarray(mask)
-    return _core.marching_cubes_dense(
-        samples, mask, *_as_placement(spacing, origin), _as_level(level), num_threads
-    )
+    placement = _as_placement(spacing, origin, samples.shape)
+    return _core.marching_cubes_dense(samples, mask, *placement, _as_level(level), num_threads)
 
 
 def extract_cells(
@@ -143,11 +144,13 @@ def extract_cells(
     >>> vertices.sum(axis=0).tolist(), faces.shape
     ([0.5, 0.5, 0.5], (1, 3))
     """
+    corners = _as_int32(corners, "corners")
+    furthest = np.abs(corners, dtype=np.float64).max(initial=0.0) + 1
     return _core.marching_cubes_sparse(
-        _as_int32(corners, "corners"),
+        corners,
         _as_samples(values, "values"),
         _as_int32(cells, "cells"),
-        *_as_placement(spacing, origin),
+        *_as_placement(spacing, origin, (furthest,) * 3),
         _as_level(level),
         num_threads,
     )
@@ -233,7 +236,7 @@ def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[n
     # float32 where it holds every value of the type: it is half of the memory to read
     if np.can_cast(array.dtype, np.float32, "safe"):
         return np.ascontiguousarray(array, dtype=np.float32)
-    return np.ascontiguousarray(array, dtype=np.float64)
+    return np.ascontiguousarray(real_array(array, name))
 
 
 def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
@@ -251,19 +254,26 @@ def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
     return np.ascontiguousarray(array, dtype=np.int32)
 
 
-def _as_placement(spacing: ArrayLike, origin: ArrayLike) -> tuple[list[float], list[float]]:
-    step, start = np.asarray(spacing, dtype=np.float64), np.asarray(origin, dtype=np.float64)
+def _as_placement(
+    spacing: ArrayLike, origin: ArrayLike, extent: tuple[float, ...]
+) -> tuple[list[float], list[float]]:
+    step, start = real_array(spacing, "spacing"), real_array(origin, "origin")
     if step.shape != (3,) or not np.all(np.isfinite(step) & (step > 0)):
         msg = f"spacing must be three finite positive numbers, not {spacing!r}"
         raise ValueError(msg)
     if start.shape != (3,) or not np.all(np.isfinite(start)):
         msg = f"origin must be three finite numbers, not {origin!r}"
         raise ValueError(msg)
+    with np.errstate(over="ignore"):
+        if not np.isfinite(np.abs(start) + step * extent).all():
+            msg = f"spacing {spacing!r} puts the lattice's end beyond float64"
+            raise ValueError(msg)
     return step.tolist(), start.tolist()
 
 
 def _as_level(level: float) -> float:
-    if not np.isfinite(level):
-        msg = f"level must be finite, not {level}"
+    value = real_array(level, "level")
+    if value.shape != () or not np.isfinite(value):
+        msg = f"level must be a finite number, not {level!r:.50}"
         raise ValueError(msg)
-    return float(level)
+    return float(value)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from radarsdf._checks import real_array
 from radarsdf._core import cell_keys
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
@@ -295,10 +296,17 @@ class RadarMap:
         """
         is_tensor = isinstance(x, Tensor)
         # Writable, or PyTorch warns: a read-only array is copied.
-        world = x.detach() if is_tensor else torch.from_numpy(np.require(x, np.float64, ["C", "W"]))
+        world = (
+            x.detach()
+            if is_tensor
+            else torch.from_numpy(np.require(real_array(x, "positions"), requirements=["C", "W"]))
+        )
         dtype = x.dtype if is_tensor else getattr(x, "dtype", None)
         if rows is not None and world.shape == (3,):
             world = world.expand(rows, 3)
+        if world.is_complex():
+            msg = "positions must be real numbers"
+            raise TypeError(msg)
         if world.ndim != 2 or world.shape[1] != 3 or (rows is not None and len(world) != rows):
             msg = f"positions must have shape (N, 3), not {tuple(world.shape)}"
             raise ValueError(msg)

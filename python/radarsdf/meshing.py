@@ -12,6 +12,7 @@ import torch
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf._checks import MAX_POSITION_M, positive, real_array
 from radarsdf.isosurface import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map import evaluate
 from radarsdf.picture import intensity_colors
@@ -19,6 +20,7 @@ from radarsdf.picture import intensity_colors
 if TYPE_CHECKING:
     from radarsdf.map import RadarMap
 
+_MAX_VOXELS = 2**30  # of which some are the same; coordinates, and rows of corners, are int32
 _INWARD = 1e-3  # of a voxel: how far corners on the map's border are moved into it to be evaluated
 
 
@@ -66,8 +68,9 @@ def extract_mesh(
     if not 0 <= min_confidence <= 1:
         msg = f"min_confidence must be in [0, 1], not {min_confidence}"
         raise ValueError(msg)
-    if not (math.isfinite(voxel_size) and voxel_size > 0):
-        msg = f"voxel_size must be positive and finite, not {voxel_size}"
+    voxel_size = positive(voxel_size, "voxel_size")
+    if voxel_size > MAX_POSITION_M:
+        msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
         raise ValueError(msg)
     sensor_position = None if viewpoint is None else _check_viewpoint(radar_map, viewpoint)
     voxels = _occupied_voxels(radar_map, voxel_size)
@@ -104,7 +107,7 @@ def _check_viewpoint(radar_map: RadarMap, viewpoint: ArrayLike) -> NDArray[np.fl
     if not radar_map.has_intensity:
         msg = "a viewpoint needs a map with intensities, and this one was fitted without"
         raise ValueError(msg)
-    sensor_position = np.asarray(viewpoint, np.float64)
+    sensor_position = real_array(viewpoint, "viewpoint")
     if sensor_position.shape != (3,) or not np.isfinite(sensor_position).all():
         msg = "viewpoint must be one position (3,)"
         raise ValueError(msg)
@@ -112,7 +115,7 @@ def _check_viewpoint(radar_map: RadarMap, viewpoint: ArrayLike) -> NDArray[np.fl
 
 
 def _check_box(box: ArrayLike) -> NDArray[np.float64]:
-    corners = np.asarray(box, np.float64)
+    corners = real_array(box, "box")
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         msg = "box must be a lower and a higher corner, (2, 3)"
         raise ValueError(msg)
@@ -123,7 +126,10 @@ def _occupied_voxels(radar_map: RadarMap, voxel_size: float) -> NDArray[np.int32
     """Lattice coordinates (M, 3) of the voxels that overlap an occupied leaf cell; some more than once."""
     leaf_size_m = radar_map.config.leaf_size_m
     cells = radar_map.field.cells.table.leaf_cells()
-    parts = max(1, math.ceil(leaf_size_m / voxel_size - 1e-9))
+    parts = max(1, math.ceil(min(leaf_size_m / voxel_size, _MAX_VOXELS) - 1e-9))
+    if max(len(cells) * (parts + 1) ** 3, int(np.abs(cells).max(initial=0)) * parts) > _MAX_VOXELS:
+        msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
+        raise ValueError(msg)
     if math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9):  # voxels divide cells evenly
         part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1)
         return (cells[:, None, :] * np.int32(parts) + part.reshape(1, -1, 3)).reshape(-1, 3)

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+import stat
 import zipfile
-import zlib
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -13,6 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+_ARRAYS = ("points", "frame", "poses", "intensity", "static", "lidar_points")
+# A few megabytes of zeros can unpack to gigabytes. Measurements, which are mostly noise, compress by two to five.
+_MAX_COMPRESSION = 100
+_ALWAYS_UNPACKED = 1 << 28  # bytes
 
 
 @dataclass(frozen=True)
@@ -54,42 +59,76 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     if Path(path).suffix != ".npz":
         msg = f"{path}: only .npz files of scans can be read"
         raise ValueError(msg)
+    check_regular_file(path)
     try:
-        with zipfile.ZipFile(path) as file:
-            arrays = {Path(n).stem: np.lib.format.read_array(file.open(n)) for n in file.namelist()}
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError) as error:
+        arrays = _read_arrays(Path(path))
+    except (
+        Exception
+    ) as error:  # of which kind, OSError among them, depends on where a damaged file breaks off
         msg = f"{path} is not a whole .npz file: {error}"
         raise ValueError(msg) from error
     if missing := sorted({"points", "frame", "poses"} - set(arrays)):
         msg = f"{path} lacks the arrays {', '.join(missing)}"
         raise ValueError(msg)
     points, frame, poses = arrays["points"], arrays["frame"], arrays["poses"]
-    if (
-        points.ndim != 2
-        or poses.ndim != 3
-        or frame.dtype.kind not in "iuf"
-        or (frame != np.floor(frame)).any()
-    ):
-        msg = f"{path}: points must have shape (N, 3), poses (F, 4, 4), and frame be row numbers"
-        raise ValueError(msg)
-    count = len(points)
-    for name in ("frame", "intensity", "static"):
-        if name in arrays and arrays[name].shape != (count,):
-            msg = f"{path}: {name} must have shape ({count},), not {arrays[name].shape}"
+    count, num_poses = points.shape[:1], poses.shape[:1]
+    for name, shape in {
+        "points": (*count, 3), "poses": (*num_poses, 4, 4), "frame": count, "intensity": count, "static": count
+    }.items():  # fmt: skip
+        if name in arrays and arrays[name].shape != shape:
+            msg = f"{path}: {name} must have shape {shape}, not {arrays[name].shape}"
             raise ValueError(msg)
-    if count and not 0 <= frame.min() <= frame.max() < len(poses):
+    truth = arrays.get("lidar_points", points)
+    if truth.ndim != 2 or truth.shape[1] != 3:
+        msg = f"{path}: lidar_points must have shape (M, 3), not {truth.shape}"
+        raise ValueError(msg)
+    for name, array in arrays.items():
+        if array.dtype.kind not in ("biuf" if name == "static" else "iuf"):
+            msg = f"{path}: {name} must be real numbers, not {array.dtype}"
+            raise ValueError(msg)
+    if (frame != np.floor(frame)).any():
+        msg = f"{path}: frame must hold row numbers of poses"
+        raise ValueError(msg)
+    if len(frame) and not 0 <= frame.min() <= frame.max() < len(poses):
         msg = f"{path}: frame must lie in [0, {len(poses)})"
         raise ValueError(msg)
-    used = arrays.get("static", np.ones(count, bool)).astype(bool)
+    used = arrays.get("static", np.ones(len(frame), bool)).astype(bool)
     frame = frame.astype(np.int64)
-    frames = np.unique(frame[used])
-    rows = [np.flatnonzero(used & (frame == i)) for i in frames]
+    order = np.flatnonzero(used)
+    order = order[np.argsort(frame[order], kind="stable")]
+    frames, first = np.unique(frame[order], return_index=True)
+    rows = np.split(order, first)[1:]  # before the first frame there is nothing
     return Scans(
         points=[points[r] for r in rows],
         poses=poses[frames].astype(np.float64),
         intensities=[arrays["intensity"][r] for r in rows] if "intensity" in arrays else None,
         ground_truth=arrays.get("lidar_points"),
     )
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    with zipfile.ZipFile(path) as file:
+        names = file.namelist()
+        members = {name: file.getinfo(f"{name}.npy") for name in _ARRAYS if f"{name}.npy" in names}
+        unpacked = sum(member.file_size for member in members.values())
+        if unpacked > max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * path.stat().st_size):
+            msg = f"its arrays would unpack to {unpacked} bytes, which is no compression of measurements"
+            raise ValueError(msg)
+        arrays = {}
+        for name, member in members.items():
+            with file.open(member) as stream:
+                arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
+        return arrays
+
+
+def check_regular_file(path: str | PathLike[str]) -> None:
+    """An OSError that names the path where it cannot be read, a ValueError where it is a pipe or a device, which could
+    keep a reader waiting, or feed it, for ever."""
+    if not Path(path).is_dir() and not stat.S_ISREG(Path(path).stat().st_mode):
+        msg = f"{path} is not a regular file"
+        raise ValueError(msg)
+    with open(path, "rb"):  # noqa: PTH123 - of a directory too, whose error it is
+        pass
 
 
 def write_scans(path: str | PathLike[str], scans: Scans) -> None:

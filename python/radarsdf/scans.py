@@ -11,6 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf._checks import MAX_POSITION_M, number, real_array, whole_number
+from radarsdf._checks import positions as check_positions
+
 _MAX_ROTATION_ERROR = 1e-3  # of R R^T - 1: float32 poses pass, a scaled or sheared one does not
 
 
@@ -69,18 +72,19 @@ class Rays:
 
 def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
     """`poses` as (F, 4, 4) float64, or a ValueError that names the first that is not a rigid transform."""
-    T_world_sensor = np.asarray(poses, np.float64)
+    T_world_sensor = real_array(poses, "poses")
     if T_world_sensor.shape != (num_scans, 4, 4):
         msg = f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
         raise ValueError(msg)
     rotation = T_world_sensor[:, :3, :3]
-    rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    rigid = (
-        np.isfinite(T_world_sensor).all(axis=(1, 2))
-        & (rotation_error < _MAX_ROTATION_ERROR)
-        & (np.linalg.det(rotation) > 0)
-        & (T_world_sensor[:, 3] == [0, 0, 0, 1]).all(axis=1)
-    )
+    with np.errstate(all="ignore"):  # of what is refused
+        rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        rigid = (
+            (np.abs(T_world_sensor) <= MAX_POSITION_M).all(axis=(1, 2))
+            & (rotation_error < _MAX_ROTATION_ERROR)
+            & (np.linalg.det(rotation) > 0)
+            & (T_world_sensor[:, 3] == [0, 0, 0, 1]).all(axis=1)
+        )
     if not rigid.all():
         msg = (
             f"pose {int(np.argmin(rigid))} is not a rigid transform (rotation, translation, last row 0 0 0 1)"
@@ -92,7 +96,7 @@ def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
 def _check_scans(
     points: Sequence[ArrayLike], intensities: Sequence[ArrayLike] | None
 ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None]:
-    scans = [np.asarray(p, np.float64) for p in points]
+    scans = [real_array(scan, f"scan {i}") for i, scan in enumerate(points)]
     if not scans:
         msg = "points holds no scans"
         raise ValueError(msg)
@@ -105,7 +109,7 @@ def _check_scans(
             raise ValueError(msg)
     values = None
     if intensities is not None:
-        values = [np.asarray(v, np.float32) for v in intensities]
+        values = [real_array(v, f"intensities of scan {i}", np.float32) for i, v in enumerate(intensities)]
         if len(values) != len(scans):
             msg = f"intensities holds {len(values)} scans, points {len(scans)}"
             raise ValueError(msg)
@@ -113,7 +117,7 @@ def _check_scans(
             if value.shape != (len(scan),):
                 msg = f"intensities of scan {i} must have shape ({len(scan)},), not {value.shape}"
                 raise ValueError(msg)
-    bad = [~np.isfinite(scan).all(axis=1) for scan in scans]
+    bad = [~(np.abs(scan) <= MAX_POSITION_M).all(axis=1) for scan in scans]
     if values is not None:
         bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
     if count := sum(int(b.sum()) for b in bad):
@@ -159,7 +163,14 @@ def prepare(
     scans, values = _check_scans(points, intensities)
     T_world_sensor = check_poses(poses, len(scans))
     positions = T_world_sensor[:, :3, 3]
-    local_origin = positions.mean(axis=0) if origin is None else np.asarray(origin, np.float64)
+    local_origin = (
+        positions.mean(axis=0)
+        if origin is None
+        else check_positions(real_array(origin, "origin")[None], "origin")[0]
+    )
+    min_range_m = number(min_range_m, "min_range_m")
+    max_range_m = np.inf if max_range_m is None else number(max_range_m, "max_range_m")
+    whole_number(accumulate_frames, "accumulate_frames", 1)
 
     kept_points, kept_origins, kept_values, kept_scans = [], [], [], []
     for i, scan in enumerate(scans):
@@ -167,11 +178,7 @@ def prepare(
         middle = (first + min(first + accumulate_frames, len(scans)) - 1) // 2
         ranges = np.linalg.norm(scan, axis=1)
         # A return at the sensor itself has no direction.
-        keep = (
-            (ranges > 0)
-            & (ranges >= min_range_m)
-            & (ranges <= (np.inf if max_range_m is None else max_range_m))
-        )
+        keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= max_range_m)
         local = scan[keep] @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
         kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))
@@ -180,7 +187,7 @@ def prepare(
             kept_values.append(values[i][keep])
     local_points = np.concatenate(kept_points)
     if len(local_points) == 0:
-        msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {max_range_m or np.inf} m"
+        msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {max_range_m} m"
         raise ValueError(msg)
     rays = local_points - np.concatenate(kept_origins)
     ranges = np.maximum(np.linalg.norm(rays, axis=1), 1e-6)

@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
 from radarsdf.map import IntensityScale, RadarMap
+from radarsdf.readers import check_regular_file
 
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 2  # 1: without support
@@ -28,7 +29,10 @@ _UNITS = "positions and distances in m, world frame; signed distance positive in
 
 
 def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
-    """Writes a map; the old file at `path`, if any, is replaced only once the new one is whole."""
+    """Writes a map; the old file at `path`, if any, is replaced only once the new one is whole.
+
+    A process that is killed meanwhile may leave a hidden file beside it, ``.NAME.`` and 16 hexadecimal digits.
+    """
     tensors: dict[str, Tensor] = {
         f"field.{name}": value for name, value in radar_map.field.state_dict().items()
     }
@@ -84,36 +88,33 @@ def load(path: str | PathLike[str]) -> RadarMap:
     OSError
         If it cannot be read.
     """
-    with open(path, "rb"):  # noqa: PTH123 - a missing or unreadable file is an OSError that names it
-        pass
+    check_regular_file(path)
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             _check_format(metadata, path)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+            # Copies, since these are views of the file, which may change or go.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a mapping
         return _build(tensors, json.loads(metadata["description"]))
-    except (
-        SafetensorError,
-        KeyError,
-        TypeError,
-        OverflowError,
-        RuntimeError,
-        AttributeError,
-        RecursionError,
-        json.JSONDecodeError,
-    ) as error:
+    except (OSError, _OtherFileError):
+        raise
+    except Exception as error:  # of which kind depends on where a damaged file breaks off
         msg = f"{path} is not a whole radarsdf map: {error}"
         raise ValueError(msg) from error
+
+
+class _OtherFileError(ValueError):
+    """The file may be whole, but is of another program or version."""
 
 
 def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
     if metadata.get("format") != FORMAT:
         msg = f"{path} is not a radarsdf map"
-        raise ValueError(msg)
+        raise _OtherFileError(msg)
     version = metadata.get("format_version", "")
-    if not version.isdecimal() or int(version) > FORMAT_VERSION:
+    if not version.isdecimal() or len(version) > 9 or int(version) > FORMAT_VERSION:
         msg = f"{path} has format version {version!r}; this radarsdf reads up to {FORMAT_VERSION}"
-        raise ValueError(msg)
+        raise _OtherFileError(msg)
 
 
 def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
@@ -137,17 +138,23 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
         if not -math.inf < scale.low < scale.high < math.inf:
             msg = f"the intensity scale is {low} to {high}"
             raise ValueError(msg)
-    field = Field(leaf_keys.numpy().astype(np.uint64), config, with_intensity=scale is not None)
+    # The description could ask for more than any machine has. Of as many layers as there are tensors, at most, and
+    # without memory, the field only says what shapes these must have.
+    if len(config.sdf_hidden + config.intensity_hidden) > len(tensors):
+        msg = "there are fewer tensors than layers"
+        raise ValueError(msg)
+    with torch.device("meta"):
+        field = Field(leaf_keys.numpy().astype(np.uint64), config, with_intensity=scale is not None)
     state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
     for name, tensor in state.items():
         if tensor.dtype != torch.float32 or not tensor.isfinite().all():
             msg = f"{name} holds something other than finite float32 numbers"
             raise ValueError(msg)
-    field.load_state_dict(state)  # a RuntimeError for wrong names or shapes
+    field.load_state_dict(state, assign=True)  # a RuntimeError for wrong names or shapes
     field.requires_grad_(False)
     return RadarMap(
         field=field,
-        origin=origin.numpy().copy(),  # the tensor is a view of the file, which may change or go
+        origin=origin.numpy(),
         intensity_scale=scale,
         config=config,
         report=dict(description["report"]),

@@ -11,9 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from radarsdf._checks import MAX_POSITION_M, positive, real_array, whole_number
+
 INTENSITY_PROTOCOL = "radarsdf-intensity-1"
 """Name and version of the definitions in `intensity_metrics`; a change of any number's meaning changes it."""
 
+_MAX_FRAMES = 10**8  # 58 days at 20 Hz; a larger number is a mistake, and would fill the memory
+_MAX_INTENSITY = 1e100  # the sum of as many as memory holds is finite
 _CHUNK = 1 << 17  # queries at a time: 20 candidates of each take about 150 MB
 
 
@@ -45,15 +49,15 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
         If the shapes differ, there is no return, or a value is not finite: a return without a prediction
         has to be given one, since leaving it out would flatter the method.
     """
-    p, m = np.asarray(predicted, dtype=np.float64), np.asarray(measured, dtype=np.float64)
+    p, m = real_array(predicted, "predicted"), real_array(measured, "measured")
     if p.ndim != 1 or p.shape != m.shape:
         msg = f"predicted {p.shape} and measured {m.shape} must both be (N,)"
         raise ValueError(msg)
     if p.size == 0:
         msg = "no returns to compare"
         raise ValueError(msg)
-    if not (np.isfinite(p).all() and np.isfinite(m).all()):
-        msg = "predicted and measured must be finite"
+    if not ((np.abs(p) <= _MAX_INTENSITY).all() and (np.abs(m) <= _MAX_INTENSITY).all()):
+        msg = f"predicted and measured must be finite, and within {_MAX_INTENSITY:g}"
         raise ValueError(msg)
     error = np.abs(p - m)
     return IntensityMetrics(
@@ -94,9 +98,16 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
     >>> train.tolist(), test.tolist()
     ([1, 2, 4, 5], [0, 3, 6])
     """
-    numbers = np.arange(frames) if isinstance(frames, (int, np.integer)) else np.unique(np.asarray(frames))
+    whole_number(every, "every", -(2**63))
+    if isinstance(frames, (int, np.integer)):
+        numbers = np.arange(whole_number(frames, "frames", 0, _MAX_FRAMES))
+    else:
+        numbers = np.unique(np.asarray(frames))
     if numbers.ndim != 1 or not (numbers.size == 0 or np.issubdtype(numbers.dtype, np.integer)):
         msg = "frames must be a number of frames or integer frame numbers"
+        raise ValueError(msg)
+    if numbers.size and numbers[-1] > np.iinfo(np.int64).max:
+        msg = "frame numbers must fit int64"
         raise ValueError(msg)
     if every < 2 or numbers.size < 2:
         msg = f"cannot hold out every {every}th of {numbers.size} frames: something must remain to train on"
@@ -149,19 +160,20 @@ class KNNIntensity:
         num_threads: int = -1,
     ) -> None:
         points, directions = _rays(points_world, sensor_positions)
-        values = np.asarray(intensities, dtype=np.float64)
+        values = real_array(intensities, "intensities")
         if len(points) == 0:
             msg = "a baseline needs at least one return"
             raise ValueError(msg)
-        if values.shape != (len(points),) or not np.isfinite(values).all():
+        if values.shape != (len(points),) or not (np.abs(values) <= _MAX_INTENSITY).all():
             msg = f"intensities must be ({len(points)},) and finite, but have shape {values.shape}"
             raise ValueError(msg)
-        if not 1 <= k <= candidates:
+        whole_number(k, "k", 1)
+        whole_number(candidates, "candidates", 1)
+        if not k <= candidates:
             msg = f"1 <= k <= candidates is needed, not k={k}, candidates={candidates}"
             raise ValueError(msg)
-        if distance_scale_m <= 0 or angle_scale_rad <= 0:
-            msg = "distance_scale_m and angle_scale_rad must be positive"
-            raise ValueError(msg)
+        positive(distance_scale_m, "distance_scale_m")
+        positive(angle_scale_rad, "angle_scale_rad")
         self._directions, self._values = directions, values
         self._origin = points.mean(axis=0)
         self._tree = cKDTree(points - self._origin)
@@ -210,13 +222,16 @@ class KNNIntensity:
 
 def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Check points and sensor positions; return the points and unit vectors from the sensor to them."""
-    x, s = np.asarray(points, dtype=np.float64), np.asarray(sensors, dtype=np.float64)
+    x, s = real_array(points, "points"), real_array(sensors, "sensor positions")
     if x.ndim != 2 or x.shape[1] != 3 or s.shape not in {x.shape, (3,)}:
         msg = f"points must be (N, 3) and sensor positions (N, 3) or (3,), not {x.shape} and {s.shape}"
         raise ValueError(msg)
+    if not ((np.abs(x) <= MAX_POSITION_M).all() and (np.abs(s) <= MAX_POSITION_M).all()):
+        msg = f"points and sensor positions must be finite, and within {MAX_POSITION_M:g} m"
+        raise ValueError(msg)
     ray = x - s
     length = np.linalg.norm(ray, axis=1, keepdims=True)
-    if not np.isfinite(length).all() or (length == 0).any():
-        msg = "points and sensor positions must be finite and differ: each point needs a viewing direction"
+    if (length == 0).any():
+        msg = "points and sensor positions must differ: each point needs a viewing direction"
         raise ValueError(msg)
     return x, ray / length

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from radarsdf._checks import positions, positive, real_array, whole_number
 from radarsdf._core import cell_keys
 
 if TYPE_CHECKING:
@@ -119,11 +120,12 @@ def surface_metrics(
     perfect mesh has a completion error of half the samples' spacing, 0.5 · sqrt(area / samples), 5 mm for 1e7 on
     1000 m². Compare at equal `samples`.
     """
-    if samples < 1 or min(threshold_m, outlier_m, truncation_m) <= 0:
-        msg = "samples, threshold_m, outlier_m and truncation_m must be positive"
-        raise ValueError(msg)
+    whole_number(samples, "samples", 1)
+    positive(threshold_m, "threshold_m")
+    positive(outlier_m, "outlier_m")
+    positive(truncation_m, "truncation_m")
     corners = None if box is None else _check_box(box)
-    points = _in_box(_check_points(ground_truth, "ground_truth"), corners)
+    points = _in_box(positions(ground_truth, "ground_truth"), corners)
     if len(points) == 0:
         msg = "there are no ground-truth points" + ("" if corners is None else " in the box")
         raise ValueError(msg)
@@ -131,7 +133,7 @@ def surface_metrics(
     # Near the origin from here on, where differences of coordinates lose nothing.
     origin = points.mean(axis=0)
     points = points - origin
-    vertices = _check_points(mesh.vertices, "mesh.vertices") - origin
+    vertices = positions(mesh.vertices, "mesh.vertices") - origin
     faces = _faces(mesh)
     if corners is not None:
         corners = corners - origin
@@ -208,7 +210,7 @@ def adjacent_angles(mesh: trimesh.Trimesh, *, box: ArrayLike | None = None) -> N
     ValueError
         If a vertex is not finite or the box has a wrong shape.
     """
-    vertices, faces = _check_points(mesh.vertices, "mesh.vertices"), _faces(mesh)
+    vertices, faces = positions(mesh.vertices, "mesh.vertices"), _faces(mesh)
     if len(faces) == 0:
         return np.zeros(0)
     origin = vertices.mean(axis=0)
@@ -247,19 +249,8 @@ def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0 else 0.0
 
 
-def _check_points(values: ArrayLike, name: str) -> _Points:
-    points = np.ascontiguousarray(values, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        msg = f"{name} must be (N, 3), not {points.shape}"
-        raise ValueError(msg)
-    if not np.isfinite(points).all():
-        msg = f"{name} must be finite"
-        raise ValueError(msg)
-    return points
-
-
 def _check_box(box: ArrayLike) -> _Points:
-    corners = np.asarray(box, dtype=np.float64)
+    corners = real_array(box, "box")
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         msg = "box must be (2, 3): a lower corner and an upper one above it"
         raise ValueError(msg)
@@ -267,7 +258,14 @@ def _check_box(box: ArrayLike) -> _Points:
 
 
 def _faces(mesh: trimesh.Trimesh) -> NDArray[np.int64]:
-    return np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
+    faces = np.asarray(mesh.faces)
+    if faces.size and (faces.dtype.kind not in "iu" or faces.ndim != 2 or faces.shape[1] != 3):
+        msg = f"mesh.faces must be (F, 3) integers, not {faces.shape} {faces.dtype}"
+        raise ValueError(msg)
+    if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
+        msg = f"mesh.faces must be rows of the {len(mesh.vertices)} vertices"
+        raise ValueError(msg)
+    return faces.astype(np.int64).reshape(-1, 3)
 
 
 def _in_box(points: _Points, corners: _Points | None) -> _Points:

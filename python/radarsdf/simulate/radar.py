@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -12,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from radarsdf._checks import number, whole_number
+
 from .scene import Hits, Scene
 
 __all__ = ["Origin", "RadarSensor", "Scan", "generator"]
@@ -19,6 +22,8 @@ __all__ = ["Origin", "RadarSensor", "Scan", "generator"]
 FloatArray = NDArray[np.float64]
 
 _OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, so as not to hit it again
+_MAX_BEAMS = 10**7  # in a scan; their rays fill some gigabytes
+_LARGEST = 1e9  # of any number of a sensor: sums and products of such are far from overflow
 _MIN_LEG_M = 0.01  # shorter ways from a mirror to the next surface are no reflection
 # Streams of random numbers within a scan: more clutter, say, must not change the noise of the surface returns.
 _BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER = range(6)
@@ -79,7 +84,7 @@ class RadarSensor:
 
     azimuth_fov_rad: float = 1.92  # full width, centred on x [rad], 0..2π
     elevation_fov_rad: float = 0.52  # full height, centred on the xy plane [rad], 0..π
-    beams: int = 3000  # candidate directions in a scan, a jittered grid over the field of view; > 0
+    beams: int = 3000  # candidate directions in a scan, a jittered grid over the field of view; 1..10^7
     min_range_m: float = 0.5  # nothing nearer is returned [m], > 0
     max_range_m: float = 60.0  # nothing further is returned [m], > min_range_m
     sigma_range_m: float = 0.04  # standard deviation along the beam [m]
@@ -98,14 +103,20 @@ class RadarSensor:
 
     def __post_init__(self) -> None:
         """Refuse what no sensor can be."""
+        whole_number(self.beams, "beams", 1, _MAX_BEAMS)
+        for field in dataclasses.fields(self):
+            value = number(getattr(self, field.name), field.name)
+            if abs(value) > _LARGEST and not (field.name == "floor_db" and value == -np.inf):
+                msg = f"{field.name} must be within {_LARGEST:g}, not {value}"
+                raise ValueError(msg)
+        if 0 < self.step_db < 1 / _LARGEST:
+            msg = f"step_db must be 0 or at least {1 / _LARGEST:g}, not {self.step_db}"
+            raise ValueError(msg)
         if not (0 < self.azimuth_fov_rad <= 2 * np.pi and 0 < self.elevation_fov_rad <= np.pi):
             msg = "the field of view must be within (0, 2π] in azimuth and (0, π] in elevation"
             raise ValueError(msg)
         if not 0 < self.min_range_m < self.max_range_m < np.inf:
             msg = f"need 0 < min_range_m < max_range_m, not {self.min_range_m} and {self.max_range_m}"
-            raise ValueError(msg)
-        if self.beams < 1:
-            msg = f"beams must be positive, not {self.beams}"
             raise ValueError(msg)
         sigmas = (self.sigma_range_m, self.sigma_azimuth_rad, self.sigma_elevation_rad, self.sigma_power_db)
         if not all(value >= 0 for value in (*sigmas, self.step_db, self.clutter_per_scan)):
@@ -183,7 +194,8 @@ class RadarSensor:
 
     def _beam_angles(self, rng: np.random.Generator) -> FloatArray:
         """Azimuth and elevation (beams, 2) of a jittered grid, uniform in azimuth and in the sine of elevation."""
-        columns = max(1, round(np.sqrt(self.beams * self.azimuth_fov_rad / self.elevation_fov_rad)))
+        aspect = self.azimuth_fov_rad / self.elevation_fov_rad
+        columns = max(1, round(min(self.beams, np.sqrt(self.beams * aspect))))
         rows = -(-self.beams // columns)
         cell = rng.permutation(rows * columns)[: self.beams]
         u = (np.stack([cell % columns, cell // columns], axis=1) + rng.random((self.beams, 2))) / [

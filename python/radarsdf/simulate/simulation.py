@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.scans import check_poses
+
 from .radar import Origin, RadarSensor, generator, unit_vectors
 from .scene import Scene
 
@@ -105,6 +107,7 @@ def simulate(
     Simulation
         With one entry per pose.
     """
+    poses = check_poses(poses, len(poses))
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
     return Simulation(
         points=[scan.points for scan in scans],

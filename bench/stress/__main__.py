@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Long random tests, one command each: `python -m bench.stress kernels|files|save|arguments`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one of them; a failure ends the program with status 1."""
+    parser = argparse.ArgumentParser(prog="python -m bench.stress", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    kernels = commands.add_parser("kernels", help="rounding errors of the kernels against float64")
+    kernels.add_argument("--largest", type=int, default=1_000_000, help="batch; default: 1000000")
+    files = commands.add_parser("files", help="damaged files into every reader")
+    files.add_argument("--count", type=int, default=100_000, help="files in all; default: 100000")
+    files.add_argument("--seed", type=int, default=0)
+    files.add_argument("--only", nargs="+", metavar="READER", help="default: all")
+    save = commands.add_parser("save", help="savers killed at random moments")
+    save.add_argument("--count", type=int, default=200, help="kills; default: 200")
+    random = commands.add_parser("arguments", help="random arguments for the public functions")
+    random.add_argument("--count", type=int, default=2000, help="examples for each; default: 2000")
+    words = parser.parse_args(arguments)
+    if words.command == "kernels":
+        from .kernels import BATCHES, run  # noqa: PLC0415 - each command imports what it needs
+
+        run(tuple(count for count in BATCHES if count <= words.largest))
+    elif words.command == "files":
+        from .files import run as run_files  # noqa: PLC0415
+
+        sys.exit(not run_files(words.count, words.seed, words.only))
+    elif words.command == "save":
+        from .save import run as run_save  # noqa: PLC0415
+
+        run_save(words.count)
+    else:
+        environment = os.environ | {"RADARSDF_EXAMPLES": str(words.count)}
+        tests = Path(__file__).parents[2] / "tests" / "test_arguments.py"
+        sys.exit(
+            subprocess.run(
+                [sys.executable, "-m", "pytest", "-q", tests], env=environment, check=False
+            ).returncode
+        )
+
+
+if __name__ == "__main__":
+    main()

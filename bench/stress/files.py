@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Damaged and hostile files into every reader: each is read, or refused by a ValueError or OSError that names it."""
+
+from __future__ import annotations
+
+import collections
+import resource
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import radarsdf
+from radarsdf.readers import read_scans
+from tqdm import tqdm
+
+from bench.paper.folders import read_posed_folder
+from bench.paper.pcd import read_pcd
+from bench.paper.report import markdown
+from bench.paper.trajectory import read_trajectory
+
+from . import samples
+from .mutations import boundaries, mutate
+
+MAX_GROWTH_BYTES = 1 << 29  # all files together: any one is below 100 kB
+MAX_SECONDS = 5.0  # of the processor, for one file
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A function that reads files, valid files for it, and how to damage them with knowledge of their format."""
+
+    read: Callable[[Path], object]
+    name: str
+    """Of the file."""
+    valid: Callable[[], list[bytes]]
+    hostile: Callable[[np.random.Generator], bytes] | None = None
+
+
+def _load(path: Path) -> None:
+    """A map that loads also answers."""
+    radar_map = radarsdf.load(path)
+    x = np.zeros((2, 3))
+    assert radar_map.sdf(x).shape == radar_map.observed(x).shape == (2,)
+
+
+def _scans(path: Path) -> None:
+    scans = read_scans(path)
+    assert scans.poses.shape == (len(scans.points), 4, 4)
+    assert all(points.ndim == 2 and points.shape[1] == 3 and len(points) for points in scans.points)
+    if scans.intensities is not None:
+        assert list(map(len, scans.intensities)) == list(map(len, scans.points))
+
+
+def _pcd(path: Path) -> None:
+    assert len({len(column) for column in read_pcd(path).values()}) <= 1
+
+
+def _trajectory(path: Path) -> None:
+    trajectory = read_trajectory(path)
+    assert len(trajectory.times_s) == len(trajectory.positions) == len(trajectory.rotations) >= 2
+
+
+def _folder(path: Path) -> None:
+    """A folder in which everything but the file is whole; ValueErrors name files of the folder."""
+    folder = path.parent if path.parent.name != "radar" else path.parent.parent
+    try:
+        scans = read_posed_folder(folder)
+    except ValueError as error:
+        if str(folder) in str(error):  # perhaps of another file, which does not fit to this one
+            msg = f"{path}: {error}"
+            raise ValueError(msg) from error
+        raise
+    assert 1 <= len(scans.points) == len(scans.poses) <= 2  # a scan that the poses do not cover is left out
+
+
+READERS = {
+    "load": Reader(_load, "map.safetensors", samples.maps, samples.hostile_map),
+    "read_scans": Reader(_scans, "scans.npz", samples.scans, samples.hostile_scans),
+    "read_pcd": Reader(_pcd, "scan.pcd", samples.clouds),
+    "read_trajectory": Reader(_trajectory, "poses.txt", samples.trajectories),
+    "folder: scan": Reader(_folder, "radar/100.0.pcd", samples.clouds),
+    "folder: poses": Reader(_folder, "poses.txt", samples.trajectories),
+    "folder: mounting": Reader(_folder, "base_T_radar.txt", samples.transforms),
+    "folder: lidar": Reader(_folder, "lidar.ply", samples.meshes),
+}
+
+
+@dataclass
+class Outcomes:
+    """What became of a reader's files."""
+
+    counts: collections.Counter[str] = field(default_factory=collections.Counter)
+    failures: list[str] = field(default_factory=list)
+    slowest_s: float = 0.0
+
+
+def damaged(reader: Reader, seed: int) -> Iterator[bytes]:
+    """Files without end, the same for the same seed: first the valid ones, whole and cut at every boundary."""
+    valid = reader.valid()
+    for data in valid:
+        yield data
+        yield from (data[:end] for end in boundaries(data))
+    rng = np.random.default_rng(seed)
+    while True:
+        if reader.hostile is not None and rng.random() < 0.4:
+            data = reader.hostile(rng)
+            yield mutate(rng, data, valid) if rng.random() < 0.2 else data
+        else:
+            yield mutate(rng, valid[rng.integers(len(valid))], valid)
+
+
+def try_file(reader: Reader, path: Path, data: bytes, outcomes: Outcomes) -> None:
+    """Read `data` from a file at `path`, and note what happened."""
+    path.write_bytes(data)
+    started = time.process_time()
+    try:
+        reader.read(path)
+        kind = "read"
+    except ValueError as error:
+        kind = "ValueError" if str(path) in str(error) else "ValueError without the file's name"
+        if kind != "ValueError":
+            outcomes.failures.append(f"{error!r}")
+    except OSError as error:
+        kind = "OSError"
+        if str(path) not in str(error):
+            outcomes.failures.append(f"{error!r}")
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # noqa: BLE001 - a panic of the safetensors library is not an Exception
+        kind = type(error).__name__
+        outcomes.failures.append(f"{error!r}")
+    seconds = time.process_time() - started
+    outcomes.counts[kind] += 1
+    outcomes.slowest_s = max(outcomes.slowest_s, seconds)
+    if seconds > MAX_SECONDS:
+        outcomes.failures.append(f"{seconds:.1f} s")
+
+
+def place(reader: Reader, folder: Path) -> Path:
+    """Where the reader's file belongs, and the whole files round it."""
+    if reader.read is _folder:
+        samples.write_folder(folder)
+    return folder / reader.name
+
+
+def run(count: int, seed: int, only: list[str] | None = None) -> bool:
+    """Read `count` files in all and print what became of them; whether all was well."""
+    shared_memory = Path("/dev/shm")
+    names = only or list(READERS)
+    rows: list[list[str]] = []
+    failures: list[str] = []
+    with tempfile.TemporaryDirectory(dir=shared_memory if shared_memory.is_dir() else None) as folder:
+        for name in names:
+            reader = READERS[name]
+            path = place(reader, Path(folder))
+            # A first file, so that what is imported on the way does not count as growth.
+            try_file(reader, path, reader.valid()[0], Outcomes())
+            before = _peak_bytes()
+            outcomes = Outcomes()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                share = count // len(names)
+                for data, _ in zip(damaged(reader, seed), tqdm(range(share), name), strict=False):
+                    failed = len(outcomes.failures)
+                    try_file(reader, path, data, outcomes)
+                    if len(outcomes.failures) > failed and failed < 5:
+                        kept = (
+                            Path(tempfile.gettempdir()) / f"radarsdf_{name.split()[-1]}_{failed}{path.suffix}"
+                        )
+                        kept.write_bytes(data)
+                        failures.append(f"{name}: {outcomes.failures[-1][:300]} (kept as {kept})")
+            growth = _peak_bytes() - before
+            if growth > MAX_GROWTH_BYTES:
+                failures.append(f"{name}: memory grew by {growth / 1e6:.0f} MB")
+            good = [outcomes.counts.pop(kind, 0) for kind in ("read", "ValueError", "OSError")]
+            other = ", ".join(f"{n} {kind}" for kind, n in outcomes.counts.items())
+            rows.append(
+                [
+                    name,
+                    *(f"{n:,}" for n in good),
+                    other or "0",
+                    f"{outcomes.slowest_s:.2f}",
+                    f"{growth / 1e6:.0f}",
+                ]
+            )
+    header = ["reader", "read", "ValueError", "OSError", "other (failures)", "slowest, s", "memory, + MB"]
+    print(f"\n{count:,} files, seed {seed}\n\n{markdown(header, rows)}\n")
+    for failure in failures:
+        print(failure, file=sys.stderr)
+    return not failures
+
+
+def _peak_bytes() -> int:
+    usage: Any = resource.getrusage(resource.RUSAGE_SELF)
+    return int(usage.ru_maxrss) * (1 if sys.platform == "darwin" else 1024)

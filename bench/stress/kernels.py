@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Rounding errors of the compiled kernels, against float64 in NumPy."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from radarsdf import _core, kernels
+
+from bench.paper.report import markdown
+
+from .reference import Reference
+
+Array = NDArray[Any]
+LEAF_M = 0.2
+NUM_LEVELS = 3
+BATCHES = (0, 1, 7, 8191, 8192, 1_000_000)
+ENCODINGS = {"tri-quadtree": _core.Encoding.TRI_QUADTREE, "octree": _core.Encoding.OCTREE}
+_SURFACE_POINTS = 8000
+_OFTEN = 100_000  # larger batches only once for each type: the reference takes a minute for a million points
+_EXTENT_M = 8.0
+
+
+def points_of(place: str, count: int, dtype: Any, seed: int = 0) -> Array:
+    """Points (count, 3), m, on or beside occupied cells: anywhere, or on borders of cells and next to them."""
+    rng = np.random.default_rng([seed, count])
+    points = surface(rng, count, offset_m=500.0 if place == "500 m away" else 0.0).astype(dtype)
+    if place == "on borders":
+        near = np.round(points / LEAF_M) * LEAF_M
+        kind = rng.integers(4, size=points.shape)
+        beside = np.nextafter(near.astype(dtype), np.where(kind == 1, -np.inf, np.inf).astype(dtype))
+        points = np.where(kind == 0, near, np.where(kind < 3, beside, points)).astype(dtype)
+        points[points == 0] = -0.0
+    elif place == "one cell":
+        points = rng.uniform(0, LEAF_M, (count, 3)).astype(dtype)
+    return points
+
+
+def surface(rng: np.random.Generator, count: int, offset_m: float = 0.0) -> Array:
+    """Points (count, 3) near a wavy surface, m."""
+    xy = rng.uniform(-_EXTENT_M, _EXTENT_M, (count, 2))
+    z = np.sin(xy[:, 0]) + rng.uniform(-0.3, 0.3, count)
+    return np.column_stack([xy, z]) + offset_m
+
+
+@functools.cache
+def table_and_reference(place: str, dtype: Any, encoding: Any) -> tuple[_core.VertexTable, Reference]:
+    """Cells round all points that `points_of` gives for the place."""
+    cells = _core.CellSet(LEAF_M)
+    cells.insert(np.ascontiguousarray(points_of(place, _SURFACE_POINTS, dtype, seed=1)))
+    table = _core.VertexTable(cells.sorted_keys(), LEAF_M, NUM_LEVELS, encoding)
+    return table, Reference(table.leaf_cells(), LEAF_M, NUM_LEVELS, encoding)
+
+
+def relative_error(got: Array, exact: tuple[Array, Array]) -> float:
+    """Largest |error| / sum of |terms|; where there are no terms the result must be zero."""
+    value, scale = exact
+    error = np.abs(got.astype(np.float64) - value)
+    assert not error[scale == 0].any()
+    return float((error[scale > 0] / scale[scale > 0]).max(initial=0.0))
+
+
+def interpolation_errors(place: str, count: int, dtype: Any, encoding: Any) -> dict[str, float]:
+    """Largest relative error of each sum; the first derivatives are "backward", those along directions the second."""
+    table, reference = table_and_reference(place, dtype, encoding)
+    assert table.num_rows == reference.num_rows
+    rng = np.random.default_rng(count)
+    points = points_of(place, count, dtype)
+    features = rng.normal(size=(table.num_rows, 8)).astype(dtype)
+    g = rng.normal(size=(count, 8 * NUM_LEVELS)).astype(dtype)
+    v = rng.normal(size=(count, 3)).astype(dtype)
+    located = np.zeros((count, NUM_LEVELS), np.int32)
+    table.locate(points, located)
+    errors = {}
+    for name, directions in (("", None), (" along v", v)):
+        # Filled by the core, which must write every number of the first and the last.
+        out, points_grad = np.full_like(g, np.nan), np.full_like(points, np.nan)
+        features_grad = np.zeros_like(features)
+        table.interpolate(features, points, located, directions, out)
+        table.scatter(points, located, directions, g, features_grad)
+        table.coordinate_gradient(features, points, located, directions, g, points_grad)
+        errors["y" + name] = relative_error(out, reference.interpolate(features, points, directions))
+        errors["dF" + name] = relative_error(features_grad, reference.scatter(g, points, directions))
+        errors["dx" + name] = relative_error(
+            points_grad, reference.coordinate_gradient(features, g, points, directions)
+        )
+    return errors
+
+
+def fourier_error(
+    count: int, dtype: Any, half_width_m: float = 409.6, frequencies: int = 16
+) -> dict[str, float]:
+    """Largest absolute error of sines and cosines, and relative one of the first and second derivative.
+
+    The reference takes the kernel's rounded position in units of the half width, x̂: all of the rest is the kernel's.
+    """
+    rng = np.random.default_rng(count)
+    points = rng.uniform(-500, 500, (count, 3)).astype(dtype)
+    points[: count // 8] = np.round(points[: count // 8])
+    scaled = (points * dtype(1.0 / half_width_m)).astype(np.float64)
+    turns = scaled[:, None, :] * 2.0 ** np.arange(frequencies)[:, None]
+    angle = np.pi * (turns - 2 * np.round(turns / 2))  # exact up to the last product
+    x = torch.tensor(points, requires_grad=True)
+    y = kernels.fourier(x, half_width_m, 0, frequencies)
+    exact = np.concatenate(
+        [np.sin(angle).reshape(count, 3 * frequencies), np.cos(angle).reshape(count, 3 * frequencies)], 1
+    )
+    g = torch.tensor(rng.normal(size=tuple(y.shape)).astype(dtype))
+    (first,) = torch.autograd.grad(y, x, g, create_graph=True)
+    v = torch.tensor(rng.normal(size=(count, 3)).astype(dtype))
+    (second,) = torch.autograd.grad(first, x, v)
+    w = np.pi * 2.0 ** np.arange(frequencies)[:, None] / half_width_m
+    sine_g, cosine_g = np.moveaxis(g.double().numpy().reshape(count, 2, frequencies, 3), 1, 0)
+    terms = [sine_g * np.cos(angle) * w, -cosine_g * np.sin(angle) * w]
+    terms2 = [-sine_g * np.sin(angle) * w**2, -cosine_g * np.cos(angle) * w**2]
+
+    def sums(parts: list[Array], factor: Array | float = 1.0) -> tuple[Array, Array]:
+        # Scaled by the largest that the terms can be: a sine near zero has no relative accuracy to ask for.
+        size = (np.abs(sine_g) + np.abs(cosine_g)) * (w if parts is terms else w**2)
+        return sum(parts).sum(1) * factor, size.sum(1) * np.abs(factor)  # type: ignore[union-attr]
+
+    return {
+        "y": float(np.abs(y.detach().double().numpy() - exact).max(initial=0.0)),
+        "dx": relative_error(first.detach().numpy(), sums(terms)),
+        "dx along v": relative_error(second.numpy(), sums(terms2, v.double().numpy())),
+    }
+
+
+def harmonics_error(count: int, dtype: Any) -> float:
+    """Largest absolute error of the spherical harmonics of unit vectors; of these the largest value is about 1."""
+    directions = np.random.default_rng(count).normal(size=(count, 3))
+    rounded = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(dtype)
+    got = kernels.spherical_harmonics(torch.from_numpy(rounded)).double().numpy()
+    return float(np.abs(got - harmonics(rounded.astype(np.longdouble))).max(initial=0.0))
+
+
+def harmonics(directions: Array) -> Array:
+    """(N, 16) real spherical harmonics of degree 0 to 3 from cos, sin and Legendre functions, in long double."""
+    x, y, z = directions.T
+    rho, azimuth = np.hypot(x, y), np.arctan2(y, x)
+    legendre = {
+        (0, 0): np.ones_like(z), (1, 0): z, (1, 1): rho,
+        (2, 0): (2 * z * z - rho * rho) / 2, (2, 1): 3 * z * rho, (2, 2): 3 * rho * rho,
+        (3, 0): z * (2 * z * z - 3 * rho * rho) / 2, (3, 1): 1.5 * rho * (4 * z * z - rho * rho),
+        (3, 2): 15 * z * rho * rho, (3, 3): 15 * rho**3,
+    }  # fmt: skip
+    columns = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            m = abs(order)
+            norm = math.sqrt(
+                (2 * degree + 1) / (4 * math.pi) * math.factorial(degree - m) / math.factorial(degree + m)
+            )
+            angle = np.cos(m * azimuth) if order >= 0 else np.sin(m * azimuth)
+            columns.append((math.sqrt(2) if m else 1) * norm * legendre[degree, m] * angle)
+    return np.stack(columns, 1)
+
+
+def one_row_error(count: int, dtype: Any, *, same_sign: bool) -> float:
+    """Largest relative error of gradients that are sums over a whole batch in one cell."""
+    table, reference = table_and_reference("one cell", dtype, _core.Encoding.TRI_QUADTREE)
+    rng = np.random.default_rng(count)
+    points = points_of("one cell", count, dtype)
+    points = np.clip(points, dtype(1e-4), dtype(LEAF_M - 1e-4))
+    shape = (count, 8 * NUM_LEVELS)
+    g = (rng.uniform(0.5, 1.5, shape) if same_sign else rng.normal(size=shape)).astype(dtype)
+    located = np.zeros((count, NUM_LEVELS), np.int32)
+    table.locate(points, located)
+    got = np.zeros((table.num_rows, 8), dtype)
+    table.scatter(points, located, None, g, got)
+    return relative_error(got, reference.scatter(g, points, None))
+
+
+def run(batches: tuple[int, ...] = BATCHES) -> None:
+    """Print the tables for every instruction set."""
+    before = _core.instruction_set()
+    for isa in _core.available_instruction_sets():
+        _core.set_instruction_set(isa)
+        print(f"\n## {isa}: interpolation, largest |error| / Σ|terms| over batches of {batches}\n")
+        rows = []
+        for (name, encoding), dtype, place in itertools.product(
+            ENCODINGS.items(), (np.float32, np.float64), ("anywhere", "on borders", "500 m away")
+        ):
+            worst: dict[str, float] = {}
+            for count in batches:
+                if count > _OFTEN and (isa, place) != (before, "anywhere"):
+                    continue
+                for key, error in interpolation_errors(place, count, dtype, encoding).items():
+                    worst[key] = max(worst.get(key, 0.0), error)
+            rows.append([name, np.dtype(dtype).name, place, *(f"{e:.1e}" for e in worst.values())])
+        print(markdown(["encoding", "type", "points", *worst], rows), flush=True)
+
+        print(f"\n## {isa}: Fourier features and spherical harmonics, largest error\n")
+        rows = []
+        for dtype in (np.float32, np.float64):
+            fourier = [fourier_error(count, dtype) for count in batches]
+            largest = [max(errors[key] for errors in fourier) for key in fourier[0]]
+            sphere = max(harmonics_error(count, dtype) for count in batches)
+            rows.append([np.dtype(dtype).name, *(f"{e:.1e}" for e in [*largest, sphere])])
+        header = ["type", *(f"Fourier {key}" for key in fourier[0]), "harmonics"]
+        print(markdown(header, rows), flush=True)
+
+        print(
+            f"\n## {isa}: gradient of the rows of one cell that every sample hits, largest |error| / Σ|terms|\n"
+        )
+        rows = [
+            [f"{count:,}", np.dtype(dtype).name, *(f"{one_row_error(count, dtype, same_sign=s):.1e}" for s in (True, False))]
+            for count, dtype in itertools.product((512, 4096, 65_536, 1_000_000), (np.float32, np.float64))
+        ]  # fmt: skip
+        print(markdown(["samples", "type", "of one sign", "of both"], rows), flush=True)
+    _core.set_instruction_set(before)

@@ -1,0 +1,252 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Small valid files of every kind, and hostile ones whose outermost layer is whole."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import radarsdf
+import trimesh
+from radarsdf import FitConfig
+from radarsdf.readers import Scans, write_scans
+
+_CONFIG = FitConfig(
+    sdf_iterations=2, intensity_iterations=2, batch_size=64, intensity_batch_size=64, sdf_hidden=(4,),
+    intensity_hidden=(4, 3), num_levels=2, fourier_count=2, num_threads=1,
+)  # fmt: skip
+_VALUES: list[Any] = [
+    None, True, -1, 0, 1, 12, 13, 2**31, 2**63, 10**400, 1e308, -0.0, float("nan"), float("inf"), "", "x" * 10_000, [],
+    [[]], [1e6] * 4, [30_000, 30_000, 30_000], [1] * 20_000, [2**62, 2**62], {}, {"a": {}}, "octree", "tri-quadtree",
+]  # fmt: skip
+
+
+def _small_scans(with_intensity: bool) -> Scans:
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, 0, 3] = [0.0, 0.5]
+    points = [np.column_stack([np.full(9, 5.0), rng.uniform(-1, 1, (9, 2))]) for _ in poses]
+    values = [rng.uniform(0, 9, 9) for _ in poses] if with_intensity else None
+    return Scans(points, poses, values, rng.normal(size=(5, 3)))
+
+
+@functools.cache
+def maps() -> list[bytes]:
+    """Fitted maps with and without intensities."""
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        for with_intensity, encoding in ((True, "tri-quadtree"), (False, "octree")):
+            scans = _small_scans(with_intensity)
+            config = FitConfig.from_dict(_CONFIG.to_dict() | {"encoding": encoding})
+            path = Path(folder) / "map.safetensors"
+            radarsdf.fit(scans.points, scans.poses, scans.intensities, config=config, progress=False).save(
+                path
+            )
+            found.append(path.read_bytes())
+    return found
+
+
+def hostile_map(rng: np.random.Generator) -> bytes:
+    """A map whose header is valid JSON of the right length, with one to three of its values exchanged."""
+    data = maps()[rng.integers(2)]
+    size = int.from_bytes(data[:8], "little")
+    header, body = json.loads(data[8 : 8 + size]), data[8 + size :]
+    description = json.loads(header["__metadata__"]["description"])
+    for _ in range(rng.integers(1, 4)):
+        value = _VALUES[rng.integers(len(_VALUES))]
+        tensors = [name for name in header if name != "__metadata__"]
+        tensor = header[tensors[rng.integers(len(tensors))]]
+        match rng.integers(6):
+            case 0 | 1:
+                settings = list(description["config"]) if isinstance(description.get("config"), dict) else []
+                if settings:
+                    description["config"][settings[rng.integers(len(settings))]] = value
+            case 2:
+                description[str(rng.choice(["config", "report", "intensity_scale", "more"]))] = value
+            case 3:
+                shapes = [value, [2**32, 2**32], [0, 2**63], [10**12], [-1], [8, 8]]
+                tensor["shape"] = shapes[rng.integers(len(shapes))]
+            case 4:
+                tensor["dtype"] = str(
+                    rng.choice(["F64", "F16", "BF16", "I64", "U8", "BOOL", "F8_E4M3", "X", ""])
+                )
+            case 5:
+                begin = int(rng.choice([0, 1, len(body), 2**40, 2**62]))
+                tensor["data_offsets"] = [begin, begin + int(rng.choice([-1, 0, 4, len(body), 2**40]))]
+    metadata = header["__metadata__"]
+    metadata["description"] = json.dumps(description)
+    if rng.random() < 0.1:
+        metadata[str(rng.choice(["format", "format_version"]))] = str(
+            rng.choice(["", "2", "9" * 5000, "٣", "1.0"])
+        )
+    text = json.dumps(header).encode()
+    if rng.random() < 0.1:  # the same key twice
+        text = text[:-1] + b"," + text[1:]
+    if rng.random() < 0.1:  # numbers that are not
+        body = bytes(rng.choice(np.array([0, 0x7F, 0x80, 0xFF, 0xC0], np.uint8), len(body)))
+    return len(text).to_bytes(8, "little") + text + body
+
+
+@functools.cache
+def scans() -> list[bytes]:
+    """Compressed and plain, with and without intensities."""
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        for with_intensity in (True, False):
+            path = Path(folder) / "scans.npz"
+            write_scans(path, _small_scans(with_intensity))
+            found.append(path.read_bytes())
+    plain = io.BytesIO()
+    with np.load(io.BytesIO(found[0])) as arrays:
+        np.savez(plain, **arrays)
+    return [*found, plain.getvalue()]
+
+
+def hostile_scans(rng: np.random.Generator) -> bytes:
+    """A zip file that is whole, of members that are not."""
+    with np.load(io.BytesIO(scans()[0])) as file:
+        arrays: dict[str, Any] = {name: _npy(array) for name, array in file.items()}
+        arrays["static"] = _npy(np.ones(len(file["frame"]), bool))
+        shapes = {name: array.shape for name, array in file.items()}
+    for _ in range(rng.integers(1, 4)):
+        name = str(rng.choice(["points", "frame", "poses", "intensity", "static", "lidar_points"]))
+        shape = shapes.get(name, (18,))
+        match rng.integers(6):
+            case 0:
+                types = [
+                    "f2",
+                    "f8",
+                    "i1",
+                    "u8",
+                    "c16",
+                    "S3",
+                    "U2",
+                    "M8[s]",
+                    "m8[s]",
+                    "V4",
+                    "?",
+                    ">f4",
+                    "f4,i4",
+                    "V0",
+                    "U0",
+                ]
+                arrays[name] = _npy(np.zeros(shape, str(rng.choice(types))))
+            case 1:
+                other = [
+                    (0, *shape[1:]),
+                    shape[:-1],
+                    (*shape, 1),
+                    (),
+                    (1,) * 30,
+                    (0,),
+                    tuple(reversed(shape)),
+                ]
+                arrays[name] = _npy(np.zeros(other[rng.integers(len(other))]))
+            case 2:
+                values = [np.nan, np.inf, -1, 2**63, 1e308, 0.5]
+                arrays[name] = _npy(np.full(shape, values[rng.integers(len(values))]))
+            case 3:
+                claims = [
+                    (10**12,),
+                    (2**32, 2**32),
+                    (2**63,),
+                    (-1, 3),
+                    (10**9, 3),
+                    (0, 2**62, 2**62),
+                    (2**16,) * 4,
+                ]
+                arrays[name] = _claim(claims[rng.integers(len(claims))])
+            case 4:
+                heads = [b"(" * 9000, b"[" * 9000, b"{'descr': '<f4', 'fortran_order': 0, 'shape': 3}", b"__import__('os')",
+                         b"{'descr': [('a', " * 400, b"\x00" * 50, b"{'descr': '<f4'}", b"9" * 9000]  # fmt: skip
+                arrays[name] = _header(heads[rng.integers(len(heads))])
+            case 5:
+                del arrays[name]
+                arrays[str(rng.choice(["../points", "/points", "points/points", "x", "C:\\points"]))] = _npy(
+                    np.ones((18, 3))
+                )
+        arrays.setdefault(name, _npy(np.zeros(shape)))
+    result = io.BytesIO()
+    kind = int(rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]))
+    with zipfile.ZipFile(result, "w", kind) as file:
+        for name, data in arrays.items():
+            file.writestr(name + ".npy", data)
+    data = result.getvalue()
+    if rng.random() < 0.1:
+        data = data.replace(
+            b"PK\x01\x02\x14\x03\x14\x00\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01\x00"
+        )  # "encrypted"
+    return data
+
+
+def _npy(array: np.ndarray[Any, Any]) -> bytes:
+    data = io.BytesIO()
+    np.save(data, array)
+    return data.getvalue()
+
+
+def _header(text: bytes) -> bytes:
+    return b"\x93NUMPY\x01\x00" + (len(text) + 1).to_bytes(2, "little") + text + b"\n" + bytes(100)
+
+
+def _claim(shape: tuple[int, ...]) -> bytes:
+    return _header(f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".encode())
+
+
+def clouds() -> list[bytes]:
+    """PCD files, binary and ASCII."""
+    rng = np.random.default_rng(1)
+    table = np.column_stack([rng.uniform(1, 9, (12, 3)), rng.uniform(0, 30, 12)]).astype(np.float32)
+    found = []
+    for kind in ("binary", "ascii"):
+        head = (
+            "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z power\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+            f"WIDTH 12\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 12\nDATA {kind}\n"
+        ).encode()
+        rows = "".join(" ".join(map(str, row)) + "\n" for row in table.tolist()).encode()
+        found.append(head + (table.tobytes() if kind == "binary" else rows))
+    return found
+
+
+def trajectories() -> list[bytes]:
+    """Poses that cover the times of the folder's scans."""
+    rows = [
+        f"{99.8 + 0.2 * i:.3f} {0.1 * i} 2.5 -1e-3 0 0 {np.sin(0.1 * i):.9f} {np.cos(0.1 * i):.9f}\n"
+        for i in range(6)
+    ]
+    return [("# time x y z qx qy qz qw\n" + "".join(rows)).encode()]
+
+
+def transforms() -> list[bytes]:
+    """A mounting, 4 x 4."""
+    return [b"0 -1 0 0.5\n1 0 0 0\n0 0 1 -0.2 # z\n0 0 0 1\n"]
+
+
+@functools.cache
+def meshes() -> list[bytes]:
+    """PLY files of points, binary and ASCII, and one of a mesh."""
+    make_cloud: Any = trimesh.PointCloud
+    cloud = make_cloud(np.random.default_rng(2).normal(size=(9, 3)))
+    box: Any = trimesh.creation.box()
+    return [
+        cloud.export(file_type="ply"),
+        box.export(file_type="ply", encoding="ascii"),
+        box.export(file_type="ply"),
+    ]
+
+
+def write_folder(folder: Path) -> None:
+    """A folder of two scans that `read_posed_folder` reads."""
+    (folder / "radar").mkdir(parents=True, exist_ok=True)
+    for time_s in ("100.0", "100.3"):
+        (folder / "radar" / f"{time_s}.pcd").write_bytes(clouds()[0])
+    (folder / "poses.txt").write_bytes(trajectories()[0])
+    (folder / "base_T_radar.txt").write_bytes(transforms()[0])
+    (folder / "lidar.ply").write_bytes(meshes()[0])

@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What users hand over as arrays of numbers, checked in one place: a ValueError or TypeError that names it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+MAX_POSITION_M = 1e12
+"""Further out than the planets, yet squares and products of three such lengths are far from overflow."""
+
+
+def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
+    """`values` as an array of floats, of any shape, not copied where it is one already.
+
+    Raises
+    ------
+    TypeError
+        For anything but real numbers: of complex ones NumPy would drop a part, of text it would read numbers.
+    ValueError
+        For rows of different lengths, or integers beyond float64.
+    """
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind == "O":  # numbers of other types, or integers of many digits
+            array = array.astype(np.float64)
+    except OverflowError as error:
+        msg = f"{name}: {error}"
+        raise ValueError(msg) from error
+    except RuntimeError as error:  # a tensor that requires a gradient
+        msg = f"{name}: {error}"
+        raise TypeError(msg) from error
+    if array.dtype.kind not in "biuf":
+        msg = f"{name} must be real numbers, not {array.dtype}"
+        raise TypeError(msg)
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, which the callers refuse
+        return array.astype(dtype, copy=False)
+
+
+def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """`values` as (N, 3) finite positions, m, in C order."""
+    points: NDArray[np.float64] = np.ascontiguousarray(real_array(values, name))
+    if points.ndim != 2 or points.shape[1] != 3:
+        msg = f"{name} must be (N, 3), not {points.shape}"
+        raise ValueError(msg)
+    if not (np.abs(points) <= MAX_POSITION_M).all():
+        msg = f"{name} must be finite, and within {MAX_POSITION_M:g} m"
+        raise ValueError(msg)
+    return points
+
+
+def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:
+    """`value` as an int of a range."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+        msg = f"{name} must be a whole number, not {value!r:.50}"
+        raise TypeError(msg)
+    if not lowest <= value <= highest:
+        least = "positive" if lowest == 1 else f"at least {lowest}"
+        msg = f"{name} must be {least} and at most {highest}, not {value!r:.50}"
+        raise ValueError(msg)
+    return int(value)
+
+
+def positive(value: Any, name: str) -> float:
+    """`value` as a positive, finite number."""
+    array = real_array(value, name)
+    if array.shape != () or not 0 < array < np.inf:
+        msg = f"{name} must be positive and finite, not {value!r:.50}"
+        raise ValueError(msg)
+    return float(array)
+
+
+def number(value: Any, name: str) -> float:
+    """`value` as a float, infinity allowed."""
+    array = real_array(value, name)
+    if array.shape != () or np.isnan(array):
+        msg = f"{name} must be a number, not {value!r:.50}"
+        raise ValueError(msg)
+    return float(array)

@@ -1,0 +1,208 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Files that are damaged, or made to do damage: read, or refused by an error that names them; nothing in between.
+
+`python -m bench.stress files --count 100000` does the same for longer.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import os
+import pickle
+import resource
+import warnings
+import zipfile
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf.readers import read_scans
+
+from bench.stress import files, samples
+from bench.stress.mutations import boundaries
+
+FILES = 250
+
+
+@pytest.mark.parametrize("name", files.READERS)
+def test_damaged_files_are_read_or_refused(name, tmp_path):
+    reader = files.READERS[name]
+    path = files.place(reader, tmp_path)
+    outcomes = files.Outcomes()
+    # The long run begins with cuts at every boundary; of these, some.
+    cuts = sum(1 + len(boundaries(data)) for data in reader.valid())
+    stream = files.damaged(reader, seed=0)
+    some = list(itertools.islice(stream, 0, cuts, 7)) + list(itertools.islice(stream, FILES))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy's, of numbers too large for a type
+        for data in some:
+            files.try_file(reader, path, data, outcomes)
+    assert outcomes.failures == []
+    assert outcomes.counts["read"] > 0
+    assert outcomes.counts["ValueError"] > FILES / 5
+
+
+@pytest.fixture
+def bounded_memory():
+    """Peak memory may grow by 300 MB."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    growth_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert growth_kb < 300_000
+
+
+class Plant:
+    """An object whose unpickling creates a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (self.path, "w")
+
+
+def test_pickles_are_not_executed(tmp_path):
+    planted = tmp_path / "executed"
+    objects = np.array([Plant(str(planted))] * 2, object)
+    pickle.loads(pickle.dumps(objects[0])).close()
+    planted.unlink()  # so this is what an unpickling would have left
+
+    path = tmp_path / "scans.npz"
+    for name in ("points", "frame", "lidar_points", "static"):
+        arrays = {"points": np.ones((2, 3)), "frame": np.zeros(2), "poses": np.eye(4)[None]}
+        np.savez(path, **(arrays | {name: objects}))
+        with pytest.raises(ValueError, match=r"scans\.npz"):
+            read_scans(path)
+    for content in (pickle.dumps(objects), pickle.dumps(Plant(str(planted)))):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"scans\.npz"):
+            read_scans(path)
+        (tmp_path / "map.safetensors").write_bytes(content)
+        with pytest.raises(ValueError, match=r"map\.safetensors"):
+            radarsdf.load(tmp_path / "map.safetensors")
+    assert not planted.exists()
+
+
+@pytest.mark.usefixtures("bounded_memory")
+def test_a_zip_bomb_is_not_unpacked(tmp_path):
+    path = tmp_path / "scans.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file, file.open("points.npy", "w") as member:
+        member.write(samples._claim((10**8, 3)))
+        for _ in range(600):
+            member.write(bytes(1 << 20))
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(ValueError, match=r"scans\.npz.*would unpack"):
+        read_scans(path)
+
+
+@pytest.mark.usefixtures("bounded_memory")
+@pytest.mark.parametrize("shape", [(10**9, 3), (10**13, 3), (2**32, 2**32), (2**63,), (-1, 3)])
+def test_shapes_that_no_file_holds(tmp_path, shape):
+    path = tmp_path / "scans.npz"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("points.npy", samples._claim(shape))
+    with pytest.raises(ValueError, match=r"scans\.npz is not a whole"):
+        read_scans(path)
+
+
+def test_names_in_an_npz_lead_nowhere(tmp_path):
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    data = io.BytesIO()
+    np.save(data, np.ones((2, 3)))
+    with zipfile.ZipFile(folder / "scans.npz", "w") as file:
+        for name in ("../points.npy", "/points.npy", str(tmp_path / "points.npy"), "a/points.npy"):
+            file.writestr(name, data.getvalue())
+    with pytest.raises(ValueError, match="lacks the arrays frame, points, poses"):
+        read_scans(folder / "scans.npz")
+    assert [p.name for p in tmp_path.iterdir()] == ["inner"]
+    assert [p.name for p in folder.iterdir()] == ["scans.npz"]
+
+
+@pytest.mark.usefixtures("bounded_memory")
+def test_as_many_frames_as_returns(tmp_path):
+    count = 30_000
+    poses = np.broadcast_to(np.eye(4, dtype=np.float32), (count, 4, 4))
+    np.savez(tmp_path / "scans.npz", points=np.ones((count, 3)), frame=np.arange(count)[::-1], poses=poses)
+    assert len(read_scans(tmp_path / "scans.npz").points) == count  # in linear time
+
+
+def with_config(**changes):
+    data = samples.maps()[0]
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    description = json.loads(header["__metadata__"]["description"])
+    description["config"].update(changes)
+    header["__metadata__"]["description"] = json.dumps(description)
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text + data[8 + size :]
+
+
+@pytest.mark.usefixtures("bounded_memory")
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sdf_hidden": [30_000] * 3},
+        {"intensity_hidden": [2**62, 2**62]},
+        {"sdf_hidden": [1] * 1_000_000},
+        {"geometry_feature_dim": 10**9},
+        {"num_levels": 12},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_a_map_that_describes_more_than_it_holds(tmp_path, changes):
+    path = tmp_path / "map.safetensors"
+    path.write_bytes(with_config(**changes))
+    with pytest.raises(ValueError, match=r"map\.safetensors is not a whole"):
+        radarsdf.load(path)
+
+
+@pytest.mark.usefixtures("bounded_memory")
+@pytest.mark.parametrize("claimed", [2**63, 2**64 - 1, 10**12, 10**8])
+def test_a_header_that_claims_terabytes(tmp_path, claimed):
+    path = tmp_path / "map.safetensors"
+    path.write_bytes(claimed.to_bytes(8, "little") + samples.maps()[0][8:])
+    with pytest.raises(ValueError, match=r"map\.safetensors is not a whole"):
+        radarsdf.load(path)
+
+
+@pytest.mark.parametrize("read", [radarsdf.load, read_scans])
+def test_what_is_no_file(tmp_path, read):
+    path = tmp_path / "map.npz"
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"map\.npz is not a whole"):
+        read(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(OSError, match=r"map\.npz"):
+        read(path)
+    path.rmdir()
+    path.symlink_to(path)
+    with pytest.raises(OSError, match=r"map\.npz"):
+        read(path)
+    path.unlink()
+    path.symlink_to(tmp_path / "nothing")
+    with pytest.raises(FileNotFoundError, match=r"map\.npz"):
+        read(path)
+    path.unlink()
+    os.mkfifo(path)  # nobody ever writes to it
+    with pytest.raises(ValueError, match=r"map\.npz is not a regular file"):
+        read(path)
+
+
+def test_a_symbolic_link_to_a_file_is_read(tmp_path):
+    (tmp_path / "there.npz").write_bytes(samples.scans()[0])
+    (tmp_path / "scans.npz").symlink_to(tmp_path / "there.npz")
+    assert len(read_scans(tmp_path / "scans.npz").points) == 2
+
+
+def test_loading_leaves_the_random_numbers_of_the_caller_alone(tmp_path):
+    path = tmp_path / "map.safetensors"
+    path.write_bytes(samples.maps()[0])
+    before = torch.get_rng_state()
+    radarsdf.load(path)
+    assert torch.equal(torch.get_rng_state(), before)
