@@ -8,7 +8,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "flat_map.hpp"
+#include "cell_blocks.hpp"
 
 namespace radarsdf {
 
@@ -27,7 +27,7 @@ struct BeamNoise {
 
 class SurfelMap {
  public:
-  // keys: Morton keys of the surfels' cells, each once; surfels in the same order.
+  // keys: Morton keys of the surfels' cells, ascending, each once; surfels in the same order.
   SurfelMap(const std::uint64_t* keys, const Surfel* surfels, std::int64_t count, double cell_size_m);
 
   // For each ray the first surfel that it crosses from the front and ends behind of by more than
@@ -37,7 +37,7 @@ class SurfelMap {
 
  private:
   double cell_size_m_;
-  FlatMap cells_;
+  CellBlocks cells_;
   std::vector<Surfel> surfels_;
 };
 

@@ -40,6 +40,7 @@ std::int64_t row_stride(const Rows<T>& array, const char* name) {
   return array.shape(0) > 1 ? array.strides(0) / item : array.shape(1);
 }
 
+void bind_cell_sums(py::module_& m);
 void bind_encodings(py::module_& m);
 void bind_marching_cubes(py::module_& m);
 void bind_surface_crossings(py::module_& m);

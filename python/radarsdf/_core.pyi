@@ -10,6 +10,7 @@ import numpy.typing
 import typing
 
 __all__: list[str] = [
+    "CellBlocks",
     "CellSet",
     "Encoding",
     "SurfelMap",
@@ -27,6 +28,7 @@ __all__: list[str] = [
     "set_instruction_set",
     "sparse_lattice",
     "spherical_harmonics",
+    "sum_moments",
 ]
 
 class Encoding:
@@ -250,6 +252,34 @@ class VertexTable:
     @property
     def num_rows(self) -> int: ...
 
+class CellBlocks:
+    """
+    From the keys of cells to their rows, and sums over the cells round a key.
+    """
+    def __init__(self, keys: numpy.typing.NDArray[numpy.uint64]) -> None:
+        """
+        `keys` (C,) uint64 of `cell_keys`, ascending, each once.
+        """
+    def __len__(self) -> int: ...
+    def rows(
+        self,
+        keys: numpy.typing.NDArray[numpy.uint64],
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.int32]:
+        """
+        Row of each key (N,) int32, -1 where there is no such cell.
+        """
+    def sum_round(
+        self,
+        keys: numpy.typing.NDArray[numpy.uint64],
+        values: numpy.typing.NDArray[numpy.float64],
+        weight: typing.SupportsFloat | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.float64]:
+        """
+        For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that shares a face counts `weight` times, an edge its square, a corner its cube.
+        """
+
 class SurfelMap:
     """
     Pieces of plane in cells, and the rays that pass through them.
@@ -434,6 +464,17 @@ def spherical_harmonics(
 ) -> None:
     """
     Writes the real spherical harmonics of degree 0 to 3 of unit vectors (N, 3) to `out` (N, 16).
+    """
+
+def sum_moments(
+    points: numpy.typing.NDArray[numpy.float32],
+    directions: numpy.typing.NDArray[numpy.float32],
+    cells: numpy.typing.NDArray[numpy.int32],
+    num_cells: typing.SupportsInt | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.float64]:
+    """
+    Sums over the returns of each cell, (num_cells, 13): 1, x, y, z, xx, xy, xz, yy, yz, zz, direction. `points` and `directions` (N, 3) float32; `cells` (N,) int32, the row of each return's cell.
     """
 
 __version__: str

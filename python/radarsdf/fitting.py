@@ -91,7 +91,7 @@ def fit(
     with Workers(config.num_threads) as workers:
         is_ghost, surface = None, rays
         if config.drop_ghosts:
-            is_ghost = Surfels.of(rays).ghosts(rays, workers.num_threads)
+            is_ghost = Surfels.of(rays, workers.num_threads).ghosts(rays, workers.num_threads)
             surface = rays.select(~is_ghost)
             clock.lap("ghosts_s")
         field = _new_field(surface, config, workers.num_threads)
@@ -100,7 +100,9 @@ def fit(
         training = _Training(field, rays, is_ghost, scale, config, workers)
         training.run(progress)
         clock.lap("training_s")
-        support = support_of(surface.points, field.cells.table.leaf_keys(), config.leaf_size_m)
+        support = support_of(
+            surface.points, field.cells.table.leaf_keys(), config.leaf_size_m, workers.num_threads
+        )
         clock.lap("support_s")
     field.requires_grad_(False)
     field.zero_grad(set_to_none=True)  # the last gradient is as large as the map

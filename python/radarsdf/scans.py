@@ -44,7 +44,7 @@ class Rays:
         """Each `step`-th ray from `first` on."""
         return self.select(slice(first, None, step))
 
-    def select(self, part: slice | NDArray[np.bool_]) -> Rays:
+    def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
         """Some of the rays."""
         return dataclasses.replace(
             self,

@@ -1,0 +1,92 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include <algorithm>
+#include <memory>
+
+#include "arrays.hpp"
+#include "cell_blocks.hpp"
+#include "cell_sums.hpp"
+
+namespace radarsdf {
+namespace {
+
+template <typename T>
+std::int64_t check_column(const Array<T>& array, const char* name) {
+  if (array.ndim() != 1) throw std::invalid_argument(std::string(name) + " must have shape (N,)");
+  return array.shape(0);
+}
+
+}  // namespace
+
+void bind_cell_sums(py::module_& m) {
+  using namespace py::literals;
+  py::class_<CellBlocks>(m, "CellBlocks", "From the keys of cells to their rows, and sums over the cells round a key.")
+      .def(py::init([](const Array<std::uint64_t>& keys) {
+             const std::int64_t count = check_column(keys, "keys");
+             const std::uint64_t* k = keys.data();
+             const py::gil_scoped_release release;
+             return std::make_unique<CellBlocks>(k, count);
+           }),
+           "keys"_a.noconvert(), "`keys` (C,) uint64 of `cell_keys`, ascending, each once.")
+      .def("__len__", &CellBlocks::size)
+      .def(
+          "rows",
+          [](const CellBlocks& cells, const Array<std::uint64_t>& keys, int num_threads) {
+            const std::int64_t count = check_column(keys, "keys");
+            py::array_t<std::int32_t> rows(static_cast<py::ssize_t>(count));
+            const std::uint64_t* k = keys.data();
+            std::int32_t* result = rows.mutable_data();
+            {
+              const py::gil_scoped_release release;
+              cells.rows(k, count, result, num_threads);
+            }
+            return rows;
+          },
+          "keys"_a.noconvert(), "num_threads"_a = 0, "Row of each key (N,) int32, -1 where there is no such cell.")
+      .def(
+          "sum_round",
+          [](const CellBlocks& cells, const Array<std::uint64_t>& keys, const Array<double>& values, double weight,
+             int num_threads) {
+            const std::int64_t count = check_column(keys, "keys");
+            const py::ssize_t columns = values.ndim() == 2 ? values.shape(1) : 0;
+            check_shape(values, cells.size(), columns, "values");
+            py::array_t<double> sums({static_cast<py::ssize_t>(count), columns});
+            const std::uint64_t* k = keys.data();
+            const double* v = values.data();
+            double* result = sums.mutable_data();
+            {
+              const py::gil_scoped_release release;
+              sum_round(cells, k, count, v, static_cast<int>(columns), weight, result, num_threads);
+            }
+            return sums;
+          },
+          "keys"_a.noconvert(), "values"_a.noconvert(), "weight"_a, "num_threads"_a = 0,
+          "For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that "
+          "shares a face counts `weight` times, an edge its square, a corner its cube.");
+  m.def(
+      "sum_moments",
+      [](const Array<float>& points, const Array<float>& directions, const Array<std::int32_t>& cells,
+         std::int64_t num_cells, int num_threads) {
+        const std::int64_t count = check_column(cells, "cells");
+        check_shape(points, count, 3, "points");
+        check_shape(directions, count, 3, "directions");
+        const std::int32_t* c = cells.data();
+        if (std::any_of(c, c + count, [&](std::int32_t cell) { return cell < 0 || cell >= num_cells; })) {
+          throw std::invalid_argument("cells must lie in [0, num_cells)");
+        }
+        py::array_t<double> moments({static_cast<py::ssize_t>(num_cells), py::ssize_t{kMoments}});
+        const float *p = points.data(), *d = directions.data();
+        double* result = moments.mutable_data();
+        {
+          const py::gil_scoped_release release;
+          sum_moments(p, d, c, count, num_cells, result, num_threads);
+        }
+        return moments;
+      },
+      "points"_a.noconvert(), "directions"_a.noconvert(), "cells"_a.noconvert(), "num_cells"_a, "num_threads"_a = 0,
+      "Sums over the returns of each cell, (num_cells, 13): 1, x, y, z, xx, xy, xz, yy, yz, zz, direction. `points` "
+      "and "
+      "`directions` (N, 3) float32; `cells` (N,) int32, the row of each return's cell.");
+}
+
+}  // namespace radarsdf

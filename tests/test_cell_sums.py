@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Rows of cells by their keys, and sums over returns and over neighbouring cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radarsdf._core import CellBlocks, cell_keys, sum_moments
+
+
+def keys_of(cells):
+    return cell_keys(np.asarray(cells, np.float64) + 0.5, 1.0)
+
+
+def some_cells(seed=0):
+    """Cells (C, 3) in the order of their keys: crowded, on both sides of the origin, and lonely far away."""
+    rng = np.random.default_rng(seed)
+    crowd, far = rng.integers(-6, 7, (700, 3)), rng.integers(-900_000, 900_000, (100, 3))
+    cells = np.unique(np.concatenate([crowd, far]), axis=0)
+    return cells[np.argsort(keys_of(cells))]
+
+
+def test_rows_are_positions_and_absent_cells_have_none():
+    cells = some_cells()
+    blocks = CellBlocks(keys_of(cells))
+    assert len(blocks) == len(cells)
+    asked = np.concatenate([cells[::-1], some_cells(1)])
+    row_of = {tuple(cell): row for row, cell in enumerate(cells.tolist())}
+    expected = [row_of.get(tuple(cell), -1) for cell in asked.tolist()]
+    assert -1 in expected
+    assert blocks.rows(keys_of(asked)).tolist() == expected
+    assert CellBlocks(np.zeros(0, np.uint64)).rows(keys_of(asked)).tolist() == [-1] * len(asked)
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.7])
+def test_sums_round_a_key(weight):
+    cells, asked = some_cells(), some_cells(1)
+    values = np.random.default_rng(2).normal(size=(len(cells), 3))
+    apart = np.abs(cells[None] - asked[:, None])
+    weights = np.where(apart.max(axis=2) <= 1, weight ** apart.sum(axis=2), 0.0)
+    blocks = CellBlocks(keys_of(cells))
+    sums = blocks.sum_round(keys_of(asked), values, weight)
+    np.testing.assert_allclose(sums, weights @ values, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(sums, blocks.sum_round(keys_of(asked), values, weight, num_threads=1))
+    backwards = blocks.sum_round(np.ascontiguousarray(keys_of(asked)[::-1]), values, weight)
+    np.testing.assert_array_equal(sums, backwards[::-1])
+
+
+def test_moments_of_the_returns_in_a_cell():
+    rng = np.random.default_rng(0)
+    count, num_cells = 50_000, 300  # enough for several threads
+    points, directions = (rng.normal(size=(count, 3)).astype(np.float32) for _ in range(2))
+    cells = rng.integers(0, num_cells - 1, count).astype(np.int32)  # the last stays empty
+    x, y, z = points.astype(np.float64).T
+    columns = [np.ones(count), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, *directions.T]
+    expected = np.stack([np.bincount(cells, column, num_cells) for column in columns], 1)
+    moments = sum_moments(points, directions, cells, num_cells)
+    np.testing.assert_allclose(moments, expected, rtol=1e-10, atol=1e-10)
+    for num_threads in (1, 3):
+        again = sum_moments(points, directions, cells, num_cells, num_threads)
+        np.testing.assert_array_equal(moments, again)
+
+
+def test_arguments_are_checked():
+    keys = np.array([1, 2, 3], np.uint64)
+    for wrong in (keys[::-1].copy(), keys[[0, 1, 1]]):
+        with pytest.raises(ValueError, match="ascending"):
+            CellBlocks(wrong)
+    with pytest.raises(ValueError, match="values"):
+        CellBlocks(keys).sum_round(keys, np.zeros((2, 1)), 1.0)
+    with pytest.raises(ValueError, match="values"):
+        CellBlocks(keys).sum_round(keys, np.zeros(3), 1.0)
+    with pytest.raises(ValueError, match="keys"):
+        CellBlocks(keys).rows(keys[None])
+    points = np.zeros((2, 3), np.float32)
+    for cell in (-1, 5):
+        with pytest.raises(ValueError, match="cells"):
+            sum_moments(points, points, np.array([0, cell], np.int32), 5)
+    with pytest.raises(ValueError, match="directions"):
+        sum_moments(points, points[:1], np.zeros(2, np.int32), 5)
