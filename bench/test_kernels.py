@@ -17,6 +17,7 @@ from radarsdf import FitConfig, kernels
 from radarsdf._core import CellSet, VertexTable
 from radarsdf.field import Field
 from radarsdf.losses import sdf_loss
+from radarsdf.optimiser import Adam
 from radarsdf.sampling import RaySampler
 from radarsdf.scans import prepare
 from radarsdf.threads import Workers
@@ -126,15 +127,13 @@ def test_training_step(benchmark, batch_size):
     field = Field(cells.sorted_keys(), config, with_intensity=False)
     field.cells.initialise(config.feature_std)
     parameters = list(field.parameters())
-    adam = torch.optim.Adam(parameters, lr=config.learning_rate, eps=config.adam_epsilon, fused=True)
+    adam = Adam(parameters, config.learning_rate, config.adam_epsilon)
     sampler = RaySampler(rays, config, batch_size, torch.Generator().manual_seed(0))
 
     def step():
         samples = sampler.batch()
         loss = sdf_loss(field.logit(samples.points), samples.sdf_m, config.sigma_m)
-        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-            parameter.grad = gradient
-        adam.step()
+        adam.step(torch.autograd.grad(loss, parameters))
         return loss.item()
 
     with Workers(1):

@@ -5,10 +5,11 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from radarsdf.config import MAX_THREADS, FitConfig
 from radarsdf.field import Field
 from radarsdf.losses import intensity_loss, sdf_loss
 from radarsdf.map import IntensityScale, RadarMap
+from radarsdf.optimiser import Adam
 from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays, prepare
 from radarsdf.surfels import Surfels, support_of
@@ -105,7 +107,6 @@ def fit(
         )
         clock.lap("support_s")
     field.requires_grad_(False)
-    field.zero_grad(set_to_none=True)  # the last gradient is as large as the map
     report = {
         "returns": sum(len(np.asarray(scan)) for scan in points),
         "returns_used": len(surface),
@@ -292,9 +293,11 @@ class _Training:
             disable=None if progress is None else not progress,
         ) as bar:
             geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
-            adams = [_adam(geometry, config.learning_rate, config)]
+            adams = [Adam(geometry, config.learning_rate, config.adam_epsilon)]
             if reflectance is not None:
-                reflectance_adam = _adam(reflectance.parameters(), config.intensity_learning_rate, config)
+                reflectance_adam = Adam(
+                    reflectance.parameters(), config.intensity_learning_rate, config.adam_epsilon
+                )
                 if joint:
                     adams.append(reflectance_adam)
             loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
@@ -308,29 +311,24 @@ class _Training:
         self,
         name: str,
         iterations: int,
-        adams: list[torch.optim.Adam],
+        adams: list[Adam],
         loss_of: Callable[[_Shard], Tensor],
         bar: Any,
     ) -> None:
-        parameters = [p for adam in adams for group in adam.param_groups for p in group["params"]]
+        parameters = [p for adam in adams for p in adam.parameters]
 
         def loss_and_gradients(shard: _Shard) -> tuple[Tensor, tuple[Tensor, ...]]:
             loss = loss_of(shard) / len(self._shards)
             return loss.detach(), torch.autograd.grad(loss, parameters)
 
         for i in range(iterations):
-            if self._config.cosine_schedule:
-                for (
-                    adam
-                ) in adams:  # from the full rate on in each stage, also for one that has been through another
-                    adam.param_groups[0]["lr"] = (
-                        adam.defaults["lr"] * 0.5 * (1 + math.cos(math.pi * i / iterations))
-                    )
+            # From the full rate on in each stage, also for an Adam that has been through another.
+            share = 0.5 * (1 + math.cos(math.pi * i / iterations)) if self._config.cosine_schedule else 1.0
             losses, gradients = zip(*self._workers.map(loss_and_gradients, self._shards), strict=True)
-            for parameter, *parts in zip(parameters, *gradients, strict=True):
-                parameter.grad = functools.reduce(Tensor.add_, parts)
+            total = iter([functools.reduce(Tensor.add_, parts) for parts in zip(*gradients, strict=True)])
             for adam in adams:
-                adam.step()
+                adam.learning_rate = share * adam.full_rate
+                adam.step(list(itertools.islice(total, len(adam.parameters))))
             bar.update()
             if i % 100 == 0 or i == iterations - 1:
                 self.losses[name] = float(sum(losses))
@@ -342,10 +340,6 @@ class _Training:
 def _share(count: int, part: int, parts: int) -> int:
     """`count` things over `parts`: how many the `part`-th gets."""
     return count * (part + 1) // parts - count * part // parts
-
-
-def _adam(parameters: Iterable[Tensor], learning_rate: float, config: FitConfig) -> torch.optim.Adam:
-    return torch.optim.Adam(parameters, lr=learning_rate, eps=config.adam_epsilon, fused=True)
 
 
 class _Clock:
