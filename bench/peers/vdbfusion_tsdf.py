@@ -21,7 +21,9 @@ def vdbfusion(scans: ScanArrays, voxel_m: float) -> tuple[np.ndarray, np.ndarray
         own = scans.frame == frame
         if own.any():
             volume.integrate(np.ascontiguousarray(world[own]), T_world_sensor)
-    vertices, faces = volume.extract_triangle_mesh()
+    # Filled, the border of the truncation band behind every surface becomes surface, too: a third of the mesh is
+    # outliers then. Not filled is what "isolated vertex filtering" is taken to mean, and the stronger peer.
+    vertices, faces = volume.extract_triangle_mesh(fill_holes=False, min_weight=0.0)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "grids.vdb"
         volume.extract_vdb_grids(str(path))
