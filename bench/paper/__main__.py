@@ -60,7 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
     stem = words.out / words.experiment
     rows: list[Row] = []
     made = provenance()
-    with tqdm(tasks, unit="task") as bar:
+    with tqdm(tasks, unit="task", disable=None) as bar:
         for task in bar:
             bar.set_description(task.label)
             rows += task.run()
