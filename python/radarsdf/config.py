@@ -97,7 +97,8 @@ class FitConfig:
 
     drop_ghosts: bool = True
     """Whether returns behind a surface that their own rays passed through, as mirrors make them, are dropped (3QFPI: no;
-    measured: nine tenths of the false surface gone, half a percent of the true one with it)."""
+    measured: 84 to 94 % of the surface that they cause gone, and 0.7 % of the true returns). The intensity network
+    learns from them all the same."""
 
     # Encoding
     encoding: Literal["tri-quadtree", "octree"] = "tri-quadtree"
