@@ -91,7 +91,7 @@ def fit(
     )
     clock.lap("prepare_s")
     with Workers(config.num_threads) as workers:
-        is_ghost, surface = None, rays
+        surface = rays
         if config.drop_ghosts:
             is_ghost = Surfels.of(rays, workers.num_threads).ghosts(rays, workers.num_threads)
             surface = rays.select(~is_ghost)
@@ -99,7 +99,7 @@ def fit(
         field = _new_field(surface, config, workers.num_threads)
         clock.lap("occupied_cells_s")
         scale = IntensityScale.of(rays.intensities)
-        training = _Training(field, rays, is_ghost, scale, config, workers)
+        training = _Training(field, surface, rays, scale, config, workers)
         training.run(progress)
         clock.lap("training_s")
         support = support_of(
@@ -175,8 +175,8 @@ class _Shard:
     def __init__(
         self,
         field: Field,
-        rays: Rays,
-        is_ghost: NDArray[np.bool_] | None,
+        surface: Rays,
+        returns: Rays,
         scale: IntensityScale | None,
         config: FitConfig,
         part: int,
@@ -187,13 +187,13 @@ class _Shard:
         self._config = config
         generator = torch.Generator().manual_seed(config.seed * MAX_THREADS + part)
 
-        def source(returns: Rays) -> _Source:
+        def source(rays: Rays) -> _Source:
             share = _share(config.batch_size, part, parts)
-            return _Source(returns.every(parts, part), scale, config, share, generator)
+            return _Source(rays.every(parts, part), scale, config, share, generator)
 
-        self._surface = source(rays if is_ghost is None else rays.select(~is_ghost))
+        self._surface = source(surface)
         # A ghost has an intensity, though no surface: the sensor will see it again.
-        self._returns = self._surface if is_ghost is None or scale is None else source(rays)
+        self._returns = self._surface if returns is surface or scale is None else source(returns)
         self._dropouts = (dropout_scale * config.feature_dropout, dropout_scale * config.fourier_dropout)
         self._intensity_batch_size = _share(config.intensity_batch_size, part, parts)
 
@@ -249,8 +249,8 @@ class _Training:
     def __init__(
         self,
         field: Field,
-        rays: Rays,
-        is_ghost: NDArray[np.bool_] | None,
+        surface: Rays,
+        returns: Rays,
         scale: IntensityScale | None,
         config: FitConfig,
         workers: Workers,
@@ -258,13 +258,12 @@ class _Training:
         self._field = field
         self._config = config
         self._workers = workers
-        num_surface = len(rays) - (0 if is_ghost is None else int(is_ghost.sum()))
-        parts = min(workers.num_threads, num_surface, config.batch_size, config.intensity_batch_size)
-        samples = num_surface * (config.near_samples + config.free_samples)
+        parts = min(workers.num_threads, len(surface), config.batch_size, config.intensity_batch_size)
+        samples = len(surface) * (config.near_samples + config.free_samples)
         self._sdf_iterations = config.sdf_iterations or max(
             config.min_sdf_iterations, math.ceil(config.sdf_passes * samples / config.batch_size)
         )
-        samples = len(rays) * config.near_samples
+        samples = len(returns) * config.near_samples
         self._intensity_iterations = config.intensity_iterations or max(
             config.min_intensity_iterations,
             math.ceil(config.intensity_passes * samples / config.intensity_batch_size),
@@ -274,7 +273,8 @@ class _Training:
         passes = self._intensity_iterations * config.intensity_batch_size / samples
         dropout_scale = passes / (passes + _DROPOUT_HALF_PASSES)
         self._shards = [
-            _Shard(field, rays, is_ghost, scale, config, part, parts, dropout_scale) for part in range(parts)
+            _Shard(field, surface, returns, scale, config, part, parts, dropout_scale)
+            for part in range(parts)
         ]
         if scale is None:
             self._intensity_iterations = 0
