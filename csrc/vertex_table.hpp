@@ -32,7 +32,7 @@ class VertexTable {
   const std::vector<Cell>& cells() const { return cells_; }
 
   // The occupied cell of every level, finest first, that holds each point, or -1: (count, num_levels). Points outside
-  // the lattice and NaN are in no cell.
+  // the lattice and NaN are in no cell. Leaf cells have the numbers of their keys, from 0; coarser ones follow.
   template <typename T>
   void locate(const T* points, std::int64_t count, std::int32_t* cells) const;
 

@@ -14,8 +14,9 @@ import radarsdf
 import torch
 from radarsdf.isosurface import mesh_components
 from radarsdf.map import RadarMap
-from radarsdf.meshing import _corner_distances, _occupied_voxels
+from radarsdf.meshing import _corner_distances, _crossed, _smooth_in_cells, _voxels_of
 from radarsdf.picture import intensity_colors
+from scipy.spatial import KDTree
 
 from .conftest import ground_and_wall
 from .mesh_checks import has_single_cycle_links, single_edges
@@ -23,6 +24,10 @@ from .mesh_checks import has_single_cycle_links, single_edges
 UTM = np.array([5e5, 5.4e6, 300.0])
 SENSOR = np.array([3.0, 0.0, 1.5])
 LEAF_M = 0.2
+
+
+def occupied_voxels(radar_map, voxel_size):
+    return _voxels_of(radar_map.field.cells.table.leaf_cells(), LEAF_M, voxel_size)
 
 
 def with_changes(radar_map, *, origin=(0, 0, 0), **settings):
@@ -127,7 +132,7 @@ def test_meshes_are_open_only_where_the_occupied_region_ends(sharp_map):
     mesh = with_changes(sharp_map, min_component_triangles=0, min_support=0.0).mesh(voxel_size)
     edges = single_edges(mesh.faces)
     assert len(edges) > 0
-    voxels = {tuple(v) for v in _occupied_voxels(sharp_map, voxel_size).tolist()}
+    voxels = {tuple(v) for v in occupied_voxels(sharp_map, voxel_size).tolist()}
     ends = (np.asarray(mesh.vertices) - sharp_map.origin)[edges] / voxel_size
     for a, b in ends:
         flat = [i for i in range(3) if abs(a[i] - round(a[i])) < 1e-6 and abs(b[i] - a[i]) < 1e-6]
@@ -269,7 +274,7 @@ def test_a_viewpoint_needs_intensities(scene):
 
 
 def lattice(radar_map, voxel_size):
-    voxels = _occupied_voxels(radar_map, voxel_size)
+    voxels = occupied_voxels(radar_map, voxel_size)
     return radarsdf.isosurface.sparse_lattice(voxels)
 
 
@@ -288,10 +293,29 @@ def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
     assert sharp_map.field.cells.occupied(torch.from_numpy(inner.reshape(-1, 3).astype(np.float32))).all()
 
 
+# Voxels that do not divide the cells are moved otherwise at the border: there, a few vertices differ.
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1])
+def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, voxel_size, monkeypatch):
+    cells = sharp_map.field.cells.table.leaf_cells()
+    assert len(_crossed(sharp_map, cells)) < 0.8 * len(cells)
+    mesh = sharp_map.mesh(voxel_size)
+    monkeypatch.setattr("radarsdf.meshing._crossed", lambda _, cells: cells)
+    whole = sharp_map.mesh(voxel_size)
+    assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4)
+    distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)
+    assert np.quantile(distance_m, 0.9999) < 1e-4  # other batches, other rounding
+
+
+def test_cells_are_skipped_only_where_the_encoding_is_smooth():
+    assert _smooth_in_cells(radarsdf.FitConfig())
+    assert _smooth_in_cells(radarsdf.FitConfig(fourier_count=0))
+    assert not _smooth_in_cells(radarsdf.FitConfig.paper())  # its finest wavelength is 2.5 cm
+
+
 def test_occupied_voxels_fill_the_cells(sharp_map):
     cells = {tuple(c) for c in sharp_map.field.cells.table.leaf_cells().tolist()}
     for parts in (1, 2, 4):
-        voxels = _occupied_voxels(sharp_map, LEAF_M / parts)
+        voxels = occupied_voxels(sharp_map, LEAF_M / parts)
         assert len(np.unique(voxels, axis=0)) == len(cells) * parts**3
         assert {tuple(v) for v in np.unique(voxels // parts, axis=0).tolist()} == cells
 
@@ -299,7 +323,7 @@ def test_occupied_voxels_fill_the_cells(sharp_map):
 @pytest.mark.parametrize("voxel_size", [0.07, 0.15, 0.3, 0.45])
 def test_uneven_voxels_cover_the_cells_and_little_more(sharp_map, voxel_size):
     cells = sharp_map.field.cells.table.leaf_cells()
-    voxels = np.unique(_occupied_voxels(sharp_map, voxel_size), axis=0)
+    voxels = np.unique(occupied_voxels(sharp_map, voxel_size), axis=0)
     known = {tuple(v) for v in voxels.tolist()}
     # The middle of each cell is covered; a hair to either side, as it may lie on a face between two voxels.
     for middle in (cells + 0.5) * LEAF_M / voxel_size:

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from radarsdf import kernels
 from radarsdf._checks import real_array
-from radarsdf._core import cell_keys
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
 from radarsdf.threads import Workers
@@ -197,9 +197,10 @@ class RadarMap:
             msg = "this map was saved by an earlier version, without confidence: fit it again"
             raise ValueError(msg)
         points, answer = self._local(x)
-        leaf_keys = self._field.cells.table.leaf_keys()
-        leaf_size_m = self._field.cells.table.leaf_size_m
-        support = torch.from_numpy(self.support.astype(np.float32))
+        table = self._field.cells.table
+        leaf_size_m = table.leaf_size_m
+        # In the order of the leaf cells' numbers; the one more is that of no cell, -1.
+        support = torch.from_numpy(np.append(self.support, 0).astype(np.float32))
 
         def confidence(chunk: Tensor) -> Tensor:
             # Trilinear between the centres of cells: a vertex on a cell's face is of both sides.
@@ -209,12 +210,9 @@ class RadarMap:
             returns = torch.zeros(len(chunk))
             for corner in itertools.product((0.0, 1.0), repeat=3):
                 at = torch.tensor(corner)
-                centres = ((lower + at + 0.5) * leaf_size_m).numpy()
-                keys = cell_keys(centres, leaf_size_m, 1)
-                rows = np.minimum(np.searchsorted(leaf_keys, keys), len(leaf_keys) - 1)
-                known = torch.from_numpy(leaf_keys[rows] == keys)
+                cells = kernels.locate((lower + at + 0.5) * leaf_size_m, table)[:, 0]
                 weight = torch.where(at > 0, share, 1 - share).prod(1)
-                returns += weight * torch.where(known, support[torch.from_numpy(rows)], 0.0)
+                returns += weight * support[cells]
             return returns / (returns + _HALF_SUPPORT)
 
         return answer(evaluate(confidence, points))

@@ -18,9 +18,11 @@ from radarsdf.map import evaluate
 from radarsdf.picture import intensity_colors
 
 if TYPE_CHECKING:
+    from radarsdf.config import FitConfig
     from radarsdf.map import RadarMap
 
 _MAX_VOXELS = 2**30  # of which some are the same; coordinates, and rows of corners, are int32
+_CLEARLY = 0.25  # of a leaf cell. Measured on four scenes: 0.1 loses no triangle that 0 lost, and 0.25 keeps half the cells
 _INWARD = 1e-3  # of a voxel: how far corners on the map's border are moved into it to be evaluated
 
 
@@ -73,9 +75,15 @@ def extract_mesh(
         msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
         raise ValueError(msg)
     sensor_position = None if viewpoint is None else _check_viewpoint(radar_map, viewpoint)
-    voxels = _occupied_voxels(radar_map, voxel_size)
+    cells = radar_map.field.cells.table.leaf_cells()
+    leaf_size_m = radar_map.config.leaf_size_m
     if box is not None:
         lower, upper = _check_box(box) - radar_map.origin
+        cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
+    if voxel_size < leaf_size_m and _smooth_in_cells(radar_map.config):
+        cells = _crossed(radar_map, cells)
+    voxels = _voxels_of(cells, leaf_size_m, voxel_size)
+    if box is not None:
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     num_threads = torch.get_num_threads()
@@ -122,10 +130,24 @@ def _check_box(box: ArrayLike) -> NDArray[np.float64]:
     return corners
 
 
-def _occupied_voxels(radar_map: RadarMap, voxel_size: float) -> NDArray[np.int32]:
-    """Lattice coordinates (M, 3) of the voxels that overlap an occupied leaf cell; some more than once."""
-    leaf_size_m = radar_map.config.leaf_size_m
-    cells = radar_map.field.cells.table.leaf_cells()
+def _smooth_in_cells(config: FitConfig) -> bool:
+    """Whether nothing in the encoding swings more than once within two leaf cells."""
+    finest = config.fourier_first + config.fourier_count - 1
+    return config.fourier_count == 0 or 2 * config.fourier_half_width_m / 2**finest >= 2 * config.leaf_size_m
+
+
+def _crossed(radar_map: RadarMap, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The leaf cells (M, 3) that can hold the surface: those whose corners are not all clearly on one side."""
+    size_m = radar_map.config.leaf_size_m
+    cells, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
+    values = _corner_distances(radar_map, size_m, cells, corners, cell_corners, progress=False)[cell_corners]
+    margin_m = _CLEARLY * size_m
+    crossed: NDArray[np.int32] = cells[(values.min(axis=1) <= margin_m) & (values.max(axis=1) >= -margin_m)]
+    return crossed
+
+
+def _voxels_of(cells: NDArray[np.int32], leaf_size_m: float, voxel_size: float) -> NDArray[np.int32]:
+    """Lattice coordinates (M, 3) of the voxels that overlap leaf cells; some more than once."""
     parts = max(1, math.ceil(min(leaf_size_m / voxel_size, _MAX_VOXELS) - 1e-9))
     if max(len(cells) * (parts + 1) ** 3, int(np.abs(cells).max(initial=0)) * parts) > _MAX_VOXELS:
         msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
@@ -157,6 +179,8 @@ def _corner_distances(
     corner_points = corners.astype(np.float32) * np.float32(voxel_size)
     points = corner_points.copy()
     outside = ~evaluate(field.cells.occupied, torch.from_numpy(points)).numpy()
+    on_border = outside[voxel_corners].any(axis=1)
+    voxels, voxel_corners = voxels[on_border], voxel_corners[on_border]
     for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
         voxel, corner = np.nonzero(outside[voxel_corners])
         moved = voxel_corners[voxel, corner]  # a corner of several voxels several times: the last one counts
