@@ -86,6 +86,35 @@ void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_
 }
 
 template <typename T>
+void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
+               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, std::int32_t* slots, int part,
+               int parts) {
+  const InterpolationKernels<T>& kernels = kernels_for<T>(table);
+  const AdamKernel<T> adam_kernel = RADARSDF_KERNEL(adam_kernel<T>)();
+  const int groups = num_vertex_groups(table.encoding());
+  const std::int64_t corners = table.encoding() == Encoding::kTriQuadtree ? 4 : 8;
+  std::int64_t points = 0;
+  for (const PointBatch<T>& batch : batches) points += batch.count;
+  // Kept from call to call: fresh pages would cost as much as the sums.
+  thread_local std::vector<std::int32_t> rows;
+  thread_local std::vector<T> sums;
+  const auto most = static_cast<std::size_t>(std::min(points * corners, table.num_rows()));
+  if (rows.size() < most) {
+    rows.resize(most);
+    sums.resize(most * kFeatureDim);
+  }
+  for (int task = part; task < table.num_levels() * groups; task += parts) {
+    RowSums<T> touched{slots, rows.data(), sums.data(), 0};
+    for (std::size_t b = 0; b < batches.size(); ++b) {
+      kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, task / groups,
+                           task % groups, 0, batches[b].count);
+    }
+    adam_kernel.move(adam, touched.rows, touched.sums, touched.count);
+    for (std::int64_t i = 0; i < touched.count; ++i) slots[touched.rows[i]] = -1;
+  }
+}
+
+template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,
                          std::int64_t stride, T* points_grad, int num_threads) {
   const InterpolationKernels<T>& kernels = kernels_for<T>(table);
@@ -138,6 +167,8 @@ void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::i
   template void encode(const VertexTable&, const T*, const T*, std::int64_t, std::int32_t*, T*, std::int64_t, int); \
   template void interpolate(const VertexTable&, const T*, const PointBatch<T>&, T*, std::int64_t, int);             \
   template void scatter(const VertexTable&, const PointBatch<T>&, const T*, std::int64_t, T*, int);                 \
+  template void adam_step(const VertexTable&, const std::vector<PointBatch<T>>&, const std::vector<const T*>&,      \
+                          const std::vector<std::int64_t>&, const AdamStep<T>&, std::int32_t*, int, int);           \
   template void coordinate_gradient(const VertexTable&, const T*, const PointBatch<T>&, const T*, std::int64_t, T*, \
                                     int);                                                                           \
   template void fourier(const T*, std::int64_t, double, int, int, T*, std::int64_t, int);                           \

@@ -6,7 +6,9 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
+#include "adam_kernels.hpp"
 #include "vertex_table.hpp"
 
 namespace radarsdf {
@@ -36,6 +38,14 @@ void interpolate(const VertexTable& table, const T* features, const PointBatch<T
 template <typename T>
 void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
              T* features_grad, int num_threads);
+
+// One step of Adam with the gradients that `scatter` would sum over the batches, on the rows that they touch: for part
+// `part` of `parts` of all (level, group) pairs, so that each of the caller's threads can take one. `slots` (num_rows)
+// is scratch: -1 before and after.
+template <typename T>
+void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
+               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, std::int32_t* slots, int part,
+               int parts);
 
 template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,

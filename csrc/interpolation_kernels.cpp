@@ -2,11 +2,7 @@
 // SPDX-License-Identifier: MIT
 #include "interpolation_kernels.hpp"
 
-#include <string.h>  // not <cstring>: see fourier_kernels.cpp
-
-#ifndef RADARSDF_ISA
-#error "RADARSDF_ISA names the instruction set that this copy is compiled for"
-#endif
+#include "feature_vector.hpp"
 
 namespace radarsdf::RADARSDF_ISA {
 namespace {  // internal linkage for everything: see the header
@@ -25,56 +21,6 @@ template <typename C>
 constexpr int axis_of(int group, int i) {
   if (C::kAxes == 3) return i;
   return i == 0 ? (group == 2 ? 1 : 0) : (group == 0 ? 1 : 2);
-}
-
-// The features of one vertex as one vector: left to itself, the compiler unrolls eight floats into scalars.
-#if defined(__GNUC__)
-template <typename T>
-struct VectorOf {
-  typedef T Type __attribute__((vector_size(kFeatureDim * sizeof(T))));
-};
-#else
-template <typename T>
-struct VectorOf {
-  struct Type {
-    T lanes[kFeatureDim];
-    T operator[](int i) const { return lanes[i]; }
-  };
-};
-template <typename V>
-inline V operator*(V a, V b) {
-  for (int i = 0; i < kFeatureDim; ++i) a.lanes[i] *= b.lanes[i];
-  return a;
-}
-template <typename T, typename V>
-inline V operator*(T a, V b) {
-  for (int i = 0; i < kFeatureDim; ++i) b.lanes[i] *= a;
-  return b;
-}
-template <typename V>
-inline V operator+(V a, V b) {
-  for (int i = 0; i < kFeatureDim; ++i) a.lanes[i] += b.lanes[i];
-  return a;
-}
-template <typename V>
-inline V& operator+=(V& a, V b) {
-  return a = a + b;
-}
-#endif
-template <typename T>
-using Features = typename VectorOf<T>::Type;
-
-// Rows are aligned to the size of a number only.
-template <typename T>
-inline Features<T> load(const T* row) {
-  Features<T> features;
-  memcpy(&features, row, sizeof features);
-  return features;
-}
-
-template <typename T>
-inline void store(T* row, Features<T> features) {
-  memcpy(row, &features, sizeof features);
 }
 
 // Where a point lies in its cell.
@@ -167,8 +113,29 @@ void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __
   }
 }
 
-template <typename C, bool kDirectional, typename T>
-void scatter(const Interpolation<T>& in, const T* __restrict out_grad, std::int64_t stride, T* __restrict features_grad,
+// Where the gradient of a row is added up: in the matrix of all of them, or in the sums of those that are touched.
+template <typename T>
+struct AllRows {
+  T* gradients;
+  T* operator()(std::int32_t row) const { return gradients + static_cast<std::int64_t>(row) * kFeatureDim; }
+};
+
+template <typename T>
+struct TouchedRows {
+  RowSums<T>& touched;
+  T* operator()(std::int32_t row) const {
+    std::int32_t& slot = touched.slots[row];
+    if (slot < 0) {
+      slot = static_cast<std::int32_t>(touched.count);
+      touched.rows[touched.count] = row;
+      store(touched.sums + touched.count++ * kFeatureDim, Features<T>{});
+    }
+    return touched.sums + static_cast<std::int64_t>(slot) * kFeatureDim;
+  }
+};
+
+template <typename C, bool kDirectional, typename T, typename SumOf>
+void scatter(const Interpolation<T>& in, const T* __restrict out_grad, std::int64_t stride, const SumOf& sum_of,
              int level, int group, std::int64_t begin, std::int64_t end) {
   for (std::int64_t n = begin; n < end; ++n) {
     const std::int32_t cell = in.located[n * in.num_levels + level];
@@ -177,8 +144,8 @@ void scatter(const Interpolation<T>& in, const T* __restrict out_grad, std::int6
     corner_weights<C, kDirectional>(local_coordinates(in, n, level), direction_of(in, n), group, weights);
     const Features<T> grad = load(out_grad + n * stride + level * kFeatureDim);
     for (int c = 0; c < C::kPerGroup; ++c) {
-      T* row = features_grad + static_cast<std::int64_t>(in.cells[cell].rows[group * C::kPerGroup + c]) * kFeatureDim;
-      store(row, load(row) + weights[c] * grad);
+      T* sum = sum_of(in.cells[cell].rows[group * C::kPerGroup + c]);
+      store(sum, load(sum) + weights[c] * grad);
     }
   }
 }
@@ -222,8 +189,15 @@ constexpr InterpolationKernels<T> kKernels = {
     },
     [](const Interpolation<T>& in, const T* out_grad, std::int64_t stride, T* features_grad, int level, int group,
        std::int64_t begin, std::int64_t end) {
-      (in.directions ? scatter<C, true, T> : scatter<C, false, T>)(in, out_grad, stride, features_grad, level, group,
-                                                                   begin, end);
+      const AllRows<T> rows{features_grad};
+      (in.directions ? scatter<C, true, T, AllRows<T>> : scatter<C, false, T, AllRows<T>>)(in, out_grad, stride, rows,
+                                                                                           level, group, begin, end);
+    },
+    [](const Interpolation<T>& in, const T* out_grad, std::int64_t stride, RowSums<T>& touched, int level, int group,
+       std::int64_t begin, std::int64_t end) {
+      const TouchedRows<T> rows{touched};
+      (in.directions ? scatter<C, true, T, TouchedRows<T>>
+                     : scatter<C, false, T, TouchedRows<T>>)(in, out_grad, stride, rows, level, group, begin, end);
     },
     [](const Interpolation<T>& in, const T* features, const T* out_grad, std::int64_t stride, T* points_grad,
        std::int64_t begin, std::int64_t end) {

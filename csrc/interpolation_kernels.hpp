@@ -25,6 +25,15 @@ struct Interpolation {
   T inverse_leaf_size;  // 1/m
 };
 
+// Sums of the rows that a batch touches, side by side, so that they stay in the cache however large the map is.
+template <typename T>
+struct RowSums {
+  std::int32_t* slots;  // of every row: which of the sums is its own, -1: none yet
+  std::int32_t* rows;   // of the sums, in the order in which they were first touched
+  T* sums;              // (.., 8)
+  std::int64_t count;
+};
+
 template <typename T>
 struct InterpolationKernels {
   // out (n, num_levels * 8), rows `stride` apart. Zero where a point has no cell.
@@ -34,6 +43,9 @@ struct InterpolationKernels {
   // different (level, group) touch different rows.
   void (*scatter)(const Interpolation<T>&, const T* out_grad, std::int64_t stride, T* features_grad, int level,
                   int group, std::int64_t begin, std::int64_t end);
+  // The same into the sums of the rows that are touched.
+  void (*scatter_rows)(const Interpolation<T>&, const T* out_grad, std::int64_t stride, RowSums<T>& touched, int level,
+                       int group, std::int64_t begin, std::int64_t end);
   // points_grad (n, 3) = d(out . out_grad)/dx, 1/m.
   void (*coordinate_gradient)(const Interpolation<T>&, const T* features, const T* out_grad, std::int64_t stride,
                               T* points_grad, std::int64_t begin, std::int64_t end);

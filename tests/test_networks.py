@@ -104,12 +104,17 @@ def test_range_enters_as_its_logarithm():
     np.testing.assert_allclose(network(**given).detach(), [4, 5, 6, 1], atol=1e-6)
 
 
+def intensity(field, points, *, frozen=True, encoding_factors=None):
+    geometry = field.geometry(points, frozen=frozen)
+    return field.reflectance(geometry, *views(points), encoding_factors=encoding_factors)
+
+
 def test_normals_are_the_normalised_gradient():
     config = FitConfig(normals=True, sdf_hidden=(8,), intensity_hidden=(8,))
     field, points = make_field(config)
     seen = []
     field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[3]))
-    field.intensity(points, *views(points))
+    intensity(field, points)
     x = points.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(field.logit(x).sum(), x)
     np.testing.assert_allclose(seen[0], gradient / gradient.norm(dim=1, keepdim=True), atol=1e-5)
@@ -124,7 +129,7 @@ def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_fr
     factors[:, ::2] = 0
     factors[:, 1::2] = 3
     for given in (None, factors):
-        field.intensity(points, *views(points), geometry_frozen=geometry_frozen, encoding_factors=given)
+        intensity(field, points, frozen=geometry_frozen, encoding_factors=given)
     (encoding, logit), (hidden, logit_with_dropout) = seen
     assert torch.equal(hidden, encoding * factors)
     assert torch.equal(logit, logit_with_dropout)
@@ -134,7 +139,7 @@ def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_fr
 @pytest.mark.parametrize("geometry_frozen", [False, True])
 def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geometry_frozen):
     field, points = make_field(FitConfig(normals=normals, geometry_feature_dim=3))
-    field.intensity(points, *views(points), geometry_frozen=geometry_frozen).sum().backward()
+    intensity(field, points, frozen=geometry_frozen).sum().backward()
     geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
     assert all(p.grad is not None and p.grad.any() for p in field.intensity_network.parameters())
     assert any(p.grad is not None and bool(p.grad.any()) for p in geometry) != geometry_frozen
@@ -146,8 +151,7 @@ def test_the_second_derivative_through_the_normals_is_right():
     field, points = make_field(config)
     field = field.double()
     points = points[:8].double()
-    directions, ranges_m = views(points)
-    field.intensity(points, directions, ranges_m, geometry_frozen=False).sum().backward()
+    intensity(field, points, frozen=False).sum().backward()
     analytic = field.cells.features.grad
     rows = analytic.abs().sum(1).argsort(descending=True)[:5]
     step = 1e-6
@@ -156,7 +160,7 @@ def test_the_second_derivative_through_the_normals_is_right():
         for sign in (1, -1):
             with torch.no_grad():
                 field.cells.features[row, 2] += sign * step
-            values.append(float(field.intensity(points, directions, ranges_m).sum().detach()))
+            values.append(float(intensity(field, points).sum().detach()))
             with torch.no_grad():
                 field.cells.features[row, 2] -= sign * step
         assert (values[0] - values[1]) / (2 * step) == pytest.approx(float(analytic[row, 2]), abs=1e-6)

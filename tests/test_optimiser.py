@@ -1,14 +1,20 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The optimiser is PyTorch's, without what PyTorch's brings along."""
+"""Adam is PyTorch's, without what PyTorch's brings along; by rows it is the same where all rows are touched."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
+import numpy as np
+import pytest
 import torch
-from radarsdf.optimiser import Adam
+from radarsdf import kernels
+from radarsdf._core import CellSet
+from radarsdf.encodings import Octree, TriQuadtree
+from radarsdf.optimiser import Adam, RowAdam
+from radarsdf.threads import Workers
 
 
 def test_same_bits_as_pytorch_s():
@@ -39,3 +45,112 @@ def test_a_fit_does_not_import_pytorch_s_compiler():
         "sys.exit(any(name.partition('.')[0] == 'sympy' or name == 'torch._dynamo' for name in sys.modules))\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def cells_and_points(encoding, half_m=1.0, count=500):
+    generator = torch.Generator().manual_seed(1)
+    points = (2 * torch.rand(count, 3, generator=generator) - 1) * half_m
+    occupied = CellSet(0.2)
+    occupied.insert(points.numpy())
+    cells = encoding(occupied.sorted_keys(), 0.2, 3)
+    with torch.no_grad():
+        cells.features.copy_(torch.randn(cells.features.shape, generator=generator))
+    return cells, points, generator
+
+
+def steps(cells, batches, threads, learning_rate=1e-2):
+    """Features after one step for each batch, of RowAdam; the loss is the sum of interpolated features times weights."""
+    adam = RowAdam(cells, learning_rate, 1e-15)
+    with Workers(threads) as workers:
+        for parts in batches:
+            touched = []
+            gradients = []
+            for points, weights in parts:
+                out = cells.interpolated(points, touched)
+                gradients.append(torch.autograd.grad((out * weights).sum(), touched[-1].interpolated)[0])
+            adam.step(touched, gradients, workers)
+    return cells.features.detach().clone()
+
+
+@pytest.mark.parametrize("encoding", [TriQuadtree, Octree])
+def test_by_rows_it_is_the_same_where_all_are_touched(encoding):
+    cells, points, generator = cells_and_points(encoding)
+    weights = torch.randn(10, len(points), cells.table.num_levels * 8, generator=generator)
+    dense = cells.features.detach().clone().requires_grad_()
+    reference = torch.optim.Adam([dense], lr=1e-2, eps=1e-15)
+    for w in weights:
+        reference.zero_grad()
+        (kernels.interpolate(dense, points, cells.table) * w).sum().backward()
+        assert dense.grad.any(dim=1).all()
+        reference.step()
+    before = cells.features.detach().clone()
+    half = len(points) // 2  # as two threads' shares
+    batches = [((points[:half], w[:half]), (points[half:], w[half:])) for w in weights]
+    after = steps(cells, batches, threads=2)
+    np.testing.assert_allclose(after, dense.detach(), atol=2e-5)
+    assert (after - before).abs().max() > 0.05
+
+
+def test_what_a_batch_does_not_touch_stays_and_its_momentum_fades():
+    cells, points, _ = cells_and_points(TriQuadtree)
+    left, right = points[points[:, 0] < -0.6], points[points[:, 0] > 0.6]
+    one = torch.ones(1, 24)
+    start = cells.features.detach().clone()
+    sequence = [[(left, one)], [(right, one)], [(right, one)], [(left, -one)]]
+    first = steps(cells, sequence[:1], threads=1)
+    touched = (first != start).any(dim=1)
+    assert 0 < touched.sum() < len(start)
+    with torch.no_grad():
+        cells.features.copy_(start)
+    after = steps(cells, sequence, threads=1)
+    # Rows that only the left batches touch: first a step of the full rate, then one from moments three steps old.
+    with torch.no_grad():
+        cells.features.copy_(start)
+    only_right = (steps(cells, sequence[1:2], threads=1) != start).any(dim=1)
+    own = touched & ~only_right
+    mean = 0.9**3 * 0.1 - 0.1
+    square = 0.999**3 * 0.001 + 0.001
+    second = -1e-2 * (mean / (1 - 0.9**4)) / (square / (1 - 0.999**4)) ** 0.5
+    # Adam does not see the size of a row's gradient, which is the same both times but for its sign.
+    np.testing.assert_allclose((after - start)[own], np.float32(-1e-2 + second), atol=2e-5)
+
+
+def test_by_rows_the_number_of_threads_changes_nothing():
+    results = []
+    for threads in (1, 2, 3):
+        cells, points, generator = cells_and_points(TriQuadtree)
+        batches = [[(points[:200], torch.randn(200, 24, generator=generator))] for _ in range(3)]
+        results.append(steps(cells, batches, threads))
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0], results[2])
+
+
+def test_a_step_refuses_what_does_not_fit():
+    cells, points, _ = cells_and_points(TriQuadtree)
+    rows = len(cells.features)
+    memory = kernels.AdamMemory(
+        torch.zeros(rows, 16),
+        torch.zeros(rows, 1, dtype=torch.int32),
+        torch.full((rows, 1), -1, dtype=torch.int32),
+    )
+    _, located = kernels.encode(cells.features, points, cells.table)
+    decays = torch.ones(5, 2)
+
+    def step(gradient, features=cells.features, number=1, **changes):
+        kernels.adam_step(
+            cells.table, [(points, located, gradient)], features, memory, decays,
+            step=number, learning_rate=1e-2, epsilon=1e-15, **changes,
+        )  # fmt: skip
+
+    good = torch.zeros(len(points), 24)
+    step(good)
+    for gradient in (good[:-1], good[:, :-1]):
+        with pytest.raises(ValueError, match="out_grad"):
+            step(gradient)
+    with pytest.raises(ValueError, match="features"):
+        step(good, features=torch.zeros(rows - 1, 8))
+    for number in (0, 5):
+        with pytest.raises(ValueError, match=r"step|decays"):
+            step(good, number=number)
+    with pytest.raises(ValueError, match="part"):
+        step(good, part=2, parts=2)

@@ -110,6 +110,54 @@ class VertexTable:
         num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
     ) -> None: ...
     @typing.overload
+    def adam_step(
+        self,
+        batches: collections.abc.Sequence[
+            tuple[
+                typing.Annotated[numpy.typing.ArrayLike, numpy.float32],
+                typing.Annotated[numpy.typing.ArrayLike, numpy.int32],
+                typing.Annotated[numpy.typing.ArrayLike, numpy.float32],
+            ]
+        ],
+        features: numpy.typing.NDArray[numpy.float32],
+        moments: numpy.typing.NDArray[numpy.float32],
+        last_step: numpy.typing.NDArray[numpy.int32],
+        decays: numpy.typing.NDArray[numpy.float32],
+        slots: numpy.typing.NDArray[numpy.int32],
+        step: typing.SupportsInt | typing.SupportsIndex,
+        learning_rate: typing.SupportsFloat | typing.SupportsIndex,
+        epsilon: typing.SupportsFloat | typing.SupportsIndex,
+        part: typing.SupportsInt | typing.SupportsIndex = 0,
+        parts: typing.SupportsInt | typing.SupportsIndex = 1,
+    ) -> None:
+        """
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch, all -1.
+        """
+    @typing.overload
+    def adam_step(
+        self,
+        batches: collections.abc.Sequence[
+            tuple[
+                typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+                typing.Annotated[numpy.typing.ArrayLike, numpy.int32],
+                typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+            ]
+        ],
+        features: numpy.typing.NDArray[numpy.float64],
+        moments: numpy.typing.NDArray[numpy.float64],
+        last_step: numpy.typing.NDArray[numpy.int32],
+        decays: numpy.typing.NDArray[numpy.float64],
+        slots: numpy.typing.NDArray[numpy.int32],
+        step: typing.SupportsInt | typing.SupportsIndex,
+        learning_rate: typing.SupportsFloat | typing.SupportsIndex,
+        epsilon: typing.SupportsFloat | typing.SupportsIndex,
+        part: typing.SupportsInt | typing.SupportsIndex = 0,
+        parts: typing.SupportsInt | typing.SupportsIndex = 1,
+    ) -> None:
+        """
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch, all -1.
+        """
+    @typing.overload
     def coordinate_gradient(
         self,
         features: numpy.typing.NDArray[numpy.float32],

@@ -197,6 +197,9 @@ class FitConfig:
     """Whether the learning rates fall to zero along a cosine (3QFPI: constant)."""
     adam_epsilon: float = 1e-15
     """Adam's (3QFP)."""
+    row_updates: bool = True
+    """Whether an iteration moves only the features that its samples touch, instead of all by their fading momentum
+    (3QFP: no). With `normals` in a joint fit, all move in any case."""
 
     # Mesh
     min_support: float = 0.15
@@ -264,6 +267,7 @@ class FitConfig:
             "learning_rate": 1e-3,
             "intensity_learning_rate": 1e-3,
             "cosine_schedule": False,
+            "row_updates": False,
         }
         return cls(**(values | changes))
 

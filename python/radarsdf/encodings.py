@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,7 +15,19 @@ from radarsdf import kernels
 from radarsdf._core import Encoding, VertexTable
 
 
-class _VertexFeatures(nn.Module):
+@dataclass(frozen=True)
+class Touched:
+    """What a batch took from the features of cells, for :class:`~radarsdf.optimiser.RowAdam`."""
+
+    points: Tensor
+    """(N, 3), local frame, m."""
+    located: Tensor
+    """(N, num_levels) int32, the cells that hold them."""
+    interpolated: Tensor
+    """(N, 8 · num_levels), a leaf of the graph: the gradient by it is all that the features' step needs."""
+
+
+class VertexFeatures(nn.Module):
     """Learnable vectors of 8 floats at the vertices of the occupied cells.
 
     Parameters
@@ -41,12 +55,20 @@ class _VertexFeatures(nn.Module):
         """Draws the features from N(0, std²)."""
         nn.init.normal_(self.features, std=std)
 
+    def interpolated(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
+        """(N, 8 · num_levels). With `touched`, no gradient reaches the features: what there is to know is put there."""
+        if touched is None:
+            return kernels.interpolate(self.features, points, self.table)
+        out, located = kernels.encode(self.features, points, self.table)
+        touched.append(Touched(points, located, out.requires_grad_()))
+        return out
+
     def occupied(self, points: Tensor) -> Tensor:
         """Whether each point (N, 3), local frame, m, lies in an occupied leaf cell: (N,) bool."""
         return kernels.locate(points, self.table)[:, 0] >= 0
 
 
-class TriQuadtree(_VertexFeatures):
+class TriQuadtree(VertexFeatures):
     """Quadtrees on the planes xy, xz, yz: planes summed, levels concatenated (3QFP, ICRA 2024).
 
     ``forward`` takes points (N, 3), local frame, m, and returns (N, 8 · num_levels).
@@ -58,11 +80,11 @@ class TriQuadtree(_VertexFeatures):
     def dim(self) -> int:
         return kernels.FEATURE_DIM * self.table.num_levels
 
-    def forward(self, points: Tensor) -> Tensor:
-        return kernels.interpolate(self.features, points, self.table)
+    def forward(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
+        return self.interpolated(points, touched)
 
 
-class Octree(_VertexFeatures):
+class Octree(VertexFeatures):
     """Features at the eight corners of the cells in space, trilinear, levels summed (SHINE-Mapping, ICRA 2023).
 
     ``forward`` takes points (N, 3), local frame, m, and returns (N, 8).
@@ -71,8 +93,8 @@ class Octree(_VertexFeatures):
     encoding = Encoding.OCTREE
     dim = kernels.FEATURE_DIM
 
-    def forward(self, points: Tensor) -> Tensor:
-        levels = kernels.interpolate(self.features, points, self.table)
+    def forward(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
+        levels = self.interpolated(points, touched)
         return levels.view(-1, self.table.num_levels, kernels.FEATURE_DIM).sum(1)
 
 

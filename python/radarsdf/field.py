@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,8 +13,27 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from radarsdf.config import FitConfig
-from radarsdf.encodings import Fourier, Octree, TriQuadtree
+from radarsdf.encodings import Fourier, Octree, Touched, TriQuadtree
 from radarsdf.networks import IntensityNetwork, SDFNetwork
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What the SDF network sees and says of N points."""
+
+    encoding: Tensor
+    """(N, D)."""
+    logit: Tensor
+    """(N,) signed distance / sigma, positive in free space."""
+    feature: Tensor
+    """(N, G), handed on to the intensity network."""
+    normals: Tensor | None
+    """(N, 3) unit vectors towards free space, where the intensity network asks for them."""
+
+    def first(self, count: int) -> Geometry:
+        """Of the first `count` points alone."""
+        normals = None if self.normals is None else self.normals[:count]
+        return Geometry(self.encoding[:count], self.logit[:count], self.feature[:count], normals)
 
 
 class Field(nn.Module):
@@ -42,42 +63,50 @@ class Field(nn.Module):
         self.sdf_network = SDFNetwork(dim, config)
         self.intensity_network = IntensityNetwork(dim, config) if with_intensity else None
 
-    def encode(self, points: Tensor) -> Tensor:
-        """(N, 3) local, m, to (N, D)."""
-        return torch.cat([self.cells(points), self.fourier(points)], 1)
+    def encode(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
+        """(N, 3) local, m, to (N, D). With `touched`, features learn by way of that: see :class:`VertexFeatures`."""
+        return torch.cat([self.cells(points, touched), self.fourier(points)], 1)
 
-    def logit(self, points: Tensor) -> Tensor:
+    def logit(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
         """Signed distance / sigma (N,), positive in free space."""
-        return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
+        return self.sdf_network(self.encode(points, touched))[0]  # type: ignore[no-any-return]
 
-    def intensity(
+    def geometry(
+        self, points: Tensor, *, frozen: bool = True, touched: list[Touched] | None = None
+    ) -> Geometry:
+        """All that the intensity network is to know of points (N, 3). `frozen`: none of its graph is kept."""
+        wants_normals = self.intensity_network is not None and self.intensity_network.normals
+        # The normal is itself a gradient: where it is wanted, its own graph is needed for a moment.
+        with torch.set_grad_enabled((torch.is_grad_enabled() and not frozen) or wants_normals):
+            if wants_normals:
+                points = points.detach().requires_grad_()
+            encoding = self.encode(points, touched)
+            logit, feature = self.sdf_network(encoding)
+            normals = None
+            if wants_normals:
+                (gradient,) = torch.autograd.grad(logit.sum(), points, create_graph=not frozen)
+                normals = functional.normalize(gradient, dim=1)
+        if frozen:
+            encoding, logit, feature = encoding.detach(), logit.detach(), feature.detach()
+        return Geometry(encoding, logit, feature, normals)
+
+    def reflectance(
         self,
-        points: Tensor,
+        geometry: Geometry,
         directions: Tensor,
         ranges_m: Tensor,
         *,
-        geometry_frozen: bool = True,
         encoding_factors: Tensor | None = None,
     ) -> Tensor:
-        """Scaled intensity (N,); arguments as of :class:`~radarsdf.networks.IntensityNetwork`.
+        """Scaled intensity (N,) where the geometry is that of the same points.
 
-        With `geometry_frozen`, no gradient reaches features and SDF network, and none of their graph is kept. What the
-        intensity network sees of the encoding is multiplied by `encoding_factors` (N, D): dropout.
+        Directions and ranges are those of :class:`~radarsdf.networks.IntensityNetwork`. What that sees of the encoding is
+        multiplied by `encoding_factors` (N, D): dropout.
         """
-        network = self.intensity_network
-        assert network is not None
-        normals = None
-        # The normal is itself a gradient: where it is wanted, its own graph is needed for a moment.
-        with torch.set_grad_enabled((torch.is_grad_enabled() and not geometry_frozen) or network.normals):
-            if network.normals:
-                points = points.detach().requires_grad_()
-            encoding = self.encode(points)
-            logit, geometry_feature = self.sdf_network(encoding)
-            if network.normals:
-                (gradient,) = torch.autograd.grad(logit.sum(), points, create_graph=not geometry_frozen)
-                normals = functional.normalize(gradient, dim=1)
-        if geometry_frozen:
-            encoding, logit, geometry_feature = encoding.detach(), logit.detach(), geometry_feature.detach()
+        assert self.intensity_network is not None
+        encoding = geometry.encoding
         if encoding_factors is not None:
             encoding = encoding * encoding_factors
-        return network(encoding, logit, geometry_feature, normals, directions, ranges_m)  # type: ignore[no-any-return]
+        return self.intensity_network(  # type: ignore[no-any-return]
+            encoding, geometry.logit, geometry.feature, geometry.normals, directions, ranges_m
+        )

@@ -12,6 +12,8 @@ Tensors cross to the core as NumPy views of the same memory. Results are the sam
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,18 @@ from radarsdf._core import spherical_harmonics as _spherical_harmonics
 
 FEATURE_DIM = 8
 NUM_SPHERICAL_HARMONICS = 16
+
+
+@dataclass(frozen=True)
+class AdamMemory:
+    """What :func:`adam_step` keeps between steps, for every row."""
+
+    moments: Tensor
+    """(num_rows, 16): mean and mean square of each row's gradients."""
+    last_step: Tensor
+    """(num_rows, 1) int32, in which a row last moved; 0: never."""
+    slots: Tensor
+    """(num_rows, 1) int32, scratch: -1 between steps."""
 
 
 def _view(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -97,9 +111,7 @@ def _coordinate_gradient(
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
-        located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
-        out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
-        table.encode(_view(features), _view(points), located.numpy(), out.numpy(), _threads())
+        out, located = encode(features, points, table)
         ctx.save_for_backward(features, points, located)
         ctx.table = table
         return out
@@ -212,6 +224,63 @@ def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
         Differentiable twice, by features and points. The gradient by points is that inside the cell.
     """
     return _Interpolate.apply(features, points, table)  # type: ignore[no-any-return, no-untyped-call]
+
+
+def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor, Tensor]:
+    """:func:`interpolate` without a gradient, and the cells (N, num_levels) int32 of :func:`locate`."""
+    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
+    out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
+    table.encode(_view(features), _view(points), located.numpy(), out.numpy(), _threads())
+    return out, located
+
+
+def adam_step(
+    table: VertexTable,
+    batches: Sequence[tuple[Tensor, Tensor, Tensor]],
+    features: Tensor,
+    memory: AdamMemory,
+    decays: Tensor,
+    *,
+    step: int,
+    learning_rate: float,
+    epsilon: float,
+    part: int = 0,
+    parts: int = 1,
+) -> None:
+    """One step of Adam on the rows that batches touch, in place; the others stay as they are.
+
+    Parameters
+    ----------
+    table : VertexTable
+        Of the features.
+    batches : sequence of (points, located, gradient)
+        (N, 3), (N, num_levels) int32 and (N, 8 · num_levels): where, and the loss's gradient by the interpolated features.
+    features : Tensor
+        (num_rows, 8).
+    memory : AdamMemory
+        What the step remembers of earlier ones.
+    decays : Tensor
+        (more than `step`, 2): both betas to the powers 0, 1, …
+    step : int
+        Number of this step, from 1 on.
+    learning_rate, epsilon : float
+        Adam's.
+    part, parts : int
+        Which share of the rows to move: the shares are disjoint, and all of them make the step.
+    """
+    table.adam_step(
+        [(_view(points), located.numpy(), _rows(grad)) for points, located, grad in batches],
+        _view(features),
+        memory.moments.numpy(),
+        memory.last_step.numpy(),
+        decays.numpy(),
+        memory.slots.numpy(),
+        step,
+        learning_rate,
+        epsilon,
+        part,
+        parts,
+    )
 
 
 def locate(points: Tensor, table: VertexTable) -> Tensor:

@@ -252,7 +252,8 @@ class RadarMap:
             positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
             ranges_m = rays.norm(dim=1)
             directions = rays / ranges_m.clamp_min(1e-6)[:, None]
-            return scale.to_sensor(self._field.intensity(positions, directions, ranges_m))
+            geometry = self._field.geometry(positions)
+            return scale.to_sensor(self._field.reflectance(geometry, directions, ranges_m))
 
         return answer(evaluate(intensity, torch.cat([points, sensors], 1)))
 

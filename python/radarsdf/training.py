@@ -7,7 +7,8 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,10 +16,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf.config import MAX_THREADS, FitConfig
-from radarsdf.field import Field
+from radarsdf.encodings import Touched
+from radarsdf.field import Field, Geometry
 from radarsdf.losses import intensity_loss, sdf_loss
 from radarsdf.map import IntensityScale
-from radarsdf.optimiser import Adam
+from radarsdf.optimiser import Adam, RowAdam
 from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays
 from radarsdf.threads import Workers
@@ -73,36 +75,35 @@ class _Shard:
         self._dropouts = (dropout_scale * config.feature_dropout, dropout_scale * config.fourier_dropout)
         self._intensity_batch_size = _share(config.intensity_batch_size, part, parts)
 
-    def geometry_loss(self) -> Tensor:
+    def geometry_loss(self, touched: list[Touched] | None) -> Tensor:
         samples = self._surface.sampler.batch()
-        return sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
+        logit = self._field.logit(samples.points, touched)
+        return sdf_loss(logit, samples.sdf_m, self._config.sigma_m)
 
-    def joint_loss(self) -> Tensor:
+    def joint_loss(self, touched: list[Touched] | None) -> Tensor:
         samples = self._surface.sampler.batch()
-        loss = sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
-        return self._config.sdf_loss_weight * loss + self._intensity_loss(
-            samples, self._surface, geometry_frozen=False
-        )
+        geometry = self._field.geometry(samples.points, frozen=False, touched=touched)
+        loss = sdf_loss(geometry.logit, samples.sdf_m, self._config.sigma_m)
+        return self._config.sdf_loss_weight * loss + self._intensity_loss(samples, self._surface, geometry)
 
-    def reflectance_loss(self) -> Tensor:
+    def reflectance_loss(self, _: list[Touched] | None) -> Tensor:
         if self._config.intensity_in_free_space:
             samples = self._returns.sampler.batch()
         else:
             samples = self._returns.sampler.spread(self._intensity_batch_size)
-        return self._intensity_loss(samples, self._returns, geometry_frozen=True)
+        return self._intensity_loss(samples, self._returns, self._field.geometry(samples.points))
 
-    def _intensity_loss(self, samples: Samples, source: _Source, *, geometry_frozen: bool) -> Tensor:
+    def _intensity_loss(self, samples: Samples, source: _Source, geometry: Geometry) -> Tensor:
         assert source.intensities is not None
-        used = slice(None) if self._config.intensity_in_free_space else slice(samples.num_near)
-        rays = samples.rays[used]
+        count = len(samples.rays) if self._config.intensity_in_free_space else samples.num_near
+        rays = samples.rays[:count]
         labels = source.intensities[rays]
         labels[samples.num_near :] = 0  # no return is expected from free space (3QFPI)
-        predicted = self._field.intensity(
-            samples.points[used],
+        predicted = self._field.reflectance(
+            geometry.first(count),
             source.directions[rays],
-            source.ranges_m[rays] - samples.sdf_m[used],
-            geometry_frozen=geometry_frozen,
-            encoding_factors=self._encoding_factors(len(rays)),
+            source.ranges_m[rays] - samples.sdf_m[:count],
+            encoding_factors=self._encoding_factors(count),
         )
         return intensity_loss(predicted, labels)
 
@@ -113,6 +114,17 @@ class _Shard:
         dims = (self._field.cells.dim, self._field.fourier.dim)
         kept = [self._surface.sampler.kept(count, *part) for part in zip(dims, self._dropouts, strict=True)]
         return torch.cat(kept, 1)
+
+
+@dataclass(frozen=True)
+class _Gradients:
+    """Of one thread's share of a batch."""
+
+    loss: Tensor
+    by_parameters: Sequence[Tensor]
+    touched: Sequence[Touched]
+    by_interpolated: Sequence[Tensor]
+    """Of `touched`, in the same order."""
 
 
 class Training:
@@ -134,6 +146,8 @@ class Training:
         self._field = field
         self._config = config
         self._workers = workers
+        # Through normals the loss sees the features twice, which only autograd can take apart.
+        self._by_rows = config.row_updates and not (config.joint and config.normals and scale is not None)
         parts = min(workers.num_threads, len(surface), config.batch_size, config.intensity_batch_size)
         samples = len(surface) * (config.near_samples + config.free_samples)
         self._sdf_iterations = config.sdf_iterations or max(
@@ -168,7 +182,12 @@ class Training:
             unit="it",
             disable=None if progress is None else not progress,
         ) as bar:
-            geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
+            geometry = list(field.sdf_network.parameters())
+            rows = None
+            if self._by_rows:
+                rows = RowAdam(field.cells, config.learning_rate, config.adam_epsilon)
+            else:
+                geometry = [*field.cells.parameters(), *geometry]
             adams = [Adam(geometry, config.learning_rate, config.adam_epsilon)]
             if reflectance is not None:
                 reflectance_adam = Adam(
@@ -177,7 +196,7 @@ class Training:
                 if joint:
                     adams.append(reflectance_adam)
             loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
-            self._loop("sdf", self._sdf_iterations, adams, loss_of, bar)
+            self._loop("sdf", self._sdf_iterations, adams, loss_of, bar, rows)
             field.cells.requires_grad_(False)
             field.sdf_network.requires_grad_(False)
             if reflectance is not None and rest:
@@ -188,26 +207,38 @@ class Training:
         name: str,
         iterations: int,
         adams: list[Adam],
-        loss_of: Callable[[_Shard], Tensor],
+        loss_of: Callable[[_Shard, list[Touched] | None], Tensor],
         bar: Any,
+        rows: RowAdam | None = None,
     ) -> None:
         parameters = [p for adam in adams for p in adam.parameters]
 
-        def loss_and_gradients(shard: _Shard) -> tuple[Tensor, tuple[Tensor, ...]]:
-            loss = loss_of(shard) / len(self._shards)
-            return loss.detach(), torch.autograd.grad(loss, parameters)
+        def gradients(shard: _Shard) -> _Gradients:
+            touched: list[Touched] = []
+            loss = loss_of(shard, None if rows is None else touched) / len(self._shards)
+            interpolated = [t.interpolated for t in touched]
+            found = torch.autograd.grad(loss, [*parameters, *interpolated])
+            return _Gradients(loss.detach(), found[: len(parameters)], touched, found[len(parameters) :])
 
         for i in range(iterations):
             # From the full rate on in each stage, also for an Adam that has been through another.
             share = 0.5 * (1 + math.cos(math.pi * i / iterations)) if self._config.cosine_schedule else 1.0
-            losses, gradients = zip(*self._workers.map(loss_and_gradients, self._shards), strict=True)
-            total = iter([functools.reduce(Tensor.add_, parts) for parts in zip(*gradients, strict=True)])
+            found = list(self._workers.map(gradients, self._shards))
+            by_parameter = zip(*[part.by_parameters for part in found], strict=True)
+            total = iter([functools.reduce(Tensor.add_, parts) for parts in by_parameter])
+            if rows is not None:
+                rows.learning_rate = share * rows.full_rate
+                rows.step(
+                    [t for part in found for t in part.touched],
+                    [g for part in found for g in part.by_interpolated],
+                    self._workers,
+                )
             for adam in adams:
                 adam.learning_rate = share * adam.full_rate
                 adam.step(list(itertools.islice(total, len(adam.parameters))))
             bar.update()
             if i % 100 == 0 or i == iterations - 1:
-                self.losses[name] = float(sum(losses))
+                self.losses[name] = float(sum(part.loss for part in found))
                 if not math.isfinite(self.losses[name]):
                     msg = f"the {name} loss is {self.losses[name]} at iteration {i}: a lower learning rate may help"
                     raise FloatingPointError(msg)

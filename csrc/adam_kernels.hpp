@@ -1,0 +1,44 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Adam (Kingma and Ba, ICLR 2015) on some rows of the feature matrix, compiled once for each instruction set (see
+// interpolation_kernels.hpp).
+#pragma once
+
+#include <cstdint>
+
+#include "cell.hpp"
+
+namespace radarsdf {
+
+// One step. What a row missed since it last moved fades as it would have with gradients of zero; only the movement that
+// those would still have caused is left out. So a step costs the rows that it touches, not the map.
+template <typename T>
+struct AdamStep {
+  T* features;              // (rows, 8)
+  T* moments;               // (rows, 2, 8): mean and mean square of a row's gradients
+  std::int32_t* last_step;  // (rows) in which a row last moved; 0: never
+  const T* decays;          // (step + 1, 2): both betas to the power of the steps since
+  std::int32_t step;        // from 1 on
+  T rate;                   // learning rate / (1 - beta1^step)
+  T square_scale;           // 1 / (1 - beta2^step)
+  T epsilon;
+};
+
+template <typename T>
+struct AdamKernel {
+  // Moves rows[i] against gradients[i] (8), for i in [0, count).
+  void (*move)(const AdamStep<T>&, const std::int32_t* rows, const T* gradients, std::int64_t count);
+};
+
+#define RADARSDF_DECLARE_KERNEL(isa) \
+  namespace isa {                    \
+  template <typename T>              \
+  AdamKernel<T> adam_kernel();       \
+  }
+RADARSDF_DECLARE_KERNEL(baseline)
+RADARSDF_DECLARE_KERNEL(avx2)
+RADARSDF_DECLARE_KERNEL(avx512)
+#undef RADARSDF_DECLARE_KERNEL
+
+}  // namespace radarsdf
