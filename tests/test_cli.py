@@ -131,6 +131,15 @@ def test_geometry_only(scans_file, tmp_path, capsys):
     assert "viewpoint" in fails(capsys, command, tmp_path)
 
 
+def test_quick(scans_file, tmp_path):
+    path = tmp_path / "map.safetensors"
+    command = ["fit", str(scans_file), "-o", str(path), "--quick", "--geometry-only"]
+    assert main([*command, "--set", "seed=3"]) == 0
+    assert radarsdf.load(path).config == FitConfig.quick(seed=3)
+    with pytest.raises(SystemExit):
+        main([*command, "--paper"])
+
+
 def test_settings(scans_file, tmp_path):
     path = tmp_path / "map.safetensors"
     settings = [

@@ -38,7 +38,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "sigma_m": _POSITIVE,
     "sdf_loss_weight": _FROM_0,
     "batch_size": _FROM_1,
-    "sdf_iterations": _FROM_1,
+    "sdf_iterations": _FROM_0,
     "sdf_passes": _POSITIVE,
     "min_sdf_iterations": _FROM_1,
     "intensity_batch_size": _FROM_1,
@@ -109,6 +109,8 @@ class FitConfig:
     """Levels of cells, each twice as large as the one before (3QFP)."""
     feature_std: float = 0.05
     """Standard deviation of the features at the start (3QFP)."""
+    start: Literal["noise", "average"] = "noise"
+    """What training starts from: noise (3QFP), or the rays' average of truncated distances, which only an octree holds."""
     fourier_half_width_m: float = 409.6
     """Half of the longest Fourier wavelength, m (3QFP: 2^12 · 0.2 m / 2)."""
     fourier_first: int = 0
@@ -172,7 +174,7 @@ class FitConfig:
     further)."""
     sdf_iterations: int | None = None
     """Iterations of SDF network and features, which are then frozen (3QFPI: 1000). None: `sdf_passes` over the data,
-    but at least `min_sdf_iterations`."""
+    but at least `min_sdf_iterations`. 0: what it starts from stays."""
     sdf_passes: float = 1.0
     """Times each sample is seen where `sdf_iterations` is None (measured: more fits the noise)."""
     min_sdf_iterations: int = 150
@@ -230,6 +232,12 @@ class FitConfig:
         if self.encoding not in ("tri-quadtree", "octree"):
             msg = f"encoding must be 'tri-quadtree' or 'octree', not {self.encoding!r}"
             raise ValueError(msg)
+        if self.start not in ("noise", "average"):
+            msg = f"start must be 'noise' or 'average', not {self.start!r}"
+            raise ValueError(msg)
+        if self.start == "average" and (self.encoding != "octree" or min(self.sdf_hidden, default=0) < 2):
+            msg = "start='average' needs encoding='octree' and hidden layers of at least two"
+            raise ValueError(msg)
         if self.fourier_first + self.fourier_count > MAX_FREQUENCIES:
             msg = f"only frequencies below {MAX_FREQUENCIES} are possible"
             raise ValueError(msg)
@@ -241,6 +249,24 @@ class FitConfig:
         ):
             msg = "networks need at least one hidden layer, of positive width"
             raise ValueError(msg)
+
+    @classmethod
+    def quick(cls, **changes: Any) -> FitConfig:
+        """An average instead of a trained surface, with `changes` on top: rougher, larger, and there in a fraction of the time.
+
+        Mesh it with voxels of 0.2 m, the size of its cells: finer ones show no more.
+        """
+        values: dict[str, Any] = {
+            "encoding": "octree",
+            "num_levels": 1,
+            "fourier_count": 0,
+            "sdf_hidden": (2,),
+            "near_band_m": 0.6,
+            "start": "average",
+            "sdf_iterations": 0,
+            "joint": False,
+        }
+        return cls(**(values | changes))
 
     @classmethod
     def paper(cls, **changes: Any) -> FitConfig:

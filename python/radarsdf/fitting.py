@@ -14,6 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import CellSet
+from radarsdf.averaging import start_from_average
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
 from radarsdf.map import IntensityScale, RadarMap
@@ -89,6 +90,9 @@ def fit(
             clock.lap("ghosts_s")
         field = _new_field(surface, config, workers.num_threads)
         clock.lap("occupied_cells_s")
+        if config.start == "average":
+            start_from_average(field, surface, config, workers.num_threads)
+            clock.lap("average_s")
         scale = IntensityScale.of(rays.intensities)
         training = Training(field, surface, rays, scale, config, workers)
         training.run(progress)

@@ -30,6 +30,20 @@ class SDFNetwork(nn.Module):
         super().__init__()
         self.layers = _mlp([encoding_dim, *config.sdf_hidden, 1 + config.geometry_feature_dim])
 
+    @torch.no_grad()
+    def start_as_input(self, index: int) -> None:
+        """Makes the logit one number of the encoding, which two units of each hidden layer carry past the ReLUs."""
+        first, *hidden, last = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        for layer in (first, *hidden):
+            layer.weight[:2] = 0
+            layer.bias[:2] = 0
+        first.weight[0, index], first.weight[1, index] = 1, -1
+        for layer in hidden:
+            layer.weight[0, 0] = layer.weight[1, 1] = 1
+        last.weight[0] = 0
+        last.bias[0] = 0
+        last.weight[0, 0], last.weight[0, 1] = 1, -1
+
     def forward(self, encoding: Tensor) -> tuple[Tensor, Tensor]:
         """(N, D) to the logit (N,) and the geometry feature (N, geometry_feature_dim)."""
         out = self.layers(encoding)

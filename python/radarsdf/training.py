@@ -150,8 +150,9 @@ class Training:
         self._by_rows = config.row_updates and not (config.joint and config.normals and scale is not None)
         parts = min(workers.num_threads, len(surface), config.batch_size, config.intensity_batch_size)
         samples = len(surface) * (config.near_samples + config.free_samples)
-        self._sdf_iterations = config.sdf_iterations or max(
-            config.min_sdf_iterations, math.ceil(config.sdf_passes * samples / config.batch_size)
+        passes = math.ceil(config.sdf_passes * samples / config.batch_size)
+        self._sdf_iterations = (
+            max(config.min_sdf_iterations, passes) if config.sdf_iterations is None else config.sdf_iterations
         )
         samples = len(returns) * config.near_samples
         self._intensity_iterations = config.intensity_iterations or max(
@@ -160,8 +161,8 @@ class Training:
         )
         # Where each sample is seen often, there is more to learn by heart. The same dropout for all (0.7 and 0.2) would
         # be as good on sparse scenes, and cost 2 % on a dense one, whose samples are seen twice.
-        passes = self._intensity_iterations * config.intensity_batch_size / samples
-        dropout_scale = passes / (passes + _DROPOUT_HALF_PASSES)
+        times_seen = self._intensity_iterations * config.intensity_batch_size / samples
+        dropout_scale = times_seen / (times_seen + _DROPOUT_HALF_PASSES)
         self._shards = [
             _Shard(field, surface, returns, scale, config, part, parts, dropout_scale)
             for part in range(parts)

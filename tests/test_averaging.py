@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The average of truncated distances: exact where rays agree, the mean where they do not, and what training starts from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
+from radarsdf.networks import SDFNetwork
+
+from .conftest import ground_and_wall
+
+
+def rays_down(heights, half_m=3.0, spacing_m=0.05):
+    """A sensor high above a grid of returns, so far that its rays are parallel to 1 %; its heights alternate."""
+    x, y = np.meshgrid(*[np.arange(-half_m, half_m, spacing_m)] * 2, indexing="ij")
+    z = np.resize(heights, x.shape)
+    points = np.column_stack([x.ravel(), y.ravel(), z.ravel() - 300.0])
+    pose = np.eye(4)
+    pose[2, 3] = 300.0
+    return [points], pose[None]
+
+
+def fit(points, poses, **changes):
+    return radarsdf.fit(points, poses, config=FitConfig.quick(drop_ghosts=False, **changes), progress=False)
+
+
+def inner_points(count=500):
+    rng = np.random.default_rng(0)
+    return rng.uniform([-1.5, -1.5, -0.2], [1.5, 1.5, 0.2], (count, 3))
+
+
+def test_a_plane_is_its_own_average():
+    x = inner_points()
+    np.testing.assert_allclose(fit(*rays_down([0.0])).sdf(x), x[:, 2], atol=0.01)
+
+
+def test_rays_that_differ_are_averaged():
+    x = inner_points()
+    expected = x[:, 2] - (0.0 + 0.12 + 0.12) / 3
+    np.testing.assert_allclose(fit(*rays_down([0.0, 0.12, 0.12])).sdf(x), expected, atol=0.02)
+
+
+def test_free_space_of_other_rays_removes_what_floats_in_it():
+    points, poses = rays_down([0.0])
+    clutter = np.column_stack(
+        [np.random.default_rng(0).uniform(-0.3, 0.3, (40, 2)), np.full(40, 2.0 - 300.0)]
+    )
+    points = [np.concatenate([points[0], clutter])]
+    x = np.column_stack([np.zeros((9, 2)), np.linspace(1.7, 2.3, 9)])
+    assert (fit(points, poses, free_from=0.95, free_samples=40).sdf(x) > 0).all()
+    assert (fit(points, poses, free_samples=0).sdf(x) < 0).any()
+
+
+def test_the_quick_mesh_lies_on_the_surface():
+    scene = ground_and_wall(scans=8, returns_per_scan=3000)
+    radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(), progress=False)
+    vertices = np.asarray(radar_map.mesh(0.2).vertices)
+    off_m = np.minimum(np.abs(vertices[:, 2]), np.abs(vertices[:, 0] - 20))
+    assert np.quantile(off_m, 0.95) < 0.1
+    assert radar_map.report["iterations"] == {"sdf": 0, "intensity": 0}
+
+
+def test_intensities_are_fitted_on_the_average():
+    scene = ground_and_wall()
+    config = FitConfig.quick(intensity_iterations=200)
+    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+    world = scene.points[0] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
+    error = np.abs(radar_map.intensity(world, scene.poses[0, :3, 3]) - scene.intensities[0])
+    assert np.median(error) < 2.0  # of some 20 dB from near to far
+
+
+def test_training_goes_on_from_the_average():
+    scene = ground_and_wall()
+    start = fit(scene.points, scene.poses)
+    on = fit(scene.points, scene.poses, sdf_iterations=30, learning_rate=1e-3)
+    x = np.random.default_rng(1).uniform([10, -4, -0.1], [18, 4, 0.1], (400, 3))
+    change = np.abs(on.sdf(x) - start.sdf(x))
+    assert 0 < np.median(change) < 0.05
+
+
+@pytest.mark.parametrize("hidden", [(2,), (5, 3), (4, 4, 4)])
+def test_the_network_starts_as_one_input(hidden):
+    torch.manual_seed(0)
+    network = SDFNetwork(6, FitConfig(sdf_hidden=hidden, geometry_feature_dim=2))
+    network.start_as_input(4)
+    encoding = torch.randn(50, 6)
+    logit, _ = network(encoding)
+    torch.testing.assert_close(logit, encoding[:, 4])
+    logit.sum().backward()
+    assert network.layers[-1].weight.grad.any()
+
+
+def test_only_an_octree_holds_an_average():
+    with pytest.raises(ValueError, match="octree"):
+        FitConfig(start="average")
+    with pytest.raises(ValueError, match="start"):
+        FitConfig(start="zero")
+    with pytest.raises(ValueError, match="at least two"):
+        FitConfig.quick(sdf_hidden=(1,))
