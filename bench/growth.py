@@ -41,7 +41,12 @@ def street(count: int) -> Rays:
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     points = sensors + rays * range_m[:, None]
     return Rays(
-        np.zeros(3), *(a.astype(np.float32) for a in (points, rays, range_m)), intensities=None, scans=scans
+        origin=np.zeros(3),
+        points=points.astype(np.float32),
+        directions=rays.astype(np.float32),
+        ranges_m=range_m.astype(np.float32),
+        intensities=None,
+        scans=scans,
     )
 
 

@@ -25,6 +25,9 @@ def main(arguments: list[str] | None = None) -> None:
     save.add_argument("--count", type=int, default=200, help="kills; default: 200")
     random = commands.add_parser("arguments", help="random arguments for the public functions")
     random.add_argument("--count", type=int, default=2000, help="examples for each; default: 2000")
+    interrupts = commands.add_parser("interrupts", help="Ctrl-C at many moments of a fit and of a mesh")
+    interrupts.add_argument("--returns", type=int, default=3_000_000, help="default: 3000000")
+    interrupts.add_argument("--count", type=int, default=40, help="of each; default: 40")
     words = parser.parse_args(arguments)
     if words.command == "kernels":
         from .kernels import BATCHES, run  # noqa: PLC0415 - each command imports what it needs
@@ -38,6 +41,10 @@ def main(arguments: list[str] | None = None) -> None:
         from .save import run as run_save  # noqa: PLC0415
 
         run_save(words.count)
+    elif words.command == "interrupts":
+        from .interrupts import run as run_interrupts  # noqa: PLC0415
+
+        run_interrupts(words.returns, words.count)
     else:
         environment = os.environ | {"RADARSDF_EXAMPLES": str(words.count)}
         tests = Path(__file__).parents[2] / "tests" / "test_arguments.py"

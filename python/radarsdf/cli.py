@@ -18,7 +18,7 @@ import torch
 import trimesh
 
 import radarsdf
-from radarsdf import FitConfig, RadarMap, _core
+from radarsdf import Diverged, FitConfig, Interrupted, RadarMap, _core
 from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
 from radarsdf.picture import save_picture
 from radarsdf.readers import Scans, read_scans, write_scans
@@ -32,6 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError, FloatingPointError) as error:
         print(f"radarsdf {options.command}: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt as interruption:
+        print(f"radarsdf {options.command}: {interruption or 'interrupted'}", file=sys.stderr)
+        return 130  # as shells have it: 128 and the number of the signal
     return 0
 
 
@@ -59,6 +62,12 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("-o", "--out", type=Path, required=True, help="the map, .safetensors")
     fit.add_argument("--holdout", type=int, metavar="N", help="leave out the first and then every N-th scan")
     fit.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
+    fit.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="PATH",
+        help="write the state there on the way, and go on from it if it exists; removed once the map is written",
+    )
     _fit_options(fit)
 
     mesh = _command(commands, "mesh", _mesh, "turn a map into triangles")
@@ -183,10 +192,23 @@ def _fit(options: argparse.Namespace) -> None:
         scans = scans.select(holdout(len(scans.points), options.holdout)[0])
     intensities = None if options.geometry_only else scans.intensities
     started = time.perf_counter()
-    radar_map = radarsdf.fit(
-        scans.points, scans.poses, intensities, config=_config(options), progress=_progress(options)
-    )
+    try:
+        radar_map = radarsdf.fit(
+            scans.points,
+            scans.poses,
+            intensities,
+            config=_config(options),
+            progress=_progress(options),
+            checkpoint=options.checkpoint,
+        )
+    except (Interrupted, Diverged) as stop:
+        if stop.radar_map is not None:
+            stop.radar_map.save(options.out)
+            stop.args = (f"{stop}; the map so far is in {options.out}",)
+        raise
     radar_map.save(options.out)
+    if options.checkpoint is not None:
+        options.checkpoint.unlink(missing_ok=True)
     print(f"fit {time.perf_counter() - started:.1f} s: {radar_map}, written to {options.out}")
 
 

@@ -33,6 +33,16 @@ class Adam:
         self._squares = [torch.zeros_like(p) for p in self.parameters]
         self._steps = [torch.zeros(()) for _ in self.parameters]
 
+    def state(self) -> dict[str, Tensor]:
+        """What the next steps depend on beside the parameters. Not copies."""
+        lists = {"mean": self._means, "square": self._squares, "steps": self._steps}
+        return {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on as the optimiser of the same parameters that gave `state`."""
+        for name, value in self.state().items():
+            value.copy_(state[name])
+
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor]) -> None:
         """Move the parameters by their gradients, in the same order."""

@@ -8,12 +8,14 @@ import functools
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from radarsdf.checkpoint import Checkpoint
 from radarsdf.config import MAX_THREADS, FitConfig
 from radarsdf.field import Field
 from radarsdf.losses import intensity_loss, sdf_loss
@@ -21,9 +23,13 @@ from radarsdf.map import IntensityScale
 from radarsdf.optimiser import Adam
 from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays
+from radarsdf.stopping import Diverged, deferred_interrupts
 from radarsdf.threads import Workers
 
 _DROPOUT_HALF_PASSES = 3.0  # each sample seen so often: half of the configured dropout
+_KEEP_EVERY = (
+    100  # iterations: to look through all parameters, and copy them, in each would cost a tenth of it
+)
 
 
 class _Source:
@@ -72,6 +78,24 @@ class _Shard:
         self._returns = self._surface if returns is surface or scale is None else source(returns)
         self._dropouts = (dropout_scale * config.feature_dropout, dropout_scale * config.fourier_dropout)
         self._intensity_batch_size = _share(config.intensity_batch_size, part, parts)
+        self._generator = generator
+        self.joint_parts: dict[str, Tensor] = {}
+        """The two losses of the last joint one."""
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next batches depend on."""
+        samplers = self._samplers()
+        state = {f"{name}.{k}": v for name, sampler in samplers.items() for k, v in sampler.state().items()}
+        return state | {"generator": self._generator.get_state()}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        for name, sampler in self._samplers().items():
+            sampler.restore(_part(state, name))
+        self._generator.set_state(state["generator"])  # last: the samplers draw their orders again
+
+    def _samplers(self) -> dict[str, RaySampler]:
+        samplers = {"surface": self._surface.sampler}
+        return samplers if self._returns is self._surface else samplers | {"returns": self._returns.sampler}
 
     def geometry_loss(self) -> Tensor:
         samples = self._surface.sampler.batch()
@@ -79,10 +103,10 @@ class _Shard:
 
     def joint_loss(self) -> Tensor:
         samples = self._surface.sampler.batch()
-        loss = sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
-        return self._config.sdf_loss_weight * loss + self._intensity_loss(
-            samples, self._surface, geometry_frozen=False
-        )
+        geometry = sdf_loss(self._field.logit(samples.points), samples.sdf_m, self._config.sigma_m)
+        intensity = self._intensity_loss(samples, self._surface, geometry_frozen=False)
+        self.joint_parts = {"sdf": geometry.detach(), "intensity": intensity.detach()}
+        return self._config.sdf_loss_weight * geometry + intensity
 
     def reflectance_loss(self) -> Tensor:
         if self._config.intensity_in_free_space:
@@ -113,6 +137,15 @@ class _Shard:
         dims = (self._field.cells.dim, self._field.fourier.dim)
         kept = [self._surface.sampler.kept(count, *part) for part in zip(dims, self._dropouts, strict=True)]
         return torch.cat(kept, 1)
+
+
+@dataclass(frozen=True)
+class _Pauses:
+    """What is asked after each iteration."""
+
+    bar: Any
+    interrupted: Callable[[], bool]
+    checkpoint: Checkpoint | None
 
 
 class Training:
@@ -155,33 +188,81 @@ class Training:
         if scale is None:
             self._intensity_iterations = 0
         self.iterations = {"sdf": self._sdf_iterations, "intensity": self._intensity_iterations}
+        self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
+        geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
+        self._adams = {"geometry": Adam(geometry, config.learning_rate, config.adam_epsilon)}
+        if field.intensity_network is not None:
+            self._adams["reflectance"] = Adam(
+                field.intensity_network.parameters(), config.intensity_learning_rate, config.adam_epsilon
+            )
 
-    def run(self, progress: bool | None) -> None:
+    def state(self) -> dict[str, Tensor]:
+        """All that the rest of the training depends on, between two iterations. Not copies."""
+        losses = [self.losses.get(name, 0.0) for name in self.iterations_done]
+        state = {
+            "done": torch.tensor(list(self.iterations_done.values())),
+            "losses": torch.tensor(losses, dtype=torch.float64),
+        }
+        state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
+        for name, adam in self._adams.items():
+            state |= {f"adam.{name}.{k}": v for k, v in adam.state().items()}
+        for i, shard in enumerate(self._shards):
+            state |= {f"shard.{i}.{k}": v for k, v in shard.state().items()}
+        return state
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on where another training of the same rays and configuration was when it gave `state`."""
+        done = dict(zip(self.iterations_done, state["done"].tolist(), strict=True))
+        if not all(0 <= done[name] <= self.iterations[name] for name in done):
+            msg = f"{done} iterations of {self.iterations}"
+            raise ValueError(msg)
+        self.iterations_done.update(done)
+        losses = zip(done, state["losses"].tolist(), strict=True)
+        self.losses.update({name: loss for name, loss in losses if done[name]})
+        for name, parameter in self._field.named_parameters():
+            parameter.data.copy_(state[f"field.{name}"])
+        for name, adam in self._adams.items():
+            adam.restore(_part(state, f"adam.{name}"))
+        for i, shard in enumerate(self._shards):
+            shard.restore(_part(state, f"shard.{i}"))
+
+    def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
+        """All iterations that are left.
+
+        Raises
+        ------
+        Diverged
+            With the parameters as they last were when all were finite.
+        KeyboardInterrupt
+            For Ctrl-C, between two iterations.
+        """
         config, field = self._config, self._field
-        reflectance = field.intensity_network
+        geometry, reflectance = self._adams["geometry"], self._adams.get("reflectance")
         joint = config.joint and reflectance is not None
         rest = max(0, self._intensity_iterations - (self._sdf_iterations if joint else 0))
-        with tqdm(
-            total=self._sdf_iterations + rest,
-            desc="fit",
-            unit="it",
-            disable=None if progress is None else not progress,
-        ) as bar:
-            geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
-            adams = [Adam(geometry, config.learning_rate, config.adam_epsilon)]
-            if reflectance is not None:
-                reflectance_adam = Adam(
-                    reflectance.parameters(), config.intensity_learning_rate, config.adam_epsilon
-                )
-                if joint:
-                    adams.append(reflectance_adam)
+        with (
+            tqdm(
+                total=self._sdf_iterations + rest,
+                desc="fit",
+                unit="it",
+                disable=None if progress is None else not progress,
+            ) as bar,
+            deferred_interrupts() as interrupted,
+        ):
+            pauses = _Pauses(bar, interrupted, checkpoint)
+            adams = [geometry, reflectance] if joint and reflectance is not None else [geometry]
             loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
-            self._loop("sdf", self._sdf_iterations, adams, loss_of, bar)
+            bar.update(sum(self.iterations_done.values()))
+            self._loop("sdf", self._sdf_iterations, adams, loss_of, pauses)
             field.cells.requires_grad_(False)
             field.sdf_network.requires_grad_(False)
             if reflectance is not None and rest:
-                self._loop("intensity", rest, [reflectance_adam], _Shard.reflectance_loss, bar)
+                self._loop("intensity", rest, [reflectance], _Shard.reflectance_loss, pauses)
+            if checkpoint is not None:
+                checkpoint.write(self.state())
+            if interrupted():  # by now all is done, but whoever pressed it wants to stop more than this
+                raise KeyboardInterrupt
 
     def _loop(
         self,
@@ -189,28 +270,62 @@ class Training:
         iterations: int,
         adams: list[Adam],
         loss_of: Callable[[_Shard], Tensor],
-        bar: Any,
+        pauses: _Pauses,
     ) -> None:
         parameters = [p for adam in adams for p in adam.parameters]
+        kept = [p.detach().clone() for p in parameters]
 
         def loss_and_gradients(shard: _Shard) -> tuple[Tensor, tuple[Tensor, ...]]:
             loss = loss_of(shard) / len(self._shards)
             return loss.detach(), torch.autograd.grad(loss, parameters)
 
-        for i in range(iterations):
+        def give_up(fault: str) -> NoReturn:
+            for parameter, value in zip(parameters, kept, strict=True):
+                parameter.data.copy_(value)
+            msg = f"{fault} at iteration {i} of {iterations} of the {name} stage: a lower learning rate may help"
+            raise Diverged(msg)
+
+        for i in range(self.iterations_done[name], iterations):
             # From the full rate on in each stage, also for an Adam that has been through another.
             share = 0.5 * (1 + math.cos(math.pi * i / iterations)) if self._config.cosine_schedule else 1.0
             losses, gradients = zip(*self._workers.map(loss_and_gradients, self._shards), strict=True)
+            loss = float(sum(losses))
+            if not math.isfinite(loss):
+                give_up(f"the {self._loss_name(name)} loss is {loss}")
             total = iter([functools.reduce(Tensor.add_, parts) for parts in zip(*gradients, strict=True)])
             for adam in adams:
                 adam.learning_rate = share * adam.full_rate
                 adam.step(list(itertools.islice(total, len(adam.parameters))))
-            bar.update()
-            if i % 100 == 0 or i == iterations - 1:
-                self.losses[name] = float(sum(losses))
-                if not math.isfinite(self.losses[name]):
-                    msg = f"the {name} loss is {self.losses[name]} at iteration {i}: a lower learning rate may help"
-                    raise FloatingPointError(msg)
+            self.losses[name] = loss
+            self.iterations_done[name] = i + 1
+            pauses.bar.update()
+            stop = pauses.interrupted()
+            write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
+            if stop or write or i % _KEEP_EVERY == _KEEP_EVERY - 1 or i == iterations - 1:
+                # The sum is finite only if all are; that it overflows by itself is as bad.
+                if not all(math.isfinite(float(p.detach().sum())) for p in parameters):
+                    give_up("a parameter is not finite")
+                for parameter, value in zip(parameters, kept, strict=True):
+                    value.copy_(parameter.detach())
+            if write and pauses.checkpoint is not None:
+                pauses.checkpoint.write(self.state())
+            if stop:
+                raise KeyboardInterrupt
+
+    def _loss_name(self, stage: str) -> str:
+        """Which of the losses it is that is not finite."""
+        bad = {
+            name
+            for shard in self._shards
+            for name, value in shard.joint_parts.items()
+            if stage == "sdf" and not math.isfinite(float(value))
+        }
+        return " and ".join(sorted(bad)) or stage
+
+
+def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    """Those of a state whose names begin with `name` and a dot, without these."""
+    return {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")}
 
 
 def _share(count: int, part: int, parts: int) -> int:
