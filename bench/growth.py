@@ -50,6 +50,15 @@ def street(count: int) -> Rays:
     )
 
 
+def scans_of(rays: Rays) -> tuple[list[np.ndarray], np.ndarray]:
+    """A street's returns (F times (N_i, 3), sensor frame, m), and poses (F, 4, 4), as a fit takes them."""
+    poses = np.eye(4)[None].repeat(int(rays.scans[-1]) + 1, 0)
+    poses[:, 0, 3] = np.arange(len(poses)) - rays.scans.mean()
+    poses[:, 2, 3] = 2.0
+    points = np.split(rays.points, np.flatnonzero(np.diff(rays.scans)) + 1)
+    return [(p - T[:3, 3]).astype(np.float32) for p, T in zip(points, poses, strict=True)], poses
+
+
 def memory_mb(field: str) -> float:
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1e3

@@ -22,7 +22,8 @@ void set_interrupt_check(void (*check)());
 void check_interrupt();
 
 // Runs task(i) for i in [0, num_tasks) on up to num_threads threads, each task whole on one thread.
-// An exception thrown by a task is rethrown here, and the tasks not yet begun are left out: it must not leave an OpenMP region.
+// An exception thrown by a task is rethrown here, and the tasks not yet begun are left out: it must not leave an OpenMP
+// region.
 template <typename Task>
 void parallel_tasks(std::int64_t num_tasks, int num_threads, const Task& task) {
   const int threads = static_cast<int>(std::min<std::int64_t>(resolve_num_threads(num_threads), num_tasks));

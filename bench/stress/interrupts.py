@@ -16,7 +16,7 @@ import numpy as np
 import radarsdf
 from radarsdf import FitConfig, Interrupted
 
-from bench.growth import street
+from bench.growth import scans_of, street
 from bench.paper.report import markdown
 
 
@@ -51,12 +51,7 @@ def waits(work: Callable[[], Any], moments: int, seed: int = 0) -> tuple[float, 
 
 def run(returns: int, moments: int) -> None:
     """Print the table for a fit of a street, and for its mesh."""
-    rays = street(returns)
-    poses = np.eye(4)[None].repeat(rays.scans[-1] + 1, 0)
-    poses[:, 0, 3] = np.arange(len(poses)) - (len(poses) - 1) / 2
-    poses[:, 2, 3] = 2.0
-    scans = np.split(rays.points.astype(np.float64), np.flatnonzero(np.diff(rays.scans)) + 1)
-    points = [scan - pose[:3, 3] for scan, pose in zip(scans, poses, strict=True)]
+    points, poses = scans_of(street(returns))
     config = FitConfig(sdf_iterations=100)
     radar_map = radarsdf.fit(points, poses, config=config, progress=False)
     rows = []

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch  # noqa: F401 - before the compiled core, which then shares PyTorch's OpenMP runtime
 
+from radarsdf.budget import Estimate, estimate
 from radarsdf.config import FitConfig
 from radarsdf.fitting import fit
 from radarsdf.isosurface import marching_cubes
@@ -20,9 +21,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Diverged",
+    "Estimate",
     "FitConfig",
     "Interrupted",
     "RadarMap",
+    "estimate",
     "evaluation",
     "fit",
     "load",

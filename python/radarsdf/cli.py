@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         options.run(options)
-    except (ValueError, OSError, ImportError, FloatingPointError) as error:
+    except (ValueError, OSError, ImportError, FloatingPointError, MemoryError) as error:
         print(f"radarsdf {options.command}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interruption:
@@ -59,7 +59,9 @@ def _parser() -> argparse.ArgumentParser:
 
     fit = _command(commands, "fit", _fit, "fit a map to scans")
     fit.add_argument("scans", type=Path, help=".npz with points, frame, poses and, if any, intensity, static")
-    fit.add_argument("-o", "--out", type=Path, required=True, help="the map, .safetensors")
+    out = fit.add_mutually_exclusive_group(required=True)
+    out.add_argument("-o", "--out", type=Path, help="the map, .safetensors")
+    out.add_argument("--dry-run", action="store_true", help="only estimate memory and time")
     fit.add_argument("--holdout", type=int, metavar="N", help="leave out the first and then every N-th scan")
     fit.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
     fit.add_argument(
@@ -191,13 +193,17 @@ def _fit(options: argparse.Namespace) -> None:
     if options.holdout:
         scans = scans.select(holdout(len(scans.points), options.holdout)[0])
     intensities = None if options.geometry_only else scans.intensities
+    config = _config(options)
+    if options.dry_run:
+        print(radarsdf.estimate(scans.points, scans.poses, intensities, config=config))
+        return
     started = time.perf_counter()
     try:
         radar_map = radarsdf.fit(
             scans.points,
             scans.poses,
             intensities,
-            config=_config(options),
+            config=config,
             progress=_progress(options),
             checkpoint=options.checkpoint,
         )

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf import threads
 from radarsdf._core import CellSet
+from radarsdf.budget import check_fit
 from radarsdf.checkpoint import Checkpoint
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
@@ -65,6 +66,8 @@ def fit(
     ValueError
         For scans or poses that cannot be what they should be, see :func:`radarsdf.scans.prepare`, and for a
         `checkpoint` that is damaged or belongs to another fit.
+    MemoryError
+        If the estimate of :func:`radarsdf.estimate` exceeds ``config.max_memory_bytes``, or what the system has.
     Interrupted
         A KeyboardInterrupt, for Ctrl-C: with the map so far as its ``radar_map``.
     Diverged
@@ -91,6 +94,7 @@ def fit(
             max_range_m=config.max_range_m,
             accumulate_frames=config.accumulate_frames,
         )
+        check_fit(rays, config)
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
         clock.lap("prepare_s")
         with Workers(config.num_threads) as workers:

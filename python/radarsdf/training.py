@@ -168,26 +168,16 @@ class Training:
         self._config = config
         self._workers = workers
         parts = min(workers.num_threads, len(surface), config.batch_size, config.intensity_batch_size)
-        samples = len(surface) * (config.near_samples + config.free_samples)
-        self._sdf_iterations = config.sdf_iterations or max(
-            config.min_sdf_iterations, math.ceil(config.sdf_passes * samples / config.batch_size)
-        )
-        samples = len(returns) * config.near_samples
-        self._intensity_iterations = config.intensity_iterations or max(
-            config.min_intensity_iterations,
-            math.ceil(config.intensity_passes * samples / config.intensity_batch_size),
-        )
+        self.iterations = iterations_of(config, len(surface), len(returns), with_intensity=scale is not None)
         # Where each sample is seen often, there is more to learn by heart. The same dropout for all (0.7 and 0.2) would
         # be as good on sparse scenes, and cost 2 % on a dense one, whose samples are seen twice.
-        passes = self._intensity_iterations * config.intensity_batch_size / samples
+        samples = len(returns) * config.near_samples
+        passes = self.iterations["intensity"] * config.intensity_batch_size / samples
         dropout_scale = passes / (passes + _DROPOUT_HALF_PASSES)
         self._shards = [
             _Shard(field, surface, returns, scale, config, part, parts, dropout_scale)
             for part in range(parts)
         ]
-        if scale is None:
-            self._intensity_iterations = 0
-        self.iterations = {"sdf": self._sdf_iterations, "intensity": self._intensity_iterations}
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
@@ -240,10 +230,10 @@ class Training:
         config, field = self._config, self._field
         geometry, reflectance = self._adams["geometry"], self._adams.get("reflectance")
         joint = config.joint and reflectance is not None
-        rest = max(0, self._intensity_iterations - (self._sdf_iterations if joint else 0))
+        rest = max(0, self.iterations["intensity"] - (self.iterations["sdf"] if joint else 0))
         with (
             tqdm(
-                total=self._sdf_iterations + rest,
+                total=self.iterations["sdf"] + rest,
                 desc="fit",
                 unit="it",
                 disable=None if progress is None else not progress,
@@ -254,7 +244,7 @@ class Training:
             adams = [geometry, reflectance] if joint and reflectance is not None else [geometry]
             loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
             bar.update(sum(self.iterations_done.values()))
-            self._loop("sdf", self._sdf_iterations, adams, loss_of, pauses)
+            self._loop("sdf", self.iterations["sdf"], adams, loss_of, pauses)
             field.cells.requires_grad_(False)
             field.sdf_network.requires_grad_(False)
             if reflectance is not None and rest:
@@ -321,6 +311,19 @@ class Training:
             if stage == "sdf" and not math.isfinite(float(value))
         }
         return " and ".join(sorted(bad)) or stage
+
+
+def iterations_of(
+    config: FitConfig, surface_returns: int, all_returns: int, *, with_intensity: bool
+) -> dict[str, int]:
+    """Iterations of the two stages; a joint beginning counts in both."""
+    samples = surface_returns * (config.near_samples + config.free_samples)
+    passes = math.ceil(config.sdf_passes * samples / config.batch_size)
+    sdf = config.sdf_iterations or max(config.min_sdf_iterations, passes)
+    samples = all_returns * config.near_samples
+    passes = math.ceil(config.intensity_passes * samples / config.intensity_batch_size)
+    intensity = config.intensity_iterations or max(config.min_intensity_iterations, passes)
+    return {"sdf": sdf, "intensity": intensity if with_intensity else 0}
 
 
 def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
