@@ -41,8 +41,22 @@ def street(count: int) -> Rays:
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     points = sensors + rays * range_m[:, None]
     return Rays(
-        np.zeros(3), *(a.astype(np.float32) for a in (points, rays, range_m)), intensities=None, scans=scans
+        origin=np.zeros(3),
+        points=points.astype(np.float32),
+        directions=rays.astype(np.float32),
+        ranges_m=range_m.astype(np.float32),
+        intensities=None,
+        scans=scans,
     )
+
+
+def scans_of(rays: Rays) -> tuple[list[np.ndarray], np.ndarray]:
+    """A street's returns (F times (N_i, 3), sensor frame, m), and poses (F, 4, 4), as a fit takes them."""
+    poses = np.eye(4)[None].repeat(int(rays.scans[-1]) + 1, 0)
+    poses[:, 0, 3] = np.arange(len(poses)) - rays.scans.mean()
+    poses[:, 2, 3] = 2.0
+    points = np.split(rays.points, np.flatnonzero(np.diff(rays.scans)) + 1)
+    return [(p - T[:3, 3]).astype(np.float32) for p, T in zip(points, poses, strict=True)], poses
 
 
 def memory_mb(field: str) -> float:

@@ -6,29 +6,45 @@
 #pragma once
 
 #include <algorithm>
+#include <atomic>
 #include <cstdint>
 #include <exception>
+#include <thread>
 
 namespace radarsdf {
 
 // 0 or less: as many as OpenMP would use (OMP_NUM_THREADS is respected); at most 1024. Never sets a global.
+// In a process that was forked, 1: OpenMP's threads stayed with the parent, and to wait for them would be for ever.
 int resolve_num_threads(int num_threads);
 
+// What a long call asks, at most ten times a second, on the thread that made it: `check` may throw to end the call.
+void set_interrupt_check(void (*check)());
+void check_interrupt();
+
 // Runs task(i) for i in [0, num_tasks) on up to num_threads threads, each task whole on one thread.
-// An exception thrown by a task is rethrown here after all have ended: it must not leave an OpenMP region.
+// An exception thrown by a task is rethrown here, and the tasks not yet begun are left out: it must not leave an OpenMP
+// region.
 template <typename Task>
 void parallel_tasks(std::int64_t num_tasks, int num_threads, const Task& task) {
   const int threads = static_cast<int>(std::min<std::int64_t>(resolve_num_threads(num_threads), num_tasks));
   if (threads <= 1) {
-    for (std::int64_t i = 0; i < num_tasks; ++i) task(i);
+    for (std::int64_t i = 0; i < num_tasks; ++i) {
+      check_interrupt();
+      task(i);
+    }
     return;
   }
   std::exception_ptr error;
+  std::atomic<bool> failed{false};
+  const std::thread::id caller = std::this_thread::get_id();
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
   for (std::int64_t i = 0; i < num_tasks; ++i) {
+    if (failed) continue;
     try {
+      if (std::this_thread::get_id() == caller) check_interrupt();
       task(i);
     } catch (...) {
+      failed = true;
 #pragma omp critical(radarsdf_parallel_error)
       if (!error) error = std::current_exception();
     }

@@ -164,8 +164,10 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
     return -1;
   };
 
-  parallel_blocks(count, 1 << 10, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
+  constexpr std::int64_t kRays = 1 << 12;  // a task: few enough for a long walk to be interrupted
+  parallel_tasks((count + kRays - 1) / kRays, num_threads, [&](std::int64_t task) {
+    const std::int64_t end = std::min(count, (task + 1) * kRays);
+    for (std::int64_t i = task * kRays; i < end; ++i) {
       crossed[i] = -1;
       const double range_m = ranges_m[i];
       double start[3], direction[3];

@@ -68,6 +68,7 @@ std::int64_t assign_rows(const VertexGroup& group, const std::vector<std::uint64
   std::vector<std::uint64_t> columns = projected;
   sort_unique(columns, num_threads);
 
+  check_interrupt();
   std::vector<std::uint64_t> vertices;
   vertices.reserve(columns.size() * static_cast<std::size_t>(group.num_corners));
   for (const std::uint64_t column : columns) {
@@ -79,6 +80,7 @@ std::int64_t assign_rows(const VertexGroup& group, const std::vector<std::uint64
     throw std::invalid_argument("the map needs more than 2^31 vertices: use larger cells");
   }
 
+  check_interrupt();
   FlatMap row_of(vertices.size());
   for (std::size_t i = 0; i < vertices.size(); ++i)
     row_of.insert(vertices[i], static_cast<std::int32_t>(first_row) + static_cast<std::int32_t>(i));

@@ -27,7 +27,7 @@ LEAF_M = 0.2
 
 
 def occupied_voxels(radar_map, voxel_size):
-    return _voxels_of(radar_map.field.cells.table.leaf_cells(), LEAF_M, voxel_size)
+    return _voxels_of(radar_map.field.cells.table.leaf_cells(), voxel_size, radar_map.config)
 
 
 def with_changes(radar_map, *, origin=(0, 0, 0), **settings):

@@ -25,6 +25,17 @@ def main(arguments: list[str] | None = None) -> None:
     save.add_argument("--count", type=int, default=200, help="kills; default: 200")
     random = commands.add_parser("arguments", help="random arguments for the public functions")
     random.add_argument("--count", type=int, default=2000, help="examples for each; default: 2000")
+    interrupts = commands.add_parser("interrupts", help="Ctrl-C at many moments of a fit and of a mesh")
+    interrupts.add_argument("--returns", type=int, default=3_000_000, help="default: 3000000")
+    interrupts.add_argument("--count", type=int, default=40, help="of each; default: 40")
+    memory = commands.add_parser(
+        "memory", help="memory of fits against their estimates, and of many fits in a row"
+    )
+    memory.add_argument("--largest", type=int, default=3_000_000, help="returns; default: 3000000")
+    memory.add_argument("--count", type=int, default=100, help="fits in a row; default: 100")
+    training = commands.add_parser("training", help="extreme settings, and very many iterations")
+    training.add_argument("--iterations", type=int, default=1000, help="of each case; default: 1000")
+    training.add_argument("--longest", type=int, default=100_000, help="of the default; default: 100000")
     words = parser.parse_args(arguments)
     if words.command == "kernels":
         from .kernels import BATCHES, run  # noqa: PLC0415 - each command imports what it needs
@@ -38,6 +49,18 @@ def main(arguments: list[str] | None = None) -> None:
         from .save import run as run_save  # noqa: PLC0415
 
         run_save(words.count)
+    elif words.command == "interrupts":
+        from .interrupts import run as run_interrupts  # noqa: PLC0415
+
+        run_interrupts(words.returns, words.count)
+    elif words.command == "memory":
+        from .memory import run as run_memory  # noqa: PLC0415
+
+        run_memory(words.largest, words.count)
+    elif words.command == "training":
+        from .training import run as run_training  # noqa: PLC0415
+
+        run_training(words.iterations, words.longest)
     else:
         environment = os.environ | {"RADARSDF_EXAMPLES": str(words.count)}
         tests = Path(__file__).parents[2] / "tests" / "test_arguments.py"

@@ -8,7 +8,18 @@
 
 namespace radarsdf {
 
+namespace {
+
+// Python runs its handlers of signals, Ctrl-C's among them, only when a call returns, unless it is asked to.
+void check_signals() {
+  const py::gil_scoped_acquire hold;
+  if (PyErr_CheckSignals() != 0) throw py::error_already_set();
+}
+
+}  // namespace
+
 void bind_system(py::module_& m) {
+  set_interrupt_check(&check_signals);
   using namespace py::literals;
   m.attr("__version__") = RADARSDF_VERSION;
   m.def(

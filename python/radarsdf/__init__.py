@@ -8,16 +8,30 @@ from typing import TYPE_CHECKING
 
 import torch  # noqa: F401 - before the compiled core, which then shares PyTorch's OpenMP runtime
 
+from radarsdf.budget import Estimate, estimate
 from radarsdf.config import FitConfig
 from radarsdf.fitting import fit
 from radarsdf.isosurface import marching_cubes
 from radarsdf.map import RadarMap
+from radarsdf.stopping import Diverged, Interrupted
 from radarsdf.storage import load
 
 if TYPE_CHECKING:
     from radarsdf import evaluation, simulate
 
-__all__ = ["FitConfig", "RadarMap", "evaluation", "fit", "load", "marching_cubes", "simulate"]
+__all__ = [
+    "Diverged",
+    "Estimate",
+    "FitConfig",
+    "Interrupted",
+    "RadarMap",
+    "estimate",
+    "evaluation",
+    "fit",
+    "load",
+    "marching_cubes",
+    "simulate",
+]
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -18,7 +18,7 @@ import torch
 import trimesh
 
 import radarsdf
-from radarsdf import FitConfig, RadarMap, _core
+from radarsdf import Diverged, FitConfig, Interrupted, RadarMap, _core
 from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
 from radarsdf.picture import save_picture
 from radarsdf.readers import Scans, read_scans, write_scans
@@ -29,9 +29,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         options.run(options)
-    except (ValueError, OSError, ImportError, FloatingPointError) as error:
+    except (ValueError, OSError, ImportError, FloatingPointError, MemoryError) as error:
         print(f"radarsdf {options.command}: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt as interruption:
+        print(f"radarsdf {options.command}: {interruption or 'interrupted'}", file=sys.stderr)
+        return 130  # as shells have it: 128 and the number of the signal
     return 0
 
 
@@ -56,9 +59,17 @@ def _parser() -> argparse.ArgumentParser:
 
     fit = _command(commands, "fit", _fit, "fit a map to scans")
     fit.add_argument("scans", type=Path, help=".npz with points, frame, poses and, if any, intensity, static")
-    fit.add_argument("-o", "--out", type=Path, required=True, help="the map, .safetensors")
+    out = fit.add_mutually_exclusive_group(required=True)
+    out.add_argument("-o", "--out", type=Path, help="the map, .safetensors")
+    out.add_argument("--dry-run", action="store_true", help="only estimate memory and time")
     fit.add_argument("--holdout", type=int, metavar="N", help="leave out the first and then every N-th scan")
     fit.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
+    fit.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="PATH",
+        help="write the state there on the way, and go on from it if it exists; removed once the map is written",
+    )
     _fit_options(fit)
 
     mesh = _command(commands, "mesh", _mesh, "turn a map into triangles")
@@ -188,11 +199,28 @@ def _fit(options: argparse.Namespace) -> None:
     if options.holdout:
         scans = scans.select(holdout(len(scans.points), options.holdout)[0])
     intensities = None if options.geometry_only else scans.intensities
+    config = _config(options)
+    if options.dry_run:
+        print(radarsdf.estimate(scans.points, scans.poses, intensities, config=config))
+        return
     started = time.perf_counter()
-    radar_map = radarsdf.fit(
-        scans.points, scans.poses, intensities, config=_config(options), progress=_progress(options)
-    )
+    try:
+        radar_map = radarsdf.fit(
+            scans.points,
+            scans.poses,
+            intensities,
+            config=config,
+            progress=_progress(options),
+            checkpoint=options.checkpoint,
+        )
+    except (Interrupted, Diverged) as stop:
+        if stop.radar_map is not None:
+            stop.radar_map.save(options.out)
+            stop.args = (f"{stop}; the map so far is in {options.out}",)
+        raise
     radar_map.save(options.out)
+    if options.checkpoint is not None:
+        options.checkpoint.unlink(missing_ok=True)
     print(f"fit {time.perf_counter() - started:.1f} s: {radar_map}, written to {options.out}")
 
 

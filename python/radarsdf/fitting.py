@@ -5,25 +5,27 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Sequence
+from os import PathLike
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf import threads
 from radarsdf._core import CellSet
 from radarsdf.averaging import start_from_average
+from radarsdf.budget import check_fit
+from radarsdf.checkpoint import Checkpoint
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
 from radarsdf.map import IntensityScale, RadarMap
 from radarsdf.scans import Rays, prepare
+from radarsdf.stopping import Diverged, Interrupted
 from radarsdf.surfels import Surfels, support_of
 from radarsdf.threads import Workers
 from radarsdf.training import Training
-
-_global_generator = threading.Lock()
 
 
 def fit(
@@ -33,6 +35,7 @@ def fit(
     *,
     config: FitConfig | None = None,
     progress: bool | None = None,
+    checkpoint: str | PathLike[str] | None = None,
 ) -> RadarMap:
     """Fits a signed distance field, and with intensities a reflectance field, to radar returns.
 
@@ -48,6 +51,10 @@ def fit(
         Every choice of the fit; ``FitConfig.paper()`` is the published configuration.
     progress : bool, optional
         Whether to show a progress bar; by default only on a terminal.
+    checkpoint : path-like, optional
+        File that the state of the training is written to every half minute, and when it is interrupted or done. If the
+        file exists, a fit of the same scans, configuration and number of threads goes on from it, and ends with the
+        same bits as one without a stop. It stays when the fit is done, to be removed once the map is saved.
 
     Returns
     -------
@@ -58,9 +65,14 @@ def fit(
     Raises
     ------
     ValueError
-        For scans or poses that cannot be what they should be; see :func:`radarsdf.scans.prepare`.
-    FloatingPointError
-        If a loss stops being finite.
+        For scans or poses that cannot be what they should be, see :func:`radarsdf.scans.prepare`, and for a
+        `checkpoint` that is damaged or belongs to another fit.
+    MemoryError
+        If the estimate of :func:`radarsdf.estimate` exceeds ``config.max_memory_bytes``, or what the system has.
+    Interrupted
+        A KeyboardInterrupt, for Ctrl-C: with the map so far as its ``radar_map``.
+    Diverged
+        A FloatingPointError, if a loss or parameter stops being finite: with the last good map as its ``radar_map``.
 
     Examples
     --------
@@ -73,53 +85,68 @@ def fit(
     """
     config = FitConfig() if config is None else config
     clock = _Clock()
-    rays = prepare(
-        points,
-        poses,
-        intensities,
-        min_range_m=config.min_range_m,
-        max_range_m=config.max_range_m,
-        accumulate_frames=config.accumulate_frames,
-    )
-    clock.lap("prepare_s")
-    with Workers(config.num_threads) as workers:
-        surface = rays
-        if config.drop_ghosts:
-            is_ghost = Surfels.of(rays, workers.num_threads).ghosts(rays, workers.num_threads)
-            surface = rays.select(~is_ghost)
-            clock.lap("ghosts_s")
-        field = _new_field(surface, config, workers.num_threads)
-        clock.lap("occupied_cells_s")
-        if config.start == "average":
-            start_from_average(field, surface, config, workers.num_threads)
-            clock.lap("average_s")
-        scale = IntensityScale.of(rays.intensities)
-        training = Training(field, surface, rays, scale, config, workers)
-        training.run(progress)
-        clock.lap("training_s")
-        support = support_of(
-            surface.points, field.cells.table.leaf_keys(), config.leaf_size_m, workers.num_threads
+    radar_map = None
+    try:
+        rays = prepare(
+            points,
+            poses,
+            intensities,
+            min_range_m=config.min_range_m,
+            max_range_m=config.max_range_m,
+            accumulate_frames=config.accumulate_frames,
         )
-        clock.lap("support_s")
-    field.requires_grad_(False)
-    report = {
-        "returns": sum(len(np.asarray(scan)) for scan in points),
-        "returns_used": len(surface),
-        "ghosts": len(rays) - len(surface),
-        "leaf_cells": len(field.cells.table.leaf_keys()),
-        "vertices": field.cells.table.num_rows,
-        "iterations": training.iterations,
-        "losses": training.losses,
-        **clock.laps,
-    }
-    return RadarMap(
-        field=field,
-        origin=rays.origin,
-        intensity_scale=scale,
-        config=config,
-        report=report,
-        support=support,
-    )
+        check_fit(rays, config)
+        saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
+        clock.lap("prepare_s")
+        with Workers(config.num_threads) as workers:
+            surface = rays
+            if config.drop_ghosts:
+                is_ghost = Surfels.of(rays, workers.num_threads).ghosts(rays, workers.num_threads)
+                surface = rays.select(~is_ghost)
+                clock.lap("ghosts_s")
+            field = _new_field(surface, config, workers.num_threads)
+            leaf_keys = field.cells.table.leaf_keys()
+            clock.lap("occupied_cells_s")
+            if config.start == "average":
+                start_from_average(field, surface, config, workers.num_threads)
+                clock.lap("average_s")
+            support = support_of(surface.points, leaf_keys, config.leaf_size_m, workers.num_threads)
+            clock.lap("support_s")
+            scale = IntensityScale.of(rays.intensities)
+            training = Training(field, surface, rays, scale, config, workers)
+            if saved is not None:
+                saved.resume(training)
+            report = {
+                "returns": sum(len(np.asarray(scan)) for scan in points),
+                "returns_used": len(surface),
+                "ghosts": len(rays) - len(surface),
+                "leaf_cells": len(leaf_keys),
+                "vertices": field.cells.table.num_rows,
+                "iterations": training.iterations,
+                "iterations_done": training.iterations_done,
+                "losses": training.losses,
+            }
+            # Whole from here on, and better with every iteration: what there is when the training ends too early.
+            radar_map = RadarMap(
+                field=field,
+                origin=rays.origin,
+                intensity_scale=scale,
+                config=config,
+                report=report,
+                support=support,
+            )
+            training.run(progress, saved)
+    except KeyboardInterrupt as interruption:
+        raise Interrupted(radar_map) from interruption
+    except Diverged as error:
+        error.radar_map = radar_map
+        raise
+    finally:
+        if radar_map is not None:
+            clock.lap("training_s")
+            radar_map.report.update(clock.laps)
+            radar_map.field.requires_grad_(False)
+    return radar_map
 
 
 def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
@@ -138,7 +165,7 @@ def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArr
 def _new_field(rays: Rays, config: FitConfig, num_threads: int) -> Field:
     leaf_keys = occupied_leaf_keys(rays, config, num_threads)
     # The layers of torch.nn draw from the global generator, of which fits in several threads take turns.
-    with _global_generator, torch.random.fork_rng(devices=[]):
+    with threads.global_generator, torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         field = Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
         field.cells.initialise(config.feature_std)

@@ -52,7 +52,7 @@ class RadarMap:
 
     Queries take world coordinates, m, as NumPy arrays or CPU tensors, and answer in kind and in the same precision.
     Positions are brought to the map's local frame in float64 before they become float32, so UTM coordinates are fine.
-    Queries may run in many threads at once.
+    Queries may run in many threads at once, and maps be pickled, for workers in other processes.
 
     Attributes
     ----------
@@ -91,6 +91,14 @@ class RadarMap:
         return (
             f"RadarMap({kind}, {len(self._field.cells.table.leaf_keys())} cells, {self.nbytes / 1e6:.1f} MB)"
         )
+
+    def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
+        from safetensors.torch import save as to_bytes  # noqa: PLC0415
+
+        from radarsdf.storage import from_pickle, parts_of  # noqa: PLC0415 - storage is built on the map
+
+        tensors, description = parts_of(self)
+        return from_pickle, (to_bytes(tensors), description)
 
     @property
     def has_intensity(self) -> bool:

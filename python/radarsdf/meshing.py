@@ -13,6 +13,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._checks import MAX_POSITION_M, positive, real_array
+from radarsdf.budget import check_mesh
 from radarsdf.isosurface import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map import evaluate
 from radarsdf.picture import intensity_colors
@@ -66,6 +67,8 @@ def extract_mesh(
     ValueError
         For a voxel size, box, viewpoint or confidence that makes no sense, a viewpoint for a map without intensities,
         or a confidence for a map that does not know it.
+    MemoryError
+        If so many voxels take more than ``config.max_memory_bytes``, or than the system has.
     """
     if not 0 <= min_confidence <= 1:
         msg = f"min_confidence must be in [0, 1], not {min_confidence}"
@@ -82,7 +85,7 @@ def extract_mesh(
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
     if voxel_size < leaf_size_m and _smooth_in_cells(radar_map.config):
         cells = _crossed(radar_map, cells)
-    voxels = _voxels_of(cells, leaf_size_m, voxel_size)
+    voxels = _voxels_of(cells, voxel_size, radar_map.config)
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
@@ -146,13 +149,16 @@ def _crossed(radar_map: RadarMap, cells: NDArray[np.int32]) -> NDArray[np.int32]
     return crossed
 
 
-def _voxels_of(cells: NDArray[np.int32], leaf_size_m: float, voxel_size: float) -> NDArray[np.int32]:
+def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -> NDArray[np.int32]:
     """Lattice coordinates (M, 3) of the voxels that overlap leaf cells; some more than once."""
+    leaf_size_m = config.leaf_size_m
     parts = max(1, math.ceil(min(leaf_size_m / voxel_size, _MAX_VOXELS) - 1e-9))
     if max(len(cells) * (parts + 1) ** 3, int(np.abs(cells).max(initial=0)) * parts) > _MAX_VOXELS:
         msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
         raise ValueError(msg)
-    if math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9):  # voxels divide cells evenly
+    even = math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
+    check_mesh(len(cells) * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
+    if even:
         part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1)
         return (cells[:, None, :] * np.int32(parts) + part.reshape(1, -1, 3)).reshape(-1, 3)
     # Points of the cell no further apart than a voxel, from one end to the other, fall into each voxel that overlaps it.

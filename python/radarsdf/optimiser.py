@@ -37,6 +37,16 @@ class Adam:
         self._squares = [torch.zeros_like(p) for p in self.parameters]
         self._steps = [torch.zeros(()) for _ in self.parameters]
 
+    def state(self) -> dict[str, Tensor]:
+        """What the next steps depend on beside the parameters. Not copies."""
+        lists = {"mean": self._means, "square": self._squares, "steps": self._steps}
+        return {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on as the optimiser of the same parameters that gave `state`."""
+        for name, value in self.state().items():
+            value.copy_(state[name])
+
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor]) -> None:
         """Move the parameters by their gradients, in the same order."""
@@ -84,6 +94,29 @@ class RowAdam:
             slots=torch.full((rows, 1), -1, dtype=torch.int32),
         )
         self._decays = torch.zeros(0, 2, dtype=dtype)
+
+    @property
+    def features(self) -> Tensor:
+        """What is optimised, (num_rows, 8)."""
+        return self._cells.features
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next steps depend on beside the features. Not copies."""
+        memory = self._memory
+        count = torch.tensor(self.step_count)
+        return {"moments": memory.moments, "last_step": memory.last_step, "step_count": count}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on as the optimiser of the same features that gave `state`."""
+        count, last_step = int(state["step_count"]), state["last_step"]
+        if count < 0 or (
+            last_step.numel() and not 0 <= int(last_step.min()) <= int(last_step.max()) <= count
+        ):
+            msg = f"a row cannot have moved after step {count}"  # the core trusts it
+            raise ValueError(msg)
+        self._memory.moments.copy_(state["moments"])
+        self._memory.last_step.copy_(last_step)
+        self.step_count = count
 
     @torch.no_grad()
     def step(self, touched: Sequence[Touched], gradients: Sequence[Tensor], workers: Workers) -> None:

@@ -48,18 +48,40 @@ class RaySampler:
             [torch.from_numpy(a) for a in (rays.points, rays.directions, rays.ranges_m[:, None])], 1
         )[self._original]
         self._order = np.zeros(0, np.int64)
+        self._order_from = torch.zeros_like(generator.get_state())
+        """The generator's state that `_order` was drawn from."""
         self._next = 0
         share = config.near_samples / (config.near_samples + config.free_samples)
         self._num_near = max(1, round(batch_size * share))
         self._num_free = batch_size - self._num_near
+
+    def state(self) -> dict[str, Tensor]:
+        """Where in which order of the rays it is; the generator is its owner's."""
+        drawn = len(self._order) > 0
+        return {"order_from": self._order_from, "next": torch.tensor(self._next if drawn else -1)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on as the sampler of the same rays that gave `state`; leaves the generator in another state."""
+        following = int(state["next"])
+        if not -1 <= following <= len(self._rays):
+            msg = f"a sampler of {len(self._rays)} rays is at none of them"
+            raise ValueError(msg)
+        if following >= 0:
+            self._generator.set_state(state["order_from"])
+            self._draw_order()
+            self._next = following
+
+    def _draw_order(self) -> None:
+        self._order_from = self._generator.get_state()
+        self._order = torch.randperm(len(self._rays), generator=self._generator).numpy()
+        self._next = 0
 
     def _take(self, count: int) -> Tensor:
         """The next `count` rays of the random order, sorted; a new order begins where one ends."""
         parts = []
         while count > 0:
             if self._next >= len(self._order):
-                self._order = torch.randperm(len(self._rays), generator=self._generator).numpy()
-                self._next = 0
+                self._draw_order()
             part = self._order[self._next : self._next + count]
             self._next += len(part)
             count -= len(part)

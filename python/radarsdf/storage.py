@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import safe_open
+from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
@@ -33,6 +34,18 @@ def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
 
     A process that is killed meanwhile may leave a hidden file beside it, ``.NAME.`` and 16 hexadecimal digits.
     """
+    tensors, description = parts_of(radar_map)
+    metadata = {
+        "format": FORMAT,
+        "format_version": str(FORMAT_VERSION),
+        "units": _UNITS,
+        "description": json.dumps(description),
+    }
+    write_whole(path, to_bytes(tensors, metadata))
+
+
+def parts_of(radar_map: RadarMap) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """All numbers of a map, and a description of JSON's types."""
     tensors: dict[str, Tensor] = {
         f"field.{name}": value for name, value in radar_map.field.state_dict().items()
     }
@@ -47,14 +60,17 @@ def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
         "intensity_scale": None if scale is None else [scale.low, scale.high],
         "report": radar_map.report,
     }
-    metadata = {
-        "format": FORMAT,
-        "format_version": str(FORMAT_VERSION),
-        "units": _UNITS,
-        "description": json.dumps(description),
-    }
+    return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
+
+
+def from_pickle(data: bytes, description: dict[str, Any]) -> RadarMap:
+    """What pickles of maps call: no module of PyTorch's is in them."""
+    return _build(from_bytes(data), description)
+
+
+def write_whole(path: str | PathLike[str], data: bytes) -> None:
+    """Writes a file; the old one, if any, is replaced only once the new one is on the disk."""
     target = Path(path)
-    data = to_bytes({name: tensor.contiguous() for name, tensor in tensors.items()}, metadata)
     # Not tempfile, whose files only their owner may read, and a map would stay so.
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
     try:

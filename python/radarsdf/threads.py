@@ -11,6 +11,7 @@ compiled core release it.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
+global_generator = threading.Lock()
+"""Held by whoever draws from PyTorch's global generator of random numbers, and puts its state back."""
+
 _lock = threading.Lock()
 _users = 0
 _threads_before = 0
@@ -34,6 +38,21 @@ _blocks = threading.local()  # .depth: blocks that this thread is in
 def _use_one_thread() -> None:
     torch.get_num_threads()  # a thread's first call of anything else would undo the next line
     torch.set_num_threads(1)
+
+
+def _begin_anew() -> None:
+    """In a forked child there is only the thread that forked, and OpenMP waits for its others for ever.
+
+    A lock that another thread held would never be released. The compiled core sees to its own number of threads.
+    """
+    global global_generator, _lock, _users, _blocks
+    global_generator, _lock = threading.Lock(), threading.Lock()
+    _users, _blocks = 0, threading.local()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_anew)
 
 
 def resolve_num_threads(num_threads: int) -> int:
@@ -73,12 +92,14 @@ class Workers:
     ) -> None:
         global _users  # noqa: PLW0603
         assert self._pool is not None
-        self._pool.shutdown(cancel_futures=True)
-        with _lock:
-            _users -= 1
-            _blocks.depth -= 1
-            if _blocks.depth == 0:
-                torch.set_num_threads(_blocks.threads_before)
+        try:
+            self._pool.shutdown(cancel_futures=True)
+        finally:  # a second Ctrl-C does not wait for the threads
+            with _lock:
+                _users -= 1
+                _blocks.depth -= 1
+                if _blocks.depth == 0:
+                    torch.set_num_threads(_blocks.threads_before)
 
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
         """Like the built-in, in order, the items on different threads. Grad mode is each thread's own."""

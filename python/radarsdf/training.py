@@ -9,12 +9,13 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from radarsdf.checkpoint import Checkpoint
 from radarsdf.config import MAX_THREADS, FitConfig
 from radarsdf.encodings import Touched
 from radarsdf.field import Field, Geometry
@@ -23,9 +24,13 @@ from radarsdf.map import IntensityScale
 from radarsdf.optimiser import Adam, RowAdam
 from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays
+from radarsdf.schedule import Schedule
+from radarsdf.stopping import Diverged, deferred_interrupts
 from radarsdf.threads import Workers
 
-_DROPOUT_HALF_PASSES = 3.0  # each sample seen so often: half of the configured dropout
+_KEEP_EVERY = (
+    100  # iterations: to look through all parameters, and copy them, in each would cost a tenth of it
+)
 
 
 class _Source:
@@ -57,23 +62,42 @@ class _Shard:
         returns: Rays,
         scale: IntensityScale | None,
         config: FitConfig,
+        schedule: Schedule,
         part: int,
         parts: int,
-        dropout_scale: float,
     ) -> None:
         self._field = field
         self._config = config
         generator = torch.Generator().manual_seed(config.seed * MAX_THREADS + part)
 
         def source(rays: Rays) -> _Source:
-            share = _share(config.batch_size, part, parts)
+            share = _share(schedule.batch_size, part, parts)
             return _Source(rays.every(parts, part), scale, config, share, generator)
 
         self._surface = source(surface)
         # A ghost has an intensity, though no surface: the sensor will see it again.
         self._returns = self._surface if returns is surface or scale is None else source(returns)
-        self._dropouts = (dropout_scale * config.feature_dropout, dropout_scale * config.fourier_dropout)
+        dropouts = (config.feature_dropout, config.fourier_dropout)
+        self._dropouts = [schedule.dropout_scale * dropout for dropout in dropouts]
         self._intensity_batch_size = _share(config.intensity_batch_size, part, parts)
+        self._generator = generator
+        self.joint_parts: dict[str, Tensor] = {}
+        """The two losses of the last joint one."""
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next batches depend on."""
+        samplers = self._samplers()
+        state = {f"{name}.{k}": v for name, sampler in samplers.items() for k, v in sampler.state().items()}
+        return state | {"generator": self._generator.get_state()}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        for name, sampler in self._samplers().items():
+            sampler.restore(_part(state, name))
+        self._generator.set_state(state["generator"])  # last: the samplers draw their orders again
+
+    def _samplers(self) -> dict[str, RaySampler]:
+        samplers = {"surface": self._surface.sampler}
+        return samplers if self._returns is self._surface else samplers | {"returns": self._returns.sampler}
 
     def geometry_loss(self, touched: list[Touched] | None) -> Tensor:
         samples = self._surface.sampler.batch()
@@ -83,8 +107,10 @@ class _Shard:
     def joint_loss(self, touched: list[Touched] | None) -> Tensor:
         samples = self._surface.sampler.batch()
         geometry = self._field.geometry(samples.points, frozen=False, touched=touched)
-        loss = sdf_loss(geometry.logit, samples.sdf_m, self._config.sigma_m)
-        return self._config.sdf_loss_weight * loss + self._intensity_loss(samples, self._surface, geometry)
+        sdf = sdf_loss(geometry.logit, samples.sdf_m, self._config.sigma_m)
+        intensity = self._intensity_loss(samples, self._surface, geometry)
+        self.joint_parts = {"sdf": sdf.detach(), "intensity": intensity.detach()}
+        return self._config.sdf_loss_weight * sdf + intensity
 
     def reflectance_loss(self, _: list[Touched] | None) -> Tensor:
         if self._config.intensity_in_free_space:
@@ -127,6 +153,15 @@ class _Gradients:
     """Of `touched`, in the same order."""
 
 
+@dataclass(frozen=True)
+class _Pauses:
+    """What is asked after each iteration."""
+
+    bar: Any
+    interrupted: Callable[[], bool]
+    checkpoint: Checkpoint | None
+
+
 class Training:
     """The schedule: geometry first, then, on frozen geometry, reflectance; or, as published, both from the start.
 
@@ -146,62 +181,103 @@ class Training:
         self._field = field
         self._config = config
         self._workers = workers
-        # Through normals the loss sees the features twice, which only autograd can take apart.
-        self._by_rows = config.row_updates and not (config.joint and config.normals and scale is not None)
-        parts = min(workers.num_threads, len(surface), config.batch_size, config.intensity_batch_size)
-        samples = len(surface) * (config.near_samples + config.free_samples)
-        passes = math.ceil(config.sdf_passes * samples / config.batch_size)
-        self._sdf_iterations = (
-            max(config.min_sdf_iterations, passes) if config.sdf_iterations is None else config.sdf_iterations
+        schedule = Schedule.of(
+            config,
+            surface_returns=len(surface),
+            returns=len(returns),
+            leaf_cells=len(field.cells.table.leaf_keys()),
+            with_intensity=scale is not None,
         )
-        samples = len(returns) * config.near_samples
-        self._intensity_iterations = config.intensity_iterations or max(
-            config.min_intensity_iterations,
-            math.ceil(config.intensity_passes * samples / config.intensity_batch_size),
-        )
-        # Where each sample is seen often, there is more to learn by heart. The same dropout for all (0.7 and 0.2) would
-        # be as good on sparse scenes, and cost 2 % on a dense one, whose samples are seen twice.
-        times_seen = self._intensity_iterations * config.intensity_batch_size / samples
-        dropout_scale = times_seen / (times_seen + _DROPOUT_HALF_PASSES)
+        self.iterations = schedule.iterations
+        parts = min(workers.num_threads, len(surface), schedule.batch_size, config.intensity_batch_size)
         self._shards = [
-            _Shard(field, surface, returns, scale, config, part, parts, dropout_scale)
-            for part in range(parts)
+            _Shard(field, surface, returns, scale, config, schedule, part, parts) for part in range(parts)
         ]
-        if scale is None:
-            self._intensity_iterations = 0
-        self.iterations = {"sdf": self._sdf_iterations, "intensity": self._intensity_iterations}
+        self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
+        geometry = list(field.sdf_network.parameters())
+        self._rows = None
+        # Through normals the loss sees the features twice, which only autograd can take apart.
+        if config.row_updates and not (config.joint and config.normals and scale is not None):
+            self._rows = RowAdam(field.cells, config.learning_rate, config.adam_epsilon)
+        else:
+            geometry = [*field.cells.parameters(), *geometry]
+        self._adams = {"geometry": Adam(geometry, config.learning_rate, config.adam_epsilon)}
+        if field.intensity_network is not None:
+            self._adams["reflectance"] = Adam(
+                field.intensity_network.parameters(), config.intensity_learning_rate, config.adam_epsilon
+            )
 
-    def run(self, progress: bool | None) -> None:
+    def state(self) -> dict[str, Tensor]:
+        """All that the rest of the training depends on, between two iterations. Not copies."""
+        losses = [self.losses.get(name, 0.0) for name in self.iterations_done]
+        state = {
+            "done": torch.tensor(list(self.iterations_done.values())),
+            "losses": torch.tensor(losses, dtype=torch.float64),
+        }
+        state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
+        for name, adam in self._adams.items():
+            state |= {f"adam.{name}.{k}": v for k, v in adam.state().items()}
+        if self._rows is not None:
+            state |= {f"rows.{k}": v for k, v in self._rows.state().items()}
+        for i, shard in enumerate(self._shards):
+            state |= {f"shard.{i}.{k}": v for k, v in shard.state().items()}
+        return state
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on where another training of the same rays and configuration was when it gave `state`."""
+        done = dict(zip(self.iterations_done, state["done"].tolist(), strict=True))
+        if not all(0 <= done[name] <= self.iterations[name] for name in done):
+            msg = f"{done} iterations of {self.iterations}"
+            raise ValueError(msg)
+        self.iterations_done.update(done)
+        losses = zip(done, state["losses"].tolist(), strict=True)
+        self.losses.update({name: loss for name, loss in losses if done[name]})
+        for name, parameter in self._field.named_parameters():
+            parameter.data.copy_(state[f"field.{name}"])
+        for name, adam in self._adams.items():
+            adam.restore(_part(state, f"adam.{name}"))
+        if self._rows is not None:
+            self._rows.restore(_part(state, "rows"))
+        for i, shard in enumerate(self._shards):
+            shard.restore(_part(state, f"shard.{i}"))
+
+    def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
+        """All iterations that are left.
+
+        Raises
+        ------
+        Diverged
+            With the parameters as they last were when all were finite.
+        KeyboardInterrupt
+            For Ctrl-C, between two iterations.
+        """
         config, field = self._config, self._field
-        reflectance = field.intensity_network
+        geometry, reflectance = self._adams["geometry"], self._adams.get("reflectance")
         joint = config.joint and reflectance is not None
-        rest = max(0, self._intensity_iterations - (self._sdf_iterations if joint else 0))
-        with tqdm(
-            total=self._sdf_iterations + rest,
-            desc="fit",
-            unit="it",
-            disable=None if progress is None else not progress,
-        ) as bar:
-            geometry = list(field.sdf_network.parameters())
-            rows = None
-            if self._by_rows:
-                rows = RowAdam(field.cells, config.learning_rate, config.adam_epsilon)
-            else:
-                geometry = [*field.cells.parameters(), *geometry]
-            adams = [Adam(geometry, config.learning_rate, config.adam_epsilon)]
-            if reflectance is not None:
-                reflectance_adam = Adam(
-                    reflectance.parameters(), config.intensity_learning_rate, config.adam_epsilon
-                )
-                if joint:
-                    adams.append(reflectance_adam)
+        rest = max(0, self.iterations["intensity"] - (self.iterations["sdf"] if joint else 0))
+        with (
+            tqdm(
+                total=self.iterations["sdf"] + rest,
+                desc="fit",
+                unit="it",
+                disable=None if progress is None else not progress,
+            ) as bar,
+            deferred_interrupts() as interrupted,
+        ):
+            pauses = _Pauses(bar, interrupted, checkpoint)
+            adams = [geometry, reflectance] if joint and reflectance is not None else [geometry]
             loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
-            self._loop("sdf", self._sdf_iterations, adams, loss_of, bar, rows)
+            bar.update(sum(self.iterations_done.values()))
+            self._loop("sdf", self.iterations["sdf"], adams, loss_of, pauses, self._rows)
             field.cells.requires_grad_(False)
             field.sdf_network.requires_grad_(False)
             if reflectance is not None and rest:
-                self._loop("intensity", rest, [reflectance_adam], _Shard.reflectance_loss, bar)
+                self._loop("intensity", rest, [reflectance], _Shard.reflectance_loss, pauses)
+            if checkpoint is not None:
+                checkpoint.write(self.state())
+            if interrupted():  # by now all is done, but whoever pressed it wants to stop more than this
+                raise KeyboardInterrupt
 
     def _loop(
         self,
@@ -209,22 +285,32 @@ class Training:
         iterations: int,
         adams: list[Adam],
         loss_of: Callable[[_Shard, list[Touched] | None], Tensor],
-        bar: Any,
+        pauses: _Pauses,
         rows: RowAdam | None = None,
     ) -> None:
         parameters = [p for adam in adams for p in adam.parameters]
+        changing = [*parameters, *([] if rows is None else [rows.features])]
+        kept = [p.detach().clone() for p in changing]
 
         def gradients(shard: _Shard) -> _Gradients:
             touched: list[Touched] = []
             loss = loss_of(shard, None if rows is None else touched) / len(self._shards)
-            interpolated = [t.interpolated for t in touched]
-            found = torch.autograd.grad(loss, [*parameters, *interpolated])
+            found = torch.autograd.grad(loss, [*parameters, *(t.interpolated for t in touched)])
             return _Gradients(loss.detach(), found[: len(parameters)], touched, found[len(parameters) :])
 
-        for i in range(iterations):
+        def give_up(fault: str) -> NoReturn:
+            for parameter, value in zip(changing, kept, strict=True):
+                parameter.data.copy_(value)
+            msg = f"{fault} at iteration {i} of {iterations} of the {name} stage: a lower learning rate may help"
+            raise Diverged(msg)
+
+        for i in range(self.iterations_done[name], iterations):
             # From the full rate on in each stage, also for an Adam that has been through another.
             share = 0.5 * (1 + math.cos(math.pi * i / iterations)) if self._config.cosine_schedule else 1.0
             found = list(self._workers.map(gradients, self._shards))
+            loss = float(sum(part.loss for part in found))
+            if not math.isfinite(loss):
+                give_up(f"the {self._loss_name(name)} loss is {loss}")
             by_parameter = zip(*[part.by_parameters for part in found], strict=True)
             total = iter([functools.reduce(Tensor.add_, parts) for parts in by_parameter])
             if rows is not None:
@@ -237,12 +323,36 @@ class Training:
             for adam in adams:
                 adam.learning_rate = share * adam.full_rate
                 adam.step(list(itertools.islice(total, len(adam.parameters))))
-            bar.update()
-            if i % 100 == 0 or i == iterations - 1:
-                self.losses[name] = float(sum(part.loss for part in found))
-                if not math.isfinite(self.losses[name]):
-                    msg = f"the {name} loss is {self.losses[name]} at iteration {i}: a lower learning rate may help"
-                    raise FloatingPointError(msg)
+            self.losses[name] = loss
+            self.iterations_done[name] = i + 1
+            pauses.bar.update()
+            stop = pauses.interrupted()
+            write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
+            if stop or write or i % _KEEP_EVERY == _KEEP_EVERY - 1 or i == iterations - 1:
+                # The sum is finite only if all are; that it overflows by itself is as bad.
+                if not all(math.isfinite(float(p.detach().sum())) for p in changing):
+                    give_up("a parameter is not finite")
+                for parameter, value in zip(changing, kept, strict=True):
+                    value.copy_(parameter.detach())
+            if write and pauses.checkpoint is not None:
+                pauses.checkpoint.write(self.state())
+            if stop:
+                raise KeyboardInterrupt
+
+    def _loss_name(self, stage: str) -> str:
+        """Which of the losses it is that is not finite."""
+        bad = {
+            name
+            for shard in self._shards
+            for name, value in shard.joint_parts.items()
+            if stage == "sdf" and not math.isfinite(float(value))
+        }
+        return " and ".join(sorted(bad)) or stage
+
+
+def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    """Those of a state whose names begin with `name` and a dot, without these."""
+    return {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")}
 
 
 def _share(count: int, part: int, parts: int) -> int:

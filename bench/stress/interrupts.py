@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Ctrl-C at many moments of a fit and of a mesh: how long until it ends, and whether it hands back a map."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import radarsdf
+from radarsdf import FitConfig, Interrupted
+
+from bench.growth import scans_of, street
+from bench.paper.report import markdown
+
+
+def waits(work: Callable[[], Any], moments: int, seed: int = 0) -> tuple[float, np.ndarray, list[Any]]:
+    """Seconds of the whole work, seconds from each signal to the end, and the map, if any, that it gave."""
+    rng = np.random.default_rng(seed)
+    started_s = time.perf_counter()
+    work()
+    whole_s = time.perf_counter() - started_s
+    found, maps = [], []
+    for share in (np.arange(moments) + rng.random(moments)) / moments:
+        sent_s = 0.0
+
+        def press() -> None:
+            nonlocal sent_s
+            sent_s = time.perf_counter()
+            os.kill(os.getpid(), signal.SIGINT)
+
+        timer = threading.Timer(0.95 * share * whole_s, press)
+        with contextlib.suppress(KeyboardInterrupt):
+            try:
+                timer.start()
+                work()
+                timer.join()
+            except Interrupted as stop:
+                maps.append(stop.radar_map)
+                raise
+        if sent_s:
+            found.append(time.perf_counter() - sent_s)
+    return whole_s, np.array(found), maps
+
+
+def run(returns: int, moments: int) -> None:
+    """Print the table for a fit of a street, and for its mesh."""
+    points, poses = scans_of(street(returns))
+    config = FitConfig(sdf_iterations=100)
+    radar_map = radarsdf.fit(points, poses, config=config, progress=False)
+    rows = []
+    works: dict[str, Callable[[], Any]] = {
+        "fit": lambda: radarsdf.fit(points, poses, config=config, progress=False),
+        "mesh": lambda: radar_map.mesh(0.2, progress=False),
+    }
+    for name, work in works.items():
+        whole_s, wait_s, maps = waits(work, moments)
+        with_map = str(sum(m is not None for m in maps)) if name == "fit" else "–"
+        rows.append(
+            [name, f"{returns:,}", f"{whole_s:.1f}", str(len(wait_s)), with_map]
+            + [f"{np.median(wait_s):.2f}", f"{wait_s.max():.2f}"]
+        )
+    print(
+        markdown(
+            ["what", "returns", "whole, s", "signals", "with a map", "median wait, s", "longest wait, s"],
+            rows,
+        )
+    )

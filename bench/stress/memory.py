@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Memory of fits: against the estimate that is made before, and over many fits in one process. On Linux."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import radarsdf
+from radarsdf import Estimate, FitConfig
+
+from bench.growth import memory_mb, scans_of, street
+from bench.paper.report import markdown
+
+CASES: list[tuple[int, bool, dict[str, Any]]] = [
+    (10_000, True, {}),
+    (100_000, False, {}),
+    (100_000, True, {}),
+    (100_000, True, {"batch_size": 65536, "intensity_batch_size": 65536}),
+    (300_000, True, {"encoding": "octree"}),
+    (1_000_000, True, {"drop_ghosts": False, "leaf_size_m": 0.8}),
+    (1_000_000, True, {}),
+    (3_000_000, False, {}),
+    (3_000_000, True, {}),
+]
+"""Returns, whether with intensities, settings."""
+SHORT: dict[str, Any] = {"sdf_iterations": 60, "intensity_iterations": 72, "batch_size": 16384}
+"""The peak is reached once most rows have moved: pages of zeros take no memory."""
+
+
+def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
+    points, poses = scans_of(street(count))
+    intensities = [50 - 40 * np.log10(np.linalg.norm(p, axis=1)) for p in points]
+    return points, poses, intensities if with_intensities else None
+
+
+def peak_of_a_fit(count: int, with_intensities: bool, changes: dict[str, Any]) -> tuple[Estimate, float]:
+    """The estimate, and the measured peak over what there was before, bytes, in a process of its own."""
+    case = json.dumps([count, with_intensities, SHORT | changes])
+    # Without the threshold, memory that was freed but kept would hide some of the peak.
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}
+    command = [sys.executable, "-m", "bench.stress.memory", case]
+    done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    values, peak = json.loads(done.stdout)
+    return Estimate(**values), peak
+
+
+def _measure(count: int, with_intensities: bool, changes: dict[str, Any]) -> None:
+    scans, config = _street(count, with_intensities), FitConfig(**changes)
+    estimate = radarsdf.estimate(*scans, config=config)
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
+    before_mb = memory_mb("VmRSS")
+    radarsdf.fit(*scans, config=config, progress=False)
+    print(json.dumps([vars(estimate), 1e6 * (memory_mb("VmHWM") - before_mb)]))
+
+
+def memory_of_fits(count: int, returns: int = 2000) -> list[float]:
+    """MB that this process has after each of so many small fits with a query and a mesh."""
+    scans, config = _street(returns, True), FitConfig(**SHORT | {"batch_size": 1024})
+    found = []
+    for _ in range(count):
+        radar_map = radarsdf.fit(*scans, config=config, progress=False)
+        radar_map.sdf(np.zeros((10_000, 3)))
+        radar_map.mesh(0.2, progress=False)
+        found.append(memory_mb("VmRSS"))
+    return found
+
+
+def run(largest: int, fits: int) -> None:
+    """Print the two tables."""
+    rows = []
+    for count, with_intensities, changes in CASES:
+        if count <= largest:
+            estimate, peak = peak_of_a_fit(count, with_intensities, changes)
+            settings = ", ".join(f"{k} {v}" for k, v in changes.items()) or "default"
+            rows.append(
+                [f"{count:,}", "yes" if with_intensities else "no", settings, f"{estimate.leaf_cells:,}"]
+                + [f"{peak / 1e6:.0f}", f"{estimate.peak_memory_bytes / 1e6:.0f}"]
+                + [f"{estimate.peak_memory_bytes / peak:.2f}"]
+            )
+    columns = [
+        "returns",
+        "intensities",
+        "settings",
+        "leaf cells, estimated",
+        "peak, MB",
+        "estimate, MB",
+        "ratio",
+    ]
+    print(markdown(columns, rows))
+    found = memory_of_fits(fits)
+    after = sorted({1, 2, max(1, fits // 10), max(1, fits // 2), fits})
+    print(markdown(["fits in a row", "MB"], [[str(n), f"{found[n - 1]:.1f}"] for n in after]))
+
+
+if __name__ == "__main__":
+    _measure(*json.loads(sys.argv[1]))

@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Training at the edges of its settings, and for very long: every number of the map stays finite, or the fit says where."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import radarsdf
+from radarsdf import Diverged, FitConfig, RadarMap
+
+from bench.paper.report import markdown
+
+CASES: dict[str, dict[str, Any]] = {
+    "default": {},
+    **{f"learning rates {r:g}": {"learning_rate": r, "intensity_learning_rate": r} for r in
+       (1e-4, 1e-3, 1e-1, 1.0)},
+    "learning rates 1, constant": {"learning_rate": 1.0, "intensity_learning_rate": 1.0, "cosine_schedule": False},
+    **{f"sigma {s:g} m": {"sigma_m": s} for s in (1e-3, 1e-2, 1.0, 10.0)},
+    # Labels of hundreds of sigmas, and logits that overtake them.
+    "saturated": {"sigma_m": 1e-3, "free_beyond_m": 50.0, "learning_rate": 0.1},
+    "no free space": {"free_samples": 0},
+    "batches of one": {"batch_size": 1, "intensity_batch_size": 1},
+    "one near sample": {"near_samples": 1, "free_samples": 1000},
+    "all of 3QFPI": {"normals": True, "geometry_feature_dim": 15, "intensity_in_free_space": True},
+    "most is dropped": {"feature_dropout": 0.95, "fourier_dropout": 0.95},
+    "features of 1e6": {"feature_std": 1e6},
+}  # fmt: skip
+"""Settings beside the default."""
+
+
+def room(returns: int = 300, seed: int = 0) -> tuple[list[Any], Any, list[Any]]:
+    """Three scans, poses and intensities of a box of 8 m x 8 m x 3 m seen from within."""
+    rng = np.random.default_rng(seed)
+    points, poses, intensities = [], np.eye(4)[None].repeat(3, 0), []
+    for i, pose in enumerate(poses):
+        pose[:3, 3] = [0.2 * i, 0.0, 0.0]
+        rays = rng.normal(size=(returns, 3))
+        walls_m = (np.where(rays > 0, [4, 4, 1.5], [-4, -4, -1.5]) - pose[:3, 3]) / rays
+        points.append(rays * walls_m.min(axis=1, keepdims=True))
+        intensities.append(60 - 40 * np.log10(np.linalg.norm(points[-1], axis=1)))
+    return points, poses, intensities
+
+
+def fitted(changes: dict[str, Any], iterations: int) -> tuple[RadarMap, str]:
+    """A map of the room, and how the fit ended.
+
+    Raises
+    ------
+    AssertionError
+        If any number of the map, or of its answers, is not finite.
+    """
+    config = FitConfig(
+        **({"batch_size": 256, "intensity_batch_size": 256, "min_range_m": 0.5, "num_threads": 1} | changes)
+    )
+    config = dataclasses.replace(config, sdf_iterations=iterations, intensity_iterations=2 * iterations)
+    points, poses, intensities = room()
+    try:
+        radar_map, end = radarsdf.fit(points, poses, intensities, config=config, progress=False), "done"
+    except Diverged as error:
+        radar_map, end = error.radar_map, str(error)
+    assert radar_map is not None
+    assert all(value.isfinite().all() for value in radar_map.field.state_dict().values())
+    assert all(np.isfinite(loss) for loss in radar_map.report["losses"].values())
+    x = np.random.default_rng(1).uniform(-4.5, 4.5, (2000, 3))
+    for values in (radar_map.sdf(x), radar_map.gradient(x), radar_map.intensity(x, poses[0, :3, 3])):
+        assert np.isfinite(values).all()
+    assert np.isfinite(radar_map.mesh(0.2, progress=False).vertices).all()
+    return radar_map, end
+
+
+def free_and_solid(radar_map: RadarMap) -> tuple[float, float]:
+    """Shares of places 0.2 m in front of the walls that are free, and 0.2 m behind them that are not."""
+    rng = np.random.default_rng(2)
+    rays = rng.normal(size=(2000, 3))
+    on_wall = rays * (np.array([4, 4, 1.5]) / np.abs(rays)).min(axis=1, keepdims=True)
+    outward = np.where(np.isclose(np.abs(on_wall), [4, 4, 1.5]), np.sign(on_wall), 0.0)
+    free = float((radar_map.sdf(on_wall - 0.2 * outward) > 0).mean())
+    return free, float((radar_map.sdf(on_wall + 0.2 * outward) < 0).mean())
+
+
+def run(iterations: int, longest: int) -> None:
+    """Print a row for each case, and one for the longest fit."""
+    rows = []
+    for name, changes in [*CASES.items(), ("default, long", {})]:
+        count = longest if name == "default, long" else iterations
+        radar_map, end = fitted(changes, count)
+        free, solid = free_and_solid(radar_map)
+        losses = ", ".join(f"{name} {loss:.3g}" for name, loss in radar_map.report["losses"].items())
+        rows.append([name, f"{count:,}", end, losses, f"{100 * free:.0f}", f"{100 * solid:.0f}"])
+        print(f"{name}: {end}", flush=True)
+    print(markdown(["case", "iterations", "end", "last losses", "free in front, %", "solid behind, %"], rows))

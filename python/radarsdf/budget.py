@@ -1,0 +1,278 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a fit or a mesh will take, before it is begun: an estimate, and an error where there is not so much memory."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf.config import FitConfig
+from radarsdf.kernels import FEATURE_DIM
+from radarsdf.scans import Rays, prepare
+from radarsdf.schedule import Schedule
+from radarsdf.threads import resolve_num_threads
+
+# Measured: peaks of fits of 1e4 to 3e6 returns of a street, over what the process had before; `bench.stress memory`
+# repeats it, and a test holds it. Bytes.
+_ALWAYS = 55e6  # code that is loaded on the way, stacks and arenas of the threads
+_PER_RETURN = 30.0
+_PER_INTENSITY = 20.0
+_PER_RETURN_AGAIN = 110.0  # where the intensities are learnt from other returns than the surface
+_PER_RETURN_CHECKED = 200.0  # passing, in float64, before there is anything else
+_PER_CELL = 215.0
+_PER_OCTREE_ROW = 110.0  # passing, while they are numbered
+_COPIES = 4  # of each parameter: itself, two moments, the last good one; where all rows move, a gradient for each thread
+_PER_ROW = 8.0  # where only the touched rows do
+_PER_VOXEL = 220.0
+
+# Orders of magnitude, of one processor of 2023 on a quiet machine. Seconds.
+_RETURN_S, _CELL_S, _SAMPLE_S, _ROW_S = 1e-6, 1.5e-6, 1.2e-6, 2e-8
+
+_SAMPLE = 50_000  # returns whose cells are counted
+_COLUMN = 16  # leaf cells: edge of the pieces of space that are in the sample as a whole
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a fit will take."""
+
+    peak_memory_bytes: int
+    """Over what the process has before; within a factor of 1.5 on scans like those it was measured on."""
+    seconds: float
+    """An order of magnitude: nothing is known of the machine but its threads."""
+    returns: int
+    """Within the ranges."""
+    leaf_cells: int
+    """Estimated, with the ghosts."""
+    vertices: int
+    """Rows of features, estimated likewise."""
+    iterations: dict[str, int]
+    """Of the stages `sdf` and `intensity`."""
+
+    def __str__(self) -> str:
+        return (
+            f"{self.returns} returns, about {self.leaf_cells} leaf cells and {self.vertices} vertices, "
+            f"{self.iterations['sdf']} + {self.iterations['intensity']} iterations: "
+            f"about {self.peak_memory_bytes / 1e9:.2f} GB and {self.seconds:.0f} s"
+        )
+
+
+def estimate(
+    points: Sequence[ArrayLike],
+    poses: ArrayLike,
+    intensities: Sequence[ArrayLike] | None = None,
+    *,
+    config: FitConfig | None = None,
+) -> Estimate:
+    """What :func:`radarsdf.fit` of the same arguments will take, in a small part of that.
+
+    Parameters and errors are those of :func:`radarsdf.fit`.
+
+    Examples
+    --------
+    >>> import radarsdf
+    >>> scans = radarsdf.simulate.wall(frames=4)
+    >>> estimate = radarsdf.estimate(scans.points, scans.poses)
+    >>> 10e6 < estimate.peak_memory_bytes < 1e9
+    True
+    """
+    config = FitConfig() if config is None else config
+    return estimate_rays(
+        prepare(
+            points,
+            poses,
+            intensities,
+            min_range_m=config.min_range_m,
+            max_range_m=config.max_range_m,
+            accumulate_frames=config.accumulate_frames,
+        ),
+        config,
+    )
+
+
+def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
+    """:func:`estimate` for returns that are prepared."""
+    count, threads = len(rays), resolve_num_threads(config.num_threads)
+    cells, rows = _count_cells(rays, config)
+    schedule = _schedule(rays, cells, config)
+    iterations = schedule.iterations
+    samples = iterations["sdf"] * schedule.batch_size + iterations["intensity"] * config.intensity_batch_size
+    seconds = count * _RETURN_S + cells * _CELL_S + samples * _SAMPLE_S * _sample_bytes(config) / 1700
+    return Estimate(
+        peak_memory_bytes=_fit_bytes(rays, cells, rows, config),
+        seconds=seconds / threads + rows * _ROW_S * iterations["sdf"],
+        returns=count,
+        leaf_cells=cells,
+        vertices=rows,
+        iterations=iterations,
+    )
+
+
+def _schedule(rays: Rays, cells: int, config: FitConfig) -> Schedule:
+    count, with_intensity = len(rays), rays.intensities is not None
+    return Schedule.of(
+        config, surface_returns=count, returns=count, leaf_cells=cells, with_intensity=with_intensity
+    )
+
+
+def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
+    count, with_intensity = len(rays), rays.intensities is not None
+    parameters = rows * FEATURE_DIM + _network_parameters(config, with_intensity)
+    memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL
+    gradients = 0 if config.row_updates else resolve_num_threads(config.num_threads)
+    memory += 4 * parameters * (_COPIES + gradients) + config.row_updates * rows * _PER_ROW
+    batch_size = max(_schedule(rays, cells, config).batch_size, with_intensity * config.intensity_batch_size)
+    memory += batch_size * _sample_bytes(config)
+    if with_intensity:
+        memory += count * (_PER_INTENSITY + config.drop_ghosts * _PER_RETURN_AGAIN)
+    passing = count * _PER_RETURN_CHECKED
+    if config.encoding == "octree":
+        passing = max(passing, _ALWAYS + cells * _PER_CELL + rows * _PER_OCTREE_ROW)
+    return int(max(memory, passing))
+
+
+def check_fit(rays: Rays, config: FitConfig) -> None:
+    """Raises a MemoryError where a fit would take more than there is."""
+    available = available_bytes() if config.max_memory_bytes is None else config.max_memory_bytes
+    # No line of samples meets more cells, and no cell has more corners: where this is little, there is nothing to count.
+    cells = len(rays) * (3 * math.ceil(2 * config.near_band_m / config.leaf_size_m) + 3)
+    corners = 12 if config.encoding == "tri-quadtree" else 8
+    if available is None or _fit_bytes(rays, cells, cells * corners * config.num_levels, config) <= available:
+        return
+    expected = estimate_rays(rays, config)
+    if expected.peak_memory_bytes > available:
+        msg = (
+            f"the fit would take about {expected.peak_memory_bytes / 1e9:.2f} GB for {expected.leaf_cells} leaf cells "
+            f"and {expected.returns} returns, of {available / 1e9:.2f}: use larger cells (leaf_size_m), leave out what "
+            "is far (max_range_m), or set max_memory_bytes if you know better"
+        )
+        raise MemoryError(msg)
+
+
+def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> None:
+    """Raises a MemoryError where so many voxels would take more than there is."""
+    available = available_bytes() if max_memory_bytes is None else max_memory_bytes
+    if available is not None and voxels * _PER_VOXEL > available:
+        msg = (
+            f"voxels of {voxel_size} m would take about {voxels * _PER_VOXEL / 1e9:.2f} GB, of "
+            f"{available / 1e9:.2f}: use larger ones"
+        )
+        raise MemoryError(msg)
+
+
+def available_bytes(root: Path = Path("/")) -> int | None:
+    """What this process may still take: what the system has, and its control group. None where nobody says."""
+    found = []
+    try:
+        lines = (root / "proc/meminfo").read_text().splitlines()
+        found.append(next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable")))
+        groups = (root / "proc/self/cgroup").read_text().splitlines()
+    except (OSError, StopIteration):
+        groups = []
+    top = root / "sys/fs/cgroup"
+    folders = [(top, "memory.max", "memory.current")]
+    for line in groups:
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            folders.append((top / path.lstrip("/"), "memory.max", "memory.current"))
+        elif "memory" in controllers.split(","):
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes")
+            folders += [(top / "memory" / path.lstrip("/"), *names), (top / "memory", *names)]
+    for folder, limit, usage in folders:
+        try:
+            left = int((folder / limit).read_text()) - int((folder / usage).read_text())
+            stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        except (OSError, ValueError):  # no such group, or "max"
+            continue
+        found.append(max(0, left + int(stat.get("inactive_file", 0))))  # which the system gives up
+    return min(found) if found else None
+
+
+def _sample_bytes(config: FitConfig) -> float:
+    """Of a sample in a batch: what its gradient needs of its way through the encoding and the networks."""
+    encoding = config.num_levels * FEATURE_DIM + 6 * config.fourier_count
+    numbers = 2 * encoding + sum(config.sdf_hidden) + sum(config.intensity_hidden)
+    return 4.0 * numbers * (3 if config.normals else 1)  # of normals, the gradient of a gradient
+
+
+def _network_parameters(config: FitConfig, with_intensity: bool) -> int:
+    encoding = config.num_levels * FEATURE_DIM + 6 * config.fourier_count
+    sdf = (encoding, *config.sdf_hidden, 1 + config.geometry_feature_dim)
+    intensity = (encoding + 32 + config.geometry_feature_dim, *config.intensity_hidden, 1)
+    networks = (sdf, intensity) if with_intensity else (sdf,)
+    return sum(a * b for widths in networks for a, b in itertools.pairwise(widths))
+
+
+def _count_cells(rays: Rays, config: FitConfig) -> tuple[int, int]:
+    """Leaf cells and rows of features, from those pieces of space that a hash puts into a sample."""
+    all_axes = (0, 1, 2)
+    planes = [(0, 1), (0, 2), (1, 2)] if config.encoding == "tri-quadtree" else [all_axes]
+    cells = round(sum(_distinct(rays, config, all_axes, [0], corners=False)))
+    rows = sum(
+        sum(_distinct(rays, config, axes, list(range(config.num_levels)), corners=True)) for axes in planes
+    )
+    return cells, round(rows)
+
+
+def _distinct(
+    rays: Rays, config: FitConfig, axes: tuple[int, ...], levels: list[int], *, corners: bool
+) -> list[float]:
+    """Occupied cells of each level, or corners of them, by these of their coordinates alone."""
+    share = min(1.0, _SAMPLE / len(rays))
+    band = np.array([-config.near_band_m, 0.0, config.near_band_m])
+    chosen = np.zeros(len(rays), bool)
+    for offset in band if share < 1 else ():
+        lattice = _lattice(rays, slice(None), np.array([offset]), axes, config.leaf_size_m)
+        chosen |= _in_sample(lattice, share)
+    used = np.flatnonzero(chosen) if share < 1 else slice(None)
+    steps = int(np.ceil(4 * config.near_band_m / config.leaf_size_m).clip(1, 64))
+    lattice = _lattice(rays, used, np.linspace(band[0], band[2], steps + 1), axes, config.leaf_size_m)
+    counts = []
+    for level in levels:
+        found = _unique_rows(lattice >> level)
+        if corners:
+            steps_to = np.stack(np.meshgrid(*[[0, 1]] * len(axes), indexing="ij"), -1).reshape(-1, len(axes))
+            found = _unique_rows((found[:, None, :] + steps_to).reshape(-1, len(axes)))
+        # Each by its own place: a return's cells, and a cell's corners, may lie in a column that is not in the sample.
+        counts.append(len(found) if share == 1 else int(_in_sample(found << level, share).sum()) / share)
+    return counts
+
+
+def _lattice(
+    rays: Rays,
+    used: slice | NDArray[np.int64],
+    offsets: NDArray[np.float64],
+    axes: tuple[int, ...],
+    leaf_size_m: float,
+) -> NDArray[np.int64]:
+    columns = list(axes)
+    start, direction = rays.points[used][:, columns], rays.directions[used][:, columns]
+    points = start[:, None, :] + offsets[None, :, None].astype(np.float32) * direction[:, None, :]
+    limit = float(2**40)  # what is further out has no cells, as the fit will say
+    lattice: NDArray[np.int64] = np.floor((points / leaf_size_m).clip(-limit, limit)).astype(np.int64)
+    return lattice.reshape(-1, len(axes))
+
+
+def _in_sample(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
+    """Whether a hash of its column puts a cell into the sample."""
+    hashed = np.zeros(len(lattice), np.uint64)
+    for coordinate in (lattice // _COLUMN).T:
+        hashed = (hashed ^ coordinate.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        hashed ^= hashed >> np.uint64(29)
+    return (hashed >> np.uint64(40)) < np.uint64(share * 2**24)
+
+
+def _unique_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Different rows; much faster than NumPy's, which compares them as bytes."""
+    ordered = rows[np.lexsort(rows.T)]
+    new = np.ones(len(ordered), bool)
+    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    different: NDArray[np.int64] = ordered[new]
+    return different

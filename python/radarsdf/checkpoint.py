@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The state of a fit in a file, from which it goes on to the bits that it would have come to without a stop."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import warnings
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
+from torch import Tensor
+
+from radarsdf import _core
+from radarsdf.config import FitConfig
+from radarsdf.readers import check_regular_file
+from radarsdf.scans import Rays
+from radarsdf.storage import write_whole
+
+if TYPE_CHECKING:
+    from radarsdf.training import Training
+
+FORMAT = "radarsdf.checkpoint"
+_EVERY_S = 30.0
+_SHARE = 0.02  # of the time, at most, goes into writing
+_NOT_OF_THE_TRAINING = ("num_threads", "max_memory_bytes", "min_support", "min_component_triangles")
+
+
+class Checkpoint:
+    """A file that the training writes its state to, every half minute or, where that takes long, less often.
+
+    Parameters
+    ----------
+    path : path-like
+        Written whole or not at all. If it exists, it must be a checkpoint of the same fit.
+    rays, config
+        What is fitted, and how: the file holds a digest of the first and a copy of the second.
+
+    Raises
+    ------
+    ValueError
+        If the file is no checkpoint, or one of other scans, another configuration or another version.
+    OSError
+        If it cannot be read, or its folder does not exist.
+    """
+
+    def __init__(self, path: str | PathLike[str], rays: Rays, config: FitConfig) -> None:
+        self._path = Path(path)
+        settings = {k: v for k, v in config.to_dict().items() if k not in _NOT_OF_THE_TRAINING}
+        self._identity: dict[str, Any] = json.loads(
+            json.dumps({"version": _core.__version__, "scans": _digest(rays), "config": settings})
+        )
+        self._next_s = time.monotonic() + _EVERY_S
+        if self._path.exists():
+            check_regular_file(self._path)
+            self._check_identity()
+        elif not self._path.parent.is_dir():
+            msg = f"there is no folder {self._path.parent} for the checkpoint"
+            raise FileNotFoundError(msg)
+
+    def due(self) -> bool:
+        """Whether it is time to write."""
+        return time.monotonic() >= self._next_s
+
+    def write(self, state: dict[str, Tensor]) -> None:
+        """Replaces the file. If that fails, a warning says so: to go on without is better than to stop."""
+        started_s = time.monotonic()
+        metadata = {"format": FORMAT, "identity": json.dumps(self._identity)}
+        try:
+            write_whole(self._path, to_bytes({k: v.contiguous() for k, v in state.items()}, metadata))
+        except OSError as error:
+            warnings.warn(f"no checkpoint: {error}", RuntimeWarning, stacklevel=2)
+        now_s = time.monotonic()
+        self._next_s = now_s + max(_EVERY_S, (now_s - started_s) / _SHARE)
+
+    def resume(self, training: Training) -> None:
+        """Brings a training to where the file says it was; does nothing if there is no file.
+
+        Raises
+        ------
+        ValueError
+            If the file is damaged, or was begun with another number of threads.
+        """
+        if not self._path.exists():
+            return
+        expected = training.state()
+        try:
+            with safe_open(self._path, framework="pt") as file:
+                if (names := set(file.keys())) != set(expected):
+                    shards = sum(name.endswith(".generator") for name in names)
+                    msg = f"other tensors: perhaps of {shards} threads"
+                    raise ValueError(msg)
+                for name, tensor in expected.items():
+                    shape = tuple(file.get_slice(name).get_shape())
+                    if shape != tuple(tensor.shape):  # before it is read: it could be of any size
+                        msg = f"{name} has shape {shape} instead of {tuple(tensor.shape)}"
+                        raise ValueError(msg)
+                state = {name: file.get_tensor(name).clone() for name in expected}
+            for name, value in state.items():
+                if value.dtype != expected[name].dtype or not value.isfinite().all():
+                    msg = f"{name} holds something other than finite {expected[name].dtype}"
+                    raise ValueError(msg)
+            training.restore(state)
+        except OSError:
+            raise
+        except Exception as error:  # of which kind depends on where a damaged file breaks off
+            msg = f"{self._path} is not a whole checkpoint of this fit: {error}"
+            raise ValueError(msg) from error
+
+    def _check_identity(self) -> None:
+        identity: Any = None
+        try:
+            with safe_open(self._path, framework="pt") as file:
+                metadata = file.metadata() or {}
+            if metadata.get("format") == FORMAT:
+                identity = json.loads(metadata["identity"])
+        except (SafetensorError, KeyError, ValueError, RecursionError):
+            pass
+        if (
+            not isinstance(identity, dict)
+            or identity.keys() != self._identity.keys()
+            or not isinstance(identity["config"], dict)
+        ):
+            msg = f"{self._path} is not a checkpoint of a fit: it is left as it is"
+            raise ValueError(msg)
+        if identity["version"] != self._identity["version"]:
+            msg = (
+                f"{self._path} was written by radarsdf {identity['version']!r:.50}: remove it to begin again"
+            )
+            raise ValueError(msg)
+        if identity["config"] != self._identity["config"]:
+            ours, theirs = self._identity["config"], identity["config"]
+            names = sorted(k for k in ours.keys() | theirs.keys() if ours.get(k) != theirs.get(k))
+            msg = f"{self._path} is a checkpoint of another configuration: {', '.join(names)!s:.200} differ"
+            raise ValueError(msg)
+        if identity["scans"] != self._identity["scans"]:
+            msg = f"{self._path} is a checkpoint of other scans, poses or intensities"
+            raise ValueError(msg)
+
+
+def _digest(rays: Rays) -> str:
+    """Of all that the training sees of the scans."""
+    digest = hashlib.blake2b(digest_size=16)
+    for array in (rays.origin, rays.points, rays.directions, rays.ranges_m, rays.intensities):
+        digest.update(b"-" if array is None else array.data if array.flags.c_contiguous else array.tobytes())
+    return digest.hexdigest()

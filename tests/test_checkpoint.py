@@ -1,0 +1,264 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A fit that goes on from a checkpoint ends with the bits of one without a stop, and from nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import sys
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig, Interrupted
+from radarsdf.training import Training
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+# Batches of more rays than there are, so that the order is drawn anew, and two stages.
+QUICK = FitConfig(
+    sdf_iterations=30, intensity_iterations=60, batch_size=1024, intensity_batch_size=700, num_threads=2
+)
+
+
+def fitted(scene, path=None, config=QUICK, intensities=True):
+    given = scene.intensities if intensities else None
+    return radarsdf.fit(scene.points, scene.poses, given, config=config, progress=False, checkpoint=path)
+
+
+def interrupted_after(iterations, monkeypatch, *arguments, **keywords):
+    """Ctrl-C, as the loop sees it, after so many iterations of a fit: what was done by then."""
+
+    class Deferred:
+        def __enter__(self):
+            self.left = iterations
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def __call__(self):
+            self.left -= 1
+            return self.left == 0
+
+    with monkeypatch.context() as patch:
+        patch.setattr("radarsdf.training.deferred_interrupts", Deferred)
+        with pytest.raises(Interrupted) as caught:
+            fitted(*arguments, **keywords)
+    return caught.value.radar_map.report["iterations_done"]
+
+
+def assert_same_bits(one, other):
+    for name, value in one.field.state_dict().items():
+        assert torch.equal(value, other.field.state_dict()[name]), name
+    assert one.report["losses"] == other.report["losses"]
+    assert one.report["iterations_done"] == other.report["iterations_done"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"joint": False}, {"num_threads": 1}, {"drop_ghosts": False, "intensity_batch_size": 300}],
+)
+def test_stopped_again_and_again_it_ends_with_the_same_bits(scene, tmp_path, monkeypatch, changes):
+    config = dataclasses.replace(QUICK, **changes)
+    whole = fitted(scene, config=config)
+    path = tmp_path / "state"
+    for stops in range(1, 4 if config.joint else 6):  # of 60 iterations in all, or of 90
+        done = interrupted_after(17, monkeypatch, scene, path, config)
+        assert sum(done.values()) == 17 * stops
+    resumed = fitted(scene, path, config)
+    assert_same_bits(whole, resumed)
+
+
+def test_without_intensities(scene, tmp_path, monkeypatch):
+    whole = fitted(scene, intensities=False)
+    interrupted_after(8, monkeypatch, scene, tmp_path / "state", intensities=False)
+    assert_same_bits(whole, fitted(scene, tmp_path / "state", intensities=False))
+
+
+def test_it_is_written_on_the_way_without_changing_the_result(scene, tmp_path, monkeypatch):
+    whole = fitted(scene)
+    monkeypatch.setattr("radarsdf.checkpoint._EVERY_S", 0.0)
+    monkeypatch.setattr("radarsdf.checkpoint._SHARE", 1e9)
+    written = []
+    write = radarsdf.checkpoint.Checkpoint.write
+    monkeypatch.setattr(
+        "radarsdf.checkpoint.Checkpoint.write", lambda self, state: (written.append(1), write(self, state))
+    )
+    assert_same_bits(whole, fitted(scene, tmp_path / "state"))
+    assert len(written) == 61  # each iteration, and the end
+    assert [p.name for p in tmp_path.iterdir()] == ["state"]
+
+
+def test_a_killed_fit_goes_on_from_what_was_written_last(scene, tmp_path):
+    if sys.platform == "win32":
+        pytest.skip("kills by signal")
+    import subprocess  # noqa: PLC0415
+
+    path = tmp_path / "state"
+    code = f"""
+import os, signal
+import radarsdf.checkpoint
+from tests.conftest import ground_and_wall
+from tests.test_checkpoint import fitted
+radarsdf.checkpoint._EVERY_S = 0.0
+radarsdf.checkpoint._SHARE = 1e9
+write, count = radarsdf.checkpoint.Checkpoint.write, 0
+def counted(self, state):
+    global count
+    count += 1
+    write(self, state)
+    if count == 37:
+        os.kill(os.getpid(), signal.SIGKILL)
+radarsdf.checkpoint.Checkpoint.write = counted
+fitted(ground_and_wall(), {str(path)!r})
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
+    with safe_open(path, "pt") as file:
+        assert file.get_tensor("done").sum() == 37
+    assert_same_bits(fitted(scene), fitted(scene, path))
+
+
+def test_when_the_fit_is_done_the_file_gives_its_map_at_once(scene, tmp_path, monkeypatch):
+    whole = fitted(scene, tmp_path / "state")
+    monkeypatch.setattr("radarsdf.optimiser.Adam.step", lambda *_: pytest.fail("a step"))
+    assert_same_bits(whole, fitted(scene, tmp_path / "state"))
+
+
+class TestOtherFiles:
+    """One clear ValueError, and the file stays."""
+
+    @pytest.fixture
+    def path(self, scene, tmp_path, monkeypatch):
+        interrupted_after(3, monkeypatch, scene, tmp_path / "state")
+        return tmp_path / "state"
+
+    @staticmethod
+    def refused(scene, path, match, **changes):
+        before = path.read_bytes()
+        with pytest.raises(ValueError, match=match):
+            fitted(scene, path, dataclasses.replace(QUICK, **changes))
+        assert path.read_bytes() == before
+
+    def test_of_another_configuration(self, scene, path):
+        self.refused(
+            scene, path, "another configuration: learning_rate, seed differ", learning_rate=0.5, seed=3
+        )
+
+    def test_of_other_threads(self, scene, path):
+        self.refused(scene, path, "other tensors: perhaps of 2 threads", num_threads=3)
+
+    def test_of_other_scans(self, scene, path):
+        poses = scene.poses.copy()
+        poses[2, 0, 3] += 0.001
+        self.refused(dataclasses.replace(scene, poses=poses), path, "other scans, poses or intensities")
+        values = [v.copy() for v in scene.intensities]
+        values[1][0] += 1
+        self.refused(
+            dataclasses.replace(scene, intensities=values), path, "other scans, poses or intensities"
+        )
+
+    def test_settings_of_the_mesh_may_change(self, scene, path):
+        radar_map = fitted(scene, path, dataclasses.replace(QUICK, min_support=0.5))
+        assert radar_map.config.min_support == 0.5
+
+    def test_no_checkpoint_at_all(self, scene, path):
+        for content in (b"", b"scans", bytes(100), b"\xff" * 100):
+            path.write_bytes(content)
+            self.refused(scene, path, "is not a checkpoint of a fit")
+        fitted(scene, config=dataclasses.replace(QUICK, sdf_iterations=1, intensity_iterations=1)).save(path)
+        self.refused(scene, path, "is not a checkpoint of a fit")
+
+    def test_of_another_version(self, scene, path):
+        self.rewrite(path, version="9.9.9")
+        self.refused(scene, path, "was written by radarsdf '9.9.9'")
+
+    @pytest.mark.parametrize("cut", [9, 0.3, 0.9, 0.999])
+    def test_cut_short(self, scene, path, cut):
+        data = path.read_bytes()
+        path.write_bytes(data[: cut if isinstance(cut, int) else int(cut * len(data))])
+        self.refused(scene, path, "is not a")
+
+    @staticmethod
+    def rewrite(path, tensors=None, **identity):
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata()
+            old = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+        metadata["identity"] = json.dumps(json.loads(metadata["identity"]) | identity)
+        save_file(old | (tensors or {}), path, metadata)
+        return old
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("done", torch.tensor([31, 0])),
+            ("done", torch.tensor([-1, 0])),
+            ("done", torch.tensor([1.0, 0.0])),
+            ("field.cells.features", torch.zeros(3, 8)),
+            ("field.cells.features", None),
+            ("shard.0.surface.next", torch.tensor(2**40)),
+            ("shard.0.surface.next", torch.tensor(-7)),
+            ("shard.1.generator", torch.full((5056,), 255, dtype=torch.uint8)),
+            ("shard.1.generator", torch.zeros(5, dtype=torch.uint8)),
+            ("adam.geometry.steps.0", torch.tensor(float("nan"))),
+            ("something", torch.zeros(1)),
+        ],
+    )
+    def test_hostile_tensors(self, scene, path, name, value):
+        if value is None:
+            with safe_open(path, "pt") as file:
+                value = torch.full_like(file.get_tensor(name), float("inf"))
+        self.rewrite(path, {name: value})
+        self.refused(scene, path, "is not a whole checkpoint of this fit")
+
+    def test_hostile_descriptions(self, scene, path):
+        for identity in ({"config": 3}, {"config": {}}, {"scans": []}, {"version": None}, {"more": 1}):
+            self.rewrite(path, **identity)
+            self.refused(scene, path, "checkpoint|written by")
+
+
+def test_a_folder_that_does_not_exist_is_said_before_any_work(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("radarsdf.fitting.Surfels.of", lambda *_: pytest.fail("began"))
+    with pytest.raises(FileNotFoundError, match="no folder"):
+        fitted(scene, tmp_path / "nowhere" / "state")
+
+
+def test_a_full_disk_is_a_warning_and_the_fit_goes_on(scene, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("radarsdf.checkpoint.write_whole", full)
+    with pytest.warns(RuntimeWarning, match="no checkpoint: .*No space"):
+        radar_map = fitted(scene, tmp_path / "state")
+    assert np.isfinite(radar_map.sdf(np.zeros((1, 3)))).all()
+
+
+def test_the_state_is_all_there_is(scene):
+    """What a training changes is in its state: else two of the tests above would pass by luck."""
+    taken = []
+    loop = Training._loop
+
+    def look(training, *arguments):
+        loop(training, *arguments)
+        taken.append({k: v.clone() for k, v in training.state().items()})
+
+    Training._loop = look
+    try:
+        fitted(scene)
+    finally:
+        Training._loop = loop
+    first, second = taken
+    frozen = [k for k in first if k.startswith(("field.cells", "field.sdf", "adam.geometry"))]
+    assert all(torch.equal(first[k], second[k]) for k in frozen)
+    for part in (
+        "field.intensity_network",
+        "adam.reflectance.mean",
+        "shard.0.generator",
+        "shard.1.returns.next",
+    ):
+        names = [k for k in first if k.startswith(part)]
+        assert names
+        assert not all(torch.equal(first[k], second[k]) for k in names), part

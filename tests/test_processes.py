@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Forked and spawned processes, pickles, many threads: right answers, and never a deadlock."""
+
+from __future__ import annotations
+
+import copy
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
+
+QUICK = FitConfig(sdf_iterations=20, intensity_iterations=20, batch_size=1024)
+X = np.random.default_rng(0).uniform([8, -5, -1], [20, 5, 3], (30_000, 3))
+
+FORK = """
+import os, signal, sys, threading
+import numpy as np, torch, radarsdf
+from tests.conftest import ground_and_wall
+from tests.test_processes import QUICK, X
+torch.set_num_threads(2)
+scene = ground_and_wall()
+def fitted(threads=0):
+    config = type(QUICK)(**(QUICK.to_dict() | {"num_threads": threads}))
+    return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+radar_map = fitted()
+sdf, mesh, product = radar_map.sdf(X), radar_map.mesh(0.2), torch.ones(700, 700) @ torch.ones(700, 700)
+"""
+CHILD = """
+child = os.fork()
+if child == 0:
+    signal.alarm(40)  # instead of waiting for ever
+    assert np.array_equal(radar_map.sdf(X), sdf)
+    assert np.array_equal(radar_map.mesh(0.2).faces, mesh.faces)
+    assert torch.equal(torch.ones(700, 700) @ torch.ones(700, 700), product)
+    assert torch.get_num_threads() == 1
+    again = fitted(threads=2)  # as many as the parent had: the same bits
+    assert np.array_equal(again.sdf(X), sdf)
+    os._exit(17)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
+"""
+
+
+def run(code):
+    subprocess.run([sys.executable, "-W", "ignore::DeprecationWarning", "-c", code], check=True, timeout=100)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+class TestFork:
+    def test_a_child_answers_and_fits_as_its_parent(self):
+        run(FORK + CHILD)
+
+    def test_a_child_forked_while_another_thread_fits(self):
+        # That thread's locks, and PyTorch's setting while it works, come along; it does not.
+        inside = """
+threads = [threading.Thread(target=lambda: [fitted() for _ in range(4)]) for _ in range(2)]
+for thread in threads:
+    thread.start()
+for _ in range(3):
+    child = os.fork()
+    if child == 0:
+        signal.alarm(40)
+        assert np.array_equal(radar_map.sdf(X), sdf)
+        assert np.array_equal(fitted(threads=2).sdf(X), sdf)
+        os._exit(17)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
+for thread in threads:
+    thread.join()
+assert torch.get_num_threads() == 2
+"""
+        run(FORK + inside)
+
+
+def answers(radar_map, x):
+    return radar_map.sdf(x), radar_map.confidence(x), radar_map.intensity(x, np.zeros(3))
+
+
+def test_a_map_goes_to_spawned_workers(radar_map):
+    pieces = np.array_split(X[:2000], 4)
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        found = list(pool.map(answers, [radar_map] * 4, pieces))
+    for there, here in zip(zip(*found, strict=True), answers(radar_map, X[:2000]), strict=True):
+        np.testing.assert_array_equal(np.concatenate(there), here)
+
+
+def test_pickles_and_copies_are_the_same_map(radar_map):
+    without = radarsdf.fit([X], np.eye(4)[None], config=QUICK, progress=False)
+    without.support = None  # as from a file of an earlier version
+    for original in (radar_map, without):
+        for other in (pickle.loads(pickle.dumps(original)), copy.deepcopy(original)):
+            np.testing.assert_array_equal(other.sdf(X), original.sdf(X))
+            assert (other.config, other.report) == (original.config, original.report)
+            assert other.has_intensity == original.has_intensity
+            assert (other.support is None) == (original.support is None)
+            assert other.origin.tolist() == original.origin.tolist()
+
+
+def test_a_pickle_holds_no_modules(radar_map):
+    names = [
+        str(a)
+        for op, a, _ in __import__("pickletools").genops(pickle.dumps(radar_map))
+        if op.name != "BINBYTES"
+    ]
+    assert not [name for name in names if "torch" in name]
+
+
+def test_queries_from_many_threads_give_the_bits_of_one(radar_map):
+    threads_before = torch.get_num_threads()
+    expected = radar_map.sdf(X), radar_map.gradient(X), radar_map.mesh(0.2).vertices
+    wrong = []
+
+    def work():
+        for _ in range(3):
+            found = radar_map.sdf(X), radar_map.gradient(X), radar_map.mesh(0.2).vertices
+            wrong.extend([1 for a, b in zip(found, expected, strict=True) if not np.array_equal(a, b)])
+
+    threads = [threading.Thread(target=work) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+    assert torch.get_num_threads() == threads_before

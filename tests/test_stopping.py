@@ -1,0 +1,251 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A fit that ends before its time, by Ctrl-C or by numbers that are not finite, ends soon and hands back what it has."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import Diverged, FitConfig, Interrupted
+from radarsdf.optimiser import Adam
+from radarsdf.readers import Scans, write_scans
+from radarsdf.stopping import deferred_interrupts
+
+from .conftest import ground_and_wall
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+LONG = {"sdf_iterations": 1_000_000, "batch_size": 512}
+WITHIN_S = 5.0
+"""Of what takes half a second on a quiet machine; the work interrupted would take longer on any."""
+
+
+def interrupted_python(code, after="ready", delay_s=0.3):
+    """Runs code, presses Ctrl-C some time after it says it is ready; what it says then, and its exit status."""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    try:
+        while after not in (line := process.stdout.readline()):
+            assert line, "ended before it was ready"
+        time.sleep(delay_s)
+        process.send_signal(signal.SIGINT)
+        started_s = time.monotonic()
+        assert process.stdout.readline() == "stopped\n"
+        assert time.monotonic() - started_s < WITHIN_S
+        said = process.stdout.read()
+        process.wait(timeout=60)
+    finally:
+        process.kill()
+        process.stdout.close()
+        process.wait()
+    return said, process.returncode
+
+
+FIT = """
+import sys
+import radarsdf
+from tests.conftest import ground_and_wall
+from radarsdf import FitConfig, Interrupted
+from radarsdf.training import Training
+run = Training.run
+def announced(*arguments):
+    print("ready", flush=True)
+    run(*arguments)
+Training.run = announced
+scene = ground_and_wall()
+try:
+    radarsdf.fit(scene.points, scene.poses, {intensities}, config=FitConfig(**{config}), progress=False)
+except KeyboardInterrupt as error:
+    print("stopped", flush=True)
+    radar_map = error.radar_map
+    done = radar_map.report["iterations_done"]
+    assert type(error) is radarsdf.Interrupted
+    assert 0 < done["sdf"] < 1_000_000, done
+    assert radar_map.report["training_s"] > 0
+    assert (radar_map.sdf(scene.poses[:, :3, 3]) > 0).all()
+    assert radar_map.confidence(scene.poses[:, :3, 3]).max() == 0
+    assert len(radar_map.mesh(0.2).faces) > 100
+    print("a map")
+"""
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ctrl_c_while_training_hands_back_the_map(threads):
+    code = FIT.format(intensities="scene.intensities", config=LONG | {"num_threads": threads})
+    assert interrupted_python(code, delay_s=2.0) == ("a map\n", 0)
+
+
+def test_ctrl_c_before_the_training_has_no_map():
+    # Walks 3 million rays of 300 m in one call of the core, which takes many seconds.
+    code = """
+import numpy as np
+import radarsdf
+rng = np.random.default_rng(0)
+points = rng.normal(size=(3_000_000, 3))
+points *= 300 / np.linalg.norm(points, axis=1, keepdims=True)
+prepare = radarsdf.fitting.prepare
+def announced(*arguments, **keywords):
+    rays = prepare(*arguments, **keywords)
+    print("ready", flush=True)
+    return rays
+radarsdf.fitting.prepare = announced
+try:
+    radarsdf.fit([points], np.eye(4)[None], progress=False)
+except radarsdf.Interrupted as error:
+    print("stopped", flush=True)
+    print("no map" if error.radar_map is None else error.radar_map)
+"""
+    assert interrupted_python(code, delay_s=0.5) == ("no map\n", 0)
+
+
+def test_ctrl_c_ends_a_mesh():
+    code = """
+import radarsdf
+from tests.conftest import ground_and_wall
+scene = ground_and_wall()
+config = radarsdf.FitConfig(sdf_iterations=5)
+radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
+print("ready", flush=True)
+try:
+    while True:
+        radar_map.mesh(0.03)
+except KeyboardInterrupt:
+    print("stopped", flush=True)
+"""
+    assert interrupted_python(code, delay_s=1.0) == ("", 0)
+
+
+def test_the_command_saves_the_map_so_far_and_says_so_in_one_line(tmp_path):
+    scene = ground_and_wall()
+    write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "radarsdf", "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
+        + ["--quiet", "--set", "sdf_iterations=1000000", "--checkpoint", str(tmp_path / "state")],
+        stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    time.sleep(6)
+    while not (tmp_path / "map.safetensors").exists() and process.poll() is None:
+        process.send_signal(signal.SIGINT)  # again where it came before the training
+        time.sleep(3)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert (
+        said == f"radarsdf fit: interrupted while training; the map so far is in {tmp_path}/map.safetensors\n"
+    )
+    radar_map = radarsdf.load(tmp_path / "map.safetensors")
+    assert 0 < radar_map.report["iterations_done"]["sdf"] < 1_000_000
+    assert (tmp_path / "state").exists()
+
+
+def test_a_deferred_interrupt_is_remembered_and_a_second_is_not():
+    usual = signal.getsignal(signal.SIGINT)
+    with deferred_interrupts() as pressed:
+        assert not pressed()
+        signal.raise_signal(signal.SIGINT)
+        assert pressed()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is usual
+
+
+def test_someone_elses_handler_stays():
+    seen = []
+    usual = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
+    try:
+        with deferred_interrupts() as pressed:
+            signal.raise_signal(signal.SIGINT)
+            assert not pressed()
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    assert seen == [1]
+
+
+@pytest.fixture
+def poisoned(monkeypatch):
+    """Makes the n-th step see one gradient that is not a number."""
+    step = Adam.step
+
+    def at(n):
+        count = 0
+
+        def poisoned_step(adam, gradients):
+            nonlocal count
+            count += 1
+            if count == n:
+                gradients[0].view(-1)[0] = math.nan
+            step(adam, gradients)
+
+        monkeypatch.setattr(Adam, "step", poisoned_step)
+
+    return at
+
+
+def test_a_gradient_that_is_not_finite_never_reaches_the_map(scene, poisoned):
+    poisoned(230)
+    config = FitConfig(sdf_iterations=400, batch_size=512)
+    with pytest.raises(
+        Diverged, match=r"not finite at iteration \d+ of 400 of the sdf stage|loss is nan"
+    ) as caught:
+        radarsdf.fit(scene.points, scene.poses, config=config)
+    radar_map = caught.value.radar_map
+    assert all(value.isfinite().all() for value in radar_map.field.state_dict().values())
+    assert 229 <= radar_map.report["iterations_done"]["sdf"] <= 300
+    assert (radar_map.sdf(scene.poses[:, :3, 3]) > 0).all()  # as learnt before, not as at the start
+
+
+def test_the_last_step_is_looked_at_too(scene, poisoned):
+    poisoned(20)
+    with pytest.raises(Diverged, match="iteration 19 of 20"):
+        radarsdf.fit(scene.points, scene.poses, config=FitConfig(sdf_iterations=20, batch_size=512))
+
+
+@pytest.mark.parametrize("joint", [True, False])
+@pytest.mark.parametrize("name", ["sdf", "intensity"])
+def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypatch, name, joint):
+    loss, calls = getattr(radarsdf.training, f"{name}_loss"), 0
+
+    def failing(*arguments):
+        nonlocal calls
+        calls += 1
+        return loss(*arguments) * (math.inf if calls == 8 else 1)
+
+    monkeypatch.setattr(f"radarsdf.training.{name}_loss", failing)
+    config = FitConfig(sdf_iterations=10, intensity_iterations=20, batch_size=512, num_threads=1, joint=joint)
+    stage, of = ("sdf", 10) if joint or name == "sdf" else ("intensity", 20)
+    expected = f"the {name} loss is inf at iteration 7 of {of} of the {stage} stage"
+    with pytest.raises(Diverged, match=expected) as caught:
+        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
+    assert isinstance(caught.value, FloatingPointError)
+    assert np.isfinite(caught.value.radar_map.sdf(np.zeros((1, 3)))).all()
+
+
+def test_the_map_after_a_divergence_has_no_gradients_and_threads_are_restored(scene):
+    threads = torch.get_num_threads()
+    config = FitConfig(learning_rate=1e30, sdf_iterations=50, cosine_schedule=False)
+    with pytest.raises(Diverged) as caught:
+        radarsdf.fit(scene.points, scene.poses, config=config)
+    assert not any(p.requires_grad for p in caught.value.radar_map.field.parameters())
+    assert torch.get_num_threads() == threads
+
+
+def test_an_interrupted_fit_is_a_keyboard_interrupt_even_where_nobody_defers(scene, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("radarsdf.training.Training.run", interrupt)
+    config = dataclasses.replace(FitConfig(), sdf_iterations=1)
+    with pytest.raises(Interrupted, match="while training") as caught:
+        radarsdf.fit(scene.points, scene.poses, config=config)
+    assert caught.value.radar_map.report["iterations_done"] == {"sdf": 0, "intensity": 0}
+    monkeypatch.setattr("radarsdf.fitting.prepare", interrupt)
+    with pytest.raises(Interrupted, match="before the training") as caught:
+        radarsdf.fit(scene.points, scene.poses, config=config)
+    assert caught.value.radar_map is None
