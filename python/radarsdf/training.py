@@ -135,10 +135,7 @@ class Training:
         self._config = config
         self._workers = workers
         parts = min(workers.num_threads, len(surface), config.batch_size, config.intensity_batch_size)
-        samples = len(surface) * (config.near_samples + config.free_samples)
-        self._sdf_iterations = config.sdf_iterations or max(
-            config.min_sdf_iterations, math.ceil(config.sdf_passes * samples / config.batch_size)
-        )
+        self._sdf_iterations = _sdf_iterations(len(surface), config)
         samples = len(returns) * config.near_samples
         self._intensity_iterations = config.intensity_iterations or max(
             config.min_intensity_iterations,
@@ -211,6 +208,16 @@ class Training:
                 if not math.isfinite(self.losses[name]):
                     msg = f"the {name} loss is {self.losses[name]} at iteration {i}: a lower learning rate may help"
                     raise FloatingPointError(msg)
+
+
+def _sdf_iterations(num_returns: int, config: FitConfig) -> int:
+    """How many iterations the surface gets: too few leave it unfinished, too many passes learn its noise."""
+    one_pass = num_returns * (config.near_samples + config.free_samples) / config.batch_size
+    return config.sdf_iterations or max(
+        config.min_sdf_iterations,
+        math.ceil(config.sdf_passes * one_pass),
+        min(config.enough_sdf_iterations, math.ceil(config.max_sdf_passes * one_pass)),
+    )
 
 
 def _share(count: int, part: int, parts: int) -> int:
