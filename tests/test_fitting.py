@@ -13,6 +13,7 @@ import radarsdf
 import torch
 from radarsdf import FitConfig
 from radarsdf.sampling import RaySampler
+from radarsdf.schedule import Schedule
 
 from .conftest import ground_and_wall
 
@@ -179,6 +180,28 @@ def test_each_stage_of_the_schedule_begins_at_the_full_rate(scene):
         for n in (20, 40)
     )
     assert (after_second - after_first).abs().max() > config.intensity_learning_rate
+
+
+@pytest.mark.parametrize(
+    ("returns", "changes", "expected"),
+    [
+        (100_000, {}, 300),  # one pass is nearly enough
+        (200_000, {}, 586),  # one pass is more than enough
+        (30_000, {}, 176),  # two passes are not enough, and still all that the data gives
+        (2_000, {}, 150),  # without so many iterations there is no surface
+        (100_000, {"sdf_passes": 2.0}, 586),
+        (100_000, {"enough_sdf_iterations": 1}, 293),
+        (20_000, {"max_sdf_passes": 4.0}, 235),
+        (2_000, {"min_sdf_iterations": 40}, 40),
+        (20_000, {"sdf_iterations": 7}, 7),
+    ],
+)
+def test_iterations_until_the_surface_is_finished_but_its_noise_not_learnt(returns, changes, expected):
+    schedule = Schedule.of(
+        FitConfig(**changes), surface_returns=returns, returns=returns, leaf_cells=10**6, with_intensity=False
+    )
+    assert schedule.sdf_iterations == expected
+    assert schedule.batch_size == 4096
 
 
 class TestBadInput:

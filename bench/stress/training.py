@@ -57,6 +57,7 @@ def fitted(changes: dict[str, Any], iterations: int) -> tuple[RadarMap, str]:
     )
     config = dataclasses.replace(config, sdf_iterations=iterations, intensity_iterations=2 * iterations)
     points, poses, intensities = room()
+    radar_map: RadarMap | None
     try:
         radar_map, end = radarsdf.fit(points, poses, intensities, config=config, progress=False), "done"
     except Diverged as error:

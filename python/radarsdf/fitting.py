@@ -20,6 +20,7 @@ from radarsdf.budget import check_fit
 from radarsdf.checkpoint import Checkpoint
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
+from radarsdf.gaps import bridged
 from radarsdf.map import IntensityScale, RadarMap
 from radarsdf.scans import Rays, prepare
 from radarsdf.stopping import Diverged, Interrupted
@@ -163,7 +164,13 @@ def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArr
 
 
 def _new_field(rays: Rays, config: FitConfig, num_threads: int) -> Field:
-    leaf_keys = occupied_leaf_keys(rays, config, num_threads)
+    leaf_keys = bridged(
+        occupied_leaf_keys(rays, config, num_threads),
+        rays,
+        config.leaf_size_m,
+        config.bridge_cells,
+        num_threads,
+    )
     # The layers of torch.nn draw from the global generator, of which fits in several threads take turns.
     with threads.global_generator, torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)

@@ -173,7 +173,10 @@ class RadarMap:
     @overload
     def observed(self, x: ArrayLike) -> NDArray[np.bool_]: ...
     def observed(self, x: Any) -> Any:
-        """Whether the data supports a surface at x (N, 3), world, m: its leaf cell lies round some return. (N,) bool."""
+        """Whether the data supports a surface at x (N, 3), world, m: (N,) bool.
+
+        It does in the leaf cells round a return, and in those of a small gap between two.
+        """
         points, answer = self._local(x)
         return answer(evaluate(self._field.cells.occupied, points))
 
