@@ -115,6 +115,11 @@ def surface():
     return Surface(table, torch.randn(table.num_rows, FEATURE_DIM, generator=generator))
 
 
+@pytest.fixture(scope="session")
+def dense_planes(surface):
+    return surface.dense_planes()
+
+
 @dataclass(frozen=True)
 class Batch:
     """Points, and what NumPy says of their interpolated features."""

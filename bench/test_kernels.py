@@ -48,19 +48,19 @@ class Differentiated:
         return torch.autograd.grad(self._function(*self._features), self._features, out_grad)
 
 
-def ours(surface, batch, _roofline):
+def ours(surface, batch, _fixture):
     way = Differentiated([surface.features], lambda f: kernels.interpolate(f, batch.points, surface.table))
     return way, [surface.features]
 
 
-def indexing(surface, batch, _roofline):
+def indexing(surface, batch, _fixture):
     def function(features):
         return (features[batch.rows] * batch.weights[..., None]).sum(2).flatten(1)
 
     return Differentiated([surface.features], function), [surface.features]
 
 
-def embedding_bag(surface, batch, _roofline):
+def embedding_bag(surface, batch, _fixture):
     rows, weights = batch.rows.view(-1, 12), batch.weights.view(-1, 12)
 
     def function(features):
@@ -70,10 +70,10 @@ def embedding_bag(surface, batch, _roofline):
     return Differentiated([surface.features], function), [surface.features]
 
 
-def grid_sample(surface, batch, _roofline):
+def grid_sample(_surface, batch, fixture):
     """Without a table: planes that are full wherever the scene's box is."""
     planes, grids = [], []
-    for i, (plane, lower, upper) in enumerate(surface.dense_planes()):
+    for i, (plane, lower, upper) in enumerate(fixture("dense_planes")):
         u = batch.points.numpy()[:, PLANES[i % 3]].astype(np.float64) / (LEAF_M * 2 ** (i // 3))
         u = 2 * (u - lower) / (upper - lower) - 1
         grids.append(torch.from_numpy(u[None, :, None, ::-1].astype(np.float32)))
@@ -128,11 +128,9 @@ class Roofline:
 
 
 def roofline_way(threads, scheme):
-    def way(surface, batch, roofline):
-        # Copies and planes on one thread are the same loop in another order.
-        return Roofline(roofline(), surface, batch, threads or torch.get_num_threads(), scheme), [
-            surface.features
-        ]
+    def way(surface, batch, fixture):
+        threads_used = threads or torch.get_num_threads()
+        return Roofline(fixture("roofline"), surface, batch, threads_used, scheme), [surface.features]
 
     return way
 
@@ -155,7 +153,7 @@ ROOFLINES = {
 @pytest.fixture
 def way(request, surface, batch):
     """The parametrised way, and the features that it is given, whatever their form."""
-    return request.param(surface, batch, lambda: request.getfixturevalue("roofline"))
+    return request.param(surface, batch, request.getfixturevalue)
 
 
 def over(ways):
