@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The kernels of encoding and training against the same computation in plain PyTorch.
+"""The kernels of encoding against the same computation in plain PyTorch, and against a bare loop in C++.
 
 Each case asserts a checksum from NumPy in double precision, so that a wrong answer cannot win. Ratios within a group
 and one run mean something; times of different runs or machines do not: see README.md.
@@ -14,14 +14,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from radarsdf import FitConfig, kernels
+from radarsdf import kernels
 from radarsdf._core import CellSet, VertexTable
-from radarsdf.field import Field
-from radarsdf.losses import sdf_loss
-from radarsdf.optimiser import Adam
-from radarsdf.sampling import RaySampler
-from radarsdf.scans import prepare
-from radarsdf.threads import Workers
 
 from .conftest import FEATURE_DIM, LEAF_M, NUM_LEVELS, PLANES, surface_points
 
@@ -231,35 +225,3 @@ def test_table_building(benchmark, cloud, threads):
 
     table = benchmark.pedantic(build, rounds=5, warmup_rounds=1)
     assert len(table.leaf_keys()) == num_cells
-
-
-@pytest.mark.parametrize("batch_size", [1024, 8192])
-def test_training_step(benchmark, batch_size):
-    """Samples, both encodings, SDF network, loss, gradients and Adam, as one worker of a fit does it."""
-    benchmark.group = f"training step, {batch_size} samples, one thread"
-    config = FitConfig()
-    scan = surface_points(100_000, dtype=np.float64) - [0, 0, 8]
-    rays = prepare([scan], np.eye(4)[None])
-    cells = CellSet(config.leaf_size_m)
-    for chunk in rays.along(np.linspace(-config.near_band_m, config.near_band_m, 7)):
-        cells.insert(chunk)
-    torch.manual_seed(0)
-    field = Field(cells.sorted_keys(), config, with_intensity=False)
-    field.cells.initialise(config.feature_std)
-    parameters = list(field.parameters())
-    adam = Adam(parameters, config.learning_rate, config.adam_epsilon)
-    sampler = RaySampler(rays, config, batch_size, torch.Generator().manual_seed(0))
-
-    def step():
-        samples = sampler.batch()
-        loss = sdf_loss(field.logit(samples.points), samples.sdf_m, config.sigma_m)
-        adam.step(torch.autograd.grad(loss, parameters))
-        return loss.item()
-
-    with Workers(1):
-        before = step()
-        benchmark.pedantic(step, rounds=100, warmup_rounds=5)
-        after = [step() for _ in range(60)][
-            -1
-        ]  # enough to learn something where nothing is timed and there is one round
-    assert after < 0.8 * before
