@@ -130,7 +130,9 @@ def table(rows: list[Row]) -> str:
     for (scene,), own in groups(rows, "scene").items():
         methods = medians(own)
         floor = own[0].get("noise_floor")
-        heading = f"### {scene}, {own[0]['returns']:,} returns, medians of {1 + max(r['seed'] for r in own)}"
+        heading = (
+            f"### {scene}, {own[0]['returns']:,} returns, medians of {1 + max(r['repetition'] for r in own)}"
+        )
         if floor is not None:
             heading += f", floor of the MAE {floor:.2f}"
         missing = [f"- {row['method']}: {row['why_not']}" for row in methods if row["why_not"]]

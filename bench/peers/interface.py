@@ -160,7 +160,7 @@ def reconstruct(
         except subprocess.TimeoutExpired:
             return Reconstruction(None, f"no result after {timeout_s:.0f} s")
         if done.returncode != 0:
-            return Reconstruction(None, _reason(done))
+            return Reconstruction(None, failure(done))
         with np.load(result_path) as result:
             vertices, faces = result["vertices"] + origin, result["faces"]
             seconds, peak, map_bytes = (result[k].item() for k in ("seconds", "peak_bytes", "map_bytes"))
@@ -187,12 +187,13 @@ def _interpreter(needs: str) -> tuple[str | None, str]:
         )
         if done.returncode == 0:
             return python, ""
-        why_not = _reason(done)
+        why_not = failure(done)
     hint = INSTALL.get(needs)
     return None, f"{why_not} ({hint})" if hint else why_not
 
 
-def _reason(done: subprocess.CompletedProcess[str]) -> str:
+def failure(done: subprocess.CompletedProcess[str]) -> str:
+    """Why a process failed, in one line."""
     if done.returncode < 0:
         return f"killed by signal {-done.returncode}" + (" (out of memory?)" if done.returncode == -9 else "")
     lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
