@@ -23,7 +23,7 @@ from .scenes import Scene
 
 # Training budgets, in units of the default's.
 _FACTORS = {"1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "1/2": 1 / 2, "1": 1.0, "2": 2.0, "4": 4.0}
-_QUICK_FACTORS = ("1/16", "1")
+_QUICK_FACTORS = ("1/16",)
 _OURS = ("radarsdf", "radarsdf, intensities")
 # What a fit may do or leave out, the other way round than the default has it; intensities are in all of them, since the
 # line without is that lever.
