@@ -242,7 +242,8 @@ def test_map_vtk_flying_edges(benchmark, map_lattice, backend, threads):
 def check_map(vertices, faces, crossed_edges):
     assert len(vertices) == crossed_edges
     assert np.array_equal(np.unique(faces), np.arange(len(vertices)))
-    assert 1.2 * len(vertices) < len(faces) < 2 * len(vertices)  # 2 where it is closed, less at borders
+    # Twice as many on a closed surface; borders take away, handles add.
+    assert 1.2 * len(vertices) < len(faces) < 2.1 * len(vertices)
 
 
 RADIUS, HALF = 80, 96  # of a sphere and its volume, samples
