@@ -4,7 +4,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+import shutil
+import subprocess
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,7 +53,7 @@ class Surface:
 
     def rows_and_weights(self, points):
         """(N, levels, 12) rows and weights: levels, planes, vertices numbered as the table documents it."""
-        leaf = self.table.leaf_cells().astype(np.int64) + _BIAS
+        leaf = self._leaf_cells()
         u = points.astype(np.float32) * np.float32(1 / LEAF_M)
         cell = np.floor(u).astype(np.int64) + _BIAS
         fraction_of_leaf = u.astype(np.float64) + _BIAS
@@ -71,6 +76,28 @@ class Surface:
         shape = (-1, NUM_LEVELS, 12)
         return np.stack(rows, 1).reshape(shape), np.stack(weights, 1).astype(np.float32).reshape(shape)
 
+    def dense_planes(self):
+        """The same features in all cells of the scene's box: (8, H, W) for each level and plane, 0 where there are none.
+
+        With each, the lower corner and the upper one of its vertices, lattice coordinates of its level.
+        """
+        leaf = self._leaf_cells()
+        rows, _ = self.rows_and_weights(((leaf - _BIAS + 0.5) * LEAF_M).astype(np.float32))
+        planes = []
+        for level in range(NUM_LEVELS):
+            for p, axes in enumerate(PLANES):
+                cells = (leaf >> level)[:, axes]
+                lower, upper = cells.min(0), cells.max(0) + 1
+                plane = torch.zeros(FEATURE_DIM, *(upper - lower + 1))
+                for corner in range(4):
+                    i, j = (cells - lower + [corner & 1, corner >> 1]).T
+                    plane[:, i, j] = self.features[rows[:, level, 4 * p + corner]].T
+                planes.append((plane, lower - (_BIAS >> level), upper - (_BIAS >> level)))
+        return planes
+
+    def _leaf_cells(self):
+        return self.table.leaf_cells().astype(np.int64) + _BIAS
+
     @staticmethod
     def _key(cells, axes, corner):
         a, b = ((cells[:, axis] + step).astype(np.uint64) for axis, step in zip(axes, corner, strict=True))
@@ -88,15 +115,46 @@ def surface():
     return Surface(table, torch.randn(table.num_rows, FEATURE_DIM, generator=generator))
 
 
+@pytest.fixture(scope="session")
+def dense_planes(surface):
+    return surface.dense_planes()
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Points, and what NumPy says of their interpolated features."""
+
+    points: torch.Tensor
+    rows: torch.Tensor
+    weights: torch.Tensor
+    total: float
+    """Sum of the interpolated features."""
+    scale: float
+    """Its size, were the signs of the features random."""
+
+
 @pytest.fixture(scope="session", params=[8192, 262144])
 def batch(request, surface):
-    """Points inside the surface's cells in the order of a training batch (Morton), and what NumPy says of them."""
+    """Points inside the surface's cells in the order of a training batch (Morton)."""
     points = surface_points(1_500_000)[: request.param]
     points = np.ascontiguousarray(points[np.argsort(cell_keys(points, LEAF_M), kind="stable")])
     rows, weights = surface.rows_and_weights(points)
     features = surface.features.numpy().astype(np.float64)
-    expected = sum(
+    total = sum(
         (weights[:, :, k, None].astype(np.float64) * features[rows[:, :, k]]).sum() for k in range(12)
     )
-    absolute = np.sqrt((weights.astype(np.float64) ** 2).sum() * FEATURE_DIM)
-    return torch.from_numpy(points), torch.from_numpy(rows), torch.from_numpy(weights), expected, absolute
+    scale = np.sqrt((weights.astype(np.float64) ** 2).sum() * FEATURE_DIM)
+    return Batch(torch.from_numpy(points), torch.from_numpy(rows), torch.from_numpy(weights), total, scale)
+
+
+@pytest.fixture(scope="session")
+def roofline(tmp_path_factory):
+    """`roofline.cpp`, compiled for this machine."""
+    compiler = shutil.which(os.environ.get("CXX", "c++"))
+    if compiler is None:
+        pytest.skip("no C++ compiler for roofline.cpp")
+    library = tmp_path_factory.mktemp("roofline") / "roofline.so"
+    flags = ["-O3", "-march=native", "-fopenmp", "-shared", "-fPIC"]
+    source = Path(__file__).with_name("roofline.cpp")
+    subprocess.run([compiler, *flags, str(source), "-o", str(library)], check=True)
+    return ctypes.CDLL(str(library))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The kernels of encoding and training against the same computation in plain PyTorch.
+"""The kernels of encoding against the same computation in plain PyTorch, and against a bare loop in C++.
 
 Each case asserts a checksum from NumPy in double precision, so that a wrong answer cannot win. Ratios within a group
 and one run mean something; times of different runs or machines do not: see README.md.
@@ -8,73 +8,187 @@ and one run mean something; times of different runs or machines do not: see READ
 
 from __future__ import annotations
 
+import ctypes
 import math
 
 import numpy as np
 import pytest
 import torch
-from radarsdf import FitConfig, kernels
+from radarsdf import kernels
 from radarsdf._core import CellSet, VertexTable
-from radarsdf.field import Field
-from radarsdf.losses import sdf_loss
-from radarsdf.optimiser import Adam
-from radarsdf.sampling import RaySampler
-from radarsdf.scans import prepare
-from radarsdf.threads import Workers
 
-from .conftest import FEATURE_DIM, LEAF_M, NUM_LEVELS, surface_points
+from .conftest import FEATURE_DIM, LEAF_M, NUM_LEVELS, PLANES, surface_points
 
 
-def ours(features, points, surface, *_):
-    return kernels.interpolate(features, points, surface.table)
+class Differentiated:
+    """A way to interpolate that PyTorch differentiates: `function` of the tensors `features`."""
+
+    def __init__(self, features, function):
+        self._features = [tensor.clone().requires_grad_() for tensor in features]
+        self._function = function
+        self._out = None
+
+    def forward(self):
+        with torch.no_grad():
+            return self._function(*self._features)
+
+    def backward(self, out_grad):
+        """Of one forward pass, which is not counted."""
+        if self._out is None:
+            self._out = self._function(*self._features)
+        return torch.autograd.grad(self._out, self._features, out_grad, retain_graph=True)
+
+    def both(self, out_grad):
+        return torch.autograd.grad(self._function(*self._features), self._features, out_grad)
 
 
-def indexing(features, _points, _surface, rows, weights):
-    return (features[rows] * weights[..., None]).sum(2).flatten(1)
+def ours(surface, batch, _fixture):
+    way = Differentiated([surface.features], lambda f: kernels.interpolate(f, batch.points, surface.table))
+    return way, [surface.features]
 
 
-def embedding_bag(features, _points, _surface, rows, weights):
-    flat = torch.nn.functional.embedding_bag(
-        rows.view(-1, 12), features, per_sample_weights=weights.view(-1, 12), mode="sum"
-    )
-    return flat.view(len(rows), -1)
+def indexing(surface, batch, _fixture):
+    def function(features):
+        return (features[batch.rows] * batch.weights[..., None]).sum(2).flatten(1)
+
+    return Differentiated([surface.features], function), [surface.features]
 
 
-WAYS = {"ours, look-up included": ours, "indexing": indexing, "embedding_bag": embedding_bag}
+def embedding_bag(surface, batch, _fixture):
+    rows, weights = batch.rows.view(-1, 12), batch.weights.view(-1, 12)
+
+    def function(features):
+        out = torch.nn.functional.embedding_bag(rows, features, per_sample_weights=weights, mode="sum")
+        return out.view(len(batch.rows), -1)
+
+    return Differentiated([surface.features], function), [surface.features]
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_interpolation_forward(benchmark, surface, batch, way):
-    points, rows, weights, expected, absolute = batch
-    benchmark.group = f"interpolation forward, {len(points)} points"
-    with torch.no_grad():
-        out = benchmark(WAYS[way], surface.features, points, surface, rows, weights)
-    assert out.shape == (len(points), NUM_LEVELS * FEATURE_DIM)
-    assert abs(out.double().sum().item() - expected) < 1e-3 * absolute
+def grid_sample(_surface, batch, fixture):
+    """Without a table: planes that are full wherever the scene's box is."""
+    planes, grids = [], []
+    for i, (plane, lower, upper) in enumerate(fixture("dense_planes")):
+        u = batch.points.numpy()[:, PLANES[i % 3]].astype(np.float64) / (LEAF_M * 2 ** (i // 3))
+        u = 2 * (u - lower) / (upper - lower) - 1
+        grids.append(torch.from_numpy(u[None, :, None, ::-1].astype(np.float32)))
+        planes.append(plane[None])
+
+    def function(*planes):
+        sums = []
+        for level in range(NUM_LEVELS):
+            of_level = slice(3 * level, 3 * level + 3)
+            parts = [
+                torch.nn.functional.grid_sample(plane, grid, align_corners=True)
+                for plane, grid in zip(planes[of_level], grids[of_level], strict=True)
+            ]
+            sums.append(parts[0] + parts[1] + parts[2])
+        return torch.cat(sums, 1)[0, :, :, 0].T
+
+    return Differentiated(planes, function), planes
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_interpolation_forward_and_backward(benchmark, surface, batch, way):
-    points, rows, weights, expected, absolute = batch
-    benchmark.group = f"interpolation forward and backward, {len(points)} points"
-    features = surface.features.clone().requires_grad_()
+class Roofline:
+    """No operation of PyTorch: the loops of roofline.cpp, the gradient by one of their two schemes."""
 
-    def run():
-        out = WAYS[way](features, points, surface, rows, weights)
-        return torch.autograd.grad(out.sum(), features)[0]
+    def __init__(self, library, surface, batch, threads, scheme):
+        self._library, self._scheme = library, scheme
+        self._features, self._weights = surface.features, batch.weights
+        self._rows, self._threads = batch.rows.int(), threads
 
-    gradient = benchmark(run)
+    def forward(self):
+        out = torch.empty(len(self._rows), NUM_LEVELS * FEATURE_DIM)
+        self._call("gather", self._features, self._rows, self._weights, len(out), out, self._threads)
+        return out
+
+    def backward(self, out_grad):
+        given, count = (self._rows, self._weights, out_grad), len(out_grad)
+        num_rows = len(self._features)
+        if self._scheme == "planes":
+            gradient = torch.zeros(num_rows, FEATURE_DIM)
+            self._call("scatter_by_planes", *given, count, gradient, self._threads)
+            return [gradient]
+        gradients = torch.zeros(self._threads, num_rows, FEATURE_DIM)
+        self._call("scatter_to_copies", *given, count, gradients, num_rows, self._threads)
+        return [gradients[0]]
+
+    def _call(self, name, *arguments):
+        getattr(self._library, name)(
+            *(
+                ctypes.c_void_p(a.data_ptr()) if isinstance(a, torch.Tensor) else ctypes.c_int64(a)
+                for a in arguments[:-1]
+            ),
+            ctypes.c_int(arguments[-1]),
+        )
+
+
+def roofline_way(threads, scheme):
+    def way(surface, batch, fixture):
+        threads_used = threads or torch.get_num_threads()
+        return Roofline(fixture("roofline"), surface, batch, threads_used, scheme), [surface.features]
+
+    return way
+
+
+FORWARD = {
+    "ours, look-up included": ours,
+    "indexing": indexing,
+    "embedding_bag": embedding_bag,
+    "grid_sample, dense": grid_sample,
+}
+ROOFLINE = {"roofline": roofline_way(0, "copies")}
+# Which is best depends on the threads, and on how many rows there are for a point.
+ROOFLINES = {
+    "roofline, one thread": roofline_way(1, "copies"),
+    "roofline, a copy for each thread": roofline_way(0, "copies"),
+    "roofline, planes over the threads": roofline_way(0, "planes"),
+}
+
+
+@pytest.fixture
+def way(request, surface, batch):
+    """The parametrised way, and the features that it is given, whatever their form."""
+    return request.param(surface, batch, request.getfixturevalue)
+
+
+def over(ways):
+    return pytest.mark.parametrize("way", ways.values(), ids=ways.keys(), indirect=True)
+
+
+@over(FORWARD | ROOFLINE)
+def test_interpolation_forward(benchmark, batch, way):
+    benchmark.group = f"interpolation forward, {len(batch.points)} points"
+    out = benchmark(way[0].forward)
+    assert out.shape == (len(batch.points), NUM_LEVELS * FEATURE_DIM)
+    assert abs(out.double().sum().item() - batch.total) < 1e-3 * batch.scale
+
+
+@over(FORWARD | ROOFLINES)
+def test_interpolation_backward(benchmark, batch, way):
+    benchmark.group = f"interpolation backward, {len(batch.points)} points"
+    gradients = benchmark(way[0].backward, torch.ones(len(batch.points), NUM_LEVELS * FEATURE_DIM))
+    check_gradients(gradients, way[1], batch)
+
+
+@over(FORWARD)
+def test_interpolation_forward_and_backward(benchmark, batch, way):
+    benchmark.group = f"interpolation forward and backward, {len(batch.points)} points"
+    gradients = benchmark(way[0].both, torch.ones(len(batch.points), NUM_LEVELS * FEATURE_DIM))
+    check_gradients(gradients, way[1], batch)
+
+
+def check_gradients(gradients, features, batch):
     # The output is linear in the features, and so their product with its gradient is the output again.
-    total = (gradient.double() * surface.features.double()).sum().item()
-    assert abs(total - expected) < 1e-3 * absolute
-    assert gradient.double().sum().item() == pytest.approx(
-        3.0 * NUM_LEVELS * FEATURE_DIM * len(points), rel=1e-5
+    pairs = zip(gradients, features, strict=True)
+    total = sum((gradient.double() * own.double()).sum().item() for gradient, own in pairs)
+    assert abs(total - batch.total) < 1e-3 * batch.scale
+    assert sum(gradient.double().sum().item() for gradient in gradients) == pytest.approx(
+        3.0 * NUM_LEVELS * FEATURE_DIM * len(batch.points), rel=1e-5
     )
 
 
 @pytest.mark.parametrize("way", ["ours", "torch"])
 def test_fourier(benchmark, batch, way):
-    points, half_width_m, count = batch[0], 409.6, 16
+    points, half_width_m, count = batch.points, 409.6, 16
     benchmark.group = f"Fourier encoding, {len(points)} points"
     frequencies = math.pi / half_width_m * 2.0 ** torch.arange(count)
 
@@ -111,35 +225,3 @@ def test_table_building(benchmark, cloud, threads):
 
     table = benchmark.pedantic(build, rounds=5, warmup_rounds=1)
     assert len(table.leaf_keys()) == num_cells
-
-
-@pytest.mark.parametrize("batch_size", [1024, 8192])
-def test_training_step(benchmark, batch_size):
-    """Samples, both encodings, SDF network, loss, gradients and Adam, as one worker of a fit does it."""
-    benchmark.group = f"training step, {batch_size} samples, one thread"
-    config = FitConfig()
-    scan = surface_points(100_000, dtype=np.float64) - [0, 0, 8]
-    rays = prepare([scan], np.eye(4)[None])
-    cells = CellSet(config.leaf_size_m)
-    for chunk in rays.along(np.linspace(-config.near_band_m, config.near_band_m, 7)):
-        cells.insert(chunk)
-    torch.manual_seed(0)
-    field = Field(cells.sorted_keys(), config, with_intensity=False)
-    field.cells.initialise(config.feature_std)
-    parameters = list(field.parameters())
-    adam = Adam(parameters, config.learning_rate, config.adam_epsilon)
-    sampler = RaySampler(rays, config, batch_size, torch.Generator().manual_seed(0))
-
-    def step():
-        samples = sampler.batch()
-        loss = sdf_loss(field.logit(samples.points), samples.sdf_m, config.sigma_m)
-        adam.step(torch.autograd.grad(loss, parameters))
-        return loss.item()
-
-    with Workers(1):
-        before = step()
-        benchmark.pedantic(step, rounds=100, warmup_rounds=5)
-        after = [step() for _ in range(60)][
-            -1
-        ]  # enough to learn something where nothing is timed and there is one round
-    assert after < 0.8 * before

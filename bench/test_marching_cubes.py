@@ -2,13 +2,20 @@
 # SPDX-License-Identifier: MIT
 """Marching cubes against its peers on the same float32 samples, one thread unless the case says otherwise.
 
-Each case checks the number of triangles or the area of its mesh, so that a wrong answer cannot win. The peers keep
+Groups: each field, the lattice and the extraction of a shell, a real map by cells and by its whole box, and the same
+surface in eight times the volume. Each case checks the number of triangles or the area of its mesh, so that a wrong answer cannot win. The peers keep
 their usual outputs: VTK float32 points and int64 cells, scikit-image also normals and values, PyMCubes float64 and
 int64; ours are float64 and int32.
 """
 
+from dataclasses import dataclass
+from functools import cache
+
 import numpy as np
 import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
 from radarsdf.isosurface import extract_cells, marching_cubes, mesh_components, sparse_lattice
 
 
@@ -46,30 +53,42 @@ def check_mesh(vertices, faces, field, rel=1e-4):
         assert area == pytest.approx(expected, rel=1e-3)
 
 
+def field_group(field):
+    return f"marching cubes, {field[1]:,} triangles in {field[0].size:,} samples"
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_dense(benchmark, field, threads):
+    benchmark.group = field_group(field)
     vertices, faces = benchmark(marching_cubes, field[0], num_threads=threads)
     check_mesh(vertices, faces, field)
 
 
 def test_dense_masked(benchmark, field):
+    benchmark.group = field_group(field)
     mask = np.ones(field[0].shape, dtype=bool)
     vertices, faces = benchmark(marching_cubes, field[0], mask=mask, num_threads=1)
     check_mesh(vertices, faces, field)
 
 
-def test_vtk_flying_edges(benchmark, field):
-    vtk = pytest.importorskip("vtk", reason="vtk is not installed")
-    from vtk.util.numpy_support import numpy_to_vtk, vtk_to_numpy  # noqa: PLC0415
+class FlyingEdges:
+    """VTK's filter on a volume, and its mesh as arrays."""
 
-    vtk.vtkSMPTools.Initialize(1)
-    image = vtk.vtkImageData()
-    image.SetDimensions(field[0].shape[::-1])
-    image.GetPointData().SetScalars(numpy_to_vtk(field[0].ravel(), deep=True))
+    def __init__(self, volume, backend, threads):
+        vtk = pytest.importorskip("vtk", reason="vtk is not installed")
+        from vtk.util.numpy_support import numpy_to_vtk  # noqa: PLC0415
 
-    def run():
-        filter_ = vtk.vtkFlyingEdges3D()
-        filter_.SetInputData(image)
+        assert vtk.vtkSMPTools.SetBackend(backend), f"this VTK has no {backend}"
+        vtk.vtkSMPTools.Initialize(threads)
+        assert vtk.vtkSMPTools.GetEstimatedNumberOfThreads() == threads
+        self._new_filter = vtk.vtkFlyingEdges3D
+        self._image = vtk.vtkImageData()
+        self._image.SetDimensions(volume.shape[::-1])
+        self._image.GetPointData().SetScalars(numpy_to_vtk(volume.ravel(), deep=True))
+
+    def run(self):
+        filter_ = self._new_filter()
+        filter_.SetInputData(self._image)
         filter_.SetValue(0, 0.0)
         filter_.ComputeNormalsOff()
         filter_.ComputeGradientsOff()
@@ -77,18 +96,34 @@ def test_vtk_flying_edges(benchmark, field):
         filter_.Update()
         return filter_.GetOutput()
 
-    mesh = benchmark(run)
-    faces = vtk_to_numpy(mesh.GetPolys().GetConnectivityArray()).reshape(-1, 3)
-    check_mesh(vtk_to_numpy(mesh.GetPoints().GetData()), faces, field)
+    @staticmethod
+    def arrays(mesh):
+        """Vertices (V, 3), x y z where the volume's axes are z y x, and faces (F, 3)."""
+        from vtk.util.numpy_support import vtk_to_numpy  # noqa: PLC0415
+
+        faces = vtk_to_numpy(mesh.GetPolys().GetConnectivityArray()).reshape(-1, 3)
+        return vtk_to_numpy(mesh.GetPoints().GetData()), faces
+
+
+FLYING_EDGES = pytest.mark.parametrize(("backend", "threads"), [("Sequential", 1), ("STDThread", 2)])
+
+
+@FLYING_EDGES
+def test_vtk_flying_edges(benchmark, field, backend, threads):
+    benchmark.group = field_group(field)
+    mesh = benchmark(FlyingEdges(field[0], backend, threads).run)
+    check_mesh(*FlyingEdges.arrays(mesh), field)
 
 
 def test_scikit_image(benchmark, field):
+    benchmark.group = field_group(field)
     measure = pytest.importorskip("skimage.measure", reason="scikit-image is not installed")
     vertices, faces, *_ = benchmark(measure.marching_cubes, field[0], 0.0)
     check_mesh(vertices, faces, field, rel=0.01)  # it solves ambiguous cells in another way
 
 
 def test_pymcubes(benchmark, field):
+    benchmark.group = field_group(field)
     mcubes = pytest.importorskip("mcubes", reason="PyMCubes is not installed")
     vertices, faces = benchmark(mcubes.marching_cubes, field[0], 0.0)
     check_mesh(vertices, faces, field, rel=0.01)
@@ -107,6 +142,7 @@ def shell():
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_sparse_lattice(benchmark, shell, threads):
+    benchmark.group = "lattice of a shell"
     cells, corners, cell_corners = benchmark(sparse_lattice, shell, num_threads=threads)
     assert len(cells) == 2_116_492
     assert np.array_equal(corners[cell_corners[:, 7]], cells + 1)
@@ -114,11 +150,137 @@ def test_sparse_lattice(benchmark, shell, threads):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_sparse_extraction(benchmark, shell, threads):
+    benchmark.group = "extraction from a shell"
     _, corners, cells = sparse_lattice(shell)
     values = (np.linalg.norm(corners, axis=1) - 200.0).astype(np.float32)
     vertices, faces = benchmark(extract_cells, corners, values, cells, num_threads=threads)
-    assert np.linalg.norm(vertices, axis=1) == pytest.approx(200, abs=0.01)
+    assert np.abs(np.linalg.norm(vertices, axis=1) - 200).max() < 0.01
     assert len(faces) == 1_431_246
+
+
+@dataclass(frozen=True, eq=False)
+class MapLattice:
+    """A fitted map's cells and the signed distance at their corners, as its mesh is made of them."""
+
+    cells: np.ndarray  # (M, 3)
+    values: np.ndarray  # of the corners, in the order of sparse_lattice
+    volume: np.ndarray  # the whole box, 1 where the map says nothing
+    mask: np.ndarray  # of the box: what the map says something about
+    lower: np.ndarray  # (3,) lattice coordinates of the box's corner
+
+    @cache  # noqa: B019 - as long as the module runs, there is one
+    def crossed_edges(self, *, of_cells):
+        """How many edges of the map's cells, or of the box, the surface crosses: each holds one vertex of a mesh."""
+        in_use = np.full(np.add(self.volume.shape, 1), not of_cells)  # cells, one beyond each side of the box
+        in_use[tuple((self.cells - self.lower + 1).T)] = True
+        positive, count = self.volume > 0, 0
+        for axis in range(3):
+            crossed = np.diff(positive, axis=axis)
+            of_edge = np.delete(np.delete(in_use, 0, axis), -1, axis)
+            for other in {0, 1, 2} - {axis}:
+                of_edge = np.delete(of_edge, 0, other) | np.delete(of_edge, -1, other)
+            count += (crossed & of_edge).sum()
+        return count
+
+
+@pytest.fixture(scope="module")
+def map_lattice():
+    scans = radarsdf.simulate.hugin(frames=20)
+    config = FitConfig(max_range_m=30.0, sdf_iterations=100, num_threads=1)
+    radar_map = radarsdf.fit(scans.points, scans.poses, config=config, progress=False)
+    part = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(8, 3)
+    cells = (2 * radar_map.field.cells.table.leaf_cells()[:, None] + part).reshape(-1, 3).astype(np.int32)
+    cells, corners, _ = sparse_lattice(cells)
+    points = corners.astype(np.float32) * np.float32(config.leaf_size_m / 2)
+    with torch.no_grad():
+        values = radar_map.local_sdf(torch.from_numpy(points)).numpy()
+    lower = corners.min(0)
+    shape = corners.max(0) - lower + 1
+    volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)
+    at = tuple((corners - lower).T)
+    volume[at], mask[at] = values, True
+    # The mask lets no cell in that the map has not: each eight have a corner in the middle, which is theirs alone.
+    return MapLattice(cells, values, volume, mask, lower)
+
+
+def map_group(lattice):
+    return f"real map, {len(lattice.cells):,} cells in a box of {lattice.volume.size:,}"
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_map_by_cells(benchmark, map_lattice, threads):
+    """Lattice and extraction; the network has been asked for the corners' distances already, here and in all."""
+    benchmark.group = map_group(map_lattice)
+
+    def run():
+        _, corners, cells = sparse_lattice(map_lattice.cells, num_threads=threads)
+        return extract_cells(corners, map_lattice.values, cells, num_threads=threads)
+
+    vertices, faces = benchmark(run)
+    benchmark.extra_info["distances"] = len(map_lattice.values)
+    check_map(vertices, faces, map_lattice.crossed_edges(of_cells=True))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_map_by_its_box(benchmark, map_lattice, threads):
+    benchmark.group = map_group(map_lattice)
+    vertices, faces = benchmark(
+        marching_cubes, map_lattice.volume, mask=map_lattice.mask, num_threads=threads
+    )
+    benchmark.extra_info["distances"] = map_lattice.volume.size
+    check_map(vertices, faces, map_lattice.crossed_edges(of_cells=True))
+
+
+@FLYING_EDGES
+def test_map_vtk_flying_edges(benchmark, map_lattice, backend, threads):
+    """VTK knows no mask: it also makes the border of the unknown a surface."""
+    benchmark.group = map_group(map_lattice)
+    mesh = benchmark(FlyingEdges(map_lattice.volume, backend, threads).run)
+    check_map(*FlyingEdges.arrays(mesh), map_lattice.crossed_edges(of_cells=False))
+
+
+def check_map(vertices, faces, crossed_edges):
+    assert len(vertices) == crossed_edges
+    assert np.array_equal(np.unique(faces), np.arange(len(vertices)))
+    # Twice as many on a closed surface; borders take away, handles add.
+    assert 1.2 * len(vertices) < len(faces) < 2.1 * len(vertices)
+
+
+RADIUS, HALF = 80, 96  # of a sphere and its volume, samples
+SPHERE_FACES = 243_272  # V - E + F = 2, where V is the number of edges that change sign
+
+
+@pytest.mark.parametrize("times", [1, 8])
+def test_dense_in_a_larger_volume(benchmark, times):
+    benchmark.group = "one sphere, in 1 and 8 times the volume"
+    half = HALF * round(times ** (1 / 3))
+    axis = np.arange(-half, half, dtype=np.float32)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij", sparse=True)
+    volume = np.sqrt(x * x + y * y + z * z) - np.float32(RADIUS + 0.3)
+    _, faces = benchmark(marching_cubes, volume, num_threads=1)
+    assert len(faces) == SPHERE_FACES
+
+
+@pytest.mark.parametrize("times", [1, 8])
+def test_sparse_in_a_larger_volume(benchmark, times):
+    """The eight octants of the sphere moved apart: as much surface, but all of it in other places."""
+    benchmark.group = "one sphere, in 1 and 8 times the volume"
+    axis = np.arange(-HALF, HALF - 1, dtype=np.int32)
+    cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    cells = cells[np.abs(np.linalg.norm(cells + 0.5, axis=1) - (RADIUS + 0.3)) < 2]
+    apart = HALF * (round(times ** (1 / 3)) - 1)
+    cells += np.where(cells < 0, -apart, apart).astype(np.int32)
+    _, corners, cell_corners = sparse_lattice(cells)
+    octant = np.zeros(corners.shape, np.int32)
+    octant[cell_corners] = np.where(cells < 0, -apart, apart)[:, None]  # moved apart, octants share no corner
+    values = (np.linalg.norm(corners - octant, axis=1) - (RADIUS + 0.3)).astype(np.float32)
+
+    def run():
+        _, corners, cell_corners = sparse_lattice(cells, num_threads=1)
+        return extract_cells(corners, values, cell_corners, num_threads=1)
+
+    _, faces = benchmark(run)
+    assert len(faces) == SPHERE_FACES
 
 
 def test_components(benchmark):

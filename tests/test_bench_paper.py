@@ -9,8 +9,10 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from radarsdf import FitConfig
 
 from bench.paper import __main__ as command
+from bench.paper.curve import budget, medians
 from bench.paper.experiment import Options, mean_and_deviation, world_returns
 from bench.paper.report import best_in_bold, markdown, write_json
 from bench.paper.scenes import load_scene
@@ -94,6 +96,33 @@ def test_map_size_of_the_octree_is_the_reference(tmp_path):
     assert "100 %" in table
 
 
+@pytest.mark.usefixtures("peers")
+def test_curve_has_budgets_levers_and_peers(tmp_path):
+    words = ("curve", "wall", "--peers", "BPA", "Poisson", "radarsdf", "--repetitions", "3")
+    table, values = run(tmp_path, *words, "--set", "encoding=octree", "num_levels=2")
+    rows = values["rows"]
+    assert [row["repetition"] for row in rows] == sorted([0, 1, 2] * (len(rows) // 3))  # the methods by turns
+    methods = {row["method"]: row for row in rows}
+    ours = methods["radarsdf, intensities, × 1/16"]["settings"]["changes"]
+    assert (ours["min_sdf_iterations"], ours["sdf_passes"], ours["intensity_passes"]) == (9, 1 / 16, 1 / 16)
+    assert methods["drop_ghosts=False"]["settings"]["changes"] == {"drop_ghosts": False}
+    assert methods["encoding=octree, num_levels=2"]["kind"] == "lever"
+    assert methods["BPA"]["kind"] == "peer"
+    assert "radarsdf" not in methods  # a line, not a peer
+    assert methods["BPA"]["seconds"] == 4.0  # of the frames that are not held out
+    assert "medians of 3" in table
+    assert "- Poisson: Open3D is not here" in table
+
+
+def test_a_budget_of_one_is_the_default():
+    assert FitConfig(**budget(1.0)) == FitConfig()
+
+
+def test_medians_are_of_the_rows_that_have_the_number():
+    rows = [{"method": "a", "seconds": s, "mae": m} for s, m in ((1.0, None), (2.0, 3.0), (9.0, 4.0))]
+    assert medians(rows) == [{"method": "a", "seconds": 2.0, "mae": 3.5, "why_not": ""}]
+
+
 def test_intensity_repeats_with_other_seeds(tmp_path):
     table, values = run(tmp_path, "intensity", "wall", "--base", "default")
     neighbours, *ours = values["rows"]
@@ -151,6 +180,8 @@ def test_returns_in_the_world_are_those_in_range():
 def test_unknown_peers_and_scenes_are_refused(tmp_path):
     with pytest.raises(SystemExit):
         command.main(["surface", "wall", "--peers", "nonsense", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit):
+        command.main(["curve", "wall", "--set", "nonsense=1", "--out", str(tmp_path)])
     with pytest.raises(SystemExit, match="no scene 'nowhere'"):
         command.main(["surface", "nowhere", "--out", str(tmp_path)])
 

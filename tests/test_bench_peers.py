@@ -41,6 +41,21 @@ def test_far_from_the_origin_the_same_mesh_comes_out_there(scans):
     assert here.peak_bytes > 50e6
 
 
+def test_intensities_are_predicted_at_queries_in_the_world(scans):
+    peer = PEERS["radarsdf, intensities"].with_changes(sdf_iterations=60, intensity_iterations=300)
+    poses = scans.poses.copy()
+    poses[:, :3, 3] += [5e5, 5.4e6, 100.0]
+    at = [points @ pose[:3, :3].T + pose[:3, 3] for points, pose in zip(scans.points, poses, strict=True)]
+    sensors = np.repeat(poses[:, :3, 3], [len(points) for points in scans.points], axis=0)
+    queries = np.concatenate(at), sensors
+    done = reconstruct(peer, scans.points, poses, scans.intensities, queries=queries)
+    measured = np.concatenate(scans.intensities)
+    assert done.intensity is not None
+    assert np.abs(done.intensity - measured).mean() < 0.5 * np.abs(measured - measured.mean()).mean()
+    assert done.report["training_s"] + done.report["mesh_s"] < done.seconds
+    assert reconstruct(OURS, scans.points, poses, scans.intensities, queries=queries).intensity is None
+
+
 def test_ranges_are_cut_for_all(scans):
     done = reconstruct(OURS, scans.points, scans.poses, min_range_m=50.0)
     assert done.mesh is None

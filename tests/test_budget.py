@@ -16,7 +16,7 @@ from radarsdf.cli import main
 from radarsdf.readers import Scans, write_scans
 from radarsdf.scans import prepare
 
-from bench.growth import scans_of, street
+from bench.growth.street import street
 from bench.stress.memory import peak_of_a_fit
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -35,8 +35,9 @@ def test_the_peak_is_within_half_as_much_again(count, with_intensities, changes)
 
 @pytest.mark.parametrize("changes", [{}, {"leaf_size_m": 0.4, "num_levels": 4}, {"encoding": "octree"}])
 def test_counts_are_those_of_the_fit(changes):
-    points, poses = scans_of(street(20_000))
-    config = dataclasses.replace(QUICK, drop_ghosts=False, **changes)
+    scans = street(20_000)
+    points, poses = scans.points, scans.poses
+    config = dataclasses.replace(QUICK, drop_ghosts=False, bridge_cells=0, **changes)
     estimate = radarsdf.estimate(points, poses, config=config)
     report = radarsdf.fit(points, poses, config=config, progress=False).report
     assert estimate.returns == report["returns_used"]
@@ -46,7 +47,8 @@ def test_counts_are_those_of_the_fit(changes):
 
 
 def test_a_sample_tells_about_as_much(monkeypatch):
-    points, poses = scans_of(street(50_000))
+    scans = street(50_000)
+    points, poses = scans.points, scans.poses
     counts = [radarsdf.estimate(points, poses)]
     monkeypatch.setattr(budget, "_SAMPLE", 5_000)
     counts.append(radarsdf.estimate(points, poses))
@@ -88,9 +90,7 @@ def test_the_quick_bound_is_one(scene):
 
 
 def test_a_mesh_beyond_the_budget_is_refused(scene):
-    radar_map = radarsdf.fit(
-        scene.points, scene.poses, config=dataclasses.replace(QUICK, max_memory_bytes=10**9)
-    )
+    radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(max_memory_bytes=10**9))
     radar_map.mesh(0.1)
     with pytest.raises(
         MemoryError, match=r"voxels of 0\.004 m would take about \d+\.\d\d GB, of 1\.00: use larger"

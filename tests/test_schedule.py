@@ -46,6 +46,6 @@ def test_a_small_scene_trains_its_intensities_for_long_and_with_more_dropout():
 
 
 def test_what_is_set_is_done():
-    paper = schedule(10**7, leaf_cells=10, **{"sdf_iterations": 1000, "intensity_iterations": 4000})
+    paper = schedule(10**7, leaf_cells=10, sdf_iterations=1000, intensity_iterations=4000)
     assert paper.iterations == {"sdf": 1000, "intensity": 4000}
     assert schedule(10**7, sdf_iterations=0).sdf_iterations == 0

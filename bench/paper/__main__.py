@@ -5,15 +5,18 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from radarsdf import FitConfig
 from tqdm import tqdm
 
 from bench.peers.interface import PEERS
 
-from . import ablation, angles, intensity, map_size, sparse, surface, views
+from . import ablation, angles, curve, intensity, map_size, sparse, surface, views
 from .experiment import Experiment, Options, Row
 from .report import provenance, write_json
 from .scenes import load_scene
@@ -26,6 +29,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "map-size": map_size.EXPERIMENT,
     "angles": angles.EXPERIMENT,
     "views": views.EXPERIMENT,
+    "curve": curve.EXPERIMENT,
 }
 _QUICK_FRAMES = 4
 
@@ -37,6 +41,10 @@ def main(arguments: list[str] | None = None) -> None:
     experiment = EXPERIMENTS[words.experiment]
     if unknown := sorted(set(words.peers) - set(PEERS)):
         parser.error(f"no peers {', '.join(unknown)}: there are {', '.join(PEERS)}")
+    try:
+        levers = tuple(_changes(settings) for settings in words.set)
+    except ValueError as error:
+        parser.error(str(error))
     quick = words.quick
     options = Options(
         quick=quick,
@@ -45,6 +53,7 @@ def main(arguments: list[str] | None = None) -> None:
         bases=tuple(words.base or experiment.bases),
         peers=tuple(words.peers or PEERS),
         meshes=words.out / "meshes" if words.meshes else None,
+        levers=levers,
     )
     frames = words.frames or (_QUICK_FRAMES if quick else None)
     box = None if words.box is None else np.reshape(words.box, (2, 3))
@@ -77,6 +86,19 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"written: {', '.join(str(stem.with_suffix(suffix)) for suffix in ('.md', '.json', '.png'))}")
 
 
+def _changes(settings: list[str]) -> dict[str, Any]:
+    """`NAME=VALUE` words as changes of a configuration that has them all."""
+    changes: dict[str, Any] = {}
+    for setting in settings:
+        name, _, text = setting.partition("=")
+        try:
+            changes[name] = ast.literal_eval(text)
+        except (SyntaxError, ValueError):
+            changes[name] = text  # a word, such as octree
+    FitConfig.from_dict(FitConfig().to_dict() | changes)
+    return changes
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m bench.paper", description=__doc__)
     parser.add_argument("experiment", choices=EXPERIMENTS)
@@ -95,7 +117,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--repetitions", type=int, help="with another seed each; default: as in the paper")
     parser.add_argument("--samples", type=int, help="points on a mesh; default: 10000000")
     parser.add_argument(
-        "--meshes", action="store_true", help="surface, sparse: also write each mesh and a picture of it"
+        "--meshes",
+        action="store_true",
+        help="surface, sparse, curve: also write each mesh and a picture of it",
     )
     parser.add_argument("--frames", type=int, help="of each scene; default: all")
     parser.add_argument("--scene-seed", type=int, default=0, help="of simulated scenes; default: 0")
@@ -109,6 +133,14 @@ def _parser() -> argparse.ArgumentParser:
         nargs=6,
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="to evaluate, world, m",
+    )
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="curve: one more point, with these settings of FitConfig; may be repeated",
     )
     return parser
 

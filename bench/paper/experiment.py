@@ -13,7 +13,7 @@ import numpy as np
 import radarsdf
 import trimesh
 from radarsdf import FitConfig, RadarMap
-from radarsdf.evaluation import surface_metrics
+from radarsdf.evaluation import intensity_metrics, surface_metrics
 from radarsdf.picture import save_picture
 
 from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
@@ -39,6 +39,8 @@ class Options:
     """Names of `PEERS`."""
     meshes: Path | None = None
     """Folder for the meshes of `measure` and pictures of them."""
+    levers: tuple[dict[str, Any], ...] = ()
+    """Changes of the configuration to try besides those of the experiment."""
 
     def config(self, base: str, scene: Scene, **changes: Any) -> FitConfig:
         """A configuration with the scene's ranges."""
@@ -47,9 +49,9 @@ class Options:
         settings = ranges | short | changes
         return FitConfig.paper(**settings) if base == "paper" else FitConfig(**settings)
 
-    def reconstruct(self, name: str, scene: Scene) -> Reconstruction:
-        """A peer's surface of a scene."""
-        peer: Peer = PEERS[name]
+    def reconstruct(self, method: str | Peer, scene: Scene, held_out: Scene | None = None) -> Reconstruction:
+        """A peer's surface of a scene, and with `held_out` its intensities at the returns of that."""
+        peer = PEERS[method] if isinstance(method, str) else method
         if self.quick:
             peer = peer.with_changes(sdf_iterations=20, intensity_iterations=40)
         return reconstruct(
@@ -59,14 +61,23 @@ class Options:
             scene.intensities,
             min_range_m=scene.min_range_m,
             max_range_m=scene.max_range_m,
+            queries=None if held_out is None else world_returns(held_out)[:2],
         )
 
-    def measure(self, name: str, scene: Scene) -> Row:
-        """Time, memory and errors of a peer's surface of a scene, or why there are none."""
+    def measure(self, method: str | Peer, scene: Scene, held_out: Scene | None = None) -> Row:
+        """Time, memory and errors of a peer's surface of a scene, or why there are none.
+
+        With `held_out`, also the errors of the intensity at the returns of that, where the peer predicts it.
+        """
+        name = method if isinstance(method, str) else method.name
         if scene.ground_truth is None:
             return {"why_not": "the scene has no ground truth"}
-        result = self.reconstruct(name, scene)
+        result = self.reconstruct(method, scene, held_out)
         row: Row = {"seconds": result.seconds, "peak_bytes": result.peak_bytes, "map_bytes": result.map_bytes}
+        if result.report:
+            row["report"] = result.report
+        if held_out is not None and result.intensity is not None:
+            row |= intensity_metrics(result.intensity, world_returns(held_out)[2])
         if result.mesh is None:
             return row | {"why_not": result.why_not}
         if self.meshes is not None:

@@ -21,10 +21,10 @@ from radarsdf.evaluation import INTENSITY_PROTOCOL, PROTOCOL
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def provenance() -> dict[str, Any]:
+def provenance(module: str = "bench.paper") -> dict[str, Any]:
     """Command, commit and machine."""
     return {
-        "command": " ".join(["python -m bench.paper", *sys.argv[1:]]),
+        "command": " ".join([f"python -m {module}", *sys.argv[1:]]),
         "commit": _commit(),
         "protocols": [PROTOCOL, INTENSITY_PROTOCOL],
         "processor": _processor(),
@@ -75,6 +75,21 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         for row in table
     ]
     return "\n".join([lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]])
+
+
+Column = tuple[str, str, float, int, bool | None]
+"""Key of a row, heading, factor to its unit, digits, and whether more is better (None: neither)."""
+
+
+def metric_table(rows: Sequence[dict[str, Any]], columns: Sequence[Column]) -> str:
+    """A line for each method; the best of a column in bold."""
+    cells = [[row["method"] for row in rows]]
+    for key, _, factor, digits, highest in columns:
+        values = [row.get(key) for row in rows]
+        texts = ["–" if value is None else f"{value * factor:.{digits}f}" for value in values]
+        cells.append(texts if highest is None else best_in_bold(texts, values, highest=highest))
+    header = ["method", *(heading for _, heading, *_ in columns)]
+    return markdown(header, list(zip(*cells, strict=True)))
 
 
 def best_in_bold(cells: list[str], values: Sequence[float | None], *, highest: bool) -> list[str]:

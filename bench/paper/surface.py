@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from .experiment import Experiment, Options, Row, Task, groups
-from .report import best_in_bold, figure, markdown
+from .report import Column, figure, metric_table
 from .scenes import Scene
 
-# Key, heading, factor to the unit of the heading, digits, and whether more is better (None: neither).
-_COLUMNS = (
+COLUMNS: tuple[Column, ...] = (
     ("accuracy_error_m", "acc. error, cm", 100, 2, False),
     ("accuracy_ratio", "acc. ratio, %", 100, 2, True),
     ("outlier_ratio", "outliers, %", 100, 2, False),
@@ -43,13 +42,7 @@ def table(rows: list[Row]) -> str:
     """A table for each scene; the best of a column in bold."""
     parts = []
     for (scene,), own in groups(rows, "scene").items():
-        columns = [[row["method"] for row in own]]
-        for key, _, factor, digits, highest in _COLUMNS:
-            values = [row.get(key) for row in own]
-            cells = ["–" if value is None else f"{value * factor:.{digits}f}" for value in values]
-            columns.append(cells if highest is None else best_in_bold(cells, values, highest=highest))
-        header = ["method", *(heading for _, heading, *_ in _COLUMNS)]
-        text = markdown(header, list(zip(*columns, strict=True)))
+        text = metric_table(own, COLUMNS)
         missing = [f"- {row['method']} is missing: {row['why_not']}" for row in own if row.get("why_not")]
         parts.append("\n".join([f"### {scene}, {own[0]['returns']:,} returns", "", text, *missing]))
     return "\n\n".join(parts)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: MIT
 """One reconstruction in a process of its own: `python -m bench.peers.child METHOD OPTIONS SCANS RESULT`.
 
-METHOD is `module:function` of this package, OPTIONS its keywords as JSON, SCANS and RESULT are .npz files. A process of
-its own gives each method a fresh peak of memory, its own Python where it needs one, and nobody else's crash. Needs NumPy
+METHOD is `module:function` of this package, which gives a `Made` or its first fields, OPTIONS its keywords as JSON, SCANS
+and RESULT are .npz files. A process of its own gives each method a fresh peak of memory, its own Python where it needs one, and nobody else's crash. Needs NumPy
 and what the method needs, so that it runs where radarsdf does not.
 """
 
@@ -13,8 +13,10 @@ import importlib
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,7 +40,22 @@ class ScanArrays:
         return self.poses[self.frame, :3, 3]
 
 
-def _peak_bytes() -> int:
+class Made(NamedTuple):
+    """What a method makes of some scans."""
+
+    vertices: np.ndarray
+    """(V, 3) world, m."""
+    faces: np.ndarray
+    """(F, 3) rows of the vertices."""
+    map_bytes: int | None = None
+    """Of the map that the mesh was made of, where there is one."""
+    report: dict[str, Any] | None = None
+    """What the method says of itself, as JSON has it."""
+    intensity: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    """Of points seen by sensors, both (N, 3), world, m: (N,) sensor units. Asked for when time and memory are known."""
+
+
+def peak_bytes() -> int:
     """Largest resident memory so far, or -1. Not ru_maxrss: a child starts with its parent's."""
     status = Path("/proc/self/status")
     if not status.exists():
@@ -58,16 +75,22 @@ def main() -> None:
             file["poses"],
             file.get("intensities"),
         )
+        queries = (file["query_points"], file["query_sensors"]) if "query_points" in file else None
     started = time.perf_counter()
-    vertices, faces, map_bytes = reconstruct(scans, **json.loads(options))
-    seconds = time.perf_counter() - started
+    made = Made(*reconstruct(scans, **json.loads(options)))
+    seconds, peak = time.perf_counter() - started, peak_bytes()
+    answers: dict[str, Any] = {}
+    if queries is not None and made.intensity is not None:
+        answers["intensity"] = made.intensity(*queries)
     np.savez(
         result_path,
-        vertices=np.asarray(vertices, np.float64).reshape(-1, 3),
-        faces=np.asarray(faces, np.int64).reshape(-1, 3),
+        vertices=np.asarray(made.vertices, np.float64).reshape(-1, 3),
+        faces=np.asarray(made.faces, np.int64).reshape(-1, 3),
         seconds=seconds,
-        map_bytes=-1 if map_bytes is None else map_bytes,
-        peak_bytes=_peak_bytes(),
+        map_bytes=-1 if made.map_bytes is None else made.map_bytes,
+        peak_bytes=peak,
+        report=json.dumps(made.report or {}),
+        **answers,
     )
 
 

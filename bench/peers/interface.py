@@ -12,7 +12,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,10 @@ class Reconstruction:
     """Largest resident memory of its process, interpreter and libraries included."""
     map_bytes: int | None = None
     """Of the map that the mesh was made of, where there is one."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """What it says of itself: of a fit, `RadarMap.report` and the seconds of the mesh."""
+    intensity: np.ndarray | None = None
+    """At the queries, sensor units, where there were any and it can tell."""
 
 
 def reconstruct(
@@ -96,6 +100,7 @@ def reconstruct(
     *,
     min_range_m: float = 2.5,
     max_range_m: float | None = None,
+    queries: tuple[np.ndarray, np.ndarray] | None = None,
     timeout_s: float = 3600.0,
 ) -> Reconstruction:
     """Run a peer on scans.
@@ -112,6 +117,8 @@ def reconstruct(
         F arrays (N_i,), sensor units; given to those peers that use them.
     min_range_m, max_range_m
         Nearer and farther returns are dropped, for all peers alike.
+    queries
+        Points and the positions of the sensors that see them, (N, 3) and (N, 3), world, m: where to predict intensities.
     timeout_s
         After this, the peer is stopped and has no result.
     """
@@ -132,6 +139,8 @@ def reconstruct(
     arrays = {"points": sensor_points[kept], "frame": frame, "poses": local_poses[used]}
     if peer.intensities and intensities is not None:
         arrays["intensities"] = np.concatenate(intensities)[kept]
+    if queries is not None:
+        arrays |= {"query_points": queries[0] - origin, "query_sensors": queries[1] - origin}
     options = dict(peer.options)
     if "changes" in options:
         options["changes"] = {"min_range_m": 0.0} | options["changes"]  # the ranges are cut already
@@ -151,14 +160,16 @@ def reconstruct(
         except subprocess.TimeoutExpired:
             return Reconstruction(None, f"no result after {timeout_s:.0f} s")
         if done.returncode != 0:
-            return Reconstruction(None, _reason(done))
+            return Reconstruction(None, failure(done))
         with np.load(result_path) as result:
             vertices, faces = result["vertices"] + origin, result["faces"]
             seconds, peak, map_bytes = (result[k].item() for k in ("seconds", "peak_bytes", "map_bytes"))
+            report, intensity = json.loads(result["report"].item()), result.get("intensity")
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if len(faces) == 0:
         return Reconstruction(None, "it made no triangles", seconds)
-    return Reconstruction(mesh, "", seconds, *(None if size < 0 else size for size in (peak, map_bytes)))
+    peak, map_bytes = (None if size < 0 else size for size in (peak, map_bytes))
+    return Reconstruction(mesh, "", seconds, peak, map_bytes, report, intensity)
 
 
 @cache
@@ -176,12 +187,13 @@ def _interpreter(needs: str) -> tuple[str | None, str]:
         )
         if done.returncode == 0:
             return python, ""
-        why_not = _reason(done)
+        why_not = failure(done)
     hint = INSTALL.get(needs)
     return None, f"{why_not} ({hint})" if hint else why_not
 
 
-def _reason(done: subprocess.CompletedProcess[str]) -> str:
+def failure(done: subprocess.CompletedProcess[str]) -> str:
+    """Why a process failed, in one line."""
     if done.returncode < 0:
         return f"killed by signal {-done.returncode}" + (" (out of memory?)" if done.returncode == -9 else "")
     lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]

@@ -4,17 +4,22 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
 import radarsdf
+import radarsdf.meshing  # with trimesh: imported by the first mesh otherwise, and counted
 
-from .child import ScanArrays
+from .child import Made, ScanArrays
 
 
-def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, int]:
+def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any]) -> Made:
     """Fit and mesh. `base` is "default" or "paper"; intensities are used where `scans` has them."""
-    config = radarsdf.FitConfig.paper(**changes) if base == "paper" else radarsdf.FitConfig(**changes)
+    base_config = radarsdf.FitConfig.paper() if base == "paper" else radarsdf.FitConfig()
+    config = radarsdf.FitConfig.from_dict(
+        base_config.to_dict() | changes
+    )  # not keywords: JSON knows no tuples
     frames = [np.flatnonzero(scans.frame == i) for i in range(len(scans.poses))]
     radar_map = radarsdf.fit(
         [scans.points[own] for own in frames],
@@ -23,5 +28,8 @@ def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any]) -> tuple
         config=config,
         progress=False,
     )
+    started = time.perf_counter()
     mesh = radar_map.mesh(progress=False)
-    return mesh.vertices, mesh.faces, radar_map.nbytes
+    report = radar_map.report | {"mesh_s": time.perf_counter() - started}
+    intensity = radar_map.intensity if radar_map.has_intensity else None
+    return Made(mesh.vertices, mesh.faces, radar_map.nbytes, report, intensity)

@@ -16,7 +16,7 @@ import numpy as np
 import radarsdf
 from radarsdf import FitConfig, Interrupted
 
-from bench.growth import scans_of, street
+from bench.growth.street import street
 from bench.paper.report import markdown
 
 
@@ -51,7 +51,8 @@ def waits(work: Callable[[], Any], moments: int, seed: int = 0) -> tuple[float, 
 
 def run(returns: int, moments: int) -> None:
     """Print the table for a fit of a street, and for its mesh."""
-    points, poses = scans_of(street(returns))
+    scans = street(returns)
+    points, poses = scans.points, scans.poses
     config = FitConfig(sdf_iterations=100)
     radar_map = radarsdf.fit(points, poses, config=config, progress=False)
     rows = []

@@ -15,7 +15,8 @@ import numpy as np
 import radarsdf
 from radarsdf import Estimate, FitConfig
 
-from bench.growth import memory_mb, scans_of, street
+from bench.growth.memory import memory_mb
+from bench.growth.street import street
 from bench.paper.report import markdown
 
 CASES: list[tuple[int, bool, dict[str, Any]]] = [
@@ -35,9 +36,8 @@ SHORT: dict[str, Any] = {"sdf_iterations": 60, "intensity_iterations": 72, "batc
 
 
 def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
-    points, poses = scans_of(street(count))
-    intensities = [50 - 40 * np.log10(np.linalg.norm(p, axis=1)) for p in points]
-    return points, poses, intensities if with_intensities else None
+    scans = street(count)
+    return scans.points, scans.poses, scans.intensities if with_intensities else None
 
 
 def peak_of_a_fit(count: int, with_intensities: bool, changes: dict[str, Any]) -> tuple[Estimate, float]:

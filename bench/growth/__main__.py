@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""How time and memory grow: `python -m bench.growth fits|surfels`, on Linux.
+
+Each row runs in a process of its own. Prints a Markdown table as it goes, and writes it and the numbers to
+`bench_results/growth_fits.md` and `.json`, or `growth_surfels`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from bench.paper.report import ROOT, provenance, write_json
+from bench.peers.interface import failure
+
+from . import fits, surfels
+
+TABLES = {"fits": fits, "surfels": surfels}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    words = _parser().parse_args(arguments)
+    if words.row:
+        print(json.dumps(TABLES[words.table].row(**json.loads(words.row)), default=float))
+        return
+    if words.table == "fits":
+        cases = fits.cases(
+            quick=words.quick,
+            returns=words.returns,
+            sizes_m=words.sizes,
+            threads=words.threads,
+            every=words.every,
+        )
+    else:
+        cases = surfels.cases(quick=words.quick)
+    columns = TABLES[words.table].COLUMNS
+    lines = [f"| {' | '.join(heading for _, heading, _ in columns)} |", "|" + "---|" * len(columns)]
+    print("\n".join(lines), flush=True)
+    rows: list[dict[str, Any]] = []
+    made = provenance("bench.growth")
+    words.out.mkdir(parents=True, exist_ok=True)
+    stem = words.out / f"growth_{words.table}"
+    for case in cases:
+        rows.append(case | _in_a_process(words.table, case))
+        lines.append(line(rows[-1], columns))
+        print(lines[-1], flush=True)
+        # After each row, so that an interrupted run of hours leaves what it has.
+        write_json(stem.with_suffix(".json"), {"table": words.table, **made, "rows": rows})
+        stem.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if failed := sum("why_not" in row for row in rows):
+        sys.exit(f"{failed} of {len(rows)} rows failed")
+
+
+def line(row: dict[str, Any], columns: tuple[tuple[str, str, str], ...]) -> str:
+    """A row of the table; what has no number is a dash, and the reason follows."""
+    cells = ["–" if row.get(key) is None else _text(row[key], form) for key, _, form in columns]
+    return f"| {' | '.join(cells)} |" + (f" {row['why_not']}" if "why_not" in row else "")
+
+
+def _text(value: Any, form: str) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:{form}}"
+
+
+def _in_a_process(table: str, case: dict[str, Any]) -> dict[str, Any]:
+    # Without the threshold, memory of the scene that was freed but kept would hide some of the peak.
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}
+    done = subprocess.run(
+        [sys.executable, "-m", "bench.growth", table, "--row", json.dumps(case)],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        return {"why_not": failure(done)}
+    values: dict[str, Any] = json.loads(done.stdout)
+    return values
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m bench.growth", description=__doc__)
+    parser.add_argument("table", choices=TABLES)
+    parser.add_argument(
+        "--out", type=Path, default=Path("bench_results"), help="folder; default: bench_results"
+    )
+    parser.add_argument("--quick", action="store_true", help="only see that it runs, in some seconds")
+    parser.add_argument(
+        "--returns",
+        type=lambda text: int(float(text)),
+        nargs="+",
+        default=[],
+        help="fits: how many; default: 1e4 to 1e7",
+    )
+    parser.add_argument(
+        "--sizes", type=float, nargs="+", default=[], help="fits: length, m; default: 50 500 5000"
+    )
+    parser.add_argument("--threads", type=int, nargs="+", default=[], help="fits: default: 1 and 2")
+    parser.add_argument(
+        "--every",
+        action="store_true",
+        help="fits: each size with each number of returns, not only with a million, nor these only at 500 m",
+    )
+    parser.add_argument("--row", help=argparse.SUPPRESS)
+    return parser
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A street of any length, seen by any number of returns: cheap to make, and the truth about it is known.
+
+Walls 25 m to either side of a straight path and one at each end, flat ground 2 m below the sensor. What meets none of
+them within 100 m is clutter at 30 to 100 m, and a tenth are ghosts. The intensity is that of the radar equation, in dB:
+falling with the fourth power of the range, from ground and from stripes of wall that differ in strength.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_MAX_SCAN = 5000  # returns
+_MAX_STEP_M = 10.0  # between scans
+_WALL_M = 25.0
+_HEIGHT_M = 2.0
+_REACH_M = 100.0
+
+
+@dataclass(frozen=True)
+class Street:
+    """F scans along the path, which begins at one end and stops at the other."""
+
+    points: list[NDArray[np.float32]]
+    """F arrays (N_i, 3), sensor frame (the world's axes), m."""
+    poses: NDArray[np.float64]
+    """(F, 4, 4) T_world_sensor."""
+    intensities: list[NDArray[np.float32]]
+    """F arrays (N_i,), dB."""
+    hits: NDArray[np.float32]
+    """(M, 3) places on the true surfaces that returns came from, world, m."""
+    hit_intensities: NDArray[np.float32]
+    """(M,) what the sensor would have measured of them without noise, dB."""
+    hit_sensors: NDArray[np.float32]
+    """(M, 3) where they were seen from, world, m."""
+
+
+def street(count: int, size_m: float | None = None, seed: int = 0, num_hits: int = 20_000) -> Street:
+    """`count` returns of a street, and the truth of up to `num_hits` of them.
+
+    It is `size_m` long, or 200 m and another for every 5,000 returns, so that their density stays as it is.
+    """
+    size_m = 200 + count / 5000 if size_m is None else size_m
+    rng = np.random.default_rng(seed)
+    frames = max(-(-count // _MAX_SCAN), round(size_m / _MAX_STEP_M), 2)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = (np.arange(frames) + 0.5) / frames * size_m
+    poses[:, 2, 3] = _HEIGHT_M
+    points, intensities, truths = [], [], []
+    for frame, pose in enumerate(poses):
+        own = count * (frame + 1) // frames - count * frame // frames
+        scan, intensity, *truth = _scan(own, pose[:3, 3].astype(np.float32), np.float32(size_m), rng)
+        points.append(scan)
+        intensities.append(intensity)
+        some = slice(-(-num_hits // frames))
+        truths.append([part[some] for part in truth])
+    hits, hit_intensities, hit_sensors = (np.concatenate(parts) for parts in zip(*truths, strict=True))
+    return Street(points, poses, intensities, hits, hit_intensities, hit_sensors)
+
+
+def _scan(
+    count: int, sensor: NDArray[np.float32], size_m: np.float32, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], ...]:
+    """Points and intensities of one scan; of those that are neither ghosts nor clutter, hits, intensities, sensors."""
+    azimuth = rng.random(count, np.float32) * np.float32(2 * np.pi)
+    elevation = rng.random(count, np.float32) * np.float32(0.31) - np.float32(0.06)
+    flat = np.cos(elevation)
+    rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 1)
+    with np.errstate(divide="ignore"):
+        walls_m = np.float32(_WALL_M) / np.abs(rays[:, 1])
+        ends_m = np.where(rays[:, 0] > 0, size_m - sensor[0], sensor[0]) / np.abs(rays[:, 0])
+        ground_m = np.where(rays[:, 2] < 0, -sensor[2] / rays[:, 2], np.float32(np.inf))
+    hit_m = np.minimum(np.minimum(walls_m, ends_m), ground_m)
+    is_hit = hit_m < _REACH_M
+    range_m = np.where(is_hit, hit_m, 30 + 70 * rng.random(count, np.float32))
+    is_ghost = is_hit & (hit_m < 0.7 * _REACH_M) & (rng.random(count, np.float32) < 0.1)
+    hits = sensor + rays * range_m[:, None]
+    stripe = np.sin(hits[:, 0] * np.float32(0.5)) * np.where(ground_m > hit_m, np.float32(6), np.float32(0))
+    ideal = (100 + stripe - 40 * np.log10(range_m)).astype(np.float32)
+    true = is_hit & ~is_ghost
+    range_m *= np.where(is_ghost, 1.1 + np.float32(0.3) * rng.random(count, np.float32), np.float32(1))
+    range_m += np.float32(0.05) * rng.standard_normal(count, np.float32)
+    noisy = rays + np.float32(0.005) * rng.standard_normal(rays.shape, np.float32)
+    noisy *= (range_m / np.linalg.norm(noisy, axis=1))[:, None]
+    intensity = ideal + np.float32(2) * rng.standard_normal(count, np.float32)
+    return noisy, intensity, hits[true], ideal[true], np.broadcast_to(sensor, hits.shape)[true]

@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Finding ghosts and counting support, each row in a process of its own; the street grows with the returns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from radarsdf import FitConfig
+from radarsdf.fitting import occupied_leaf_keys
+from radarsdf.scans import prepare
+from radarsdf.surfels import Surfels, support_of
+
+from .memory import memory_mb
+from .street import street
+
+Result = TypeVar("Result")
+
+COLUMNS = (
+    ("returns", "returns", ","),
+    ("ghosts_cpu_s", "ghosts: processor, s", ".2f"),
+    ("ghosts_s", "wall, s", ".2f"),
+    ("ghosts_mb", "MB", ".0f"),
+    ("support_cpu_s", "support: processor, s", ".2f"),
+    ("support_s", "wall, s", ".2f"),
+    ("support_mb", "MB", ".0f"),
+    ("ghosts", "ghosts", ","),
+    ("leaf_cells", "leaf cells", ","),
+)
+
+
+def cases(*, quick: bool) -> list[dict[str, Any]]:
+    """Arguments of `row`."""
+    return [{"returns": count, "threads": 2} for count in ((10**5,) if quick else (10**5, 10**6, 10**7))]
+
+
+def row(returns: int, threads: int) -> dict[str, Any]:
+    """Seconds of processor and of wall, and the peak of memory over what there was before, of both."""
+    scans = street(returns)
+    rays = prepare(scans.points, scans.poses)
+    del scans
+    config = FitConfig()
+    is_ghost, ghosts = _measured("ghosts", lambda: Surfels.of(rays, threads).ghosts(rays, threads))
+    kept = rays.select(~is_ghost)
+    leaf_keys = occupied_leaf_keys(kept, config, threads)
+    counts, support = _measured(
+        "support", lambda: support_of(kept.points, leaf_keys, config.leaf_size_m, threads)
+    )
+    # A tenth of those that hit something within 70 m are ghosts, and every cell lies within 0.3 m of a return.
+    if not 0.02 * returns < is_ghost.sum() < 0.15 * returns or not (counts > 0).mean() > 0.5:
+        msg = (
+            f"{is_ghost.sum()} ghosts of {returns} returns, {(counts > 0).mean():.0%} of the cells supported"
+        )
+        raise RuntimeError(msg)
+    return {"ghosts": int(is_ghost.sum()), "leaf_cells": len(leaf_keys), **ghosts, **support}
+
+
+def _measured(name: str, function: Callable[[], Result]) -> tuple[Result, dict[str, float]]:
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
+    before_mb, wall_s, processor_s = memory_mb("VmRSS"), time.perf_counter(), time.process_time()
+    result = function()
+    return result, {
+        f"{name}_cpu_s": time.process_time() - processor_s,
+        f"{name}_s": time.perf_counter() - wall_s,
+        f"{name}_mb": memory_mb("VmHWM") - before_mb,
+    }

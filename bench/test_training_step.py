@@ -1,0 +1,318 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A training step as one of two threads runs it: the whole, its parts, and what its matrix products alone would take.
+
+A group for each of the schedule's stages: geometry alone, joint with the reflectance, and reflectance on frozen
+geometry. A round is `STEPS` steps in all cases of a group, so that their ratios can be read off. The whole is
+`Training` itself; the parts are rebuilt here from what it calls, so where they do not add up to it, it has found a
+shorter way or wastes time between them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from radarsdf import FitConfig
+from radarsdf._core import CellSet
+from radarsdf.field import Field
+from radarsdf.losses import intensity_loss, sdf_loss
+from radarsdf.map import IntensityScale
+from radarsdf.optimiser import Adam
+from radarsdf.sampling import RaySampler
+from radarsdf.scans import prepare
+from radarsdf.threads import Workers
+from radarsdf.training import Training
+
+from .conftest import Surface, surface_points
+
+STEPS = 20
+STAGES = ("geometry", "joint", "reflectance")
+CONFIG = FitConfig(num_threads=1, drop_ghosts=False, cosine_schedule=False)
+SHARE = 2  # of a batch: a fit's batches are shared between two threads
+
+
+class Step:
+    """One stage of a fit on one thread: data, networks, and the parts of a step as functions."""
+
+    def __init__(self, stage, rays, leaf_keys):
+        self.stage = stage
+        self.frozen = stage == "reflectance"
+        self.size = (CONFIG.intensity_batch_size if self.frozen else CONFIG.batch_size) // SHARE
+        torch.manual_seed(0)
+        self.field = Field(leaf_keys, CONFIG, with_intensity=stage != "geometry")
+        self.field.cells.initialise(CONFIG.feature_std)
+        if self.frozen:
+            self.field.cells.requires_grad_(False)
+            self.field.sdf_network.requires_grad_(False)
+        self.parameters = [p for p in self.field.parameters() if p.requires_grad]
+        self.sampler = RaySampler(rays, CONFIG, self.size, torch.Generator().manual_seed(0))
+        self.directions = torch.from_numpy(rays.directions)
+        self.ranges_m = torch.from_numpy(rays.ranges_m)
+        self.labels = torch.from_numpy(IntensityScale.of(rays.intensities).to_unit(rays.intensities))
+
+    def samples(self):
+        """Samples, and the dropout of what the intensity network sees."""
+        samples = self.sampler.spread(self.size) if self.frozen else self.sampler.batch()
+        if self.stage == "geometry":
+            return samples, None
+        dims = (self.field.cells.dim, self.field.fourier.dim)
+        dropouts = (CONFIG.feature_dropout, CONFIG.fourier_dropout)
+        kept = [
+            self.sampler.kept(samples.num_near, dim, share) for dim, share in zip(dims, dropouts, strict=True)
+        ]
+        return samples, torch.cat(kept, 1)
+
+    def encoded(self, samples):
+        with torch.set_grad_enabled(not self.frozen):
+            return self.field.encode(samples.points)
+
+    def losses(self, samples, kept, encoding):
+        """Of the stage: the SDF's, the intensity's or both."""
+        with torch.set_grad_enabled(not self.frozen):
+            logit, feature = self.field.sdf_network(encoding)
+        losses = [] if self.frozen else [sdf_loss(logit, samples.sdf_m, CONFIG.sigma_m)]
+        if self.stage != "geometry":
+            near = slice(samples.num_near)
+            rays = samples.rays[near]
+            predicted = self.field.intensity_network(
+                encoding[near] * kept,
+                logit[near],
+                feature[near],
+                None,
+                self.directions[rays],
+                self.ranges_m[rays] - samples.sdf_m[near],
+            )
+            losses.append(intensity_loss(predicted, self.labels[rays]))
+        return losses
+
+    def products(self):
+        """Operands of all matrix products of the layers: forward, gradient of the weights, gradient of the inputs."""
+        layers = []
+        if not self.frozen:
+            layers.append((self.field.sdf_network.layers, self.size, True))
+        if self.stage != "geometry":
+            rows = self.samples()[0].num_near
+            layers.append((self.field.intensity_network.layers, rows, not self.frozen))
+        operands = [] if not self.frozen else self._forward(self.field.sdf_network.layers, self.size)
+        for modules, rows, to_inputs in layers:
+            operands += self._forward(modules, rows)
+            for i, layer in enumerate(linear(modules)):
+                inputs, grad = torch.randn(rows, layer.in_features), torch.randn(rows, layer.out_features)
+                operands.append((inputs.T, grad))
+                if i > 0 or to_inputs:
+                    operands.append((grad, layer.weight.detach()))
+        return operands
+
+    @staticmethod
+    def _forward(modules, rows):
+        return [(torch.randn(rows, layer.in_features), layer.weight.detach().T) for layer in linear(modules)]
+
+
+def linear(modules):
+    return [layer for layer in modules if isinstance(layer, torch.nn.Linear)]
+
+
+@pytest.fixture(scope="module")
+def rays():
+    scan = surface_points(100_000, dtype=np.float64) - [0, 0, 8]
+    intensities = 10 * np.sin(scan[:, 0]) - 40 * np.log10(np.linalg.norm(scan, axis=1))
+    return prepare([scan], np.eye(4)[None], [intensities])
+
+
+@pytest.fixture(scope="module")
+def leaf_keys(rays):
+    cells = CellSet(CONFIG.leaf_size_m)
+    for chunk in rays.along(np.linspace(-CONFIG.near_band_m, CONFIG.near_band_m, 7)):
+        cells.insert(chunk)
+    return cells.sorted_keys()
+
+
+@pytest.fixture(params=STAGES)
+def step(request, rays, leaf_keys):
+    with Workers(1):
+        yield Step(request.param, rays, leaf_keys)
+
+
+def measured(benchmark, step, function, *arguments):
+    """What `function` gives the last time."""
+    benchmark.group = f"training step, {step.stage}, {step.size} samples, {STEPS} steps a round"
+
+    def run():
+        for _ in range(STEPS):
+            result = function(*arguments)
+        return result
+
+    return benchmark.pedantic(run, rounds=10, warmup_rounds=1)
+
+
+def test_samples(benchmark, step, rays):
+    samples, kept = measured(benchmark, step, step.samples)
+    ray = samples.rays.numpy()
+    points = rays.points[ray] - samples.sdf_m.numpy()[:, None] * rays.directions[ray]
+    off_m = np.linalg.norm(points - samples.points.numpy(), axis=1)
+    # Of the reflectance stage, they are spread across the beam.
+    spread_m = CONFIG.cross_range_noise_rad * rays.ranges_m[ray] if step.frozen else 1e-5
+    assert (off_m < 6 * spread_m).all()
+    assert np.median(off_m / spread_m) > 1 or not step.frozen
+    assert len(samples.points) == step.size
+    assert len(np.unique(ray)) > 0.45 * step.size
+    if kept is not None:
+        assert kept.mean().item() == pytest.approx(1, abs=0.05)
+        assert (kept == 0).float().mean().item() > CONFIG.fourier_dropout
+
+
+def test_encodings_forward(benchmark, step):
+    samples, _ = step.samples()
+    encoding = measured(benchmark, step, step.encoded, samples).detach()
+    angles = encoding[:, step.field.cells.dim :].double().view(len(encoding), 2, -1)
+    assert ((angles**2).sum(1) - 1).abs().max() < 1e-5
+    points = samples.points.numpy()[: samples.num_near]
+    known = step.field.cells.occupied(samples.points[: samples.num_near]).numpy()
+    assert known.mean() > 0.8
+    surface = Surface(step.field.cells.table, step.field.cells.features.detach())
+    rows, weights = surface.rows_and_weights(points[known])
+    expected = (surface.features.numpy()[rows] * weights[..., None]).sum(2).reshape(known.sum(), -1)
+    found = encoding[: samples.num_near, : step.field.cells.dim].numpy()[known]
+    assert np.abs(found - expected).max() < 1e-4
+
+
+def test_networks_forward(benchmark, step):
+    samples, kept = step.samples()
+    encoding = step.encoded(samples).detach().requires_grad_(not step.frozen)
+    losses = measured(benchmark, step, step.losses, samples, kept, encoding)
+    logit, inputs = mlp(step.field.sdf_network.layers, encoding.detach().numpy()), encoding.detach().numpy()
+    expected = []
+    if not step.frozen:
+        label = 1 / (1 + np.exp(-samples.sdf_m.double().numpy() / CONFIG.sigma_m))
+        expected.append((np.logaddexp(0, logit) - label * logit).mean())
+    if kept is not None:
+        near, ray = slice(samples.num_near), samples.rays[: samples.num_near]
+        range_m = (step.ranges_m[ray] - samples.sdf_m[near]).double().numpy()
+        harmonics = step.field.intensity_network.harmonics(step.directions[ray]).numpy()
+        inputs = [inputs[near] * kept.numpy(), logit[near, None], harmonics, np.log10(range_m / 10)[:, None]]
+        predicted = mlp(step.field.intensity_network.layers, np.concatenate(inputs, 1))
+        expected.append(np.abs(predicted - step.labels[ray].numpy()).mean())
+    assert [loss.item() for loss in losses] == pytest.approx(expected, rel=1e-4)
+
+
+def mlp(modules, inputs):
+    layers = linear(modules)
+    for i, layer in enumerate(layers):
+        inputs = inputs.astype(np.float64) @ layer.weight.detach().double().numpy().T
+        inputs = inputs + layer.bias.detach().double().numpy()
+        inputs = inputs if i == len(layers) - 1 else np.maximum(inputs, 0)
+    return inputs[:, 0]
+
+
+def test_backward(benchmark, step):
+    samples, kept = step.samples()
+    loss = sum(step.losses(samples, kept, step.encoded(samples)))
+    gradients = measured(
+        benchmark, step, lambda: torch.autograd.grad(loss, step.parameters, retain_graph=True)
+    )
+    # Down its gradient, the loss falls by that's square. The forward pass, which is checked above, says whether it does:
+    # in double precision, and for the features apart, since the networks' gradient is larger.
+    step.field.double()
+    samples = dataclasses.replace(samples, points=samples.points.double(), sdf_m=samples.sdf_m.double())
+    gradients = dict(zip(step.parameters, gradients, strict=True))
+    features = [p for p in step.field.cells.parameters() if p in gradients]
+    networks = [p for p in step.parameters if all(p is not other for other in features)]
+    for parameters in [networks] if step.frozen else [features, networks]:
+        square = sum((gradients[p].double() ** 2).sum().item() for p in parameters)
+        h = 1e-5 / square**0.5
+        ends = []
+        for share in (h, -2 * h, h):
+            with torch.no_grad():
+                for p in parameters:
+                    p.add_(gradients[p].double(), alpha=share)
+                ends.append(sum(step.losses(samples, kept, step.encoded(samples))).item())
+        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(square, rel=0.01)
+
+
+def test_adam(benchmark, step):
+    samples, kept = step.samples()
+    loss = sum(step.losses(samples, kept, step.encoded(samples)))
+    gradients = torch.autograd.grad(loss, step.parameters)
+    before = [p.detach().clone() for p in step.parameters]
+    adam = Adam(step.parameters, CONFIG.learning_rate, CONFIG.adam_epsilon)
+    steps = 0
+
+    def run():
+        nonlocal steps
+        adam.step(gradients)
+        steps += 1
+
+    measured(benchmark, step, run)
+    # Of gradients that never change, means and squares are the gradient and its square: each step is of one length.
+    check_moves(step, before, gradients, steps * CONFIG.learning_rate)
+    # Then one that is twice as large.
+    before = [p.detach().clone() for p in step.parameters]
+    adam.step([2 * gradient for gradient in gradients])
+    mean = (0.9 * (1 - 0.9**steps) + 0.1 * 2) / (1 - 0.9 ** (steps + 1))
+    square = (0.999 * (1 - 0.999**steps) + 0.001 * 4) / (1 - 0.999 ** (steps + 1))
+    check_moves(step, before, gradients, CONFIG.learning_rate * mean / square**0.5)
+
+
+def check_moves(step, before, gradients, length):
+    for parameter, start, gradient in zip(step.parameters, before, gradients, strict=True):
+        moved = (start - parameter.detach()) / length
+        moves = gradient.abs() > 1e-9
+        assert moves.any()
+        torch.testing.assert_close(moved[moves], gradient[moves].sign(), rtol=0, atol=0.003)
+        assert (moved[gradient == 0] == 0).all()
+
+
+def test_matrix_products(benchmark, step):
+    """Those of the networks alone, forward and backward: no encoding, no loss, no bias, no ReLU, no optimiser."""
+    operands = step.products()
+
+    def run():
+        return [torch.mm(a, b) for a, b in operands]
+
+    products = measured(benchmark, step, run)
+    for product, (a, b) in zip(products, operands, strict=True):
+        expected = a.double().sum(0) @ b.double().sum(1)
+        scale = (product.double() ** 2).sum().sqrt()
+        assert abs(product.double().sum() - expected) < 1e-3 * scale
+
+
+def test_whole(benchmark, step, rays):
+    """`STEPS` steps of `Training` on one thread; those of frozen geometry come after one of geometry."""
+    field = Field(
+        step.field.cells.table.leaf_keys(), CONFIG, with_intensity=step.stage != "geometry", num_threads=1
+    )
+    field.cells.initialise(CONFIG.feature_std)
+    scale = IntensityScale.of(rays.intensities) if step.stage != "geometry" else None
+    joint = step.stage == "joint"
+    config = dataclasses.replace(
+        CONFIG,
+        batch_size=CONFIG.batch_size // SHARE,
+        intensity_batch_size=CONFIG.intensity_batch_size // SHARE,
+        sdf_iterations=1 if step.frozen else STEPS,
+        intensity_iterations=1 if joint else STEPS,
+        joint=joint,
+    )
+    losses = []
+
+    def setup():
+        field.requires_grad_(True)  # a training leaves all frozen
+        training = Training(field, rays, rays, scale, config, workers)
+        return (training,), {}
+
+    def run(training):
+        training.run(progress=False)
+        losses.append(training.losses)
+
+    benchmark.group = f"training step, {step.stage}, {step.size} samples, {STEPS} steps a round"
+    with Workers(1) as workers:
+        benchmark.pedantic(run, setup=setup, rounds=10, warmup_rounds=1)
+        if len(losses) == 1:  # nothing is timed: enough to learn something
+            for _ in range(4):
+                run(*setup()[0])
+    name = "intensity" if step.frozen else "sdf"
+    samples, kept = step.samples()
+    untrained = sum(step.losses(samples, kept, step.encoded(samples))).item()
+    assert losses[-1][name] < 0.75 * untrained  # a round goes on where the one before ended
