@@ -57,11 +57,12 @@ def fitted(changes: dict[str, Any], iterations: int) -> tuple[RadarMap, str]:
     )
     config = dataclasses.replace(config, sdf_iterations=iterations, intensity_iterations=2 * iterations)
     points, poses, intensities = room()
+    radar_map, end = None, "done"
     try:
-        radar_map, end = radarsdf.fit(points, poses, intensities, config=config, progress=False), "done"
+        radar_map = radarsdf.fit(points, poses, intensities, config=config, progress=False)
     except Diverged as error:
-        assert error.radar_map is not None
         radar_map, end = error.radar_map, str(error)
+    assert radar_map is not None
     assert all(value.isfinite().all() for value in radar_map.field.state_dict().values())
     assert all(np.isfinite(loss) for loss in radar_map.report["losses"].values())
     x = np.random.default_rng(1).uniform(-4.5, 4.5, (2000, 3))

@@ -244,7 +244,8 @@ def _lattice(
     start, direction = rays.points[used][:, columns], rays.directions[used][:, columns]
     points = start[:, None, :] + offsets[None, :, None].astype(np.float32) * direction[:, None, :]
     limit = float(2**40)  # what is further out has no cells, as the fit will say
-    return np.floor((points / leaf_size_m).clip(-limit, limit)).astype(np.int64).reshape(-1, len(axes))
+    cells: NDArray[np.int64] = np.floor((points / leaf_size_m).clip(-limit, limit)).astype(np.int64)
+    return cells.reshape(-1, len(axes))
 
 
 def _in_sample(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
@@ -253,7 +254,8 @@ def _in_sample(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
     for coordinate in (lattice // _COLUMN).T:
         hashed = (hashed ^ coordinate.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
         hashed ^= hashed >> np.uint64(29)
-    return (hashed >> np.uint64(40)) < np.uint64(share * 2**24)
+    chosen: NDArray[np.bool_] = (hashed >> np.uint64(40)) < np.uint64(share * 2**24)
+    return chosen
 
 
 def _unique_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
