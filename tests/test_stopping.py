@@ -143,6 +143,7 @@ from tests.conftest import ground_and_wall
 scene = ground_and_wall()
 config = radarsdf.FitConfig(sdf_iterations=5)
 radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
+radar_map.mesh()  # imports trimesh, which would take Ctrl-C for a library that is missing
 print("ready", flush=True)
 try:
     while True:
