@@ -4,18 +4,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 import radarsdf
 import torch
-from radarsdf import Diverged, FitConfig, Interrupted
+from radarsdf import Diverged, FitConfig, Interrupted, _core
 from radarsdf.optimiser import Adam
 from radarsdf.readers import Scans, write_scans
 from radarsdf.stopping import deferred_interrupts
@@ -83,7 +86,6 @@ def test_ctrl_c_while_training_hands_back_the_map(threads):
 
 
 def test_ctrl_c_before_the_training_has_no_map():
-    # Walks 3 million rays of 300 m in one call of the core, which takes many seconds.
     code = """
 import numpy as np
 import radarsdf
@@ -105,6 +107,35 @@ except radarsdf.Interrupted as error:
     assert interrupted_python(code, delay_s=0.5) == ("no map\n", 0)
 
 
+def test_ctrl_c_ends_a_long_call_of_the_core():
+    # Rays through thousands of cells with a plane each that none of them meets.
+    cells = (np.stack(np.meshgrid(*[np.arange(-20, 20)] * 3), -1).reshape(-1, 3) * 0.4 + 0.2).astype(
+        np.float32
+    )
+    keys = np.sort(_core.cell_keys(cells, 0.4, 1))
+    planes = np.full((len(keys), 7), 100, np.float32)
+    planes[:, 3:] = [1, 0, 0, 0.01]
+    directions = np.random.default_rng(0).normal(size=(100_000, 3))
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    surfels = _core.SurfelMap(keys, planes, 0.4)
+
+    def walk():
+        started_s = time.perf_counter()
+        # Also where it comes only after the call: the time tells.
+        with contextlib.suppress(KeyboardInterrupt):
+            surfels.first_crossings(
+                5 * directions, directions, np.full(len(directions), 10, np.float32), 0.1, 0.01, 0.1, 2.0, 1
+            )
+        return time.perf_counter() - started_s
+
+    whole_s = walk()
+    timer = threading.Timer(0.1 * whole_s, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    stopped_s = walk()
+    timer.join()
+    assert stopped_s < 0.6 * whole_s
+
+
 def test_ctrl_c_ends_a_mesh():
     code = """
 import radarsdf
@@ -112,6 +143,7 @@ from tests.conftest import ground_and_wall
 scene = ground_and_wall()
 config = radarsdf.FitConfig(sdf_iterations=5)
 radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
+radar_map.mesh()  # imports trimesh, which would take Ctrl-C for a library that is missing
 print("ready", flush=True)
 try:
     while True:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Long random tests, one command each: `python -m bench.stress kernels|files|save|arguments`."""
+"""Long random tests, one command each: `python -m bench.stress COMMAND`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import sys
 from pathlib import Path
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run one of them; a failure ends the program with status 1."""
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m bench.stress", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     kernels = commands.add_parser("kernels", help="rounding errors of the kernels against float64")
@@ -36,7 +35,16 @@ def main(arguments: list[str] | None = None) -> None:
     training = commands.add_parser("training", help="extreme settings, and very many iterations")
     training.add_argument("--iterations", type=int, default=1000, help="of each case; default: 1000")
     training.add_argument("--longest", type=int, default=100_000, help="of the default; default: 100000")
-    words = parser.parse_args(arguments)
+    seeds = commands.add_parser("seeds", help="how much the errors depend on the seed")
+    seeds.add_argument("scenes", nargs="*", default=["hugin"], metavar="SCENE", help="default: hugin")
+    seeds.add_argument("--count", type=int, default=10, help="seeds; default: 10")
+    seeds.add_argument("--quick", action="store_true", help="only see that it runs")
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run one of them; a failure ends the program with status 1."""
+    words = _parser().parse_args(arguments)
     if words.command == "kernels":
         from .kernels import BATCHES, run  # noqa: PLC0415 - each command imports what it needs
 
@@ -61,6 +69,10 @@ def main(arguments: list[str] | None = None) -> None:
         from .training import run as run_training  # noqa: PLC0415
 
         run_training(words.iterations, words.longest)
+    elif words.command == "seeds":
+        from .seeds import run as run_seeds  # noqa: PLC0415
+
+        run_seeds(words.scenes, words.count, quick=words.quick)
     else:
         environment = os.environ | {"RADARSDF_EXAMPLES": str(words.count)}
         tests = Path(__file__).parents[2] / "tests" / "test_arguments.py"

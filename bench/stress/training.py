@@ -57,9 +57,9 @@ def fitted(changes: dict[str, Any], iterations: int) -> tuple[RadarMap, str]:
     )
     config = dataclasses.replace(config, sdf_iterations=iterations, intensity_iterations=2 * iterations)
     points, poses, intensities = room()
-    radar_map: RadarMap | None
+    radar_map, end = None, "done"
     try:
-        radar_map, end = radarsdf.fit(points, poses, intensities, config=config, progress=False), "done"
+        radar_map = radarsdf.fit(points, poses, intensities, config=config, progress=False)
     except Diverged as error:
         radar_map, end = error.radar_map, str(error)
     assert radar_map is not None

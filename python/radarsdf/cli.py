@@ -18,7 +18,7 @@ import torch
 import trimesh
 
 import radarsdf
-from radarsdf import Diverged, FitConfig, Interrupted, RadarMap, _core
+from radarsdf import FitConfig, Interrupted, RadarMap, _core
 from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
 from radarsdf.picture import save_picture
 from radarsdf.readers import Scans, read_scans, write_scans
@@ -213,7 +213,7 @@ def _fit(options: argparse.Namespace) -> None:
             progress=_progress(options),
             checkpoint=options.checkpoint,
         )
-    except (Interrupted, Diverged) as stop:
+    except Interrupted as stop:
         if stop.radar_map is not None:
             stop.radar_map.save(options.out)
             stop.args = (f"{stop}; the map so far is in {options.out}",)

@@ -24,9 +24,11 @@ from radarsdf.gaps import bridged
 from radarsdf.map import IntensityScale, RadarMap
 from radarsdf.scans import Rays, prepare
 from radarsdf.stopping import Diverged, Interrupted
-from radarsdf.surfels import Surfels, support_of
+from radarsdf.surfels import SURFEL_CELL_M, Surfels, support_of
 from radarsdf.threads import Workers
 from radarsdf.training import Training
+
+_MAX_CELLS = 1_000_000  # from the origin along each axis: keys of cells have 21 bits for each
 
 
 def fit(
@@ -96,6 +98,7 @@ def fit(
             max_range_m=config.max_range_m,
             accumulate_frames=config.accumulate_frames,
         )
+        _check_extent(rays, config)
         check_fit(rays, config)
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
         clock.lap("prepare_s")
@@ -161,6 +164,19 @@ def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArr
     for chunk in rays.along(np.linspace(-config.near_band_m, config.near_band_m, steps + 1)):
         cells.insert(chunk, num_threads)
     return cells.sorted_keys(num_threads)
+
+
+def _check_extent(rays: Rays, config: FitConfig) -> None:
+    """A single outlier must not be met in the middle of the work, nor by an error that does not say what it is."""
+    cell_m = min(config.leaf_size_m, SURFEL_CELL_M) if config.drop_ghosts else config.leaf_size_m
+    distance_m = np.abs(rays.points).max(axis=1) + config.near_band_m
+    if outside := int((distance_m > _MAX_CELLS * cell_m).sum()):
+        msg = (
+            f"{outside} of {len(rays)} returns are not within a million cells of {cell_m} m of the sensors' mean "
+            f"position, the furthest {distance_m.max():.3g} m away: drop them (max_range_m), use larger cells, or split "
+            "scans so far apart"
+        )
+        raise ValueError(msg)
 
 
 def _new_field(rays: Rays, config: FitConfig, num_threads: int) -> Field:

@@ -158,7 +158,7 @@ def prepare(
     ------
     ValueError
         Mismatched lengths or shapes, empty scans, returns that are not finite (with their count), poses that are not
-        rigid, intensities that are all the same, or no return within the ranges.
+        rigid, intensities that are all the same or too far apart for float32, or no return within the ranges.
     """
     scans, values = _check_scans(points, intensities)
     T_world_sensor = check_poses(poses, len(scans))
@@ -194,6 +194,11 @@ def prepare(
     intensity = np.concatenate(kept_values) if values is not None else None
     if intensity is not None and intensity.min() == intensity.max():
         msg = f"all intensities are {intensity[0]}: leave them out where the sensor does not measure them"
+        raise ValueError(msg)
+    if intensity is not None and float(intensity.max()) - float(intensity.min()) > float(
+        np.finfo(np.float32).max
+    ):
+        msg = f"intensities from {intensity.min()} to {intensity.max()} are too far apart for float32"
         raise ValueError(msg)
     return Rays(
         origin=local_origin,

@@ -13,7 +13,7 @@ from radarsdf._core import CellBlocks, CellSet, SurfelMap, cell_keys, sum_moment
 from radarsdf.scans import Rays
 
 # Measured on simulated and real scans; see "What the levers of the surface are worth" in BENCHMARK.md.
-_CELL_M = 0.4
+SURFEL_CELL_M = 0.4
 _NEIGHBOUR_WEIGHT = 0.7  # of a cell that shares a face; its square over an edge, its cube over a corner
 _MIN_RETURNS = 12.0  # weighted, in the 27 cells of a plane
 _MAX_FLATNESS = 0.5  # smallest over middle variance: more is no plane
@@ -61,12 +61,12 @@ class Surfels:
     def of(cls, rays: Rays, num_threads: int = 0) -> Surfels:
         """Planes through returns."""
         points = np.ascontiguousarray(rays.points)
-        occupied = CellSet(_CELL_M)
+        occupied = CellSet(SURFEL_CELL_M)
         occupied.insert(points, num_threads)
         keys = occupied.sorted_keys(num_threads)
         del occupied
         cells = CellBlocks(keys)
-        cell_of_ray = cells.rows(cell_keys(points, _CELL_M, num_threads), num_threads)
+        cell_of_ray = cells.rows(cell_keys(points, SURFEL_CELL_M, num_threads), num_threads)
         moments = sum_moments(
             points, np.ascontiguousarray(rays.directions), cell_of_ray, len(keys), num_threads
         )
@@ -136,7 +136,7 @@ class Surfels:
         table = table.astype(np.float32)
 
         def crossed(planes: NDArray[np.int64], rays: Rays) -> NDArray[np.int32]:
-            surfels = SurfelMap(self.keys[self.cell_of_plane[planes]], table[planes], _CELL_M)
+            surfels = SurfelMap(self.keys[self.cell_of_plane[planes]], table[planes], SURFEL_CELL_M)
             return surfels.first_crossings(
                 np.ascontiguousarray(rays.points),
                 np.ascontiguousarray(rays.directions),

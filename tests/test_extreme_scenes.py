@@ -1,0 +1,287 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scenes far away, tiny, huge, flat, dense, empty or spoilt: an answer that means something, or a clear error."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.scans import prepare
+
+from .conftest import SEED, pose
+from .conftest import ground_and_wall as any_ground_and_wall
+
+QUICK = FitConfig(
+    sdf_iterations=60, intensity_iterations=80, batch_size=512, intensity_batch_size=512, min_range_m=0.0, num_threads=1,
+    min_component_triangles=0, min_support=0.0,
+)  # fmt: skip
+LENGTHS = [f.name for f in dataclasses.fields(FitConfig) if f.name.endswith("_m")]
+
+
+def ground_and_wall(scans=3, returns_per_scan=800):
+    return any_ground_and_wall(scans, returns_per_scan)
+
+
+def scaled(config, factor):
+    """The same fit in other units."""
+    lengths = {n: getattr(config, n) * factor for n in LENGTHS if getattr(config, n) is not None}
+    return dataclasses.replace(config, **lengths)
+
+
+def finite(radar_map, sensor):
+    """All answers at the map's own cells, and a mesh; both are given back."""
+    cells = radar_map.field.cells.table.leaf_cells()[:2000]
+    x = (cells + 0.5) * radar_map.config.leaf_size_m + radar_map.origin
+    assert radar_map.observed(x).mean() > 0.99  # far out, float32 puts some centres into the next cell
+    assert np.isfinite(radar_map.sdf(x)).all()
+    assert np.isfinite(radar_map.gradient(x)).all()
+    assert np.isfinite(radar_map.confidence(x)).all()
+    if radar_map.has_intensity:
+        assert np.isfinite(radar_map.intensity(x, sensor)).all()
+    mesh = radar_map.mesh(radar_map.config.leaf_size_m / 2, progress=False)
+    assert np.isfinite(mesh.vertices).all()
+    return x, mesh
+
+
+def moved(scene, T_new_world):
+    return dataclasses.replace(scene, poses=T_new_world @ scene.poses)
+
+
+def wall_error_m(radar_map, T_new_world, scale=1.0):
+    """Median distance of the map's zero from the wall x = 20 m, in units of the scene."""
+    rng = np.random.default_rng(1)
+    wall = np.column_stack([np.full(500, 20.0), rng.uniform(-4, 4, 500), rng.uniform(0.5, 3, 500)]) * scale
+    world = wall @ T_new_world[:3, :3].T + T_new_world[:3, 3]
+    return float(np.median(np.abs(radar_map.sdf(world)))) / scale
+
+
+@pytest.mark.parametrize("origin", [(0, 0, 0), (5e5, 5.4e6, 300), (1e7, -1e7, 1e7)])
+def test_anywhere(origin):
+    T = np.eye(4)
+    T[:3, 3] = origin
+    scene = moved(ground_and_wall(), T)
+    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK, progress=False)
+    _, mesh = finite(radar_map, scene.poses[0, :3, 3])
+    assert wall_error_m(radar_map, T) < 0.1
+    assert (radar_map.sdf(scene.poses[:, :3, 3]) > 0).all()
+    assert np.abs(mesh.vertices - scene.poses[0, :3, 3]).max() < 30
+
+
+@pytest.mark.parametrize("scale", [0.005, 1.0, 500.0])  # a scene of 10 cm, of 20 m, of 10 km
+def test_of_any_size_where_the_lengths_of_the_configuration_go_along(scale):
+    scene = ground_and_wall()
+    poses = scene.poses.copy()
+    poses[:, :3, 3] *= scale
+    points = [p * scale for p in scene.points]
+    config = dataclasses.replace(scaled(QUICK, scale), log_range=False)
+    radar_map = radarsdf.fit(points, poses, scene.intensities, config=config, progress=False)
+    finite(radar_map, poses[0, :3, 3])
+    assert wall_error_m(radar_map, np.eye(4), scale) < 0.1
+
+
+def test_of_ten_centimetres_with_the_lengths_of_a_street():
+    scene = ground_and_wall()
+    poses = scene.poses.copy()
+    poses[:, :3, 3] *= 0.005
+    points = [p * 0.005 for p in scene.points]
+    radar_map = radarsdf.fit(points, poses, scene.intensities, config=QUICK, progress=False)
+    finite(radar_map, poses[0, :3, 3])
+    assert radar_map.report["leaf_cells"] < 100  # all in a few cells: no shape, and nothing that fails
+
+
+def test_of_ten_kilometres_with_the_lengths_of_a_street():
+    scene = ground_and_wall(returns_per_scan=300)
+    poses = scene.poses.copy()
+    poses[:, :3, 3] *= 500
+    points = [p * 500.0 for p in scene.points]
+    radar_map = radarsdf.fit(points, poses, scene.intensities, config=QUICK, progress=False)
+    finite(radar_map, poses[0, :3, 3])
+    assert radar_map.report["leaf_cells"] < 12 * 1800  # along the beams of 1800 returns, and not between them
+    assert radar_map.observed(np.concatenate([p @ T[:3, :3].T + T[:3, 3] for p, T in zip(points, poses, strict=True)])).mean() > 0.99  # fmt: skip
+
+
+def rotation(seed):
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    T = np.eye(4)
+    T[:3, :3] = q * np.sign(np.linalg.det(q))
+    return T
+
+
+def test_a_tilted_world():
+    scene = moved(ground_and_wall(), rotation(3))
+    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK, progress=False)
+    finite(radar_map, scene.poses[0, :3, 3])
+    assert wall_error_m(radar_map, rotation(3)) < 0.1
+
+
+def test_a_translation_by_whole_cells_changes_nothing_but_roundings():
+    """Tolerance: 1 mm and 0.05 dB in the median, after 80 iterations."""
+    T = np.eye(4)
+    T[:3, 3] = [-7e4, 2e5, 1e3]
+    scene = ground_and_wall()
+    maps = [
+        radarsdf.fit(s.points, s.poses, s.intensities, config=QUICK, progress=False)
+        for s in (scene, moved(scene, T))
+    ]
+    x = np.random.default_rng(0).uniform([8, -5, -0.2], [20, 5, 0.2], (500, 3))
+    differences = np.abs(maps[1].sdf(x + T[:3, 3]) - maps[0].sdf(x))
+    assert np.median(differences) < 1e-3
+
+
+def test_a_rotation_changes_the_surface_by_less_than_its_noise():
+    """The lattice does not turn with the world, so not the same bits: zeros within 5 cm of each other, in the median."""
+    T = rotation(5)
+    scene = ground_and_wall()
+    maps = [radarsdf.fit(s.points, s.poses, config=QUICK, progress=False) for s in (scene, moved(scene, T))]
+    assert abs(wall_error_m(maps[0], np.eye(4)) - wall_error_m(maps[1], T)) < 0.05
+
+
+def test_centimetres_for_metres_change_nothing_but_roundings():
+    """Tolerance: 1 mm, and 0.1 dB, in the median. The range in log10(range / 10 m) is left out: it knows of metres."""
+    scene = ground_and_wall()
+    # Cells that look for ghosts are of 0.4 m, whatever the units.
+    config = dataclasses.replace(QUICK, log_range=False, drop_ghosts=False)
+    poses = scene.poses.copy()
+    poses[:, :3, 3] *= 100
+    metres = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+    centimetres = radarsdf.fit(
+        [p.astype(np.float64) * 100 for p in scene.points], poses, scene.intensities,
+        config=scaled(config, 100), progress=False,
+    )  # fmt: skip
+    x = np.random.default_rng(0).uniform([8, -5, -0.2], [20, 5, 0.2], (500, 3))
+    assert np.median(np.abs(centimetres.sdf(100 * x) / 100 - metres.sdf(x))) < 1e-3
+    sensor = np.array([0.5, 0, 1.5])
+    differences = np.abs(centimetres.intensity(100 * x, 100 * sensor) - metres.intensity(x, sensor))
+    assert np.median(differences) < 0.1
+
+
+RNG = np.random.default_rng(SEED)
+SHAPES = {
+    "plane": np.column_stack([np.full(3000, 5.0), RNG.uniform(-3, 3, (3000, 2))]),
+    "line": np.column_stack([np.full(3000, 5.0), np.linspace(-3, 3, 3000), np.zeros(3000)]),
+    "point": np.tile([5.0, 0.3, 0.2], (3000, 1)),
+    "one return": np.array([[5.0, 0.3, 0.2]]),
+    "one ray": np.column_stack([np.linspace(4, 6, 3000), np.zeros((3000, 2))]),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
+def test_returns_on_less_than_a_surface(name, encoding):
+    points = SHAPES[name]
+    values = None if len(points) == 1 else [np.linspace(0, 1, len(points))]
+    config = dataclasses.replace(QUICK, encoding=encoding)
+    radar_map = radarsdf.fit([points], np.eye(4)[None], values, config=config, progress=False)
+    finite(radar_map, np.zeros(3))
+    assert radar_map.observed(points).all()
+    if name != "one ray":
+        towards = points / np.linalg.norm(points, axis=1, keepdims=True)
+        assert (
+            np.median(radar_map.sdf(points - 0.25 * towards))
+            > 0
+            > np.median(radar_map.sdf(points + 0.25 * towards))
+        )
+
+
+def test_duplicates_weigh_but_add_nothing():
+    scene = ground_and_wall(scans=2, returns_per_scan=400)
+    twice = [np.concatenate([p] * 5) for p in scene.points]
+    maps = [radarsdf.fit(p, scene.poses, config=QUICK, progress=False) for p in (scene.points, twice)]
+    assert maps[0].report["leaf_cells"] == maps[1].report["leaf_cells"]
+    assert abs(wall_error_m(maps[0], np.eye(4)) - wall_error_m(maps[1], np.eye(4))) < 0.1
+
+
+def test_very_many_returns_in_one_cell():
+    points = np.random.default_rng(0).uniform([5.0, 0.01, 0.01], [5.15, 0.19, 0.19], (300_000, 3))
+    radar_map = radarsdf.fit([points], np.eye(4)[None], config=dataclasses.replace(QUICK, sdf_iterations=30))
+    finite(radar_map, np.zeros(3))
+    assert radar_map.report["leaf_cells"] < 60
+    assert radar_map.support.max() == 65535  # and not what is left of it in 16 bits
+    assert radar_map.confidence(points[:10]).min() > 0.99
+
+
+def test_returns_at_the_sensor_itself_are_dropped():
+    scene = ground_and_wall(scans=2, returns_per_scan=200)
+    points = [np.concatenate([p, np.zeros((50, 3))]) for p in scene.points]
+    radar_map = radarsdf.fit(points, scene.poses, config=QUICK, progress=False)
+    finite(radar_map, np.zeros(3))
+    assert (radar_map.report["returns"], radar_map.report["returns_used"]) == (500, 400)
+    with pytest.raises(ValueError, match="none of 50 returns"):
+        radarsdf.fit([np.zeros((50, 3))], np.eye(4)[None], config=QUICK)
+
+
+@pytest.mark.parametrize("distance_m", [1e5, 1e7, 1e11])
+def test_an_outlier_far_away_opens_no_cells_on_its_way(distance_m):
+    scene = ground_and_wall(scans=2, returns_per_scan=600)
+    points = [scene.points[0], np.concatenate([scene.points[1], [[distance_m, 0.0, 0.0]]])]
+    config = dataclasses.replace(QUICK, sdf_iterations=10)
+    if distance_m > 2e5:  # beyond the lattice
+        with pytest.raises(ValueError, match=r"1 of 1201 returns .* within a million cells .*max_range_m"):
+            radarsdf.fit(points, scene.poses, config=config, progress=False)
+    else:
+        with_it = radarsdf.fit(points, scene.poses, config=config, progress=False)
+        without = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
+        assert 0 <= with_it.report["leaf_cells"] - without.report["leaf_cells"] < 12
+        assert np.isfinite(with_it.sdf(points[1] @ scene.poses[1, :3, :3].T + scene.poses[1, :3, 3])).all()
+    dropped = radarsdf.fit(
+        points, scene.poses, config=dataclasses.replace(config, max_range_m=1000.0), progress=False
+    )
+    assert dropped.report["returns"] - dropped.report["returns_used"] == 1
+
+
+def test_scans_of_very_different_sizes():
+    scene = ground_and_wall(scans=3, returns_per_scan=4000)
+    points = [scene.points[0], scene.points[1][:1], scene.points[2][:40]]
+    values = [scene.intensities[0], scene.intensities[1][:1], scene.intensities[2][:40]]
+    for frames in (1, 2):
+        config = dataclasses.replace(QUICK, accumulate_frames=frames)
+        radar_map = radarsdf.fit(points, scene.poses, values, config=config, progress=False)
+        finite(radar_map, scene.poses[0, :3, 3])
+        assert wall_error_m(radar_map, np.eye(4)) < 0.1
+
+
+@pytest.mark.parametrize(
+    "name", ["negative", "huge", "tiny spread", "skewed", "of both signs and huge", "nearly constant"]
+)
+def test_intensities_of_any_kind(name):
+    scene = ground_and_wall(scans=2, returns_per_scan=600)
+    rng = np.random.default_rng(0)
+    values = {
+        "negative": [v - 1000 for v in scene.intensities],
+        "huge": [v * np.float32(1e30) for v in scene.intensities],
+        "tiny spread": [1e-30 * v for v in scene.intensities],
+        "skewed": [np.exp(rng.normal(0, 8, len(v))) for v in scene.intensities],
+        "of both signs and huge": [np.linspace(-1e38, 1e38, len(v)) for v in scene.intensities],
+        "nearly constant": [np.float32(7) + np.float32(1e-6) * (v > 50) for v in scene.intensities],
+    }[name]
+    radar_map = radarsdf.fit(scene.points, scene.poses, values, config=QUICK, progress=False)
+    x, _ = finite(radar_map, scene.poses[0, :3, 3])
+    found = radar_map.intensity(x, scene.poses[0, :3, 3])
+    low, high = np.concatenate(values).min(), np.concatenate(values).max()
+    spread = float(high) - float(low)
+    assert (found >= low - spread).all()
+    assert (found <= high + spread).all()
+    kept = prepare(scene.points, scene.poses, values)
+    predicted = radar_map.intensity(*kept.in_world())
+    assert np.isfinite(predicted).all()
+    if name in ("negative", "huge", "tiny spread"):  # a change of units: as well fitted as without
+        errors = np.abs(predicted - kept.intensities) / spread
+        assert np.median(errors) < 0.1
+
+
+def test_intensities_beyond_float32_are_refused():
+    scene = ground_and_wall(scans=1, returns_per_scan=50)
+    with pytest.raises(ValueError, match="too far apart for float32"):
+        radarsdf.fit(scene.points, scene.poses, [np.linspace(-3e38, 3e38, 50)], config=QUICK)
+
+
+def test_one_pose_far_from_the_others_is_refused_with_advice():
+    scene = ground_and_wall(scans=3, returns_per_scan=50)
+    poses = scene.poses.copy()
+    poses[1] = pose([3e6, 0, 0])
+    with pytest.raises(ValueError, match="million cells"):
+        radarsdf.fit(scene.points, poses, config=QUICK)
