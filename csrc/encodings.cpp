@@ -98,19 +98,22 @@ void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batch
   // Kept from call to call: fresh pages would cost as much as the sums.
   thread_local std::vector<std::int32_t> rows;
   thread_local std::vector<T> sums;
+  thread_local std::vector<std::uint64_t> is_touched;  // zero between calls
   const auto most = static_cast<std::size_t>(std::min(points * corners, table.num_rows()));
   if (rows.size() < most) {
     rows.resize(most);
     sums.resize(most * kFeatureDim);
   }
+  const auto words = static_cast<std::size_t>(table.num_rows() / 64 + 1);
+  if (is_touched.size() < words) is_touched.resize(words);
   for (int task = part; task < table.num_levels() * groups; task += parts) {
-    RowSums<T> touched{slots, rows.data(), sums.data(), 0};
+    RowSums<T> touched{is_touched.data(), slots, rows.data(), sums.data(), 0};
     for (std::size_t b = 0; b < batches.size(); ++b) {
       kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, task / groups,
                            task % groups, 0, batches[b].count);
     }
     adam_kernel.move(adam, touched.rows, touched.sums, touched.count);
-    for (std::int64_t i = 0; i < touched.count; ++i) slots[touched.rows[i]] = -1;
+    for (std::int64_t i = 0; i < touched.count; ++i) is_touched[static_cast<std::size_t>(touched.rows[i] >> 6)] = 0;
   }
 }
 

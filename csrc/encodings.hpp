@@ -41,7 +41,7 @@ void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_
 
 // One step of Adam with the gradients that `scatter` would sum over the batches, on the rows that they touch: for part
 // `part` of `parts` of all (level, group) pairs, so that each of the caller's threads can take one. `slots` (num_rows)
-// is scratch: -1 before and after.
+// is scratch.
 template <typename T>
 void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
                const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, std::int32_t* slots, int part,

@@ -28,9 +28,10 @@ struct Interpolation {
 // Sums of the rows that a batch touches, side by side, so that they stay in the cache however large the map is.
 template <typename T>
 struct RowSums {
-  std::int32_t* slots;  // of every row: which of the sums is its own, -1: none yet
-  std::int32_t* rows;   // of the sums, in the order in which they were first touched
-  T* sums;              // (.., 8)
+  std::uint64_t* is_touched;  // a bit for every row; so few that they stay near, as the branch on them must
+  std::int32_t* slots;        // of every touched row: which of the sums is its own
+  std::int32_t* rows;         // of the sums, in the order in which they were first touched
+  T* sums;                    // (.., 8)
   std::int64_t count;
 };
 

@@ -158,7 +158,7 @@ void bind_kernels(py::class_<VertexTable>& cls) {
       "Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums "
       "their "
       "gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its "
-      "memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch, all -1.");
+      "memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch.");
 
   cls.def(
       "coordinate_gradient",

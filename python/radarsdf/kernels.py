@@ -38,7 +38,7 @@ class AdamMemory:
     last_step: Tensor
     """(num_rows, 1) int32, in which a row last moved; 0: never."""
     slots: Tensor
-    """(num_rows, 1) int32, scratch: -1 between steps."""
+    """(num_rows, 1) int32, scratch."""
 
 
 def _view(tensor: Tensor) -> np.ndarray[Any, Any]:

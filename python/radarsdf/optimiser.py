@@ -91,7 +91,7 @@ class RowAdam:
         self._memory = kernels.AdamMemory(
             moments=torch.zeros(rows, 2 * kernels.FEATURE_DIM, dtype=dtype),
             last_step=torch.zeros(rows, 1, dtype=torch.int32),
-            slots=torch.full((rows, 1), -1, dtype=torch.int32),
+            slots=torch.empty(rows, 1, dtype=torch.int32),
         )
         self._decays = torch.zeros(0, 2, dtype=dtype)
 

@@ -11,6 +11,7 @@ compiled core release it.
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -104,6 +105,12 @@ class Workers:
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
         """Like the built-in, in order, the items on different threads. Grad mode is each thread's own."""
         assert self._pool is not None
-        if self.num_threads == 1 or len(items) == 1:
+        if self.num_threads == 1 or len(items) <= 1:
             return map(function, items)
-        return self._pool.map(function, items)
+        if len(items) > self.num_threads:
+            return self._pool.map(function, items)
+        # One for each: this thread takes the first, rather than wait and be woken, which an iteration would feel.
+        others = self._pool.map(function, items[1:])
+        with torch.enable_grad():  # as in a new thread
+            first = function(items[0])
+        return itertools.chain([first], others)
