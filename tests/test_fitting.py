@@ -87,6 +87,7 @@ def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
     radar_map = radarsdf.fit(scene.points, scene.poses, config=QUICK)
     assert radar_map.field.intensity_network is None
     assert radar_map.report["iterations"]["intensity"] == 0
+    assert any("reflectance" in words for words in radar_map.report["skipped"])
     assert set(radar_map.report["losses"]) == {"sdf"}
     with pytest.raises(ValueError, match="without intensities"):
         radar_map.intensity(np.zeros((1, 3)), np.zeros(3))
@@ -198,7 +199,7 @@ def test_each_stage_of_the_schedule_begins_at_the_full_rate(scene):
 )
 def test_iterations_until_the_surface_is_finished_but_its_noise_not_learnt(returns, changes, expected):
     schedule = Schedule.of(
-        FitConfig(**changes), surface_returns=returns, returns=returns, leaf_cells=10**6, with_intensity=False
+        FitConfig(**changes), surface_returns=returns, returns=returns, vertices=10**6, with_intensity=False
     )
     assert schedule.sdf_iterations == expected
     assert schedule.batch_size == 4096

@@ -299,6 +299,7 @@ def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, 
     cells = sharp_map.field.cells.table.leaf_cells()
     assert len(_crossed(sharp_map, cells)) < 0.8 * len(cells)
     mesh = sharp_map.mesh(voxel_size)
+    assert mesh.metadata["leaf_cells_searched"] < 0.8 * mesh.metadata["leaf_cells"] == 0.8 * len(cells)
     monkeypatch.setattr("radarsdf.meshing._crossed", lambda _, cells: cells)
     whole = sharp_map.mesh(voxel_size)
     assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4)

@@ -39,6 +39,19 @@ def sensors_of(rays, samples):
 DRAWS = {"batch": RaySampler.batch, "spread": lambda draw: draw.spread(256)}
 
 
+def test_neighbours_come_together_and_all_have_their_turn(rays):
+    draw = RaySampler(
+        rays, FitConfig(near_samples=1, free_samples=1), 64, torch.Generator().manual_seed(0), neighbours=5
+    )
+    place = np.argsort(draw._original.numpy())  # of each ray in Morton order
+    seen = []
+    while len(seen) * 32 < len(rays):
+        taken = np.sort(place[draw.batch().rays[:32].numpy()])
+        assert (np.diff(taken) == 1).sum() >= 20  # of 31, where runs of five are cut at most twice
+        seen.append(taken)
+    assert len(np.unique(np.concatenate(seen))) == len(rays)
+
+
 @pytest.mark.parametrize("kind", DRAWS)
 def test_labels_are_the_signed_distance_to_the_return(rays, kind):
     samples = DRAWS[kind](sampler(rays, cross_range_noise_rad=0.0))

@@ -9,24 +9,26 @@ from radarsdf import FitConfig
 from radarsdf.schedule import Schedule
 
 
-def schedule(returns, leaf_cells=10**9, *, with_intensity=True, **changes):
+def schedule(returns, vertices=10**9, *, with_intensity=True, **changes):
     config = FitConfig(**changes)
     return Schedule.of(
-        config, surface_returns=returns, returns=returns, leaf_cells=leaf_cells, with_intensity=with_intensity
+        config, surface_returns=returns, returns=returns, vertices=vertices, with_intensity=with_intensity
     )
 
 
-def test_many_returns_in_few_cells_take_no_more_iterations_than_the_cells_need():
+def test_many_returns_in_few_cells_take_no_more_iterations_than_their_vertices_need():
     assert schedule(10**6).sdf_iterations == pytest.approx(12e6 / 4096, abs=1)
-    assert schedule(10**6, leaf_cells=100_000).sdf_iterations == pytest.approx(16 * 100_000 / 4096, abs=1)
-    assert schedule(10**6, leaf_cells=100).sdf_iterations == FitConfig().min_sdf_iterations
+    assert schedule(10**6, vertices=50_000).sdf_iterations == pytest.approx(32 * 50_000 / 4096, abs=1)
+    assert schedule(10**6, vertices=100).sdf_iterations == FitConfig().min_sdf_iterations
 
 
 def test_batches_grow_where_iterations_would_be_too_many():
     many = schedule(10**7)
     assert many.sdf_iterations == FitConfig().max_sdf_iterations
     assert many.sdf_iterations * many.batch_size == pytest.approx(12e7, rel=1e-3)
+    assert many.neighbours == many.batch_size // FitConfig().batch_size > 1
     assert schedule(10**6).batch_size == FitConfig().batch_size
+    assert schedule(10**6).neighbours == 1
 
 
 def test_large_batches_of_a_joint_beginning_count_for_the_intensities():
@@ -46,6 +48,6 @@ def test_a_small_scene_trains_its_intensities_for_long_and_with_more_dropout():
 
 
 def test_what_is_set_is_done():
-    paper = schedule(10**7, leaf_cells=10, sdf_iterations=1000, intensity_iterations=4000)
+    paper = schedule(10**7, vertices=10, sdf_iterations=1000, intensity_iterations=4000)
     assert paper.iterations == {"sdf": 1000, "intensity": 4000}
     assert schedule(10**7, sdf_iterations=0).sdf_iterations == 0

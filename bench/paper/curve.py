@@ -30,6 +30,8 @@ _OURS = ("radarsdf", "radarsdf, intensities")
 _LEVERS: tuple[dict[str, Any], ...] = (
     {"drop_ghosts": False},
     {"min_support": 0.0},
+    {"bridge_cells": 0},
+    {"row_updates": False},
     {"joint": False},
     {"fourier_count": 16},
     {"normals": True},

@@ -50,8 +50,8 @@ class Peer:
         return replace(self, options=self.options | {"changes": self.options["changes"] | changes})
 
 
-def _fit(name: str, base: str, *, intensities: bool = False, **changes: Any) -> Peer:
-    options = {"base": base, "changes": changes}
+def _fit(name: str, base: str, *, intensities: bool = False, voxel_m: float = 0.1, **changes: Any) -> Peer:
+    options = {"base": base, "changes": changes, "voxel_m": voxel_m}
     return Peer(name, "radarsdf_fits:radarsdf_fit", options, needs="radarsdf", intensities=intensities)
 
 
@@ -66,6 +66,7 @@ PEERS = {
         _fit("SHINE (octree)", "paper", encoding="octree", fourier_count=0, learning_rate=1e-2),
         _fit("3QFP", "paper", learning_rate=1e-2),
         _fit("3QFPI", "paper", intensities=True),
+        _fit("radarsdf, quick", "quick", voxel_m=0.2),
         _fit("radarsdf, octree", "default", encoding="octree"),
         _fit("radarsdf", "default"),
         _fit("radarsdf, intensities", "default", intensities=True),

@@ -14,12 +14,17 @@ import radarsdf.meshing  # with trimesh: imported by the first mesh otherwise, a
 from .child import Made, ScanArrays
 
 
-def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any]) -> Made:
-    """Fit and mesh. `base` is "default" or "paper"; intensities are used where `scans` has them."""
-    base_config = radarsdf.FitConfig.paper() if base == "paper" else radarsdf.FitConfig()
-    config = radarsdf.FitConfig.from_dict(
-        base_config.to_dict() | changes
-    )  # not keywords: JSON knows no tuples
+_BASES = {
+    "default": radarsdf.FitConfig(),
+    "paper": radarsdf.FitConfig.paper(),
+    "quick": radarsdf.FitConfig.quick(),
+}
+
+
+def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], voxel_m: float = 0.1) -> Made:
+    """Fit and mesh. `base` is one of `_BASES`; intensities are used where `scans` has them."""
+    settings = _BASES[base].to_dict() | changes
+    config = radarsdf.FitConfig.from_dict(settings)  # not keywords: JSON knows no tuples
     frames = [np.flatnonzero(scans.frame == i) for i in range(len(scans.poses))]
     radar_map = radarsdf.fit(
         [scans.points[own] for own in frames],
@@ -29,7 +34,7 @@ def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any]) -> Made:
         progress=False,
     )
     started = time.perf_counter()
-    mesh = radar_map.mesh(progress=False)
+    mesh = radar_map.mesh(voxel_m, progress=False)
     report = radar_map.report | {"mesh_s": time.perf_counter() - started}
     intensity = radar_map.intensity if radar_map.has_intensity else None
     return Made(mesh.vertices, mesh.faces, radar_map.nbytes, report, intensity)

@@ -101,7 +101,7 @@ def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
     """:func:`estimate` for returns that are prepared."""
     count, threads = len(rays), resolve_num_threads(config.num_threads)
     cells, rows = _count_cells(rays, config)
-    schedule = _schedule(rays, cells, config)
+    schedule = _schedule(rays, rows, config)
     iterations = schedule.iterations
     samples = iterations["sdf"] * schedule.batch_size + iterations["intensity"] * config.intensity_batch_size
     seconds = count * _RETURN_S + cells * _CELL_S + samples * _SAMPLE_S * _sample_bytes(config) / 1700
@@ -115,10 +115,10 @@ def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
     )
 
 
-def _schedule(rays: Rays, cells: int, config: FitConfig) -> Schedule:
+def _schedule(rays: Rays, rows: int, config: FitConfig) -> Schedule:
     count, with_intensity = len(rays), rays.intensities is not None
     return Schedule.of(
-        config, surface_returns=count, returns=count, leaf_cells=cells, with_intensity=with_intensity
+        config, surface_returns=count, returns=count, vertices=rows, with_intensity=with_intensity
     )
 
 
@@ -128,7 +128,7 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
     memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL
     gradients = 0 if config.row_updates else resolve_num_threads(config.num_threads)
     memory += 4 * parameters * (_COPIES + gradients) + config.row_updates * rows * _PER_ROW
-    batch_size = max(_schedule(rays, cells, config).batch_size, with_intensity * config.intensity_batch_size)
+    batch_size = max(_schedule(rays, rows, config).batch_size, with_intensity * config.intensity_batch_size)
     memory += batch_size * _sample_bytes(config)
     if with_intensity:
         memory += count * (_PER_INTENSITY + config.drop_ghosts * _PER_RETURN_AGAIN)

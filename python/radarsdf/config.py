@@ -48,7 +48,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "min_sdf_iterations": _FROM_1,
     "enough_sdf_iterations": _FROM_1,
     "max_sdf_passes": _POSITIVE,
-    "max_samples_per_cell": _POSITIVE,
+    "max_samples_per_vertex": _POSITIVE,
     "max_sdf_iterations": _FROM_1,
     "intensity_batch_size": (1, MAX_SAMPLES),
     "intensity_iterations": _FROM_1,
@@ -200,9 +200,9 @@ class FitConfig:
     max_sdf_passes: float = 2.0
     """Times each sample is seen at most on the way to `enough_sdf_iterations`: beyond, the noise of a scene of few returns
     is learnt by heart (3 cost 0.6 points on `oculii(seed=1, frames=40)`, 13 cost 1.4 on a tenth of `oculii`)."""
-    max_samples_per_cell: float = 16.0
-    """So many samples for each leaf cell are enough, however many returns there are (measured: `wall`, with 54 in a pass, is
-    as good after 4)."""
+    max_samples_per_vertex: float = 32.0
+    """So many samples for each vertex of a cell are enough, however many returns there are (measured: `wall`, with 100 in a
+    pass, is as good after 20)."""
     max_sdf_iterations: int = 5000
     """Where more would be needed, batches grow instead: a batch hardly touches so large a map."""
     intensity_batch_size: int = 2048

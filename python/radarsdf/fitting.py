@@ -129,6 +129,7 @@ def fit(
                 "iterations": training.iterations,
                 "iterations_done": training.iterations_done,
                 "losses": training.losses,
+                "skipped": _skipped(config, training, scale),
             }
             # Whole from here on, and better with every iteration: what there is when the training ends too early.
             radar_map = RadarMap(
@@ -151,6 +152,23 @@ def fit(
             radar_map.report.update(clock.laps)
             radar_map.field.requires_grad_(False)
     return radar_map
+
+
+def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None) -> list[str]:
+    """What the scene did not need, in words."""
+    skipped = []
+    if scale is None:
+        skipped.append("the reflectance network: there are no intensities")
+    else:
+        unused = [("normals", config.normals), ("geometry feature", config.geometry_feature_dim > 0)]
+        skipped += [
+            f"the {name}, which the intensity network does not ask for" for name, used in unused if not used
+        ]
+    if training.passes < 1:
+        skipped.append(f"{1 - training.passes:.0%} of the samples of a pass: the others said as much")
+    if training.moves_rows:
+        skipped.append("in each iteration, the features that its batch did not touch")
+    return skipped
 
 
 def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:

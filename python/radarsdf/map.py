@@ -63,7 +63,7 @@ class RadarMap:
     intensity_scale : IntensityScale or None
         Range of the training intensities, sensor units; None without a reflectance side.
     report : dict
-        Counts, losses and seconds of the fit.
+        Counts, losses and seconds of the fit, and under `skipped` what the scene did not need.
     support : ndarray or None
         (C,) uint16, returns in and round each leaf cell, in the order of the cells' keys; None for a map from a file of
         an earlier version.

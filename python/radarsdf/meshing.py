@@ -60,7 +60,8 @@ def extract_mesh(
     trimesh.Trimesh
         World frame, m; triangles, and so vertex normals, face free space. Components of fewer triangles
         than ``config.min_component_triangles`` are left out. Empty where there is no surface. The vertices carry
-        :meth:`RadarMap.confidence` as ``mesh.vertex_attributes["confidence"]``, where the map knows it.
+        :meth:`RadarMap.confidence` as ``mesh.vertex_attributes["confidence"]``, where the map knows it. ``mesh.metadata`` counts leaf cells, and those
+        that were searched because the surface could lie in them.
 
     Raises
     ------
@@ -79,12 +80,14 @@ def extract_mesh(
         raise ValueError(msg)
     sensor_position = None if viewpoint is None else _check_viewpoint(radar_map, viewpoint)
     cells = radar_map.field.cells.table.leaf_cells()
+    num_cells = len(cells)
     leaf_size_m = radar_map.config.leaf_size_m
     if box is not None:
         lower, upper = _check_box(box) - radar_map.origin
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
     if voxel_size < leaf_size_m and _smooth_in_cells(radar_map.config):
         cells = _crossed(radar_map, cells)
+    searched = len(cells)
     voxels = _voxels_of(cells, voxel_size, radar_map.config)
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
@@ -102,6 +105,7 @@ def extract_mesh(
         faces = faces[(confidence[faces] >= least).all(axis=1)]
     kept, faces = _without_small_components(len(vertices), faces, radar_map.config.min_component_triangles)
     mesh = trimesh.Trimesh(vertices[kept] + radar_map.origin, faces, process=False)
+    mesh.metadata |= {"leaf_cells": num_cells, "leaf_cells_searched": searched}
     if confidence is not None:
         mesh.vertex_attributes["confidence"] = confidence[kept]
     if sensor_position is not None:

@@ -35,11 +35,20 @@ class RaySampler:
     Rays are taken in random order without replacement, so that after one pass each has been seen equally often; the
     positions along the rays are random. A batch takes one near-surface and one free-space sample from each of its rays
     rather than all twelve from a twelfth as many: the gradient sees more of the scene. Within a batch, rays go in
-    Morton order of their returns, so that neighbours share cache lines.
+    Morton order of their returns, so that neighbours share cache lines. `neighbours` rays that follow each other in that
+    order are taken together: in large batches of a large map, no two others would be near.
     """
 
-    def __init__(self, rays: Rays, config: FitConfig, batch_size: int, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        rays: Rays,
+        config: FitConfig,
+        batch_size: int,
+        generator: torch.Generator,
+        neighbours: int = 1,
+    ) -> None:
         self._config = config
+        self._neighbours = neighbours
         self._generator = generator
         order = np.argsort(cell_keys(np.ascontiguousarray(rays.points), config.leaf_size_m, 1), kind="stable")
         self._original = torch.from_numpy(order)
@@ -73,7 +82,9 @@ class RaySampler:
 
     def _draw_order(self) -> None:
         self._order_from = self._generator.get_state()
-        self._order = torch.randperm(len(self._rays), generator=self._generator).numpy()
+        runs = torch.randperm(-(-len(self._rays) // self._neighbours), generator=self._generator).numpy()
+        order = (runs[:, None] * self._neighbours + np.arange(self._neighbours)).ravel()
+        self._order = order[order < len(self._rays)]
         self._next = 0
 
     def _take(self, count: int) -> Tensor:

@@ -17,16 +17,20 @@ class Schedule:
     """Batches and iterations of the two stages; a joint beginning counts in both."""
 
     batch_size: int
+    neighbours: int
+    """Rays in a batch that lie side by side."""
     sdf_iterations: int
     intensity_iterations: int
     dropout_scale: float
     """Share of the configured dropout."""
+    passes: float
+    """How often the SDF network sees each sample."""
 
     @classmethod
     def of(
-        cls, config: FitConfig, *, surface_returns: int, returns: int, leaf_cells: int, with_intensity: bool
+        cls, config: FitConfig, *, surface_returns: int, returns: int, vertices: int, with_intensity: bool
     ) -> Schedule:
-        """For so many returns of surfaces, and with ghosts, in so many leaf cells."""
+        """For so many returns of surfaces, and with ghosts, on so many vertices of cells."""
         samples = surface_returns * (config.near_samples + config.free_samples)
         batch_size = config.batch_size
         sdf_iterations = config.sdf_iterations
@@ -37,14 +41,17 @@ class Schedule:
                 config.sdf_passes * one_pass,
                 min(config.enough_sdf_iterations, config.max_sdf_passes * one_pass),
             )
-            wanted = min(wanted, config.max_samples_per_cell * leaf_cells / batch_size)
+            wanted = min(wanted, config.max_samples_per_vertex * vertices / batch_size)
             sdf_iterations = max(config.min_sdf_iterations, math.ceil(wanted))
             if sdf_iterations > config.max_sdf_iterations:
                 # As many samples in larger batches: in a map so large they do not get into each other's way.
                 batch_size = math.ceil(batch_size * sdf_iterations / config.max_sdf_iterations)
                 sdf_iterations = config.max_sdf_iterations
+        # As many places as the usual batch has, but each seen by several rays, which share what they fetch.
+        neighbours = batch_size // config.batch_size
+        passes = sdf_iterations * batch_size / samples
         if not with_intensity:
-            return cls(batch_size, sdf_iterations, 0, 0.0)
+            return cls(batch_size, neighbours, sdf_iterations, 0, 0.0, passes)
         samples = returns * config.near_samples
         intensity_iterations = config.intensity_iterations
         if intensity_iterations is None:
@@ -58,7 +65,7 @@ class Schedule:
         # be as good on sparse scenes, and cost 2 % on a dense one, whose samples are seen twice.
         times_seen = intensity_iterations * config.intensity_batch_size / samples
         dropout_scale = times_seen / (times_seen + _DROPOUT_HALF_PASSES)
-        return cls(batch_size, sdf_iterations, intensity_iterations, dropout_scale)
+        return cls(batch_size, neighbours, sdf_iterations, intensity_iterations, dropout_scale, passes)
 
     @property
     def iterations(self) -> dict[str, int]:

@@ -43,8 +43,9 @@ class _Source:
         config: FitConfig,
         batch_size: int,
         generator: torch.Generator,
+        neighbours: int,
     ) -> None:
-        self.sampler = RaySampler(rays, config, batch_size, generator)
+        self.sampler = RaySampler(rays, config, batch_size, generator, neighbours)
         self.directions = torch.from_numpy(rays.directions)
         self.ranges_m = torch.from_numpy(rays.ranges_m)
         self.intensities = None
@@ -72,7 +73,7 @@ class _Shard:
 
         def source(rays: Rays) -> _Source:
             share = _share(schedule.batch_size, part, parts)
-            return _Source(rays.every(parts, part), scale, config, share, generator)
+            return _Source(rays.every(parts, part), scale, config, share, generator, schedule.neighbours)
 
         self._surface = source(surface)
         # A ghost has an intensity, though no surface: the sensor will see it again.
@@ -185,10 +186,11 @@ class Training:
             config,
             surface_returns=len(surface),
             returns=len(returns),
-            leaf_cells=len(field.cells.table.leaf_keys()),
+            vertices=field.cells.table.num_rows,
             with_intensity=scale is not None,
         )
         self.iterations = schedule.iterations
+        self.passes = schedule.passes
         parts = min(workers.num_threads, len(surface), schedule.batch_size, config.intensity_batch_size)
         self._shards = [
             _Shard(field, surface, returns, scale, config, schedule, part, parts) for part in range(parts)
@@ -207,6 +209,11 @@ class Training:
             self._adams["reflectance"] = Adam(
                 field.intensity_network.parameters(), config.intensity_learning_rate, config.adam_epsilon
             )
+
+    @property
+    def moves_rows(self) -> bool:
+        """Whether an iteration moves the touched features alone."""
+        return self._rows is not None
 
     def state(self) -> dict[str, Tensor]:
         """All that the rest of the training depends on, between two iterations. Not copies."""
