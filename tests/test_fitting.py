@@ -150,16 +150,16 @@ def test_the_more_often_samples_are_seen_the_more_is_hidden(scene, monkeypatch):
         shares.clear()
         config = dataclasses.replace(
             QUICK,
-            intensity_batch_size=256,
-            intensity_iterations=math.ceil(passes * samples / 256),
+            intensity_batch_size=1024,
+            intensity_iterations=math.ceil(passes * samples / 1024),
             sdf_iterations=1,
             feature_dropout=0.8,
             fourier_dropout=0.4,
         )
         radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
         expected = passes / (passes + 3)
-        assert min(shares) == pytest.approx(0.4 * expected, rel=0.01)
-        assert max(shares) == pytest.approx(0.8 * expected, rel=0.01)
+        assert min(shares) == pytest.approx(0.4 * expected, rel=0.02)
+        assert max(shares) == pytest.approx(0.8 * expected, rel=0.02)
     shares.clear()
     published = dataclasses.replace(QUICK, feature_dropout=0.0, fourier_dropout=0.0)
     radarsdf.fit(scene.points, scene.poses, scene.intensities, config=published)

@@ -13,7 +13,6 @@ import radarsdf.meshing  # with trimesh: imported by the first mesh otherwise, a
 
 from .child import Made, ScanArrays
 
-
 _BASES = {
     "default": radarsdf.FitConfig(),
     "paper": radarsdf.FitConfig.paper(),
