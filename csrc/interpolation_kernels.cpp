@@ -139,7 +139,8 @@ struct TouchedRows {
 template <typename C, bool kDirectional, typename T, typename SumOf>
 void scatter(const Interpolation<T>& in, const T* __restrict out_grad, std::int64_t stride, const SumOf& sum_of,
              int level, int group, std::int64_t begin, std::int64_t end) {
-  constexpr std::int64_t kAhead = 12;  // points. The branches of TouchedRows stop the processor from running ahead itself
+  constexpr std::int64_t kAhead =
+      12;  // points. The branches of TouchedRows stop the processor from running ahead itself
   for (std::int64_t n = begin; n < end; ++n) {
     if (n + kAhead < end) {
       const std::int32_t later = in.located[(n + kAhead) * in.num_levels + level];
