@@ -131,7 +131,7 @@ class VertexTable:
         parts: typing.SupportsInt | typing.SupportsIndex = 1,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch, all -1.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch.
         """
     @typing.overload
     def adam_step(
@@ -155,7 +155,7 @@ class VertexTable:
         parts: typing.SupportsInt | typing.SupportsIndex = 1,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch, all -1.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch.
         """
     @typing.overload
     def coordinate_gradient(
