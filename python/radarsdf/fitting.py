@@ -164,9 +164,9 @@ def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None
         skipped += [
             f"the {name}, which the intensity network does not ask for" for name, used in unused if not used
         ]
-    if training.passes < 1:
+    if training.passes < 1 and config.sdf_iterations is None:
         skipped.append(f"{1 - training.passes:.0%} of the samples of a pass: the others said as much")
-    if training.moves_rows:
+    if training.moves_rows and training.iterations["sdf"] > 0:
         skipped.append("in each iteration, the features that its batch did not touch")
     return skipped
 
