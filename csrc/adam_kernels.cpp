@@ -5,6 +5,7 @@
 #include <math.h>  // not <cmath>: see fourier_kernels.cpp
 
 #include "feature_vector.hpp"
+#include "prefetch.hpp"
 
 namespace radarsdf::RADARSDF_ISA {
 namespace {

@@ -71,14 +71,5 @@ inline void store(T* row, Features<T> features) {
   memcpy(row, &features, sizeof features);
 }
 
-// Asks for a cache line that will be needed soon.
-inline void prefetch(const void* address) {
-#if defined(__GNUC__)
-  __builtin_prefetch(address);
-#else
-  (void)address;
-#endif
-}
-
 }  // namespace
 }  // namespace radarsdf::RADARSDF_ISA

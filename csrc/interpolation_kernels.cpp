@@ -3,6 +3,7 @@
 #include "interpolation_kernels.hpp"
 
 #include "feature_vector.hpp"
+#include "prefetch.hpp"
 
 namespace radarsdf::RADARSDF_ISA {
 namespace {  // internal linkage for everything: see the header

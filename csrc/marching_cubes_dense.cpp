@@ -12,6 +12,7 @@
 #include "marching_cubes_common.hpp"
 #include "marching_cubes_table.hpp"
 #include "parallel.hpp"
+#include "prefetch.hpp"
 #include "volume_signs.hpp"
 
 namespace radarsdf {
@@ -98,14 +99,6 @@ PlaneOffsets count_plane(const VolumeSigns& signs, int64_t i) {
     });
   }
   return count;
-}
-
-inline void prefetch(const void* address) {
-#ifdef __GNUC__
-  __builtin_prefetch(address);
-#else
-  (void)address;
-#endif
 }
 
 // The output of a run of slabs. A slab of cells needs the vertices of the two planes around it, and no others are kept.

@@ -12,6 +12,7 @@
 #include "cell_set.hpp"
 #include "morton.hpp"
 #include "parallel.hpp"
+#include "prefetch.hpp"
 
 namespace radarsdf {
 namespace {
@@ -101,14 +102,6 @@ std::vector<std::uint64_t> parents_of(const std::vector<std::uint64_t>& keys) {
     if (parents.empty() || parents.back() != key >> 3) parents.push_back(key >> 3);
   }
   return parents;
-}
-
-inline void prefetch(const void* address) {
-#if defined(__GNUC__)
-  __builtin_prefetch(address);
-#else
-  (void)address;
-#endif
 }
 
 // Without SSE4.1 (the baseline) std::floor is a library call.

@@ -11,7 +11,7 @@ import numpy as np
 import radarsdf
 from radarsdf import FitConfig, RadarMap
 
-from bench.peers.child import peak_bytes
+from bench.memory import memory_bytes
 
 from .street import Street, street
 
@@ -78,7 +78,7 @@ def row(*, returns: int, size_m: float, threads: int, intensities: bool, quick: 
     scans = street(returns, size_m)
     changes: dict[str, Any] = {"sdf_iterations": 60, "intensity_iterations": 120} if quick else {}
     config = FitConfig(num_threads=threads, **changes)
-    before = peak_bytes()
+    before = memory_bytes("VmHWM")
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     radar_map = radarsdf.fit(
         scans.points,
@@ -88,7 +88,12 @@ def row(*, returns: int, size_m: float, threads: int, intensities: bool, quick: 
         progress=False,
     )
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-    found = {"wall_s": wall_s, "cpu_s": cpu_s, "peak_mb": peak_bytes() / 1e6, "before_mb": before / 1e6}
+    found = {
+        "wall_s": wall_s,
+        "cpu_s": cpu_s,
+        "peak_mb": memory_bytes("VmHWM") / 1e6,
+        "before_mb": before / 1e6,
+    }
     report = radar_map.report
     if report["returns"] != returns:
         msg = f"{report['returns']} returns were fitted, not {returns}"

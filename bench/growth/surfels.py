@@ -14,7 +14,8 @@ from radarsdf.fitting import occupied_leaf_keys
 from radarsdf.scans import prepare
 from radarsdf.surfels import Surfels, support_of
 
-from .memory import memory_mb
+from bench.memory import memory_bytes
+
 from .street import street
 
 Result = TypeVar("Result")
@@ -60,10 +61,10 @@ def row(returns: int, threads: int) -> dict[str, Any]:
 
 def _measured(name: str, function: Callable[[], Result]) -> tuple[Result, dict[str, float]]:
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
-    before_mb, wall_s, processor_s = memory_mb("VmRSS"), time.perf_counter(), time.process_time()
+    before, wall_s, processor_s = memory_bytes("VmRSS"), time.perf_counter(), time.process_time()
     result = function()
     return result, {
         f"{name}_cpu_s": time.process_time() - processor_s,
         f"{name}_s": time.perf_counter() - wall_s,
-        f"{name}_mb": memory_mb("VmHWM") - before_mb,
+        f"{name}_mb": (memory_bytes("VmHWM") - before) / 1e6,
     }

@@ -17,6 +17,7 @@ from radarsdf import FitConfig
 
 from bench.peers.interface import PEERS, Peer
 
+from . import surface
 from .experiment import Experiment, Options, Row, Task, groups
 from .report import Column, figure, metric_table
 from .scenes import Scene
@@ -42,17 +43,14 @@ _LEVERS: tuple[dict[str, Any], ...] = (
     {"intensity_hidden": (64, 64)},
     {"batch_size": 8192},
 )
+_SURFACE = {column[0]: column for column in surface.COLUMNS}
 _COLUMNS: tuple[Column, ...] = (
     ("seconds", "time, s", 1, 2, None),
     ("fit_seconds", "fit, s", 1, 2, None),
     ("mesh_seconds", "mesh, s", 1, 2, None),
     ("peak_bytes", "peak, MB", 1e-6, 0, None),
-    ("f_score", "F-score, %", 100, 2, True),
-    ("f_score_all", "F, nothing discarded, %", 100, 2, True),
-    ("accuracy_error_m", "acc. error, cm", 100, 2, False),
-    ("outlier_ratio", "outliers, %", 100, 2, False),
-    ("completion_error_m", "compl. error, cm", 100, 2, False),
-    ("completion_ratio", "compl. ratio, %", 100, 2, True),
+    *(_SURFACE[key] for key in ("f_score", "f_score_all", "accuracy_error_m", "outlier_ratio")),
+    *(_SURFACE[key] for key in ("completion_error_m", "completion_ratio")),
     ("mae", "held-out MAE", 1, 3, False),
 )
 _PANELS = (

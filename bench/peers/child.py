@@ -15,10 +15,11 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from bench.memory import memory_bytes
 
 
 @dataclass(frozen=True)
@@ -55,15 +56,6 @@ class Made(NamedTuple):
     """Of points seen by sensors, both (N, 3), world, m: (N,) sensor units. Asked for when time and memory are known."""
 
 
-def peak_bytes() -> int:
-    """Largest resident memory so far, or -1. Not ru_maxrss: a child starts with its parent's."""
-    status = Path("/proc/self/status")
-    if not status.exists():
-        return -1
-    (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
-    return 1024 * int(line.split()[1])
-
-
 def main() -> None:
     method, options, scans_path, result_path = sys.argv[1:]
     module, function = method.split(":")
@@ -78,7 +70,7 @@ def main() -> None:
         queries = (file["query_points"], file["query_sensors"]) if "query_points" in file else None
     started = time.perf_counter()
     made = Made(*reconstruct(scans, **json.loads(options)))
-    seconds, peak = time.perf_counter() - started, peak_bytes()
+    seconds, peak = time.perf_counter() - started, memory_bytes("VmHWM")
     answers: dict[str, Any] = {}
     if queries is not None and made.intensity is not None:
         answers["intensity"] = made.intensity(*queries)

@@ -15,8 +15,8 @@ import numpy as np
 import radarsdf
 from radarsdf import Estimate, FitConfig
 
-from bench.growth.memory import memory_mb
 from bench.growth.street import street
+from bench.memory import memory_bytes
 from bench.paper.report import markdown
 
 CASES: list[tuple[int, bool, dict[str, Any]]] = [
@@ -55,9 +55,9 @@ def _measure(count: int, with_intensities: bool, changes: dict[str, Any]) -> Non
     scans, config = _street(count, with_intensities), FitConfig(**changes)
     estimate = radarsdf.estimate(*scans, config=config)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
-    before_mb = memory_mb("VmRSS")
+    before = memory_bytes("VmRSS")
     radarsdf.fit(*scans, config=config, progress=False)
-    print(json.dumps([vars(estimate), 1e6 * (memory_mb("VmHWM") - before_mb)]))
+    print(json.dumps([vars(estimate), memory_bytes("VmHWM") - before]))
 
 
 def memory_of_fits(count: int, returns: int = 2000) -> list[float]:
@@ -71,7 +71,7 @@ def memory_of_fits(count: int, returns: int = 2000) -> list[float]:
         radar_map = radarsdf.fit(*scans, config=config, progress=False)
         radar_map.sdf(np.zeros((10_000, 3)))
         radar_map.mesh(0.2, progress=False)
-        found.append(memory_mb("VmRSS"))
+        found.append(memory_bytes("VmRSS") / 1e6)
     return found
 
 

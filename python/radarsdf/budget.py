@@ -84,17 +84,7 @@ def estimate(
     True
     """
     config = FitConfig() if config is None else config
-    return estimate_rays(
-        prepare(
-            points,
-            poses,
-            intensities,
-            min_range_m=config.min_range_m,
-            max_range_m=config.max_range_m,
-            accumulate_frames=config.accumulate_frames,
-        ),
-        config,
-    )
+    return estimate_rays(prepare(points, poses, intensities, **config.preparation), config)
 
 
 def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:

@@ -332,6 +332,12 @@ class FitConfig:
         }
         return cls(**(values | changes))
 
+    @property
+    def preparation(self) -> dict[str, Any]:
+        """What :func:`radarsdf.scans.prepare` is told for a fit."""
+        names = ("min_range_m", "max_range_m", "accumulate_frames")
+        return {name: getattr(self, name) for name in names}
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values only, for JSON."""
         return dataclasses.asdict(self)

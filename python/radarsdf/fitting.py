@@ -90,14 +90,7 @@ def fit(
     clock = _Clock()
     radar_map = None
     try:
-        rays = prepare(
-            points,
-            poses,
-            intensities,
-            min_range_m=config.min_range_m,
-            max_range_m=config.max_range_m,
-            accumulate_frames=config.accumulate_frames,
-        )
+        rays = prepare(points, poses, intensities, **config.preparation)
         _check_extent(rays, config)
         check_fit(rays, config)
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)

@@ -299,15 +299,14 @@ def add_transposed(
     num_threads : int
         To use.
     """
-    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
-    table.locate(_view(points), located.numpy(), num_threads)
+    located = locate(points, table, num_threads)
     table.scatter(_view(points), located.numpy(), None, _view(values), sums.numpy(), num_threads)
 
 
-def locate(points: Tensor, table: VertexTable) -> Tensor:
+def locate(points: Tensor, table: VertexTable, num_threads: int | None = None) -> Tensor:
     """Occupied cell that holds each point (N, 3), local frame, m: (N, num_levels) int32, finest first, -1 where none."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
-    table.locate(_view(points), located.numpy(), _threads())
+    table.locate(_view(points), located.numpy(), _threads() if num_threads is None else num_threads)
     return located
 
 
