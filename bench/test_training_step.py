@@ -48,10 +48,8 @@ class Step:
             self.field.cells.requires_grad_(False)
             self.field.sdf_network.requires_grad_(False)
         self.parameters = [p for p in self.field.parameters() if p.requires_grad]
-        self.sampler = RaySampler(rays, CONFIG, self.size, torch.Generator().manual_seed(0))
-        self.directions = torch.from_numpy(rays.directions)
-        self.ranges_m = torch.from_numpy(rays.ranges_m)
-        self.labels = torch.from_numpy(IntensityScale.of(rays.intensities).to_unit(rays.intensities))
+        unit = torch.from_numpy(IntensityScale.of(rays.intensities).to_unit(rays.intensities))
+        self.sampler = RaySampler(rays, CONFIG, self.size, torch.Generator().manual_seed(0), intensities=unit)
 
     def samples(self):
         """Samples, and the dropout of what the intensity network sees."""
@@ -63,7 +61,7 @@ class Step:
         kept = [
             self.sampler.kept(samples.num_near, dim, share) for dim, share in zip(dims, dropouts, strict=True)
         ]
-        return samples, torch.cat(kept, 1)
+        return samples, kept
 
     def encoded(self, samples):
         with torch.set_grad_enabled(not self.frozen):
@@ -76,16 +74,15 @@ class Step:
         losses = [] if self.frozen else [sdf_loss(logit, samples.sdf_m, CONFIG.sigma_m)]
         if self.stage != "geometry":
             near = slice(samples.num_near)
-            rays = samples.rays[near]
             predicted = self.field.intensity_network(
-                encoding[near] * kept,
+                [part[near] * factors for part, factors in zip(encoding, kept, strict=True)],
                 logit[near],
                 feature[near],
                 None,
-                self.directions[rays],
-                self.ranges_m[rays] - samples.sdf_m[near],
+                samples.directions[near],
+                samples.ranges_m[near] - samples.sdf_m[near],
             )
-            losses.append(intensity_loss(predicted, self.labels[rays]))
+            losses.append(intensity_loss(predicted, samples.intensities[near]))
         return losses
 
     def products(self):
@@ -160,14 +157,15 @@ def test_samples(benchmark, step, rays):
     assert len(samples.points) == step.size
     assert len(np.unique(ray)) > 0.45 * step.size
     if kept is not None:
-        assert kept.mean().item() == pytest.approx(1, abs=0.05)
-        assert (kept == 0).float().mean().item() > CONFIG.fourier_dropout
+        factors = torch.cat(kept, 1)
+        assert factors.mean().item() == pytest.approx(1, abs=0.05)
+        assert (factors == 0).float().mean().item() > CONFIG.fourier_dropout
 
 
 def test_encodings_forward(benchmark, step):
     samples, _ = step.samples()
-    encoding = measured(benchmark, step, step.encoded, samples).detach()
-    angles = encoding[:, step.field.cells.dim :].double().view(len(encoding), 2, -1)
+    cells, fourier = (part.detach() for part in measured(benchmark, step, step.encoded, samples))
+    angles = fourier.double().view(len(fourier), 2, -1)
     assert ((angles**2).sum(1) - 1).abs().max() < 1e-5
     points = samples.points.numpy()[: samples.num_near]
     known = step.field.cells.occupied(samples.points[: samples.num_near]).numpy()
@@ -175,26 +173,29 @@ def test_encodings_forward(benchmark, step):
     surface = Surface(step.field.cells.table, step.field.cells.features.detach())
     rows, weights = surface.rows_and_weights(points[known])
     expected = (surface.features.numpy()[rows] * weights[..., None]).sum(2).reshape(known.sum(), -1)
-    found = encoding[: samples.num_near, : step.field.cells.dim].numpy()[known]
+    found = cells[: samples.num_near].numpy()[known]
     assert np.abs(found - expected).max() < 1e-4
 
 
 def test_networks_forward(benchmark, step):
     samples, kept = step.samples()
-    encoding = step.encoded(samples).detach().requires_grad_(not step.frozen)
+    cells, fourier = (part.detach() for part in step.encoded(samples))
+    encoding = (cells.requires_grad_(not step.frozen), fourier)
     losses = measured(benchmark, step, step.losses, samples, kept, encoding)
-    logit, inputs = mlp(step.field.sdf_network.layers, encoding.detach().numpy()), encoding.detach().numpy()
+    inputs = torch.cat(encoding, 1).detach().numpy()
+    logit = mlp(step.field.sdf_network.layers, inputs)
     expected = []
     if not step.frozen:
         label = 1 / (1 + np.exp(-samples.sdf_m.double().numpy() / CONFIG.sigma_m))
         expected.append((np.logaddexp(0, logit) - label * logit).mean())
     if kept is not None:
-        near, ray = slice(samples.num_near), samples.rays[: samples.num_near]
-        range_m = (step.ranges_m[ray] - samples.sdf_m[near]).double().numpy()
-        harmonics = step.field.intensity_network.harmonics(step.directions[ray]).numpy()
-        inputs = [inputs[near] * kept.numpy(), logit[near, None], harmonics, np.log10(range_m / 10)[:, None]]
+        near = slice(samples.num_near)
+        range_m = (samples.ranges_m[near] - samples.sdf_m[near]).double().numpy()
+        harmonics = step.field.intensity_network.harmonics(samples.directions[near]).numpy()
+        factors = torch.cat(kept, 1).numpy()
+        inputs = [inputs[near] * factors, logit[near, None], harmonics, np.log10(range_m / 10)[:, None]]
         predicted = mlp(step.field.intensity_network.layers, np.concatenate(inputs, 1))
-        expected.append(np.abs(predicted - step.labels[ray].numpy()).mean())
+        expected.append(np.abs(predicted - samples.intensities[near].numpy()).mean())
     assert [loss.item() for loss in losses] == pytest.approx(expected, rel=1e-4)
 
 
@@ -216,7 +217,9 @@ def test_backward(benchmark, step):
     # Down its gradient, the loss falls by that's square. The forward pass, which is checked above, says whether it does:
     # in double precision, and for the features apart, since the networks' gradient is larger.
     step.field.double()
-    samples = dataclasses.replace(samples, points=samples.points.double(), sdf_m=samples.sdf_m.double())
+    exact = {name: getattr(samples, name).double() for name in ("points", "sdf_m", "of_ray")}
+    samples = dataclasses.replace(samples, **exact)
+    kept = None if kept is None else [factors.double() for factors in kept]
     gradients = dict(zip(step.parameters, gradients, strict=True))
     features = [p for p in step.field.cells.parameters() if p in gradients]
     networks = [p for p in step.parameters if all(p is not other for other in features)]

@@ -16,7 +16,7 @@ inline double root(double v) { return sqrt(v); }
 constexpr std::int64_t kBlock = 16;  // rows side by side, so that the arithmetic is one long loop of vectors
 
 template <typename T>
-void move(const AdamStep<T>& adam, const std::int32_t* rows, const T* gradients, std::int64_t count) {
+void move(const AdamStep<T>& adam, const std::int32_t* rows, T* gradients, std::int64_t count) {
   constexpr int kNumbers = kBlock * kFeatureDim;
   const T mean_share = 1 - adam.decays[2], square_share = 1 - adam.decays[3];
   const T rate = adam.rate, square_scale = adam.square_scale, epsilon = adam.epsilon;
@@ -37,7 +37,9 @@ void move(const AdamStep<T>& adam, const std::int32_t* rows, const T* gradients,
           adam.decays[2 * steps + 1] * load(adam.moments + row * std::int64_t{2 * kFeatureDim} + kFeatureDim)};
       store(mean + i * kFeatureDim, moments[0]);
       store(square + i * kFeatureDim, moments[1]);
-      store(gradient + i * kFeatureDim, load(gradients + (first + i) * kFeatureDim));
+      T* sum = gradients + row * std::int64_t{kFeatureDim};
+      store(gradient + i * kFeatureDim, load(sum));
+      store(sum, Features<T>{});
     }
     for (int d = 0; d < kNumbers; ++d) {
       const T g = gradient[d];

@@ -27,8 +27,8 @@ struct AdamStep {
 
 template <typename T>
 struct AdamKernel {
-  // Moves rows[i] against gradients[i] (8), for i in [0, count).
-  void (*move)(const AdamStep<T>&, const std::int32_t* rows, const T* gradients, std::int64_t count);
+  // Moves rows[i], for i in [0, count), against its row of gradients (num_rows, 8), which becomes zero.
+  void (*move)(const AdamStep<T>&, const std::int32_t* rows, T* gradients, std::int64_t count);
 };
 
 #define RADARSDF_DECLARE_KERNEL(isa) \

@@ -1,74 +1,26 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Eight features as one vector, for kernels that are compiled once for each instruction set. Internal linkage, so that
-// no copy takes the place of another's.
+// The features of one vertex as one vector.
 #pragma once
 
-#include <string.h>  // not <cstring>: see fourier_kernels.cpp
-
 #include "cell.hpp"
-
-#ifndef RADARSDF_ISA
-#error "RADARSDF_ISA names the instruction set that this copy is compiled for"
-#endif
+#include "vector.hpp"
 
 namespace radarsdf::RADARSDF_ISA {
 namespace {
 
-// The features of one vertex as one vector: left to itself, the compiler unrolls eight floats into scalars.
-#if defined(__GNUC__)
 template <typename T>
-struct VectorOf {
-  typedef T Type __attribute__((vector_size(kFeatureDim * sizeof(T))));
-};
-#else
-template <typename T>
-struct VectorOf {
-  struct Type {
-    T lanes[kFeatureDim];
-    T operator[](int i) const { return lanes[i]; }
-  };
-};
-template <typename V>
-inline V operator*(V a, V b) {
-  for (int i = 0; i < kFeatureDim; ++i) a.lanes[i] *= b.lanes[i];
-  return a;
-}
-template <typename T, typename V>
-inline V operator*(T a, V b) {
-  for (int i = 0; i < kFeatureDim; ++i) b.lanes[i] *= a;
-  return b;
-}
-template <typename V>
-inline V operator+(V a, V b) {
-  for (int i = 0; i < kFeatureDim; ++i) a.lanes[i] += b.lanes[i];
-  return a;
-}
-template <typename V>
-inline V operator-(V a, V b) {
-  for (int i = 0; i < kFeatureDim; ++i) a.lanes[i] -= b.lanes[i];
-  return a;
-}
-template <typename V>
-inline V& operator+=(V& a, V b) {
-  return a = a + b;
-}
-#endif
-template <typename T>
-using Features = typename VectorOf<T>::Type;
+using Features = typename VectorOf<T, kFeatureDim>::Type;
 
-// Rows are aligned to the size of a number only.
 template <typename T>
 inline Features<T> load(const T* row) {
-  Features<T> features;
-  memcpy(&features, row, sizeof features);
-  return features;
+  return load_vector<Features<T>>(row);
 }
 
 template <typename T>
 inline void store(T* row, Features<T> features) {
-  memcpy(row, &features, sizeof features);
+  store_vector(row, features);
 }
 
 }  // namespace

@@ -22,3 +22,13 @@ const char* instruction_set_name(InstructionSet isa);
 InstructionSet instruction_set_from_name(const std::string& name);
 
 }  // namespace radarsdf
+
+// The copy of a kernel for the instruction set in use. A macro, since the copies are one name in three namespaces.
+#ifdef RADARSDF_X86_VARIANTS
+#define RADARSDF_KERNEL(name)                                  \
+  (instruction_set() == InstructionSet::kAvx512 ? avx512::name \
+   : instruction_set() == InstructionSet::kAvx2 ? avx2::name   \
+                                                : baseline::name)
+#else
+#define RADARSDF_KERNEL(name) baseline::name
+#endif

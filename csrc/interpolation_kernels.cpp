@@ -114,34 +114,36 @@ void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __
   }
 }
 
-// Where the gradient of a row is added up: in the matrix of all of them, or in the sums of those that are touched.
+// Where the gradients of rows are added up, with or without a list of them.
 template <typename T>
 struct AllRows {
   T* gradients;
-  T* operator()(std::int32_t row) const { return gradients + static_cast<std::int64_t>(row) * kFeatureDim; }
+  void add(std::int32_t row, Features<T> gradient) {
+    T* sum = gradients + static_cast<std::int64_t>(row) * kFeatureDim;
+    store(sum, load(sum) + gradient);
+  }
 };
 
 template <typename T>
 struct TouchedRows {
-  RowSums<T>& touched;
-  T* operator()(std::int32_t row) const {
-    std::uint64_t& word = touched.is_touched[row >> 6];
-    const std::uint64_t bit = std::uint64_t{1} << (row & 63);
-    if (!(word & bit)) {
-      word |= bit;
-      touched.slots[row] = static_cast<std::int32_t>(touched.count);
-      touched.rows[touched.count] = row;
-      store(touched.sums + touched.count++ * kFeatureDim, Features<T>{});
-    }
-    return touched.sums + static_cast<std::int64_t>(touched.slots[row]) * kFeatureDim;
+  RowSums<T> touched;
+  void add(std::int32_t row, Features<T> gradient) {
+    T* sum = touched.sums + static_cast<std::int64_t>(row) * kFeatureDim;
+    store(sum, load(sum) + gradient);
+    // Without a branch: whether a row has been touched is a toss, and a wrong guess costs more than the sum.
+    const std::uint64_t word = touched.is_touched[row >> 6];
+    touched.is_touched[row >> 6] = word | std::uint64_t{1} << (row & 63);
+    touched.rows[touched.count] = row;
+    touched.count += static_cast<std::int64_t>(~(word >> (row & 63)) & 1);
   }
 };
 
-template <typename C, bool kDirectional, typename T, typename SumOf>
-void scatter(const Interpolation<T>& in, const T* __restrict out_grad, std::int64_t stride, const SumOf& sum_of,
-             int level, int group, std::int64_t begin, std::int64_t end) {
-  constexpr std::int64_t kAhead =
-      12;  // points. The branches of TouchedRows stop the processor from running ahead itself
+// The group is a constant, so that what concerns the others is left out; and all is passed by value, or each store into
+// the sums could have changed it.
+template <typename C, bool kDirectional, int kGroup, typename T, typename Sums>
+Sums scatter(Interpolation<T> in, const T* __restrict out_grad, std::int64_t stride, Sums sums, int level,
+             std::int64_t begin, std::int64_t end) {
+  constexpr std::int64_t kAhead = 12;  // points
   for (std::int64_t n = begin; n < end; ++n) {
     if (n + kAhead < end) {
       const std::int32_t later = in.located[(n + kAhead) * in.num_levels + level];
@@ -150,13 +152,26 @@ void scatter(const Interpolation<T>& in, const T* __restrict out_grad, std::int6
     const std::int32_t cell = in.located[n * in.num_levels + level];
     if (cell < 0) continue;
     T weights[C::kPerGroup];
-    corner_weights<C, kDirectional>(local_coordinates(in, n, level), direction_of(in, n), group, weights);
+    corner_weights<C, kDirectional>(local_coordinates(in, n, level), direction_of(in, n), kGroup, weights);
     const Features<T> grad = load(out_grad + n * stride + level * kFeatureDim);
-    for (int c = 0; c < C::kPerGroup; ++c) {
-      T* sum = sum_of(in.cells[cell].rows[group * C::kPerGroup + c]);
-      store(sum, load(sum) + weights[c] * grad);
-    }
+    const std::int32_t* rows = in.cells[cell].rows + kGroup * C::kPerGroup;
+    for (int c = 0; c < C::kPerGroup; ++c) sums.add(rows[c], weights[c] * grad);
   }
+  return sums;
+}
+
+template <typename C, typename T, typename Sums>
+Sums scatter_group(const Interpolation<T>& in, const T* out_grad, std::int64_t stride, Sums sums, int level, int group,
+                   std::int64_t begin, std::int64_t end) {
+  constexpr int kSecond = C::kGroups > 1 ? 1 : 0, kThird = C::kGroups > 1 ? 2 : 0;
+  if (in.directions) {
+    return (group == 0   ? scatter<C, true, 0, T, Sums>
+            : group == 1 ? scatter<C, true, kSecond, T, Sums>
+                         : scatter<C, true, kThird, T, Sums>)(in, out_grad, stride, sums, level, begin, end);
+  }
+  return (group == 0   ? scatter<C, false, 0, T, Sums>
+          : group == 1 ? scatter<C, false, kSecond, T, Sums>
+                       : scatter<C, false, kThird, T, Sums>)(in, out_grad, stride, sums, level, begin, end);
 }
 
 template <typename C, bool kDirectional, typename T>
@@ -198,15 +213,11 @@ constexpr InterpolationKernels<T> kKernels = {
     },
     [](const Interpolation<T>& in, const T* out_grad, std::int64_t stride, T* features_grad, int level, int group,
        std::int64_t begin, std::int64_t end) {
-      const AllRows<T> rows{features_grad};
-      (in.directions ? scatter<C, true, T, AllRows<T>> : scatter<C, false, T, AllRows<T>>)(in, out_grad, stride, rows,
-                                                                                           level, group, begin, end);
+      scatter_group<C>(in, out_grad, stride, AllRows<T>{features_grad}, level, group, begin, end);
     },
     [](const Interpolation<T>& in, const T* out_grad, std::int64_t stride, RowSums<T>& touched, int level, int group,
        std::int64_t begin, std::int64_t end) {
-      const TouchedRows<T> rows{touched};
-      (in.directions ? scatter<C, true, T, TouchedRows<T>>
-                     : scatter<C, false, T, TouchedRows<T>>)(in, out_grad, stride, rows, level, group, begin, end);
+      touched = scatter_group<C>(in, out_grad, stride, TouchedRows<T>{touched}, level, group, begin, end).touched;
     },
     [](const Interpolation<T>& in, const T* features, const T* out_grad, std::int64_t stride, T* points_grad,
        std::int64_t begin, std::int64_t end) {

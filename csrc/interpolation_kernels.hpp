@@ -25,13 +25,12 @@ struct Interpolation {
   T inverse_leaf_size;  // 1/m
 };
 
-// Sums of the rows that a batch touches, side by side, so that they stay in the cache however large the map is.
+// Sums of the rows that a batch touches, and which these are.
 template <typename T>
 struct RowSums {
-  std::uint64_t* is_touched;  // a bit for every row; so few that they stay near, as the branch on them must
-  std::int32_t* slots;        // of every touched row: which of the sums is its own
-  std::int32_t* rows;         // of the sums, in the order in which they were first touched
-  T* sums;                    // (.., 8)
+  std::uint64_t* is_touched;  // a bit for every row
+  std::int32_t* rows;         // those touched, in the order in which they first were; room for one more
+  T* sums;                    // (num_rows, 8), zero where not touched
   std::int64_t count;
 };
 

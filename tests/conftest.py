@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf import FitConfig
+from radarsdf import FitConfig, _core
 
 SEED = 7
 
@@ -73,3 +73,11 @@ def sharp_map(scene):
         min_component_triangles=100,
     )
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+
+
+@pytest.fixture(params=_core.available_instruction_sets())
+def instruction_set(request):
+    before = _core.instruction_set()
+    _core.set_instruction_set(request.param)
+    yield request.param
+    _core.set_instruction_set(before)

@@ -88,7 +88,7 @@ def test_the_network_starts_as_one_input(hidden):
     network = SDFNetwork(6, FitConfig(sdf_hidden=hidden, geometry_feature_dim=2))
     network.start_as_input(4)
     encoding = torch.randn(50, 6)
-    logit, _ = network(encoding)
+    logit, _ = network([encoding])
     torch.testing.assert_close(logit, encoding[:, 4])
     logit.sum().backward()
     assert network.layers[-1].weight.grad.any()

@@ -20,14 +20,6 @@ ENCODINGS = [_core.Encoding.TRI_QUADTREE, _core.Encoding.OCTREE]
 PLANES = [(0, 1), (0, 2), (1, 2)]
 
 
-@pytest.fixture(params=_core.available_instruction_sets())
-def instruction_set(request):
-    before = _core.instruction_set()
-    _core.set_instruction_set(request.param)
-    yield request.param
-    _core.set_instruction_set(before)
-
-
 def surface_points(count, seed=0, extent_m=4.0, dtype=np.float64):
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-extent_m, extent_m, (count, 2))

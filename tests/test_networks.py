@@ -25,7 +25,7 @@ def inputs(config, count=20, encoding_dim=10):
         return torch.randn(*shape, generator=generator)
 
     return {
-        "encoding": normal(count, encoding_dim),
+        "encoding": [normal(count, 1), normal(count, encoding_dim - 1)],
         "logit": normal(count),
         "geometry_feature": normal(count, config.geometry_feature_dim),
         "normals": torch.nn.functional.normalize(normal(count, 3), dim=1) if config.normals else None,
@@ -52,7 +52,7 @@ def views(points):
 @pytest.mark.parametrize("geometry_feature_dim", [0, 15])
 def test_sdf_network(geometry_feature_dim):
     network = SDFNetwork(10, FitConfig(sdf_hidden=(7, 5), geometry_feature_dim=geometry_feature_dim))
-    logit, feature = network(torch.randn(4, 10))
+    logit, feature = network([torch.randn(4, 4), torch.randn(4, 6)])
     assert logit.shape == (4,)
     assert feature.shape == (4, geometry_feature_dim)
     widths = [tuple(m.weight.shape) for m in network.layers if isinstance(m, torch.nn.Linear)]
@@ -61,7 +61,7 @@ def test_sdf_network(geometry_feature_dim):
 
 def test_the_logit_has_both_signs():
     # An activation behind the last layer would leave one side of the surface without a value.
-    logit, _ = SDFNetwork(10, FitConfig())(torch.randn(2000, 10) * 10)
+    logit, _ = SDFNetwork(10, FitConfig())([torch.randn(2000, 10) * 10])
     assert logit.min() < 0 < logit.max()
 
 
@@ -84,9 +84,11 @@ def test_the_intensity_network_sees_what_it_is_told_to(setting, arguments, width
     before = network(**given)
     assert before.shape == (20,)
     for name, value in given.items():
-        if value is None or value.numel() == 0:
+        if value is None or (name != "encoding" and value.numel() == 0):
             continue
-        changed = given | {name: value.roll(1, 0)}
+        changed = given | {
+            name: [part.roll(1, 0) for part in value] if name == "encoding" else value.roll(1, 0)
+        }
         seen = name in arguments | {"encoding"}
         assert torch.equal(network(**changed), before) != seen, name
 
@@ -125,13 +127,15 @@ def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_fr
     field, points = make_field(dataclasses.replace(BARE, sdf_input=True))
     seen = []
     field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[:2]))
-    factors = torch.ones(len(points), field.cells.dim + field.fourier.dim)
-    factors[:, ::2] = 0
-    factors[:, 1::2] = 3
+    factors = [torch.ones(len(points), dim) for dim in (field.cells.dim, field.fourier.dim)]
+    for part in factors:
+        part[:, ::2] = 0
+        part[:, 1::2] = 3
     for given in (None, factors):
         intensity(field, points, frozen=geometry_frozen, encoding_factors=given)
     (encoding, logit), (hidden, logit_with_dropout) = seen
-    assert torch.equal(hidden, encoding * factors)
+    for part, before, factor in zip(hidden, encoding, factors, strict=True):
+        assert torch.equal(part, before * factor)
     assert torch.equal(logit, logit_with_dropout)
 
 

@@ -131,7 +131,7 @@ def test_a_step_refuses_what_does_not_fit():
     memory = kernels.AdamMemory(
         torch.zeros(rows, 16),
         torch.zeros(rows, 1, dtype=torch.int32),
-        torch.full((rows, 1), -1, dtype=torch.int32),
+        torch.zeros(rows, 8),
     )
     _, located = kernels.encode(cells.features, points, cells.table)
     decays = torch.ones(5, 2)

@@ -23,6 +23,8 @@ __all__: list[str] = [
     "marching_cubes_dense",
     "marching_cubes_sparse",
     "mesh_components",
+    "mlp",
+    "mlp_backward",
     "num_threads",
     "openmp_version",
     "set_instruction_set",
@@ -123,7 +125,7 @@ class VertexTable:
         moments: numpy.typing.NDArray[numpy.float32],
         last_step: numpy.typing.NDArray[numpy.int32],
         decays: numpy.typing.NDArray[numpy.float32],
-        slots: numpy.typing.NDArray[numpy.int32],
+        sums: numpy.typing.NDArray[numpy.float32],
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
@@ -131,7 +133,7 @@ class VertexTable:
         parts: typing.SupportsInt | typing.SupportsIndex = 1,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `sums` (num_rows, 8) zeros, as they are left.
         """
     @typing.overload
     def adam_step(
@@ -147,7 +149,7 @@ class VertexTable:
         moments: numpy.typing.NDArray[numpy.float64],
         last_step: numpy.typing.NDArray[numpy.int32],
         decays: numpy.typing.NDArray[numpy.float64],
-        slots: numpy.typing.NDArray[numpy.int32],
+        sums: numpy.typing.NDArray[numpy.float64],
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
@@ -155,7 +157,7 @@ class VertexTable:
         parts: typing.SupportsInt | typing.SupportsIndex = 1,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `slots` (num_rows, 1) int32 scratch.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `sums` (num_rows, 8) zeros, as they are left.
         """
     @typing.overload
     def coordinate_gradient(
@@ -474,6 +476,64 @@ def marching_cubes_sparse(
 def mesh_components(
     faces: numpy.typing.NDArray[numpy.int32], num_vertices: typing.SupportsInt | typing.SupportsIndex
 ) -> tuple[numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int64]]: ...
+@typing.overload
+def mlp(
+    inputs: list[numpy.typing.NDArray[numpy.float32]],
+    weights: list[numpy.typing.NDArray[numpy.float32]],
+    biases: list[numpy.typing.NDArray[numpy.float32]],
+    out: numpy.typing.NDArray[numpy.float32],
+    keep_hidden: bool,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> typing.Any:
+    """
+    Writes to `out` (N, outputs) what linear layers with ReLU between them make of blocks of columns side by side. Gives what `mlp_backward` needs, if it is to be kept.
+    """
+
+@typing.overload
+def mlp(
+    inputs: list[numpy.typing.NDArray[numpy.float64]],
+    weights: list[numpy.typing.NDArray[numpy.float64]],
+    biases: list[numpy.typing.NDArray[numpy.float64]],
+    out: numpy.typing.NDArray[numpy.float64],
+    keep_hidden: bool,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> typing.Any:
+    """
+    Writes to `out` (N, outputs) what linear layers with ReLU between them make of blocks of columns side by side. Gives what `mlp_backward` needs, if it is to be kept.
+    """
+
+@typing.overload
+def mlp_backward(
+    inputs: list[numpy.typing.NDArray[numpy.float32]],
+    weights: list[numpy.typing.NDArray[numpy.float32]],
+    biases: list[numpy.typing.NDArray[numpy.float32]],
+    hidden: numpy.typing.NDArray[numpy.float32],
+    out_grad: numpy.typing.NDArray[numpy.float32],
+    weight_grads: list[numpy.typing.NDArray[numpy.float32]] | None,
+    bias_grads: list[numpy.typing.NDArray[numpy.float32]] | None,
+    input_grads: list[numpy.typing.NDArray[numpy.float32] | None],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> None:
+    """
+    Writes the gradients of (mlp . out_grad): by weights and biases, unless these are None, and by those inputs for which there is a matrix. `hidden` is what `mlp` gave.
+    """
+
+@typing.overload
+def mlp_backward(
+    inputs: list[numpy.typing.NDArray[numpy.float64]],
+    weights: list[numpy.typing.NDArray[numpy.float64]],
+    biases: list[numpy.typing.NDArray[numpy.float64]],
+    hidden: numpy.typing.NDArray[numpy.float64],
+    out_grad: numpy.typing.NDArray[numpy.float64],
+    weight_grads: list[numpy.typing.NDArray[numpy.float64]] | None,
+    bias_grads: list[numpy.typing.NDArray[numpy.float64]] | None,
+    input_grads: list[numpy.typing.NDArray[numpy.float64] | None],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> None:
+    """
+    Writes the gradients of (mlp . out_grad): by weights and biases, unless these are None, and by those inputs for which there is a matrix. `hidden` is what `mlp` gave.
+    """
+
 def num_threads(num_threads: typing.SupportsInt | typing.SupportsIndex = 0) -> int:
     """
     Threads that a call with this argument uses.

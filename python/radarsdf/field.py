@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,8 @@ from radarsdf.networks import IntensityNetwork, SDFNetwork
 class Geometry:
     """What the SDF network sees and says of N points."""
 
-    encoding: Tensor
-    """(N, D)."""
+    encoding: tuple[Tensor, ...]
+    """Of the cells and, where there are frequencies, of Fourier: (N, any) each."""
     logit: Tensor
     """(N,) signed distance / sigma, positive in free space."""
     feature: Tensor
@@ -33,7 +34,8 @@ class Geometry:
     def first(self, count: int) -> Geometry:
         """Of the first `count` points alone."""
         normals = None if self.normals is None else self.normals[:count]
-        return Geometry(self.encoding[:count], self.logit[:count], self.feature[:count], normals)
+        encoding = tuple(part[:count] for part in self.encoding)
+        return Geometry(encoding, self.logit[:count], self.feature[:count], normals)
 
 
 class Field(nn.Module):
@@ -63,9 +65,10 @@ class Field(nn.Module):
         self.sdf_network = SDFNetwork(dim, config)
         self.intensity_network = IntensityNetwork(dim, config) if with_intensity else None
 
-    def encode(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
-        """(N, 3) local, m, to (N, D). With `touched`, features learn by way of that: see :class:`VertexFeatures`."""
-        return torch.cat([self.cells(points, touched), self.fourier(points)], 1)
+    def encode(self, points: Tensor, touched: list[Touched] | None = None) -> tuple[Tensor, ...]:
+        """(N, 3) local, m, to (N, any) each. With `touched`, features learn by way of that: see :class:`VertexFeatures`."""
+        cells = self.cells(points, touched)
+        return (cells, self.fourier(points)) if self.fourier.dim else (cells,)
 
     def logit(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
         """Signed distance / sigma (N,), positive in free space."""
@@ -87,7 +90,8 @@ class Field(nn.Module):
                 (gradient,) = torch.autograd.grad(logit.sum(), points, create_graph=not frozen)
                 normals = functional.normalize(gradient, dim=1)
         if frozen:
-            encoding, logit, feature = encoding.detach(), logit.detach(), feature.detach()
+            encoding = tuple(part.detach() for part in encoding)
+            logit, feature = logit.detach(), feature.detach()
         return Geometry(encoding, logit, feature, normals)
 
     def reflectance(
@@ -96,17 +100,17 @@ class Field(nn.Module):
         directions: Tensor,
         ranges_m: Tensor,
         *,
-        encoding_factors: Tensor | None = None,
+        encoding_factors: Sequence[Tensor] | None = None,
     ) -> Tensor:
         """Scaled intensity (N,) where the geometry is that of the same points.
 
         Directions and ranges are those of :class:`~radarsdf.networks.IntensityNetwork`. What that sees of the encoding is
-        multiplied by `encoding_factors` (N, D): dropout.
+        multiplied by `encoding_factors`, (N, any) each: dropout.
         """
         assert self.intensity_network is not None
         encoding = geometry.encoding
         if encoding_factors is not None:
-            encoding = encoding * encoding_factors
+            encoding = tuple(part * kept for part, kept in zip(encoding, encoding_factors, strict=True))
         return self.intensity_network(  # type: ignore[no-any-return]
             encoding, geometry.logit, geometry.feature, geometry.normals, directions, ranges_m
         )

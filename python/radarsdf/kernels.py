@@ -37,21 +37,23 @@ class AdamMemory:
     """(num_rows, 16): mean and mean square of each row's gradients."""
     last_step: Tensor
     """(num_rows, 1) int32, in which a row last moved; 0: never."""
-    slots: Tensor
-    """(num_rows, 1) int32, scratch."""
+    sums: Tensor
+    """(num_rows, 8) zeros, in which a step adds up its gradients."""
 
 
-def _view(tensor: Tensor) -> np.ndarray[Any, Any]:
+def view(tensor: Tensor) -> np.ndarray[Any, Any]:
+    """What the core takes: a NumPy view in C order."""
     return tensor.detach().contiguous().numpy()
 
 
-def _rows(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """Like `_view`, but leaves a block of columns of a larger matrix where it is."""
+def rows_view(tensor: Tensor) -> np.ndarray[Any, Any]:
+    """Like :func:`view`, but leaves a block of columns of a larger matrix where it is."""
     tensor = tensor.detach()
     return (tensor if tensor.stride(1) == 1 and tensor.stride(0) > 0 else tensor.contiguous()).numpy()
 
 
-def _threads() -> int:
+def threads() -> int:
+    """How many the core is to use: as many as PyTorch would."""
     return torch.get_num_threads()
 
 
@@ -60,12 +62,12 @@ def _interpolate(
 ) -> Tensor:
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
     table.interpolate(
-        _view(features),
-        _view(points),
+        view(features),
+        view(points),
         located.numpy(),
-        None if directions is None else _view(directions),
+        None if directions is None else view(directions),
         out.numpy(),
-        _threads(),
+        threads(),
     )
     return out
 
@@ -75,12 +77,12 @@ def _scatter(
 ) -> Tensor:
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
     table.scatter(
-        _view(points),
+        view(points),
         located.numpy(),
-        None if directions is None else _view(directions),
-        _rows(out_grad),
+        None if directions is None else view(directions),
+        rows_view(out_grad),
         features_grad.numpy(),
-        _threads(),
+        threads(),
     )
     return features_grad
 
@@ -95,13 +97,13 @@ def _coordinate_gradient(
 ) -> Tensor:
     points_grad = torch.empty_like(points, memory_format=torch.contiguous_format)
     table.coordinate_gradient(
-        _view(features),
-        _view(points),
+        view(features),
+        view(points),
         located.numpy(),
-        None if directions is None else _view(directions),
-        _rows(out_grad),
+        None if directions is None else view(directions),
+        rows_view(out_grad),
         points_grad.numpy(),
-        _threads(),
+        threads(),
     )
     return points_grad
 
@@ -187,7 +189,7 @@ class _Fourier(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, half_width_m: float, first: int, count: int) -> Tensor:
         out = points.new_empty((points.shape[0], 6 * count))
-        _fourier(_view(points), half_width_m, first, count, out.numpy(), _threads())
+        _fourier(view(points), half_width_m, first, count, out.numpy(), threads())
         ctx.save_for_backward(out)
         ctx.frequencies = (half_width_m, first, count)
         return out
@@ -230,7 +232,7 @@ def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor
     """:func:`interpolate` without a gradient, and the cells (N, num_levels) int32 of :func:`locate`."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
-    table.encode(_view(features), _view(points), located.numpy(), out.numpy(), _threads())
+    table.encode(view(features), view(points), located.numpy(), out.numpy(), threads())
     return out, located
 
 
@@ -269,12 +271,12 @@ def adam_step(
         Which share of the rows to move: the shares are disjoint, and all of them make the step.
     """
     table.adam_step(
-        [(_view(points), located.numpy(), _rows(grad)) for points, located, grad in batches],
-        _view(features),
+        [(view(points), located.numpy(), rows_view(grad)) for points, located, grad in batches],
+        view(features),
         memory.moments.numpy(),
         memory.last_step.numpy(),
         decays.numpy(),
-        memory.slots.numpy(),
+        memory.sums.numpy(),
         step,
         learning_rate,
         epsilon,
@@ -300,13 +302,13 @@ def add_transposed(
         To use.
     """
     located = locate(points, table, num_threads)
-    table.scatter(_view(points), located.numpy(), None, _view(values), sums.numpy(), num_threads)
+    table.scatter(view(points), located.numpy(), None, view(values), sums.numpy(), num_threads)
 
 
 def locate(points: Tensor, table: VertexTable, num_threads: int | None = None) -> Tensor:
     """Occupied cell that holds each point (N, 3), local frame, m: (N, num_levels) int32, finest first, -1 where none."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
-    table.locate(_view(points), located.numpy(), _threads() if num_threads is None else num_threads)
+    table.locate(view(points), located.numpy(), threads() if num_threads is None else num_threads)
     return located
 
 
@@ -321,5 +323,5 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
         msg = "spherical_harmonics has no gradient by the directions"
         raise NotImplementedError(msg)
     out = directions.new_empty((directions.shape[0], NUM_SPHERICAL_HARMONICS))
-    _spherical_harmonics(_view(directions), out.numpy(), _threads())
+    _spherical_harmonics(view(directions), out.numpy(), threads())
     return out

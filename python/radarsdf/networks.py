@@ -12,9 +12,10 @@ from torch import Tensor, nn
 
 from radarsdf.config import FitConfig
 from radarsdf.encodings import SphericalHarmonics
+from radarsdf.mlp import mlp
 
 
-def _mlp(widths: Sequence[int]) -> nn.Sequential:
+def _layers(widths: Sequence[int]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
         layers.append(nn.Linear(inputs, outputs))
@@ -23,12 +24,18 @@ def _mlp(widths: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
+def _run(layers: nn.Sequential, inputs: Sequence[Tensor]) -> Tensor:
+    """`layers` on `inputs` side by side."""
+    linear = [(layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear)]
+    return mlp([x for x in inputs if x.shape[1] > 0], linear)
+
+
 class SDFNetwork(nn.Module):
     """Encoding of a point to distance / sigma (positive in free space) and, where asked for, a geometry feature."""
 
     def __init__(self, encoding_dim: int, config: FitConfig) -> None:
         super().__init__()
-        self.layers = _mlp([encoding_dim, *config.sdf_hidden, 1 + config.geometry_feature_dim])
+        self.layers = _layers([encoding_dim, *config.sdf_hidden, 1 + config.geometry_feature_dim])
 
     @torch.no_grad()
     def start_as_input(self, index: int) -> None:
@@ -44,9 +51,9 @@ class SDFNetwork(nn.Module):
         last.bias[0] = 0
         last.weight[0, 0], last.weight[0, 1] = 1, -1
 
-    def forward(self, encoding: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, D) to the logit (N,) and the geometry feature (N, geometry_feature_dim)."""
-        out = self.layers(encoding)
+    def forward(self, encoding: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Encodings (N, any), side by side, to the logit (N,) and the geometry feature (N, geometry_feature_dim)."""
+        out = _run(self.layers, encoding)
         return out[:, 0], out[:, 1:]
 
 
@@ -71,11 +78,11 @@ class IntensityNetwork(nn.Module):
             + self.harmonics.dim * config.view_direction
             + config.log_range
         )
-        self.layers = _mlp([inputs, *config.intensity_hidden, 1])
+        self.layers = _layers([inputs, *config.intensity_hidden, 1])
 
     def forward(
         self,
-        encoding: Tensor,
+        encoding: Sequence[Tensor],
         logit: Tensor,
         geometry_feature: Tensor,
         normals: Tensor | None,
@@ -87,13 +94,13 @@ class IntensityNetwork(nn.Module):
         Parameters
         ----------
         encoding, logit, geometry_feature : Tensor
-            (N, D), (N,) and (N, G): input and outputs of the SDF network.
+            (N, any) each, (N,) and (N, G): input and outputs of the SDF network.
         normals : Tensor or None
             (N, 3) unit normals, towards free space; needed where the configuration asks for them.
         directions, ranges_m : Tensor
             (N, 3) unit vectors from the sensor to the points, world axes, and the distances (N,), m.
         """
-        inputs = [encoding, geometry_feature]
+        inputs = [*encoding, geometry_feature]
         if self.sdf_input:
             inputs.append(logit[:, None])
         if self.normals:
@@ -103,4 +110,4 @@ class IntensityNetwork(nn.Module):
             inputs.append(self.harmonics(directions))
         if self.log_range:
             inputs.append(torch.log10(ranges_m.clamp_min(1e-3) / 10.0)[:, None])
-        return self.layers(torch.cat(inputs, 1))[:, 0]  # type: ignore[no-any-return]
+        return _run(self.layers, inputs)[:, 0]

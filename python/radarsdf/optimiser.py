@@ -35,12 +35,13 @@ class Adam:
         self._epsilon = epsilon
         self._means = [torch.zeros_like(p) for p in self.parameters]
         self._squares = [torch.zeros_like(p) for p in self.parameters]
-        self._steps = [torch.zeros(()) for _ in self.parameters]
+        self._step = torch.zeros(())
 
     def state(self) -> dict[str, Tensor]:
         """What the next steps depend on beside the parameters. Not copies."""
-        lists = {"mean": self._means, "square": self._squares, "steps": self._steps}
-        return {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
+        lists = {"mean": self._means, "square": self._squares}
+        state = {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
+        return state | {"step": self._step}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Go on as the optimiser of the same parameters that gave `state`."""
@@ -50,15 +51,14 @@ class Adam:
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor]) -> None:
         """Move the parameters by their gradients, in the same order."""
-        for count in self._steps:
-            count.add_(1)
+        self._step.add_(1)
         torch._fused_adam_(  # the kernel has no public name
             self.parameters,
             list(gradients),
             self._means,
             self._squares,
             [],
-            self._steps,
+            [self._step] * len(self.parameters),
             lr=self.learning_rate,
             beta1=_BETAS[0],
             beta2=_BETAS[1],
@@ -91,7 +91,7 @@ class RowAdam:
         self._memory = kernels.AdamMemory(
             moments=torch.zeros(rows, 2 * kernels.FEATURE_DIM, dtype=dtype),
             last_step=torch.zeros(rows, 1, dtype=torch.int32),
-            slots=torch.empty(rows, 1, dtype=torch.int32),
+            sums=torch.zeros(rows, kernels.FEATURE_DIM, dtype=dtype),
         )
         self._decays = torch.zeros(0, 2, dtype=dtype)
 

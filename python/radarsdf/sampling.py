@@ -23,10 +23,32 @@ class Samples:
     """(B, 3) float32, local frame, m."""
     sdf_m: Tensor
     """(B,) distance along the ray to the return, positive in front of it."""
-    rays: Tensor
-    """(B,) int64, index of each sample's ray."""
     num_near: int
     """The first `num_near` are near the surface, the others in free space."""
+    of_ray: Tensor
+    """(B, 7 or 8): return (3), direction (3), range and, where there are any, scaled intensity of each sample's ray."""
+    _places: Tensor
+    _rays_by_place: Tensor
+
+    @property
+    def directions(self) -> Tensor:
+        """(B, 3) unit vectors from the sensor to the return."""
+        return self.of_ray[:, 3:6]
+
+    @property
+    def ranges_m(self) -> Tensor:
+        """(B,) from the sensor to the return."""
+        return self.of_ray[:, 6]
+
+    @property
+    def intensities(self) -> Tensor:
+        """(B,) of the returns, scaled."""
+        return self.of_ray[:, 7]
+
+    @property
+    def rays(self) -> Tensor:
+        """(B,) int64, index of each sample's ray."""
+        return self._rays_by_place[self._places]
 
 
 class RaySampler:
@@ -36,7 +58,8 @@ class RaySampler:
     positions along the rays are random. A batch takes one near-surface and one free-space sample from each of its rays
     rather than all twelve from a twelfth as many: the gradient sees more of the scene. Within a batch, rays go in
     Morton order of their returns, so that neighbours share cache lines. `neighbours` rays that follow each other in that
-    order are taken together: in large batches of a large map, no two others would be near.
+    order are taken together: in large batches of a large map, no two others would be near. `intensities` (N,) are those of
+    the rays, scaled.
     """
 
     def __init__(
@@ -46,16 +69,18 @@ class RaySampler:
         batch_size: int,
         generator: torch.Generator,
         neighbours: int = 1,
+        intensities: Tensor | None = None,
     ) -> None:
         self._config = config
         self._neighbours = neighbours
         self._generator = generator
         order = np.argsort(cell_keys(np.ascontiguousarray(rays.points), config.leaf_size_m, 1), kind="stable")
         self._original = torch.from_numpy(order)
-        # One gather a batch fetches point, direction and range: 28 bytes, mostly one cache line.
-        self._rays = torch.cat(
-            [torch.from_numpy(a) for a in (rays.points, rays.directions, rays.ranges_m[:, None])], 1
-        )[self._original]
+        # One gather a batch fetches all there is to know of a ray: 32 bytes, half a cache line.
+        columns = [torch.from_numpy(a) for a in (rays.points, rays.directions, rays.ranges_m[:, None])]
+        if intensities is not None:
+            columns.append(intensities[:, None])
+        self._rays = torch.cat(columns, 1)[self._original]
         self._order = np.zeros(0, np.int64)
         self._order_from = torch.zeros_like(generator.get_state())
         """The generator's state that `_order` was drawn from."""
@@ -118,25 +143,26 @@ class RaySampler:
     def spread(self, count: int) -> Samples:
         """`count` samples round returns: within `near_band_m` along the beam, and across it as angular noise spreads."""
         config = self._config
-        rays = self._take(count)
+        places = self._take(count)
         sdf_m = (2 * self._uniform(count) - 1) * config.near_band_m
-        ray = self._rays[rays]
+        ray = self._rays.index_select(0, places)
         points = ray[:, :3] - sdf_m[:, None] * ray[:, 3:6]
         if config.cross_range_noise_rad > 0:
             # Isotropic: what it adds along the beam is lost in the width of the band.
             noise = torch.randn(points.shape, generator=self._generator)
             points += noise * (config.cross_range_noise_rad * ray[:, 6:7])
-        return Samples(points, sdf_m, self._original[rays], count)
+        return Samples(points, sdf_m, count, ray, places, self._original)
 
     def batch(self) -> Samples:
         """A batch of `batch_size` samples, near the surface and in free space."""
-        rays = self._take(max(self._num_near, self._num_free))
+        taken = self._take(max(self._num_near, self._num_free))
         # Where one kind is rarer, every so many-th ray has one of it: each kind still covers the whole scene.
         near, free = (
-            rays[torch.arange(n) * len(rays) // max(n, 1)] for n in (self._num_near, self._num_free)
+            taken if n == len(taken) else taken[torch.arange(n) * len(taken) // max(n, 1)]
+            for n in (self._num_near, self._num_free)
         )
-        index = torch.cat([near, free])
-        ray = self._rays[index]
+        places = torch.cat([near, free])
+        ray = self._rays.index_select(0, places)
         config = self._config
         near_m = (2 * self._uniform(self._num_near) - 1) * config.near_band_m
         range_m = ray[self._num_near :, 6]
@@ -145,6 +171,5 @@ class RaySampler:
             config.free_from * range_m, range_m + config.free_beyond_m, self._uniform(self._num_free)
         )
         sdf_m = torch.cat([near_m, free_m])
-        return Samples(
-            ray[:, :3] - sdf_m[:, None] * ray[:, 3:6], sdf_m, self._original[index], self._num_near
-        )
+        points = ray[:, :3] - sdf_m[:, None] * ray[:, 3:6]
+        return Samples(points, sdf_m, self._num_near, ray, places, self._original)

@@ -33,26 +33,6 @@ _KEEP_EVERY = (
 )
 
 
-class _Source:
-    """Rays to draw samples from, with what the intensity network is to know of them."""
-
-    def __init__(
-        self,
-        rays: Rays,
-        scale: IntensityScale | None,
-        config: FitConfig,
-        batch_size: int,
-        generator: torch.Generator,
-        neighbours: int,
-    ) -> None:
-        self.sampler = RaySampler(rays, config, batch_size, generator, neighbours)
-        self.directions = torch.from_numpy(rays.directions)
-        self.ranges_m = torch.from_numpy(rays.ranges_m)
-        self.intensities = None
-        if scale is not None and rays.intensities is not None:
-            self.intensities = torch.from_numpy(scale.to_unit(rays.intensities))
-
-
 class _Shard:
     """One thread's share of the rays and of each batch: it draws samples and computes gradients."""
 
@@ -71,13 +51,17 @@ class _Shard:
         self._config = config
         generator = torch.Generator().manual_seed(config.seed * MAX_THREADS + part)
 
-        def source(rays: Rays) -> _Source:
+        def sampler(rays: Rays) -> RaySampler:
+            rays = rays.every(parts, part)
+            unit = None
+            if scale is not None and rays.intensities is not None:
+                unit = torch.from_numpy(scale.to_unit(rays.intensities))
             share = _share(schedule.batch_size, part, parts)
-            return _Source(rays.every(parts, part), scale, config, share, generator, schedule.neighbours)
+            return RaySampler(rays, config, share, generator, schedule.neighbours, unit)
 
-        self._surface = source(surface)
+        self._surface = sampler(surface)
         # A ghost has an intensity, though no surface: the sensor will see it again.
-        self._returns = self._surface if returns is surface or scale is None else source(returns)
+        self._returns = self._surface if returns is surface or scale is None else sampler(returns)
         dropouts = (config.feature_dropout, config.fourier_dropout)
         self._dropouts = [schedule.dropout_scale * dropout for dropout in dropouts]
         self._intensity_batch_size = _share(config.intensity_batch_size, part, parts)
@@ -97,50 +81,48 @@ class _Shard:
         self._generator.set_state(state["generator"])  # last: the samplers draw their orders again
 
     def _samplers(self) -> dict[str, RaySampler]:
-        samplers = {"surface": self._surface.sampler}
-        return samplers if self._returns is self._surface else samplers | {"returns": self._returns.sampler}
+        samplers = {"surface": self._surface}
+        return samplers if self._returns is self._surface else samplers | {"returns": self._returns}
 
     def geometry_loss(self, touched: list[Touched] | None) -> Tensor:
-        samples = self._surface.sampler.batch()
+        samples = self._surface.batch()
         logit = self._field.logit(samples.points, touched)
         return sdf_loss(logit, samples.sdf_m, self._config.sigma_m)
 
     def joint_loss(self, touched: list[Touched] | None) -> Tensor:
-        samples = self._surface.sampler.batch()
+        samples = self._surface.batch()
         geometry = self._field.geometry(samples.points, frozen=False, touched=touched)
         sdf = sdf_loss(geometry.logit, samples.sdf_m, self._config.sigma_m)
-        intensity = self._intensity_loss(samples, self._surface, geometry)
+        intensity = self._intensity_loss(samples, geometry)
         self.joint_parts = {"sdf": sdf.detach(), "intensity": intensity.detach()}
         return self._config.sdf_loss_weight * sdf + intensity
 
     def reflectance_loss(self, _: list[Touched] | None) -> Tensor:
         if self._config.intensity_in_free_space:
-            samples = self._returns.sampler.batch()
+            samples = self._returns.batch()
         else:
-            samples = self._returns.sampler.spread(self._intensity_batch_size)
-        return self._intensity_loss(samples, self._returns, self._field.geometry(samples.points))
+            samples = self._returns.spread(self._intensity_batch_size)
+        return self._intensity_loss(samples, self._field.geometry(samples.points))
 
-    def _intensity_loss(self, samples: Samples, source: _Source, geometry: Geometry) -> Tensor:
-        assert source.intensities is not None
-        count = len(samples.rays) if self._config.intensity_in_free_space else samples.num_near
-        rays = samples.rays[:count]
-        labels = source.intensities[rays]
+    def _intensity_loss(self, samples: Samples, geometry: Geometry) -> Tensor:
+        count = len(samples.points) if self._config.intensity_in_free_space else samples.num_near
+        labels = samples.intensities[:count].clone()
         labels[samples.num_near :] = 0  # no return is expected from free space (3QFPI)
         predicted = self._field.reflectance(
             geometry.first(count),
-            source.directions[rays],
-            source.ranges_m[rays] - samples.sdf_m[:count],
+            samples.directions[:count],
+            samples.ranges_m[:count] - samples.sdf_m[:count],
             encoding_factors=self._encoding_factors(count),
         )
         return intensity_loss(predicted, labels)
 
-    def _encoding_factors(self, count: int) -> Tensor | None:
+    def _encoding_factors(self, count: int) -> list[Tensor] | None:
         """Dropout of the encoding for `count` samples, which the SDF network is spared."""
         if not any(self._dropouts):
             return None
         dims = (self._field.cells.dim, self._field.fourier.dim)
-        kept = [self._surface.sampler.kept(count, *part) for part in zip(dims, self._dropouts, strict=True)]
-        return torch.cat(kept, 1)
+        parts = [part for part in zip(dims, self._dropouts, strict=True) if part[0]]
+        return [self._surface.kept(count, *part) for part in parts]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,124 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include <pybind11/stl.h>
+
+#include <optional>
+
+#include "arrays.hpp"
+#include "mlp.hpp"
+
+namespace radarsdf {
+namespace {
+
+template <typename T>
+std::vector<Layer<T>> layers_of(const std::vector<Array<T>>& weights, const std::vector<Array<T>>& biases) {
+  if (weights.empty() || weights.size() != biases.size()) {
+    throw std::invalid_argument("there must be as many weights as biases, and at least one");
+  }
+  std::vector<Layer<T>> layers;
+  for (std::size_t i = 0; i < weights.size(); ++i) {
+    const auto inputs = i == 0 && weights[0].ndim() == 2 ? weights[0].shape(1) : i > 0 ? layers.back().outputs : 0;
+    const auto outputs = weights[i].ndim() == 2 ? weights[i].shape(0) : 0;
+    if (outputs == 0) throw std::invalid_argument("a layer must have outputs");
+    check_shape(weights[i], outputs, inputs, "weights");
+    if (biases[i].ndim() != 1 || biases[i].shape(0) != outputs) {
+      throw std::invalid_argument("biases must have as many numbers as weights have rows");
+    }
+    layers.push_back({weights[i].data(), biases[i].data(), inputs, outputs});
+  }
+  return layers;
+}
+
+template <typename T>
+std::vector<Columns<const T>> inputs_of(const std::vector<Rows<T>>& blocks, std::int64_t count,
+                                        const std::vector<Layer<T>>& layers) {
+  std::vector<Columns<const T>> inputs;
+  std::int64_t width = 0;
+  for (const Rows<T>& block : blocks) {
+    if (block.ndim() != 2) throw std::invalid_argument("inputs must be matrices");
+    check_shape(block, count, block.shape(1), "inputs");
+    inputs.push_back({block.data(), row_stride(block, "inputs"), block.shape(1)});
+    width += block.shape(1);
+  }
+  if (width != layers[0].inputs) throw std::invalid_argument("inputs must have as many columns as the first weights");
+  return inputs;
+}
+
+template <typename T>
+void bind_networks(py::module_& m) {
+  using namespace py::literals;
+  m.def(
+      "mlp",
+      [](const std::vector<Rows<T>>& blocks, const std::vector<Array<T>>& weights, const std::vector<Array<T>>& biases,
+         Array<T>& out, bool keep_hidden, int num_threads) -> py::object {
+        const std::vector<Layer<T>> layers = layers_of(weights, biases);
+        const std::int64_t count = out.ndim() == 2 ? out.shape(0) : 0;
+        check_shape(out, count, layers.back().outputs, "out");
+        const auto inputs = inputs_of(blocks, count, layers);
+        std::optional<Array<T>> hidden;
+        if (keep_hidden) hidden.emplace(std::vector<std::int64_t>{count, mlp_hidden_columns(layers)});
+        T *kept = hidden ? hidden->mutable_data() : nullptr, *result = out.mutable_data();
+        {
+          const py::gil_scoped_release release;
+          mlp(layers, inputs, count, kept, result, num_threads);
+        }
+        return hidden ? py::object(*hidden) : py::none();
+      },
+      "inputs"_a.noconvert(), "weights"_a.noconvert(), "biases"_a.noconvert(), "out"_a.noconvert(), "keep_hidden"_a,
+      "num_threads"_a = 0,
+      "Writes to `out` (N, outputs) what linear layers with ReLU between them make of blocks of columns side by side. "
+      "Gives what `mlp_backward` needs, if it is to be kept.");
+  m.def(
+      "mlp_backward",
+      [](const std::vector<Rows<T>>& blocks, const std::vector<Array<T>>& weights, const std::vector<Array<T>>& biases,
+         const Array<T>& hidden, const Rows<T>& out_grad, std::optional<std::vector<Array<T>>>& weight_grads,
+         std::optional<std::vector<Array<T>>>& bias_grads, std::vector<std::optional<Rows<T>>>& input_grads,
+         int num_threads) {
+        const std::vector<Layer<T>> layers = layers_of(weights, biases);
+        const std::int64_t count = hidden.ndim() == 2 ? hidden.shape(0) : 0;
+        check_shape(hidden, count, mlp_hidden_columns(layers), "hidden");
+        check_shape(out_grad, count, layers.back().outputs, "out_grad");
+        const auto inputs = inputs_of(blocks, count, layers);
+        std::vector<LayerGradients<T>> by_layers(layers.size());
+        if (weight_grads.has_value() != bias_grads.has_value() ||
+            (weight_grads && (weight_grads->size() != layers.size() || bias_grads->size() != layers.size()))) {
+          throw std::invalid_argument("gradients of weights and biases must be of all layers or of none");
+        }
+        for (std::size_t i = 0; weight_grads && i < layers.size(); ++i) {
+          check_shape((*weight_grads)[i], layers[i].outputs, layers[i].inputs, "weight_grads");
+          if ((*bias_grads)[i].ndim() != 1 || (*bias_grads)[i].shape(0) != layers[i].outputs) {
+            throw std::invalid_argument("bias_grads must have the shapes of the biases");
+          }
+          by_layers[i] = {(*weight_grads)[i].mutable_data(), (*bias_grads)[i].mutable_data()};
+        }
+        if (input_grads.size() != inputs.size()) {
+          throw std::invalid_argument("there must be one of input_grads, or None, for each of the inputs");
+        }
+        std::vector<Columns<T>> by_inputs;
+        for (std::size_t i = 0; i < inputs.size(); ++i) {
+          by_inputs.push_back({nullptr, 0, inputs[i].width});
+          if (!input_grads[i]) continue;
+          check_shape(*input_grads[i], count, inputs[i].width, "input_grads");
+          by_inputs[i].stride = row_stride(*input_grads[i], "input_grads");
+          by_inputs[i].data = input_grads[i]->mutable_data();
+        }
+        const Columns<const T> grad{out_grad.data(), row_stride(out_grad, "out_grad"), layers.back().outputs};
+        const T* kept = hidden.data();
+        const py::gil_scoped_release release;
+        mlp_backward(layers, inputs, count, kept, grad, by_layers, by_inputs, num_threads);
+      },
+      "inputs"_a.noconvert(), "weights"_a.noconvert(), "biases"_a.noconvert(), "hidden"_a.noconvert(),
+      "out_grad"_a.noconvert(), "weight_grads"_a.noconvert(), "bias_grads"_a.noconvert(), "input_grads"_a.noconvert(),
+      "num_threads"_a = 0,
+      "Writes the gradients of (mlp . out_grad): by weights and biases, unless these are None, and by those inputs for "
+      "which there is a matrix. `hidden` is what `mlp` gave.");
+}
+
+}  // namespace
+
+void bind_mlp(py::module_& m) {
+  bind_networks<float>(m);
+  bind_networks<double>(m);
+}
+
+}  // namespace radarsdf

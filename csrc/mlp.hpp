@@ -1,0 +1,50 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// A network of linear layers with ReLU between them, forward and backward, a few rows at a time through all layers:
+// what lies between two layers stays in the cache, and an iteration of training waits for the interpreter twice instead
+// of a dozen times.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+namespace radarsdf {
+
+template <typename T>
+struct Layer {
+  const T* weights;  // (outputs, inputs)
+  const T* biases;   // (outputs)
+  std::int64_t inputs, outputs;
+};
+
+// Some columns of the input, or of its gradient: rows `stride` apart.
+template <typename T>
+struct Columns {
+  T* data;  // null, of a gradient: not asked for
+  std::int64_t stride, width;
+};
+
+// Columns of what `mlp` keeps for `mlp_backward`: the hidden layers side by side, each padded.
+template <typename T>
+std::int64_t mlp_hidden_columns(const std::vector<Layer<T>>& layers);
+
+// `inputs` side by side are the input (count, layers[0].inputs), `out` is (count, layers.back().outputs). `hidden`
+// (count, mlp_hidden_columns) is null if there will be no gradient.
+template <typename T>
+void mlp(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs, std::int64_t count,
+         T* hidden, T* out, int num_threads);
+
+// Gradients of (out . out_grad), all of them overwritten: by the weights and biases of each layer unless these are
+// null, and by the inputs. Sums over rows are made in pieces that do not depend on the number of threads.
+template <typename T>
+struct LayerGradients {
+  T* weights;
+  T* biases;
+};
+template <typename T>
+void mlp_backward(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs, std::int64_t count,
+                  const T* hidden, Columns<const T> out_grad, const std::vector<LayerGradients<T>>& layer_grads,
+                  const std::vector<Columns<T>>& input_grads, int num_threads);
+
+}  // namespace radarsdf
