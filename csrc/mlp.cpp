@@ -24,29 +24,12 @@ constexpr std::int64_t padded(std::int64_t columns) {
   return (columns + kColumnBlock - 1) / kColumnBlock * kColumnBlock;
 }
 
-// Of all layers, with zeros as columns up to a multiple of the vectors'.
 template <typename T>
-struct Padded {
-  std::vector<std::vector<T>> weights, biases;
-};
-
-template <typename T>
-Padded<T> transposed(const std::vector<Layer<T>>& layers) {
-  Padded<T> result;
-  for (const Layer<T>& layer : layers) {
-    const std::int64_t columns = padded(layer.outputs);
-    std::vector<T> weights(static_cast<std::size_t>(layer.inputs * columns)), biases(static_cast<std::size_t>(columns));
-    for (std::int64_t n = 0; n < layer.outputs; ++n) {
-      for (std::int64_t k = 0; k < layer.inputs; ++k) weights[k * columns + n] = layer.weights[n * layer.inputs + k];
-    }
-    std::copy_n(layer.biases, layer.outputs, biases.begin());
-    result.weights.push_back(std::move(weights));
-    result.biases.push_back(std::move(biases));
-  }
-  return result;
+std::vector<T> zeros(std::int64_t size) {
+  return std::vector<T>(static_cast<std::size_t>(size));
 }
 
-// Where each hidden layer's columns begin.
+// Where each hidden layer's columns begin, and how many there are.
 template <typename T>
 std::vector<std::int64_t> hidden_offsets(const std::vector<Layer<T>>& layers) {
   std::vector<std::int64_t> offsets = {0};
@@ -54,18 +37,204 @@ std::vector<std::int64_t> hidden_offsets(const std::vector<Layer<T>>& layers) {
   return offsets;
 }
 
-// Rows [first, first + rows) of the inputs, side by side and padded.
+// Rows [first, first + rows) of matrices side by side, with zeros up to `columns`.
 template <typename T>
-void gather(const std::vector<Columns<const T>>& inputs, std::int64_t first, std::int64_t rows, std::int64_t columns,
+void gather(const std::vector<Columns<const T>>& matrices, std::int64_t first, std::int64_t rows, std::int64_t columns,
             T* tile) {
   for (std::int64_t r = 0; r < rows; ++r) {
     T* row = tile + r * columns;
-    for (const Columns<const T>& input : inputs) {
-      row = std::copy_n(input.data + (first + r) * input.stride, input.width, row);
+    for (const Columns<const T>& matrix : matrices) {
+      row = std::copy_n(matrix.data + (first + r) * matrix.stride, matrix.width, row);
     }
     std::fill(row, tile + (r + 1) * columns, T(0));
   }
 }
+
+template <typename T>
+class Forward {
+ public:
+  Forward(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs)
+      : layers_(layers), inputs_(inputs), offsets_(hidden_offsets(layers)) {
+    for (const Layer<T>& layer : layers) {
+      const std::int64_t columns = padded(layer.outputs);
+      weights_.push_back(zeros<T>(layer.inputs * columns));
+      biases_.push_back(zeros<T>(columns));
+      for (std::int64_t n = 0; n < layer.outputs; ++n) {
+        for (std::int64_t k = 0; k < layer.inputs; ++k) {
+          weights_.back()[k * columns + n] = layer.weights[n * layer.inputs + k];
+        }
+      }
+      std::copy_n(layer.biases, layer.outputs, biases_.back().begin());
+    }
+  }
+
+  // Rows [first, first + rows) into `hidden` (rows, hidden columns) and `results` (rows, padded outputs).
+  void tile(std::int64_t first, std::int64_t rows, T* hidden, T* results) const {
+    for (std::size_t i = 0; i < layers_.size(); ++i) {
+      const bool last = i + 1 == layers_.size();
+      Product<T> product{};
+      product.a_depth = 1;
+      product.b = weights_[i].data();
+      product.b_row = product.columns = padded(layers_[i].outputs);
+      product.c = last ? results : hidden + offsets_[i];
+      product.c_row = last ? product.columns : offsets_.back();
+      product.rows = rows;
+      product.biases = biases_[i].data();
+      if (i > 0) {
+        product.a = hidden + offsets_[i - 1];
+        product.a_row = offsets_.back();
+        product.depth = layers_[i].inputs;
+        product.rectify = !last;
+        kernel_.multiply(product);
+        continue;
+      }
+      for (std::size_t part = 0; part < inputs_.size(); ++part) {
+        product.a = inputs_[part].data + first * inputs_[part].stride;
+        product.a_row = inputs_[part].stride;
+        product.depth = inputs_[part].width;
+        product.add = part > 0;
+        product.rectify = !last && part + 1 == inputs_.size();
+        kernel_.multiply(product);
+        product.b += product.depth * product.columns;
+      }
+    }
+  }
+
+ private:
+  const std::vector<Layer<T>>& layers_;
+  const std::vector<Columns<const T>>& inputs_;
+  std::vector<std::int64_t> offsets_;
+  std::vector<std::vector<T>> weights_, biases_;  // of each layer: transposed; both padded
+  ProductKernel<T> kernel_ = RADARSDF_KERNEL(product_kernel<T>)();
+};
+
+template <typename T>
+class Backward {
+ public:
+  Backward(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs, const T* hidden,
+           Columns<const T> out_grad, const std::vector<Columns<T>>& input_grads, bool by_layers)
+      : layers_(layers),
+        inputs_(inputs),
+        hidden_(hidden),
+        out_grad_(out_grad),
+        input_grads_(input_grads),
+        by_layers_(by_layers),
+        offsets_(hidden_offsets(layers)) {
+    for (std::size_t i = 0; i < layers.size(); ++i) {
+      const Layer<T>& layer = layers[i];
+      std::vector<Columns<const T>> wanted;  // columns of the weights, one for each input whose gradient is asked for
+      std::int64_t columns = 0, offset = 0;
+      for (std::size_t part = 0; part < (i == 0 ? inputs.size() : 1); ++part) {
+        const std::int64_t width = i == 0 ? inputs[part].width : layer.inputs;
+        if (i > 0 || input_grads[part].data) {
+          wanted.push_back({layer.weights + offset, layer.inputs, width});
+          columns += width;
+        }
+        offset += width;
+      }
+      columns_.push_back(padded(columns));
+      weights_.push_back(zeros<T>(layer.outputs * columns_.back()));
+      gather(wanted, 0, layer.outputs, columns_.back(), weights_.back().data());
+      sums_at_.push_back(sums_at_.back() + layer.outputs * padded(layer.inputs) + padded(layer.outputs));
+      widest_ = std::max({widest_, padded(layer.outputs), padded(layer.inputs)});
+    }
+  }
+
+  // Numbers in the sums of all rows: of each layer the gradients by its weights (outputs, padded inputs), then by its
+  // biases (padded outputs).
+  std::int64_t num_sums() const { return sums_at_.back(); }
+  std::int64_t sums_at(std::size_t layer) const { return sums_at_[layer]; }
+
+  // Adds those of rows [begin, end) to `sums`, and writes the gradients by the inputs.
+  void rows(std::int64_t begin, std::int64_t end, T* sums) const {
+    std::vector<T> inputs = zeros<T>(by_layers_ ? kTile * padded(layers_[0].inputs) : 0);
+    std::vector<T> grads[2] = {zeros<T>(kTile * widest_), zeros<T>(kTile * widest_)};
+    for (std::int64_t first = begin; first < end; first += kTile) {
+      tile(first, std::min(kTile, end - first), inputs.data(), grads, sums);
+    }
+  }
+
+ private:
+  void tile(std::int64_t first, std::int64_t rows, T* inputs, std::vector<T> (&grads)[2], T* sums) const {
+    const std::int64_t input_columns = padded(layers_[0].inputs);
+    if (by_layers_) gather(inputs_, first, rows, input_columns, inputs);
+    const T* grad = out_grad_.data + first * out_grad_.stride;  // by the outputs of layer i
+    std::int64_t grad_row = out_grad_.stride;
+    for (std::size_t i = layers_.size(); i-- > 0;) {
+      const T* before = i > 0 ? hidden_ + first * offsets_.back() + offsets_[i - 1] : inputs;
+      const std::int64_t before_row = i > 0 ? offsets_.back() : input_columns;
+      if (by_layers_) add_layer(i, rows, grad, grad_row, before, before_row, sums + sums_at_[i]);
+      if (columns_[i] == 0) return;
+      Product<T> product{};
+      product.a = grad;
+      product.a_row = grad_row;
+      product.a_depth = 1;
+      product.b = weights_[i].data();
+      product.b_row = product.columns = product.c_row = columns_[i];
+      product.c = grads[i % 2].data();
+      product.rows = rows;
+      product.depth = layers_[i].outputs;
+      if (i > 0) {
+        product.positive = before;
+        product.positive_row = before_row;
+      }
+      kernel_.multiply(product);
+      grad = product.c;
+      grad_row = product.c_row;
+    }
+    std::int64_t column = 0;
+    for (const Columns<T>& wanted : input_grads_) {
+      if (!wanted.data) continue;
+      for (std::int64_t r = 0; r < rows; ++r) {
+        std::copy_n(grad + r * grad_row + column, wanted.width, wanted.data + (first + r) * wanted.stride);
+      }
+      column += wanted.width;
+    }
+  }
+
+  void add_layer(std::size_t i, std::int64_t rows, const T* grad, std::int64_t grad_row, const T* before,
+                 std::int64_t before_row, T* sums) const {
+    const Layer<T>& layer = layers_[i];
+    Product<T> product{};
+    product.a = grad;
+    product.a_row = 1;
+    product.a_depth = grad_row;
+    product.b = before;
+    product.b_row = before_row;
+    product.c = sums;
+    product.c_row = product.columns = padded(layer.inputs);
+    product.rows = layer.outputs;
+    product.depth = rows;
+    product.add = true;
+    kernel_.multiply(product);
+    T* biases = sums + layer.outputs * product.columns;
+    if (i + 1 < layers_.size()) {  // columns are padded: their sums are a product with ones
+      product.a = &kOne<T>;
+      product.a_row = product.a_depth = 0;
+      product.b = grad;
+      product.b_row = grad_row;
+      product.c = biases;
+      product.rows = 1;
+      product.columns = padded(layer.outputs);
+      kernel_.multiply(product);
+      return;
+    }
+    for (std::int64_t r = 0; r < rows; ++r) {
+      for (std::int64_t n = 0; n < layer.outputs; ++n) biases[n] += grad[r * grad_row + n];
+    }
+  }
+
+  const std::vector<Layer<T>>& layers_;
+  const std::vector<Columns<const T>>& inputs_;
+  const T* hidden_;
+  Columns<const T> out_grad_;
+  const std::vector<Columns<T>>& input_grads_;
+  bool by_layers_;
+  std::vector<std::int64_t> offsets_, columns_, sums_at_ = {0};
+  std::vector<std::vector<T>> weights_;  // of each layer, the columns whose gradient is asked for, padded
+  std::int64_t widest_ = 0;
+  ProductKernel<T> kernel_ = RADARSDF_KERNEL(product_kernel<T>)();
+};
 
 }  // namespace
 
@@ -77,48 +246,14 @@ std::int64_t mlp_hidden_columns(const std::vector<Layer<T>>& layers) {
 template <typename T>
 void mlp(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs, std::int64_t count,
          T* hidden, T* out, int num_threads) {
-  const ProductKernel<T> kernel = RADARSDF_KERNEL(product_kernel<T>)();
-  const Padded<T> weights = transposed(layers);
-  const std::vector<std::int64_t> offsets = hidden_offsets(layers);
-  const std::int64_t hidden_columns = offsets.back(), outputs = layers.back().outputs;
+  const Forward<T> forward(layers, inputs);
+  const std::int64_t hidden_columns = mlp_hidden_columns(layers), outputs = layers.back().outputs;
   parallel_blocks(count, kMinRows, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    std::vector<T> scratch(static_cast<std::size_t>(hidden ? 0 : kTile * hidden_columns));
-    std::vector<T> results(static_cast<std::size_t>(kTile * padded(outputs)));
+    std::vector<T> scratch = zeros<T>(hidden ? 0 : kTile * hidden_columns);
+    std::vector<T> results = zeros<T>(kTile * padded(outputs));
     for (std::int64_t first = begin; first < end; first += kTile) {
       const std::int64_t rows = std::min(kTile, end - first);
-      T* tile = hidden ? hidden + first * hidden_columns : scratch.data();
-      for (std::size_t i = 0; i < layers.size(); ++i) {
-        const bool last = i + 1 == layers.size();
-        Product<T> product{};
-        product.b_row = product.columns = padded(layers[i].outputs);
-        product.c = last ? results.data() : tile + offsets[i];
-        product.c_row = last ? product.columns : hidden_columns;
-        product.rows = rows;
-        if (i > 0) {
-          product.a = tile + offsets[i - 1];
-          product.a_row = hidden_columns;
-          product.a_depth = 1;
-          product.b = weights.weights[i].data();
-          product.depth = layers[i].inputs;
-          product.biases = weights.biases[i].data();
-          product.rectify = !last;
-          kernel.multiply(product);
-          continue;
-        }
-        const T* b = weights.weights[0].data();
-        for (std::size_t part = 0; part < inputs.size(); ++part) {
-          product.a = inputs[part].data + first * inputs[part].stride;
-          product.a_row = inputs[part].stride;
-          product.a_depth = 1;
-          product.b = b;
-          product.depth = inputs[part].width;
-          product.add = part > 0;
-          product.biases = weights.biases[0].data();
-          product.rectify = !last && part + 1 == inputs.size();
-          kernel.multiply(product);
-          b += product.depth * product.columns;
-        }
-      }
+      forward.tile(first, rows, hidden ? hidden + first * hidden_columns : scratch.data(), results.data());
       for (std::int64_t r = 0; r < rows; ++r) {
         std::copy_n(results.data() + r * padded(outputs), outputs, out + (first + r) * outputs);
       }
@@ -130,126 +265,26 @@ template <typename T>
 void mlp_backward(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs, std::int64_t count,
                   const T* hidden, Columns<const T> out_grad, const std::vector<LayerGradients<T>>& layer_grads,
                   const std::vector<Columns<T>>& input_grads, int num_threads) {
-  const ProductKernel<T> kernel = RADARSDF_KERNEL(product_kernel<T>)();
-  const std::vector<std::int64_t> offsets = hidden_offsets(layers);
-  const std::int64_t hidden_columns = offsets.back(), input_columns = padded(layers[0].inputs);
-  const bool by_layers = std::any_of(layer_grads.begin(), layer_grads.end(),
-                                     [](const LayerGradients<T>& g) { return g.weights || g.biases; });
-  // Rows of weights as they are, padded; of the first layer the columns of those inputs alone whose gradient is asked
-  // for.
-  std::vector<std::vector<T>> weights;
-  std::vector<std::int64_t> back_columns;
-  for (std::size_t i = 0; i < layers.size(); ++i) {
-    std::vector<Columns<const T>> parts;
-    std::int64_t columns = 0, offset = 0;
-    if (i > 0) {
-      parts.push_back({layers[i].weights, layers[i].inputs, layers[i].inputs});
-      columns = layers[i].inputs;
-    } else {
-      for (std::size_t part = 0; part < inputs.size(); ++part) {
-        if (input_grads[part].data) {
-          parts.push_back({layers[0].weights + offset, layers[0].inputs, inputs[part].width});
-          columns += inputs[part].width;
-        }
-        offset += inputs[part].width;
-      }
-    }
-    back_columns.push_back(padded(columns));
-    weights.emplace_back(static_cast<std::size_t>(layers[i].outputs * padded(columns)));
-    gather(parts, 0, layers[i].outputs, padded(columns), weights.back().data());
-  }
-
-  // Sums of each piece: for each layer (outputs, padded inputs) of weights, then the biases.
-  std::vector<std::int64_t> sums_at = {0};
-  for (const Layer<T>& layer : layers)
-    sums_at.push_back(sums_at.back() + layer.outputs * padded(layer.inputs) + padded(layer.outputs));
+  const bool by_layers = !layer_grads.empty();
+  const Backward<T> backward(layers, inputs, hidden, out_grad, input_grads, by_layers);
   const std::int64_t pieces = std::clamp<std::int64_t>((count + kPieceRows - 1) / kPieceRows, 1, kMaxPieces);
-  std::vector<T> sums(static_cast<std::size_t>(by_layers ? pieces * sums_at.back() : 0));
+  std::vector<T> sums = zeros<T>(by_layers ? pieces * backward.num_sums() : 0);
   parallel_tasks(pieces, num_threads, [&](std::int64_t piece) {
-    const std::int64_t begin = count * piece / pieces, end = count * (piece + 1) / pieces;
-    std::int64_t widest = 0;
-    for (const Layer<T>& layer : layers) widest = std::max({widest, padded(layer.outputs), padded(layer.inputs)});
-    std::vector<T> tile(static_cast<std::size_t>(by_layers ? kTile * input_columns : 0));
-    std::vector<T> grads[2] = {std::vector<T>(static_cast<std::size_t>(kTile * widest)),
-                               std::vector<T>(static_cast<std::size_t>(kTile * widest))};
-    for (std::int64_t first = begin; first < end; first += kTile) {
-      const std::int64_t rows = std::min(kTile, end - first);
-      if (by_layers) gather(inputs, first, rows, input_columns, tile.data());
-      const T* grad = out_grad.data + first * out_grad.stride;  // by the outputs of layer i
-      std::int64_t grad_row = out_grad.stride;
-      for (std::size_t i = layers.size(); i-- > 0;) {
-        const Layer<T>& layer = layers[i];
-        const T* before = i > 0 ? hidden + first * hidden_columns + offsets[i - 1] : tile.data();
-        const std::int64_t before_row = i > 0 ? hidden_columns : input_columns;
-        if (by_layers) {
-          Product<T> product{};
-          product.a = grad;
-          product.a_row = 1;
-          product.a_depth = grad_row;
-          product.b = before;
-          product.b_row = before_row;
-          product.c = sums.data() + piece * sums_at.back() + sums_at[i];
-          product.c_row = product.columns = padded(layer.inputs);
-          product.rows = layer.outputs;
-          product.depth = rows;
-          product.add = true;
-          kernel.multiply(product);
-          T* biases = product.c + layer.outputs * product.columns;
-          if (i + 1 < layers.size()) {  // columns are padded: sums of columns are a product with ones
-            product.a = &kOne<T>;
-            product.a_row = product.a_depth = 0;
-            product.b = grad;
-            product.b_row = grad_row;
-            product.c = biases;
-            product.rows = 1;
-            product.columns = padded(layer.outputs);
-            kernel.multiply(product);
-          } else {
-            for (std::int64_t r = 0; r < rows; ++r) {
-              for (std::int64_t n = 0; n < layer.outputs; ++n) biases[n] += grad[r * grad_row + n];
-            }
-          }
-        }
-        if (back_columns[i] == 0) continue;
-        Product<T> product{};
-        product.a = grad;
-        product.a_row = grad_row;
-        product.a_depth = 1;
-        product.b = weights[i].data();
-        product.b_row = product.columns = product.c_row = back_columns[i];
-        product.c = grads[i % 2].data();
-        product.rows = rows;
-        product.depth = layer.outputs;
-        if (i > 0) {
-          product.positive = before;
-          product.positive_row = before_row;
-        }
-        kernel.multiply(product);
-        grad = product.c;
-        grad_row = product.c_row;
-      }
-      std::int64_t column = 0;
-      for (const Columns<T>& wanted : input_grads) {
-        if (!wanted.data) continue;
-        for (std::int64_t r = 0; r < rows; ++r) {
-          std::copy_n(grad + r * grad_row + column, wanted.width, wanted.data + (first + r) * wanted.stride);
-        }
-        column += wanted.width;
-      }
-    }
+    T* own = by_layers ? sums.data() + piece * backward.num_sums() : nullptr;
+    backward.rows(count * piece / pieces, count * (piece + 1) / pieces, own);
   });
-  for (std::size_t i = 0; by_layers && i < layers.size(); ++i) {
+  if (!by_layers) return;
+  for (std::int64_t i = backward.num_sums(); i < pieces * backward.num_sums(); ++i) {
+    sums[i % backward.num_sums()] += sums[i];
+  }
+  for (std::size_t i = 0; i < layers.size(); ++i) {
     const Layer<T>& layer = layers[i];
-    const std::int64_t columns = padded(layer.inputs);
-    const T* biases = sums.data() + sums_at[i] + layer.outputs * columns;
-    for (std::int64_t piece = 1; piece < pieces; ++piece) {
-      const T* more = sums.data() + piece * sums_at.back();
-      for (std::int64_t j = sums_at[i]; j < sums_at[i + 1]; ++j) sums[j] += more[j];
+    const T* sum = sums.data() + backward.sums_at(i);
+    T* weights = layer_grads[i].weights;
+    for (std::int64_t n = 0; n < layer.outputs; ++n, sum += padded(layer.inputs)) {
+      weights = std::copy_n(sum, layer.inputs, weights);
     }
-    for (std::int64_t n = 0; layer_grads[i].weights && n < layer.outputs; ++n) {
-      std::copy_n(sums.data() + sums_at[i] + n * columns, layer.inputs, layer_grads[i].weights + n * layer.inputs);
-    }
-    if (layer_grads[i].biases) std::copy_n(biases, layer.outputs, layer_grads[i].biases);
+    std::copy_n(sum, layer.outputs, layer_grads[i].biases);
   }
 }
 

@@ -79,7 +79,7 @@ void bind_networks(py::module_& m) {
         check_shape(hidden, count, mlp_hidden_columns(layers), "hidden");
         check_shape(out_grad, count, layers.back().outputs, "out_grad");
         const auto inputs = inputs_of(blocks, count, layers);
-        std::vector<LayerGradients<T>> by_layers(layers.size());
+        std::vector<LayerGradients<T>> by_layers;
         if (weight_grads.has_value() != bias_grads.has_value() ||
             (weight_grads && (weight_grads->size() != layers.size() || bias_grads->size() != layers.size()))) {
           throw std::invalid_argument("gradients of weights and biases must be of all layers or of none");
@@ -89,7 +89,7 @@ void bind_networks(py::module_& m) {
           if ((*bias_grads)[i].ndim() != 1 || (*bias_grads)[i].shape(0) != layers[i].outputs) {
             throw std::invalid_argument("bias_grads must have the shapes of the biases");
           }
-          by_layers[i] = {(*weight_grads)[i].mutable_data(), (*bias_grads)[i].mutable_data()};
+          by_layers.push_back({(*weight_grads)[i].mutable_data(), (*bias_grads)[i].mutable_data()});
         }
         if (input_grads.size() != inputs.size()) {
           throw std::invalid_argument("there must be one of input_grads, or None, for each of the inputs");
