@@ -21,14 +21,14 @@ from radarsdf.field import Field
 from radarsdf.losses import intensity_loss, sdf_loss
 from radarsdf.map import IntensityScale
 from radarsdf.optimiser import Adam
-from radarsdf.sampling import RaySampler
+from radarsdf.sampling import RaySampler, kept
 from radarsdf.scans import prepare
 from radarsdf.threads import Workers
 from radarsdf.training import Training
 
 from .conftest import Surface, surface_points
 
-STEPS = 20
+STEPS = 100  # after so many, a training looks through its parameters and keeps them
 STAGES = ("geometry", "joint", "reflectance")
 CONFIG = FitConfig(num_threads=1, drop_ghosts=False, cosine_schedule=False)
 SHARE = 2  # of a batch: a fit's batches are shared between two threads
@@ -49,25 +49,27 @@ class Step:
             self.field.sdf_network.requires_grad_(False)
         self.parameters = [p for p in self.field.parameters() if p.requires_grad]
         unit = torch.from_numpy(IntensityScale.of(rays.intensities).to_unit(rays.intensities))
-        self.sampler = RaySampler(rays, CONFIG, self.size, torch.Generator().manual_seed(0), intensities=unit)
+        self.generator = torch.Generator().manual_seed(0)
+        self.sampler = RaySampler(rays, CONFIG, self.size, self.generator, intensities=unit)
 
     def samples(self):
         """Samples, and the dropout of what the intensity network sees."""
-        samples = self.sampler.spread(self.size) if self.frozen else self.sampler.batch()
+        (samples,) = self.sampler.spread(self.size) if self.frozen else self.sampler.batch()
         if self.stage == "geometry":
             return samples, None
         dims = (self.field.cells.dim, self.field.fourier.dim)
         dropouts = (CONFIG.feature_dropout, CONFIG.fourier_dropout)
-        kept = [
-            self.sampler.kept(samples.num_near, dim, share) for dim, share in zip(dims, dropouts, strict=True)
+        factors = [
+            kept(samples.num_near, dim, share, self.generator)
+            for dim, share in zip(dims, dropouts, strict=True)
         ]
-        return samples, kept
+        return samples, factors
 
     def encoded(self, samples):
         with torch.set_grad_enabled(not self.frozen):
             return self.field.encode(samples.points)
 
-    def losses(self, samples, kept, encoding):
+    def losses(self, samples, dropout, encoding):
         """Of the stage: the SDF's, the intensity's or both."""
         with torch.set_grad_enabled(not self.frozen):
             logit, feature = self.field.sdf_network(encoding)
@@ -75,7 +77,7 @@ class Step:
         if self.stage != "geometry":
             near = slice(samples.num_near)
             predicted = self.field.intensity_network(
-                [part[near] * factors for part, factors in zip(encoding, kept, strict=True)],
+                [part[near] * factors for part, factors in zip(encoding, dropout, strict=True)],
                 logit[near],
                 feature[near],
                 None,
@@ -146,7 +148,7 @@ def measured(benchmark, step, function, *arguments):
 
 
 def test_samples(benchmark, step, rays):
-    samples, kept = measured(benchmark, step, step.samples)
+    samples, dropout = measured(benchmark, step, step.samples)
     ray = samples.rays.numpy()
     points = rays.points[ray] - samples.sdf_m.numpy()[:, None] * rays.directions[ray]
     off_m = np.linalg.norm(points - samples.points.numpy(), axis=1)
@@ -156,8 +158,8 @@ def test_samples(benchmark, step, rays):
     assert np.median(off_m / spread_m) > 1 or not step.frozen
     assert len(samples.points) == step.size
     assert len(np.unique(ray)) > 0.45 * step.size
-    if kept is not None:
-        factors = torch.cat(kept, 1)
+    if dropout is not None:
+        factors = torch.cat(dropout, 1)
         assert factors.mean().item() == pytest.approx(1, abs=0.05)
         assert (factors == 0).float().mean().item() > CONFIG.fourier_dropout
 
@@ -178,21 +180,21 @@ def test_encodings_forward(benchmark, step):
 
 
 def test_networks_forward(benchmark, step):
-    samples, kept = step.samples()
+    samples, dropout = step.samples()
     cells, fourier = (part.detach() for part in step.encoded(samples))
     encoding = (cells.requires_grad_(not step.frozen), fourier)
-    losses = measured(benchmark, step, step.losses, samples, kept, encoding)
+    losses = measured(benchmark, step, step.losses, samples, dropout, encoding)
     inputs = torch.cat(encoding, 1).detach().numpy()
     logit = mlp(step.field.sdf_network.layers, inputs)
     expected = []
     if not step.frozen:
         label = 1 / (1 + np.exp(-samples.sdf_m.double().numpy() / CONFIG.sigma_m))
         expected.append((np.logaddexp(0, logit) - label * logit).mean())
-    if kept is not None:
+    if dropout is not None:
         near = slice(samples.num_near)
         range_m = (samples.ranges_m[near] - samples.sdf_m[near]).double().numpy()
         harmonics = step.field.intensity_network.harmonics(samples.directions[near]).numpy()
-        factors = torch.cat(kept, 1).numpy()
+        factors = torch.cat(dropout, 1).numpy()
         inputs = [inputs[near] * factors, logit[near, None], harmonics, np.log10(range_m / 10)[:, None]]
         predicted = mlp(step.field.intensity_network.layers, np.concatenate(inputs, 1))
         expected.append(np.abs(predicted - samples.intensities[near].numpy()).mean())
@@ -209,8 +211,8 @@ def mlp(modules, inputs):
 
 
 def test_backward(benchmark, step):
-    samples, kept = step.samples()
-    loss = sum(step.losses(samples, kept, step.encoded(samples)))
+    samples, dropout = step.samples()
+    loss = sum(step.losses(samples, dropout, step.encoded(samples)))
     gradients = measured(
         benchmark, step, lambda: torch.autograd.grad(loss, step.parameters, retain_graph=True)
     )
@@ -219,7 +221,7 @@ def test_backward(benchmark, step):
     step.field.double()
     exact = {name: getattr(samples, name).double() for name in ("points", "sdf_m", "of_ray")}
     samples = dataclasses.replace(samples, **exact)
-    kept = None if kept is None else [factors.double() for factors in kept]
+    dropout = None if dropout is None else [factors.double() for factors in dropout]
     gradients = dict(zip(step.parameters, gradients, strict=True))
     features = [p for p in step.field.cells.parameters() if p in gradients]
     networks = [p for p in step.parameters if all(p is not other for other in features)]
@@ -231,13 +233,13 @@ def test_backward(benchmark, step):
             with torch.no_grad():
                 for p in parameters:
                     p.add_(gradients[p].double(), alpha=share)
-                ends.append(sum(step.losses(samples, kept, step.encoded(samples))).item())
+                ends.append(sum(step.losses(samples, dropout, step.encoded(samples))).item())
         assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(square, rel=0.01)
 
 
 def test_adam(benchmark, step):
-    samples, kept = step.samples()
-    loss = sum(step.losses(samples, kept, step.encoded(samples)))
+    samples, dropout = step.samples()
+    loss = sum(step.losses(samples, dropout, step.encoded(samples)))
     gradients = torch.autograd.grad(loss, step.parameters)
     before = [p.detach().clone() for p in step.parameters]
     adam = Adam(step.parameters, CONFIG.learning_rate, CONFIG.adam_epsilon)
@@ -316,6 +318,6 @@ def test_whole(benchmark, step, rays):
             for _ in range(4):
                 run(*setup()[0])
     name = "intensity" if step.frozen else "sdf"
-    samples, kept = step.samples()
-    untrained = sum(step.losses(samples, kept, step.encoded(samples))).item()
+    samples, dropout = step.samples()
+    untrained = sum(step.losses(samples, dropout, step.encoded(samples))).item()
     assert losses[-1][name] < 0.75 * untrained  # a round goes on where the one before ended

@@ -257,7 +257,7 @@ def test_the_state_is_all_there_is(scene):
         "field.intensity_network",
         "adam.reflectance.mean",
         "shard.0.generator",
-        "shard.1.returns.next",
+        "draws.returns.next",
     ):
         names = [k for k in first if k.startswith(part)]
         assert names

@@ -12,7 +12,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.sampling import RaySampler
+from radarsdf.sampling import RaySampler, kept
 from radarsdf.schedule import Schedule
 
 from .conftest import ground_and_wall
@@ -138,13 +138,12 @@ def test_frozen_geometry_does_not_move(scene):
 
 def test_the_more_often_samples_are_seen_the_more_is_hidden(scene, monkeypatch):
     shares = []
-    kept = RaySampler.kept
 
-    def record(sampler, rows, columns, dropout):
+    def record(rows, columns, dropout, generator):
         shares.append(dropout)
-        return kept(sampler, rows, columns, dropout)
+        return kept(rows, columns, dropout, generator)
 
-    monkeypatch.setattr(RaySampler, "kept", record)
+    monkeypatch.setattr("radarsdf.training.kept", record)
     samples = FitConfig().near_samples * sum(map(len, scene.points))
     for passes in (1, 3, 27):
         shares.clear()
@@ -314,15 +313,31 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     drawn_from = []
     spread = RaySampler.spread
     monkeypatch.setattr(
-        RaySampler, "spread", lambda self, count: (drawn_from.append(len(self._rays)), spread(self, count))[1]
+        RaySampler, "spread", lambda self, *args: (drawn_from.append(len(self._rays)), spread(self, *args))[1]
     )
     config = dataclasses.replace(QUICK, joint=False, drop_ghosts=True, num_threads=1)
     with_ghosts = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     assert with_ghosts.report["ghosts"] == is_ghost.sum()
     assert set(drawn_from) == {len(is_ghost)}
-    kept = np.split(~is_ghost, np.cumsum([len(p) for p in scene.points])[:-1])
-    points = [p[k] for p, k in zip(scene.points, kept, strict=True)]
+    real = np.split(~is_ghost, np.cumsum([len(p) for p in scene.points])[:-1])
+    points = [p[k] for p, k in zip(scene.points, real, strict=True)]
     config = dataclasses.replace(config, drop_ghosts=False)
     without = radarsdf.fit(points, scene.poses, config=config)
     assert with_ghosts.report["leaf_cells"] == without.report["leaf_cells"]
     assert with_ghosts.support.tolist() == without.support.tolist()
+
+
+def test_the_number_of_threads_only_rounds_differently(scene):
+    """All see the same samples: a fit on a larger machine is the same fit."""
+    maps = [
+        radarsdf.fit(
+            scene.points,
+            scene.poses,
+            config=dataclasses.replace(QUICK, sdf_iterations=20, num_threads=threads),
+        )
+        for threads in (1, 2)
+    ]
+    x = np.random.default_rng(0).uniform([5, -6, -0.2], [20, 6, 2], (500, 3))
+    values = [radar_map.sdf(x) for radar_map in maps]
+    assert np.abs(values[0]).max() > 0.1
+    np.testing.assert_allclose(*values, atol=1e-3)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
-from radarsdf.sampling import RaySampler
+from radarsdf.sampling import RaySampler, kept
 from radarsdf.scans import prepare
 
 from .conftest import pose
@@ -36,7 +36,7 @@ def sensors_of(rays, samples):
     return points, points - rays.directions[index].astype(np.float64) * rays.ranges_m[index, None]
 
 
-DRAWS = {"batch": RaySampler.batch, "spread": lambda draw: draw.spread(256)}
+DRAWS = {"batch": lambda draw: draw.batch()[0], "spread": lambda draw: draw.spread(256)[0]}
 
 
 def test_neighbours_come_together_and_all_have_their_turn(rays):
@@ -46,7 +46,7 @@ def test_neighbours_come_together_and_all_have_their_turn(rays):
     place = np.argsort(draw._original.numpy())  # of each ray in Morton order
     seen = []
     while len(seen) * 32 < len(rays):
-        taken = np.sort(place[draw.batch().rays[:32].numpy()])
+        taken = np.sort(place[draw.batch()[0].rays[:32].numpy()])
         assert (np.diff(taken) == 1).sum() >= 20  # of 31, where runs of five are cut at most twice
         seen.append(taken)
     assert len(np.unique(np.concatenate(seen))) == len(rays)
@@ -70,7 +70,7 @@ def test_ranges_of_the_samples(rays):
     draw = RaySampler(rays, config, 512, torch.Generator().manual_seed(0))
     near, free, lowest_share = [], [], []
     for _ in range(40):
-        samples = draw.batch()
+        samples = draw.batch()[0]
         range_m = torch.from_numpy(rays.ranges_m)[samples.rays][samples.num_near :]
         near.append(samples.sdf_m[: samples.num_near])
         from_sensor = range_m - samples.sdf_m[samples.num_near :]
@@ -95,7 +95,7 @@ def test_each_ray_is_seen_equally_often(rays, batch_size):
     seen = np.zeros((2, NUM_RAYS), int)
     batches = 4 * NUM_RAYS * 2 // batch_size
     for _ in range(batches):
-        samples = draw.batch()
+        samples = draw.batch()[0]
         for kind, part in enumerate((samples.rays[: samples.num_near], samples.rays[samples.num_near :])):
             np.add.at(seen[kind], part.numpy(), 1)
     assert seen.sum() == batches * batch_size
@@ -108,7 +108,7 @@ def test_spread_sees_each_ray_equally_often(rays):
     draw = sampler(rays, 300)
     seen = np.zeros(NUM_RAYS, int)
     for _ in range(10):
-        samples = draw.spread(300)
+        samples = draw.spread(300)[0]
         assert samples.num_near == len(samples.points) == 300
         assert samples.sdf_m.abs().max() <= FitConfig().near_band_m
         np.add.at(seen, samples.rays.numpy(), 1)
@@ -116,7 +116,7 @@ def test_spread_sees_each_ray_equally_often(rays):
 
 
 def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
-    samples = sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS)
+    samples = sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS)[0]
     index = samples.rays.numpy()
     offset = samples.points.numpy() - rays.points[index]
     along = (offset * rays.directions[index]).sum(axis=1)
@@ -127,8 +127,8 @@ def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
 
 def test_passes_take_the_rays_in_different_orders(rays):
     draw = sampler(rays, NUM_RAYS, near_samples=1, free_samples=1)
-    first, second = draw.batch().rays[: NUM_RAYS // 2], draw.batch().rays[: NUM_RAYS // 2]
-    third = draw.batch().rays[: NUM_RAYS // 2]
+    first, second = draw.batch()[0].rays[: NUM_RAYS // 2], draw.batch()[0].rays[: NUM_RAYS // 2]
+    third = draw.batch()[0].rays[: NUM_RAYS // 2]
     assert set(first.tolist()).isdisjoint(second.tolist())
     assert set(third.tolist()) not in (set(first.tolist()), set(second.tolist()))
 
@@ -138,7 +138,7 @@ def test_passes_take_the_rays_in_different_orders(rays):
     [(6, 6, 120), (6, 2, 180), (1, 5, 40), (3, 0, 240), (1, 500, 1)],
 )
 def test_shares_of_near_and_free_samples(rays, near_samples, free_samples, num_near):
-    samples = sampler(rays, 240, near_samples=near_samples, free_samples=free_samples).batch()
+    samples = sampler(rays, 240, near_samples=near_samples, free_samples=free_samples).batch()[0]
     assert samples.num_near == num_near
     assert samples.points.shape == (240, 3)
     assert samples.points.dtype == samples.sdf_m.dtype == torch.float32
@@ -152,15 +152,15 @@ def test_shares_of_near_and_free_samples(rays, near_samples, free_samples, num_n
 
 def test_the_rarer_kind_reaches_every_ray_in_the_long_run(rays):
     draw = sampler(rays, 240, near_samples=5, free_samples=1)
-    free = torch.cat([(s := draw.batch()).rays[s.num_near :] for _ in range(400)])
+    free = torch.cat([(s := draw.batch()[0]).rays[s.num_near :] for _ in range(400)])
     assert len(torch.unique(free)) > 0.99 * NUM_RAYS
 
 
 def test_a_batch_larger_than_the_scene(rays):
-    few = rays.every(250, 0)
-    samples = sampler(few, 100, near_samples=1, free_samples=1).batch()
+    few = rays.select(slice(None, None, 250))
+    samples = sampler(few, 100, near_samples=1, free_samples=1).batch()[0]
     assert sorted(torch.bincount(samples.rays[:50], minlength=4).tolist()) == [12, 12, 13, 13]
-    assert len(sampler(few, 1).batch().points) == 1
+    assert len(sampler(few, 1).batch()[0].points) == 1
 
 
 def test_the_generator_decides_alone(rays):
@@ -177,7 +177,7 @@ def test_the_generator_decides_alone(rays):
 
 def test_memory_does_not_grow_with_the_samples(rays):
     def bytes_held(draw):
-        draw.batch()
+        draw.batch()[0]
         arrays = [v for v in vars(draw).values() if isinstance(v, (torch.Tensor, np.ndarray))]
         return sum(a.nbytes for a in arrays)
 
@@ -188,7 +188,7 @@ def test_memory_does_not_grow_with_the_samples(rays):
 
 def test_neighbours_in_a_batch_are_neighbours_in_space(rays):
     dense = dataclasses.replace(rays, points=rays.points * np.float32(0.1))
-    samples = sampler(dense, 512, near_samples=1, free_samples=1).spread(512)
+    samples = sampler(dense, 512, near_samples=1, free_samples=1).spread(512)[0]
     steps = np.linalg.norm(np.diff(dense.points[samples.rays.numpy()], axis=0), axis=1)
     shuffled = np.linalg.norm(
         np.diff(dense.points[np.random.default_rng(0).permutation(NUM_RAYS)], axis=0), axis=1
@@ -196,22 +196,63 @@ def test_neighbours_in_a_batch_are_neighbours_in_space(rays):
     assert np.median(steps) < 0.5 * np.median(shuffled)
 
 
+@pytest.mark.parametrize("parts", [2, 3])
+@pytest.mark.parametrize(("near_samples", "free_samples"), [(6, 6), (6, 2), (1, 5), (3, 0)])
+def test_parts_are_the_batch_each_with_its_share(rays, near_samples, free_samples, parts):
+    settings = {"near_samples": near_samples, "free_samples": free_samples}
+    (whole,) = sampler(rays, 250, **settings).batch()
+    found = sampler(rays, 250, **settings).batch(parts)
+    sizes = [len(part.points) for part in found]
+    assert sum(sizes) == 250
+    assert max(sizes) - min(sizes) <= 2
+    near = [part.num_near for part in found]
+    assert sum(near) == whole.num_near
+    assert max(near) - min(near) <= 1
+    # The same rays, each kind in the same order.
+    for kind in (slice(None, whole.num_near), slice(whole.num_near, None)):
+        kinds = [
+            part.rays[: part.num_near] if kind.start is None else part.rays[part.num_near :] for part in found
+        ]
+        assert torch.equal(torch.cat(kinds), whole.rays[kind])
+    for part in found:
+        assert torch.equal(part.ranges_m, torch.from_numpy(rays.ranges_m)[part.rays])
+        assert (part.sdf_m[: part.num_near].abs() <= FitConfig().near_band_m).all()
+        gap = part.points + part.sdf_m[:, None] * part.directions - torch.from_numpy(rays.points)[part.rays]
+        assert gap.abs().max() < 2e-5
+
+
+def test_parts_of_spread_samples(rays):
+    (whole,) = sampler(rays).spread(101)
+    found = sampler(rays).spread(101, 2)
+    assert [part.num_near for part in found] == [50, 51]
+    assert torch.equal(torch.cat([part.points for part in found]), whole.points)
+    assert torch.equal(torch.cat([part.rays for part in found]), whole.rays)
+
+
+def test_what_is_known_of_a_ray_comes_with_its_samples(rays):
+    unit = torch.linspace(0, 1, len(rays))
+    draw = RaySampler(rays, FitConfig(), 256, torch.Generator().manual_seed(0), intensities=unit)
+    for (samples,) in (draw.batch(), draw.spread(100)):
+        assert torch.equal(samples.intensities, unit[samples.rays])
+        assert torch.equal(samples.directions, torch.from_numpy(rays.directions)[samples.rays])
+
+
 @pytest.mark.parametrize("dropout", [0.0, 0.3, 0.85])
-def test_dropout_zeroes_its_share_and_keeps_the_mean(rays, dropout):
+def test_dropout_zeroes_its_share_and_keeps_the_mean(dropout):
     state = torch.get_rng_state()
-    factors = sampler(rays).kept(999, 21, dropout)
+    factors = kept(999, 21, dropout, torch.Generator().manual_seed(0))
     assert factors.shape == (999, 21)
     assert factors.dtype == torch.float32
     assert abs(float((factors == 0).float().mean()) - dropout) < 0.015
     assert abs(float(factors.mean()) - 1) < 0.05
     assert len(factors.unique()) == (1 if dropout == 0 else 2)
-    assert torch.equal(factors, sampler(rays).kept(999, 21, dropout))
-    assert not torch.equal(factors, sampler(rays, seed=1).kept(999, 21, dropout)) or dropout == 0
+    assert torch.equal(factors, kept(999, 21, dropout, torch.Generator().manual_seed(0)))
+    assert not torch.equal(factors, kept(999, 21, dropout, torch.Generator().manual_seed(1))) or dropout == 0
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_dropout_hides_no_column_or_row_more_than_another(rays):
+def test_dropout_hides_no_column_or_row_more_than_another():
     # The factors are cut from 64-bit words: each byte of a word has to do.
-    hidden = (sampler(rays).kept(8000, 8, 0.5) == 0).double()
+    hidden = (kept(8000, 8, 0.5, torch.Generator().manual_seed(0)) == 0).double()
     assert (hidden.mean(0) - 0.5).abs().max() < 0.03
     assert torch.corrcoef(hidden.T).fill_diagonal_(0).abs().max() < 0.06

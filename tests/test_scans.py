@@ -132,17 +132,17 @@ def test_lists_are_arrays_too():
     assert rays.intensities.tolist() == [1, 2]
 
 
-def test_every_takes_each_nth_ray():
+def test_select_takes_some_rays():
     points, poses = scans()
     values = [np.arange(len(p), dtype=float) for p in points]
     rays = prepare(points, poses, values)
-    parts = [rays.every(3, first) for first in range(3)]
+    parts = [rays.select(slice(first, None, 3)) for first in range(3)]
     assert sum(map(len, parts)) == len(rays)
     for name in ("points", "directions", "ranges_m", "intensities", "scans"):
         for first, part in enumerate(parts):
             np.testing.assert_array_equal(getattr(part, name), getattr(rays, name)[first::3])
     assert parts[1].directions.flags.c_contiguous
-    assert prepare(points, poses).every(2, 0).intensities is None
+    assert prepare(points, poses).select(slice(2)).intensities is None
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 100, 1 << 20])

@@ -92,7 +92,7 @@ class Checkpoint:
         try:
             with safe_open(self._path, framework="pt") as file:
                 if (names := set(file.keys())) != set(expected):
-                    shards = sum(name.endswith(".generator") for name in names)
+                    shards = sum(name.startswith("shard.") and name.endswith(".generator") for name in names)
                     msg = f"other tensors: perhaps of {shards} threads"
                     raise ValueError(msg)
                 for name, tensor in expected.items():

@@ -63,7 +63,7 @@ def fit(
     -------
     RadarMap
         With the times and counts of the fit in its ``report``. The same input, seed and number of threads give the
-        same bits.
+        same bits; another number of threads sees the same samples and rounds differently.
 
     Raises
     ------

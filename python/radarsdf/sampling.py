@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +89,7 @@ class RaySampler:
         share = config.near_samples / (config.near_samples + config.free_samples)
         self._num_near = max(1, round(batch_size * share))
         self._num_free = batch_size - self._num_near
+        self._layouts: dict[int, _Layout] = {}
 
     def state(self) -> dict[str, Tensor]:
         """Where in which order of the rays it is; the generator is its owner's."""
@@ -127,21 +129,8 @@ class RaySampler:
     def _uniform(self, count: int) -> Tensor:
         return torch.rand(count, generator=self._generator)
 
-    def kept(self, rows: int, columns: int, dropout: float) -> Tensor:
-        """(rows, columns) factors of mean one, for dropout: zero with this probability, else what makes up for it.
-
-        Not torch's own dropout, which draws from the global generator: the same seed would not give the same bits.
-        """
-        # A byte for each, eight from every number drawn: drawing one for each would take a tenth of an iteration.
-        words = torch.empty(-(-rows * columns // 8), dtype=torch.int64).random_(
-            -(2**63), None, generator=self._generator
-        )
-        keep = round(256 * (1 - dropout))
-        bytes_ = words.view(torch.uint8)[: rows * columns].view(rows, columns)
-        return (bytes_ <= keep - 1) * (256 / keep)  # not < keep: 256 is no byte
-
-    def spread(self, count: int) -> Samples:
-        """`count` samples round returns: within `near_band_m` along the beam, and across it as angular noise spreads."""
+    def spread(self, count: int, parts: int = 1) -> list[Samples]:
+        """`count` samples round returns, in parts: within `near_band_m` along the beam, and across it as angular noise is."""
         config = self._config
         places = self._take(count)
         sdf_m = (2 * self._uniform(count) - 1) * config.near_band_m
@@ -151,25 +140,93 @@ class RaySampler:
             # Isotropic: what it adds along the beam is lost in the width of the band.
             noise = torch.randn(points.shape, generator=self._generator)
             points += noise * (config.cross_range_noise_rad * ray[:, 6:7])
-        return Samples(points, sdf_m, count, ray, places, self._original)
+        near = [share(count, part, parts) for part in range(parts)]
+        return self._split(points, sdf_m, ray, places, near, near)
 
-    def batch(self) -> Samples:
-        """A batch of `batch_size` samples, near the surface and in free space."""
-        taken = self._take(max(self._num_near, self._num_free))
-        # Where one kind is rarer, every so many-th ray has one of it: each kind still covers the whole scene.
-        near, free = (
-            taken if n == len(taken) else taken[torch.arange(n) * len(taken) // max(n, 1)]
-            for n in (self._num_near, self._num_free)
-        )
-        places = torch.cat([near, free])
+    def batch(self, parts: int = 1) -> list[Samples]:
+        """`batch_size` samples, near the surface and in free space, in parts that each have their share of both."""
+        if parts not in self._layouts:
+            self._layouts[parts] = _Layout.of(self._num_near, self._num_free, parts, self._config)
+        layout = self._layouts[parts]
+        places = self._take(max(self._num_near, self._num_free)).index_select(0, layout.index)
         ray = self._rays.index_select(0, places)
-        config = self._config
-        near_m = (2 * self._uniform(self._num_near) - 1) * config.near_band_m
-        range_m = ray[self._num_near :, 6]
-        # Uniform in [free_from · range, range + free_beyond] from the sensor, as a distance in front of the return.
-        free_m = range_m - torch.lerp(
-            config.free_from * range_m, range_m + config.free_beyond_m, self._uniform(self._num_free)
+        range_m = ray[:, 6]
+        start_m, length_m = (
+            torch.addcmul(constant, of_range, range_m) for constant, of_range in (layout.start, layout.length)
         )
-        sdf_m = torch.cat([near_m, free_m])
-        points = ray[:, :3] - sdf_m[:, None] * ray[:, 3:6]
-        return Samples(points, sdf_m, self._num_near, ray, places, self._original)
+        # Drawn for the batch, and then dealt out: the number of parts changes no sample.
+        sdf_m = torch.addcmul(start_m, length_m, self._uniform(len(places)).index_select(0, layout.order))
+        points = torch.addcmul(ray[:, :3], sdf_m[:, None], ray[:, 3:6], value=-1)
+        return self._split(points, sdf_m, ray, places, layout.sizes, layout.near)
+
+    def _split(
+        self,
+        points: Tensor,
+        sdf_m: Tensor,
+        ray: Tensor,
+        places: Tensor,
+        sizes: Sequence[int],
+        near: Sequence[int],
+    ) -> list[Samples]:
+        if len(sizes) == 1:
+            return [Samples(points, sdf_m, near[0], ray, places, self._original)]
+        columns = [torch.split_with_sizes(column, sizes) for column in (points, sdf_m, ray, places)]
+        return [
+            Samples(x, sdf, num_near, of_ray, place, self._original)
+            for x, sdf, of_ray, place, num_near in zip(*columns, near, strict=True)
+        ]
+
+
+def share(count: int, part: int, parts: int) -> int:
+    """`count` things over `parts`: how many the `part`-th gets."""
+    return count * (part + 1) // parts - count * part // parts
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Which samples a batch has: part by part, the near ones of each first."""
+
+    index: Tensor
+    """(B,) int64, of each sample's ray among those that were taken."""
+    order: Tensor
+    """(B,) int64, of each sample among the near and then the free ones of the whole batch."""
+    start: tuple[Tensor, Tensor]
+    """(B,) each: c and d of the end nearest to the return, c + d · range, as a distance in front of it, m."""
+    length: tuple[Tensor, Tensor]
+    """The same, from there to the other end."""
+    sizes: list[int]
+    """Of the parts."""
+    near: list[int]
+    """Near samples of the parts."""
+
+    @classmethod
+    def of(cls, num_near: int, num_free: int, parts: int, config: FitConfig) -> _Layout:
+        taken = max(num_near, num_free)
+        shares = [[share(n, part, parts) for part in range(parts)] for n in (num_near, num_free)]
+        sizes = [size for part in zip(*shares, strict=True) for size in part]  # near, free, near, free, ...
+        kinds = torch.tensor([0, 1] * parts).repeat_interleave(torch.tensor(sizes))
+        order = kinds.argsort(stable=True).argsort()
+        # Where one kind is rarer, every so many-th ray has one of it: each kind still covers the whole scene.
+        index = torch.cat([torch.arange(n) * taken // max(n, 1) for n in (num_near, num_free)])[order]
+        # Near samples within the band; free ones uniform in [free_from · range, range + free_beyond] from the sensor.
+        band_m, before = config.near_band_m, 1 - config.free_from
+        ends = torch.tensor(
+            [[-band_m, 0, 2 * band_m, 0], [-config.free_beyond_m, 0, config.free_beyond_m, before]]
+        )[kinds]
+        start, of_range, length, length_of_range = ends.T.contiguous()
+        sums = [sum(part) for part in zip(*shares, strict=True)]
+        return cls(index, order, (start, of_range), (length, length_of_range), sums, shares[0])
+
+
+def kept(rows: int, columns: int, dropout: float, generator: torch.Generator) -> Tensor:
+    """(rows, columns) factors of mean one, for dropout: zero with this probability, else what makes up for it.
+
+    Not torch's own dropout, which draws from the global generator: the same seed would not give the same bits.
+    """
+    # A byte for each, eight from every number drawn: drawing one for each would take a tenth of an iteration.
+    words = torch.empty(-(-rows * columns // 8), dtype=torch.int64).random_(
+        -(2**63), None, generator=generator
+    )
+    keep = round(256 * (1 - dropout))
+    bytes_ = words.view(torch.uint8)[: rows * columns].view(rows, columns)
+    return (bytes_ <= keep - 1) * (256 / keep)  # not < keep: 256 is no byte

@@ -40,10 +40,6 @@ class Rays:
     def __len__(self) -> int:
         return len(self.points)
 
-    def every(self, step: int, first: int) -> Rays:
-        """Each `step`-th ray from `first` on."""
-        return self.select(slice(first, None, step))
-
     def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
         """Some of the rays."""
         return dataclasses.replace(

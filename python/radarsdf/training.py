@@ -22,52 +22,43 @@ from radarsdf.field import Field, Geometry
 from radarsdf.losses import intensity_loss, sdf_loss
 from radarsdf.map import IntensityScale
 from radarsdf.optimiser import Adam, RowAdam
-from radarsdf.sampling import RaySampler, Samples
+from radarsdf.sampling import RaySampler, Samples, kept
 from radarsdf.scans import Rays
 from radarsdf.schedule import Schedule
 from radarsdf.stopping import Diverged, deferred_interrupts
 from radarsdf.threads import Workers
 
+_GENERATORS = MAX_THREADS + 1  # of random numbers in a fit: one for the draws, one for each thread's dropout
 _KEEP_EVERY = (
     100  # iterations: to look through all parameters, and copy them, in each would cost a tenth of it
 )
 
 
-class _Shard:
-    """One thread's share of the rays and of each batch: it draws samples and computes gradients."""
+class _Draws:
+    """Samples for each thread, drawn by one: dozens of small operations on every thread would wait for each other."""
 
     def __init__(
         self,
-        field: Field,
         surface: Rays,
         returns: Rays,
         scale: IntensityScale | None,
         config: FitConfig,
         schedule: Schedule,
-        part: int,
         parts: int,
     ) -> None:
-        self._field = field
         self._config = config
-        generator = torch.Generator().manual_seed(config.seed * MAX_THREADS + part)
+        self._parts = parts
+        self._generator = torch.Generator().manual_seed(config.seed * _GENERATORS)
 
         def sampler(rays: Rays) -> RaySampler:
-            rays = rays.every(parts, part)
             unit = None
             if scale is not None and rays.intensities is not None:
                 unit = torch.from_numpy(scale.to_unit(rays.intensities))
-            share = _share(schedule.batch_size, part, parts)
-            return RaySampler(rays, config, share, generator, schedule.neighbours, unit)
+            return RaySampler(rays, config, schedule.batch_size, self._generator, schedule.neighbours, unit)
 
         self._surface = sampler(surface)
         # A ghost has an intensity, though no surface: the sensor will see it again.
         self._returns = self._surface if returns is surface or scale is None else sampler(returns)
-        dropouts = (config.feature_dropout, config.fourier_dropout)
-        self._dropouts = [schedule.dropout_scale * dropout for dropout in dropouts]
-        self._intensity_batch_size = _share(config.intensity_batch_size, part, parts)
-        self._generator = generator
-        self.joint_parts: dict[str, Tensor] = {}
-        """The two losses of the last joint one."""
 
     def state(self) -> dict[str, Tensor]:
         """What the next batches depend on."""
@@ -84,24 +75,46 @@ class _Shard:
         samplers = {"surface": self._surface}
         return samplers if self._returns is self._surface else samplers | {"returns": self._returns}
 
-    def geometry_loss(self, touched: list[Touched] | None) -> Tensor:
-        samples = self._surface.batch()
+    def of_surface(self) -> list[Samples]:
+        return self._surface.batch(self._parts)
+
+    def of_returns(self) -> list[Samples]:
+        if self._config.intensity_in_free_space:
+            return self._returns.batch(self._parts)
+        return self._returns.spread(self._config.intensity_batch_size, self._parts)
+
+
+class _Shard:
+    """One thread's share of the work on each batch."""
+
+    def __init__(self, field: Field, config: FitConfig, schedule: Schedule, part: int) -> None:
+        self._field = field
+        self._config = config
+        self._generator = torch.Generator().manual_seed(config.seed * _GENERATORS + 1 + part)
+        dropouts = (config.feature_dropout, config.fourier_dropout)
+        self._dropouts = [schedule.dropout_scale * dropout for dropout in dropouts]
+        self.joint_parts: dict[str, Tensor] = {}
+        """The two losses of the last joint one."""
+
+    def state(self) -> dict[str, Tensor]:
+        """What its dropout depends on."""
+        return {"generator": self._generator.get_state()}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        self._generator.set_state(state["generator"])
+
+    def geometry_loss(self, samples: Samples, touched: list[Touched] | None) -> Tensor:
         logit = self._field.logit(samples.points, touched)
         return sdf_loss(logit, samples.sdf_m, self._config.sigma_m)
 
-    def joint_loss(self, touched: list[Touched] | None) -> Tensor:
-        samples = self._surface.batch()
+    def joint_loss(self, samples: Samples, touched: list[Touched] | None) -> Tensor:
         geometry = self._field.geometry(samples.points, frozen=False, touched=touched)
         sdf = sdf_loss(geometry.logit, samples.sdf_m, self._config.sigma_m)
         intensity = self._intensity_loss(samples, geometry)
         self.joint_parts = {"sdf": sdf.detach(), "intensity": intensity.detach()}
         return self._config.sdf_loss_weight * sdf + intensity
 
-    def reflectance_loss(self, _: list[Touched] | None) -> Tensor:
-        if self._config.intensity_in_free_space:
-            samples = self._returns.batch()
-        else:
-            samples = self._returns.spread(self._intensity_batch_size)
+    def reflectance_loss(self, samples: Samples, _: list[Touched] | None) -> Tensor:
         return self._intensity_loss(samples, self._field.geometry(samples.points))
 
     def _intensity_loss(self, samples: Samples, geometry: Geometry) -> Tensor:
@@ -122,7 +135,7 @@ class _Shard:
             return None
         dims = (self._field.cells.dim, self._field.fourier.dim)
         parts = [part for part in zip(dims, self._dropouts, strict=True) if part[0]]
-        return [self._surface.kept(count, *part) for part in parts]
+        return [kept(count, *part, self._generator) for part in parts]
 
 
 @dataclass(frozen=True)
@@ -149,7 +162,7 @@ class Training:
     """The schedule: geometry first, then, on frozen geometry, reflectance; or, as published, both from the start.
 
     Every batch is split over the threads; their gradients are added in the order of the threads, so the same number of
-    threads gives the same bits.
+    threads gives the same bits, and another number rounds differently.
     """
 
     def __init__(
@@ -173,10 +186,9 @@ class Training:
         )
         self.iterations = schedule.iterations
         self.passes = schedule.passes
-        parts = min(workers.num_threads, len(surface), schedule.batch_size, config.intensity_batch_size)
-        self._shards = [
-            _Shard(field, surface, returns, scale, config, schedule, part, parts) for part in range(parts)
-        ]
+        parts = min(workers.num_threads, schedule.batch_size, config.intensity_batch_size)
+        self._draws = _Draws(surface, returns, scale, config, schedule, parts)
+        self._shards = [_Shard(field, config, schedule, part) for part in range(parts)]
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         geometry = list(field.sdf_network.parameters())
@@ -209,6 +221,7 @@ class Training:
             state |= {f"adam.{name}.{k}": v for k, v in adam.state().items()}
         if self._rows is not None:
             state |= {f"rows.{k}": v for k, v in self._rows.state().items()}
+        state |= {f"draws.{k}": v for k, v in self._draws.state().items()}
         for i, shard in enumerate(self._shards):
             state |= {f"shard.{i}.{k}": v for k, v in shard.state().items()}
         return state
@@ -228,6 +241,7 @@ class Training:
             adam.restore(_part(state, f"adam.{name}"))
         if self._rows is not None:
             self._rows.restore(_part(state, "rows"))
+        self._draws.restore(_part(state, "draws"))
         for i, shard in enumerate(self._shards):
             shard.restore(_part(state, f"shard.{i}"))
 
@@ -258,11 +272,14 @@ class Training:
             adams = [geometry, reflectance] if joint and reflectance is not None else [geometry]
             loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
             bar.update(sum(self.iterations_done.values()))
-            self._loop("sdf", self.iterations["sdf"], adams, loss_of, pauses, self._rows)
+            self._loop(
+                "sdf", self.iterations["sdf"], adams, self._draws.of_surface, loss_of, pauses, self._rows
+            )
             field.cells.requires_grad_(False)
             field.sdf_network.requires_grad_(False)
             if reflectance is not None and rest:
-                self._loop("intensity", rest, [reflectance], _Shard.reflectance_loss, pauses)
+                draw = self._draws.of_returns
+                self._loop("intensity", rest, [reflectance], draw, _Shard.reflectance_loss, pauses)
             if checkpoint is not None:
                 checkpoint.write(self.state())
             if interrupted():  # by now all is done, but whoever pressed it wants to stop more than this
@@ -273,7 +290,8 @@ class Training:
         name: str,
         iterations: int,
         adams: list[Adam],
-        loss_of: Callable[[_Shard, list[Touched] | None], Tensor],
+        draw: Callable[[], list[Samples]],
+        loss_of: Callable[[_Shard, Samples, list[Touched] | None], Tensor],
         pauses: _Pauses,
         rows: RowAdam | None = None,
     ) -> None:
@@ -281,9 +299,9 @@ class Training:
         changing = [*parameters, *([] if rows is None else [rows.features])]
         kept = [p.detach().clone() for p in changing]
 
-        def gradients(shard: _Shard) -> _Gradients:
+        def gradients(work: tuple[_Shard, Samples]) -> _Gradients:
             touched: list[Touched] = []
-            loss = loss_of(shard, None if rows is None else touched) / len(self._shards)
+            loss = loss_of(*work, None if rows is None else touched) / len(self._shards)
             found = torch.autograd.grad(loss, [*parameters, *(t.interpolated for t in touched)])
             return _Gradients(loss.detach(), found[: len(parameters)], touched, found[len(parameters) :])
 
@@ -296,7 +314,8 @@ class Training:
         for i in range(self.iterations_done[name], iterations):
             # From the full rate on in each stage, also for an Adam that has been through another.
             share = 0.5 * (1 + math.cos(math.pi * i / iterations)) if self._config.cosine_schedule else 1.0
-            found = list(self._workers.map(gradients, self._shards))
+            work = list(zip(self._shards, draw(), strict=True))
+            found = list(self._workers.map(gradients, work))
             loss = float(sum(part.loss for part in found))
             if not math.isfinite(loss):
                 give_up(f"the {self._loss_name(name)} loss is {loss}")
@@ -342,8 +361,3 @@ class Training:
 def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
     """Those of a state whose names begin with `name` and a dot, without these."""
     return {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")}
-
-
-def _share(count: int, part: int, parts: int) -> int:
-    """`count` things over `parts`: how many the `part`-th gets."""
-    return count * (part + 1) // parts - count * part // parts
