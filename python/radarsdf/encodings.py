@@ -43,6 +43,8 @@ class VertexFeatures(nn.Module):
     """
 
     encoding: Encoding
+    num_groups: int
+    """Of rows at each level: those of different planes are never the same."""
 
     def __init__(
         self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_levels: int, num_threads: int = 0
@@ -76,6 +78,8 @@ class TriQuadtree(VertexFeatures):
 
     encoding = Encoding.TRI_QUADTREE
 
+    num_groups = 3
+
     @property
     def dim(self) -> int:
         return kernels.FEATURE_DIM * self.table.num_levels
@@ -91,6 +95,7 @@ class Octree(VertexFeatures):
     """
 
     encoding = Encoding.OCTREE
+    num_groups = 1
     dim = kernels.FEATURE_DIM
 
     def forward(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:

@@ -11,8 +11,9 @@ Tensors cross to the core as NumPy views of the same memory. Results are the sam
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -246,9 +247,7 @@ def adam_step(
     step: int,
     learning_rate: float,
     epsilon: float,
-    part: int = 0,
-    parts: int = 1,
-) -> None:
+) -> Callable[[int, int], None]:
     """One step of Adam on the rows that batches touch, in place; the others stay as they are.
 
     Parameters
@@ -267,10 +266,14 @@ def adam_step(
         Number of this step, from 1 on.
     learning_rate, epsilon : float
         Adam's.
-    part, parts : int
-        Which share of the rows to move: the shares are disjoint, and all of them make the step.
+
+    Returns
+    -------
+    callable
+        That takes `part` and `parts` and moves this share of the rows. Shares are disjoint, and all of them make the step.
     """
-    table.adam_step(
+    return functools.partial(
+        table.adam_step,
         [(view(points), located.numpy(), rows_view(grad)) for points, located, grad in batches],
         view(features),
         memory.moments.numpy(),
@@ -280,8 +283,6 @@ def adam_step(
         step,
         learning_rate,
         epsilon,
-        part,
-        parts,
     )
 
 

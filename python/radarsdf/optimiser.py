@@ -4,7 +4,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import contextlib
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -14,6 +17,7 @@ from radarsdf.encodings import Touched, VertexFeatures
 from radarsdf.threads import Workers
 
 _BETAS = (0.9, 0.999)
+_Result = TypeVar("_Result")
 
 
 class Adam:
@@ -119,29 +123,43 @@ class RowAdam:
         self.step_count = count
 
     @torch.no_grad()
-    def step(self, touched: Sequence[Touched], gradients: Sequence[Tensor], workers: Workers) -> None:
-        """Move the rows by the gradients of what was interpolated from them."""
+    def step(
+        self,
+        touched: Sequence[Touched],
+        gradients: Sequence[Tensor],
+        workers: Workers,
+        meanwhile: Callable[[], _Result],
+    ) -> _Result:
+        """Move the rows by the gradients of what was interpolated from them.
+
+        The calling thread first does `meanwhile`, whose result it returns, and then its share of what the others left.
+        """
         self.step_count += 1
         if self.step_count >= len(self._decays):
             powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64)[:, None]
             decays = torch.tensor([_BETAS], dtype=torch.float64) ** powers
             # Denormal numbers would be slow, and are nothing beside a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
-        parts = workers.num_threads
-        batches = [(t.points, t.located, g) for t, g in zip(touched, gradients, strict=True)]
+        move = kernels.adam_step(
+            self._cells.table,
+            [(t.points, t.located, g) for t, g in zip(touched, gradients, strict=True)],
+            self._cells.features,
+            self._memory,
+            self._decays,
+            step=self.step_count,
+            learning_rate=self.learning_rate,
+            epsilon=self._epsilon,
+        )
+        groups = self._cells.table.num_levels * self._cells.num_groups
+        parts = 1 if workers.num_threads == 1 else groups
+        left = deque(reversed(range(parts)))  # coarse levels first: they take longest
 
-        def move(part: int) -> None:
-            kernels.adam_step(
-                self._cells.table,
-                batches,
-                self._cells.features,
-                self._memory,
-                self._decays,
-                step=self.step_count,
-                learning_rate=self.learning_rate,
-                epsilon=self._epsilon,
-                part=part,
-                parts=parts,
-            )
+        def work(first: Callable[[], _Result] | None) -> _Result | None:
+            result = None if first is None else first()
+            with contextlib.suppress(IndexError):  # from an empty deque
+                while True:
+                    move(left.popleft(), parts)
+            return result
 
-        list(workers.map(move, range(parts)))
+        result, *_ = workers.map(work, [meanwhile] + [None] * (workers.num_threads - 1))
+        return result  # type: ignore[return-value]

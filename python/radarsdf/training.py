@@ -297,7 +297,7 @@ class Training:
     ) -> None:
         parameters = [p for adam in adams for p in adam.parameters]
         changing = [*parameters, *([] if rows is None else [rows.features])]
-        kept = [p.detach().clone() for p in changing]
+        good = [p.detach().clone() for p in changing]
 
         def gradients(work: tuple[_Shard, Samples]) -> _Gradients:
             touched: list[Touched] = []
@@ -306,41 +306,42 @@ class Training:
             return _Gradients(loss.detach(), found[: len(parameters)], touched, found[len(parameters) :])
 
         def give_up(fault: str) -> NoReturn:
-            for parameter, value in zip(changing, kept, strict=True):
+            for parameter, value in zip(changing, good, strict=True):
                 parameter.data.copy_(value)
             msg = f"{fault} at iteration {i} of {iterations} of the {name} stage: a lower learning rate may help"
             raise Diverged(msg)
 
+        ahead: list[Samples] | None = None
         for i in range(self.iterations_done[name], iterations):
             # From the full rate on in each stage, also for an Adam that has been through another.
             share = 0.5 * (1 + math.cos(math.pi * i / iterations)) if self._config.cosine_schedule else 1.0
-            work = list(zip(self._shards, draw(), strict=True))
-            found = list(self._workers.map(gradients, work))
+            found = list(self._workers.map(gradients, list(zip(self._shards, ahead or draw(), strict=True))))
             loss = float(sum(part.loss for part in found))
             if not math.isfinite(loss):
                 give_up(f"the {self._loss_name(name)} loss is {loss}")
-            by_parameter = zip(*[part.by_parameters for part in found], strict=True)
-            total = iter([functools.reduce(Tensor.add_, parts) for parts in by_parameter])
-            if rows is not None:
+            stop = pauses.interrupted()
+            write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
+            look = stop or write or i % _KEEP_EVERY == _KEEP_EVERY - 1 or i == iterations - 1
+            # No draw before the state is looked at: it would be that after the next one.
+            rest = functools.partial(_move_networks, found, adams, share, None if look else draw)
+            if rows is None:
+                ahead = rest()
+            else:
                 rows.learning_rate = share * rows.full_rate
-                rows.step(
+                ahead = rows.step(
                     [t for part in found for t in part.touched],
                     [g for part in found for g in part.by_interpolated],
                     self._workers,
+                    meanwhile=rest,
                 )
-            for adam in adams:
-                adam.learning_rate = share * adam.full_rate
-                adam.step(list(itertools.islice(total, len(adam.parameters))))
             self.losses[name] = loss
             self.iterations_done[name] = i + 1
             pauses.bar.update()
-            stop = pauses.interrupted()
-            write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
-            if stop or write or i % _KEEP_EVERY == _KEEP_EVERY - 1 or i == iterations - 1:
+            if look:
                 # The sum is finite only if all are; that it overflows by itself is as bad.
                 if not all(math.isfinite(float(p.detach().sum())) for p in changing):
                     give_up("a parameter is not finite")
-                for parameter, value in zip(changing, kept, strict=True):
+                for parameter, value in zip(changing, good, strict=True):
                     value.copy_(parameter.detach())
             if write and pauses.checkpoint is not None:
                 pauses.checkpoint.write(self.state())
@@ -356,6 +357,18 @@ class Training:
             if stage == "sdf" and not math.isfinite(float(value))
         }
         return " and ".join(sorted(bad)) or stage
+
+
+def _move_networks(
+    found: Sequence[_Gradients], adams: Sequence[Adam], share: float, draw: Callable[[], list[Samples]] | None
+) -> list[Samples] | None:
+    """What of an iteration one thread does while the others move features: it draws the next samples, too."""
+    by_parameter = zip(*[part.by_parameters for part in found], strict=True)
+    total = iter([functools.reduce(Tensor.add_, parts) for parts in by_parameter])
+    for adam in adams:
+        adam.learning_rate = share * adam.full_rate
+        adam.step(list(itertools.islice(total, len(adam.parameters))))
+    return None if draw is None else draw()
 
 
 def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
