@@ -54,7 +54,8 @@ class SDFNetwork(nn.Module):
     def forward(self, encoding: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Encodings (N, any), side by side, to the logit (N,) and the geometry feature (N, geometry_feature_dim)."""
         out = _run(self.layers, encoding)
-        return out[:, 0], out[:, 1:]
+        # A column of several costs its gradient a matrix of zeros: where there is but one, it is the matrix.
+        return out.squeeze(1) if out.shape[1] == 1 else out[:, 0], out[:, 1:]
 
 
 class IntensityNetwork(nn.Module):
@@ -110,4 +111,4 @@ class IntensityNetwork(nn.Module):
             inputs.append(self.harmonics(directions))
         if self.log_range:
             inputs.append(torch.log10(ranges_m.clamp_min(1e-3) / 10.0)[:, None])
-        return _run(self.layers, inputs)[:, 0]
+        return _run(self.layers, inputs).squeeze(1)
