@@ -44,7 +44,8 @@ class _MLP(torch.autograd.Function):
         inputs = tensors[2 * num_layers :]
         out = inputs[0].new_empty((inputs[0].shape[0], tensors[2 * num_layers - 1].shape[0]))
         keep = any(ctx.needs_input_grad)
-        ctx.hidden = _core.mlp(*_views(num_layers, tensors), out.numpy(), keep, threads())
+        ctx.views = _views(num_layers, tensors)
+        ctx.hidden = _core.mlp(*ctx.views, out.numpy(), keep, threads())
         ctx.save_for_backward(*tensors)
         ctx.num_layers = num_layers
         return out
@@ -69,7 +70,7 @@ class _MLP(torch.autograd.Function):
         ]
         views: list[Any] = [None if g is None else g.numpy() for g in grads]
         _core.mlp_backward(
-            *_views(ctx.num_layers, tensors),
+            *ctx.views,
             ctx.hidden,
             rows_view(out_grad),
             views[:split:2] if by_layers else None,
