@@ -15,13 +15,16 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 
 import radarsdf
 from radarsdf import FitConfig, Interrupted, RadarMap, _core
 from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
 from radarsdf.picture import save_picture
 from radarsdf.readers import Scans, read_scans, write_scans
+from radarsdf.stopping import whole_import
+
+with whole_import():
+    import trimesh
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
