@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""How long fits take, against the estimate that is made before; and the constants of the estimate, measured anew."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import radarsdf
+from radarsdf import Estimate, FitConfig, durations
+from radarsdf.schedule import Schedule
+from radarsdf.threads import resolve_num_threads
+from scipy.optimize import nnls
+
+from bench.growth.street import street
+from bench.paper.report import markdown
+
+WITHIN = 2.0
+PRESETS: dict[str, Callable[..., FitConfig]] = {
+    "default": FitConfig,
+    "quick": FitConfig.quick,
+    "paper": FitConfig.paper,
+}
+SHORT: dict[str, Any] = {"sdf_iterations": 100, "intensity_iterations": 300}
+CASES: list[tuple[int, bool, str, dict[str, Any]]] = [
+    (10_000, True, "default", {}),
+    (30_000, False, "default", {}),
+    (30_000, True, "default", {"num_threads": 1}),
+    (30_000, True, "default", {"joint": False}),
+    (30_000, True, "default", SHORT | {"encoding": "octree"}),
+    (30_000, True, "default", SHORT | {"sdf_hidden": (128, 128), "intensity_hidden": (128, 128, 128)}),
+    (30_000, True, "default", SHORT | {"num_levels": 6, "fourier_count": 16}),
+    (30_000, True, "default", SHORT | {"batch_size": 32768, "intensity_batch_size": 32768}),
+    (10_000, True, "paper", SHORT),
+    (100_000, False, "paper", SHORT | {"num_threads": 1}),
+    (100_000, True, "default", {}),
+    (100_000, False, "default", {"num_threads": 1}),
+    (100_000, False, "quick", {}),
+    (300_000, False, "default", {"sdf_iterations": 300}),
+    (300_000, False, "quick", {"num_threads": 1}),
+    (1_000_000, False, "quick", {}),
+    (1_000_000, False, "default", {"sdf_iterations": 100, "drop_ghosts": False}),
+    (1_000_000, True, "default", SHORT),
+    (1_000_000, False, "default", {"sdf_iterations": 20, "leaf_size_m": 0.8, "num_threads": 1}),
+]
+"""Returns, whether with intensities, preset, settings."""
+
+
+def measured(
+    count: int, with_intensities: bool, preset: str, changes: dict[str, Any], repetitions: int
+) -> tuple[Estimate, dict[str, float], float]:
+    """The estimate, the work that it counts, and seconds of the fastest of so many fits, each in its own process."""
+    case = json.dumps([count, with_intensities, preset, changes])
+    command = [sys.executable, "-m", "bench.stress.durations", case]
+    found = []
+    for _ in range(repetitions):
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        values, work, seconds = json.loads(done.stdout)
+        found.append(seconds)
+    return Estimate(**values), work, min(found)
+
+
+def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str, Any]) -> None:
+    scene = street(count)
+    returns = (scene.points, scene.poses, scene.intensities if with_intensities else None)
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
+    config = PRESETS[preset](**settings)
+    estimate = radarsdf.estimate(*returns, config=config)
+    schedule = Schedule.of(
+        config,
+        surface_returns=estimate.returns,
+        returns=estimate.returns,
+        vertices=estimate.vertices,
+        with_intensity=with_intensities,
+    )
+    work = durations.work_of(
+        config,
+        schedule,
+        returns=estimate.returns,
+        cells=estimate.leaf_cells,
+        rows=estimate.vertices,
+        with_intensity=with_intensities,
+    )
+    work = durations.shared(work, resolve_num_threads(config.num_threads))
+    # What PyTorch sets up in a process's first steps is no part of the estimate.
+    small = street(2000)
+    tiny = FitConfig(sdf_iterations=5, intensity_iterations=10)
+    radarsdf.fit(small.points, small.poses, small.intensities, config=tiny, progress=False)
+    started_s = time.perf_counter()
+    radarsdf.fit(*returns, config=config, progress=False)
+    print(json.dumps([dataclasses.asdict(estimate), work, time.perf_counter() - started_s]))
+
+
+def constants(works: list[dict[str, float]], seconds: list[float]) -> dict[str, float]:
+    """Of each kind of work the seconds, none negative, that leave the least sum of squared relative errors."""
+    kinds = list(durations.SECONDS)
+    shares = np.array([[work[kind] for kind in kinds] for work in works]) / np.array(seconds)[:, None]
+    scale = shares.max(axis=0).clip(1e-30)
+    found, _ = nnls(shares / scale, np.ones(len(shares)))
+    return dict(zip(kinds, (found / scale).tolist(), strict=True))
+
+
+def run(largest: int, repetitions: int) -> bool:
+    """Print the table, and the constants that would fit it best; whether all estimates are within the factor."""
+    rows, works, seconds = [], [], []
+    cases = [case for case in CASES if case[0] <= largest]
+    for count, with_intensities, preset, changes in cases:
+        estimate, work, took_s = measured(count, with_intensities, preset, changes, repetitions)
+        works.append(work)
+        seconds.append(took_s)
+        settings = ", ".join([preset, *(f"{k} {v}" for k, v in changes.items())])
+        rows.append([f"{count:,}", "yes" if with_intensities else "no", settings, f"{took_s:.2f}"])
+        rows[-1] += [f"{estimate.seconds:.2f}", f"{estimate.seconds / took_s:.2f}"]
+        print(" | ".join(rows[-1]), flush=True)
+    anew = constants(works, seconds)
+    for row, work, took_s in zip(rows, works, seconds, strict=True):
+        row.append(f"{sum(anew[kind] * work[kind] for kind in anew) / took_s:.2f}")
+    columns = ["returns", "intensities", "settings", "fit, s", "estimate, s", "ratio", "ratio, calibrated"]
+    print(markdown(columns, rows))
+    print("calibrated:\n\nSECONDS = {")
+    for kind, value in anew.items():
+        print(f'    "{kind}": {value:.2g},')
+    print("}")
+    ratios = [float(row[5]) for row in rows]
+    return all(1 / WITHIN < ratio < WITHIN for ratio in ratios)
+
+
+if __name__ == "__main__":
+    _measure(*json.loads(sys.argv[1]))
