@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-from radarsdf import Estimate, FitConfig, durations
+from radarsdf import FitConfig, durations
 from radarsdf.schedule import Schedule
-from radarsdf.threads import resolve_num_threads
 from scipy.optimize import nnls
 
 from bench.growth.street import street
@@ -53,18 +52,30 @@ CASES: list[tuple[int, bool, str, dict[str, Any]]] = [
 """Returns, whether with intensities, preset, settings."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """What was expected of a fit, and what it took."""
+
+    estimated_s: float
+    work: dict[str, float]
+    """As counted before."""
+    wall_s: float
+    processor_s: float
+    """Of all threads: it hardly depends on what else the machine does."""
+
+
 def measured(
     count: int, with_intensities: bool, preset: str, changes: dict[str, Any], repetitions: int
-) -> tuple[Estimate, dict[str, float], float]:
-    """The estimate, the work that it counts, and seconds of the fastest of so many fits, each in its own process."""
+) -> Fit:
+    """The fastest of so many fits, each in its own process."""
     case = json.dumps([count, with_intensities, preset, changes])
     command = [sys.executable, "-m", "bench.stress.durations", case]
-    found = []
+    fits = []
     for _ in range(repetitions):
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-        values, work, seconds = json.loads(done.stdout)
-        found.append(seconds)
-    return Estimate(**values), work, min(found)
+        fits.append(Fit(**json.loads(done.stdout)))
+    least_s = min(fit.processor_s for fit in fits)
+    return dataclasses.replace(min(fits, key=lambda fit: fit.wall_s), processor_s=least_s)
 
 
 def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str, Any]) -> None:
@@ -88,20 +99,19 @@ def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str,
         rows=estimate.vertices,
         with_intensity=with_intensities,
     )
-    work = durations.shared(work, resolve_num_threads(config.num_threads))
     # What PyTorch sets up in a process's first steps is no part of the estimate.
-    small = street(2000)
-    tiny = FitConfig(sdf_iterations=5, intensity_iterations=10)
+    small, tiny = street(2000), FitConfig(sdf_iterations=5, intensity_iterations=10)
     radarsdf.fit(small.points, small.poses, small.intensities, config=tiny, progress=False)
-    started_s = time.perf_counter()
+    wall_s, processor_s = time.perf_counter(), time.process_time()
     radarsdf.fit(*returns, config=config, progress=False)
-    print(json.dumps([dataclasses.asdict(estimate), work, time.perf_counter() - started_s]))
+    wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s
+    print(json.dumps(dataclasses.asdict(Fit(estimate.seconds, work, wall_s, processor_s))))
 
 
-def constants(works: list[dict[str, float]], seconds: list[float]) -> dict[str, float]:
+def constants(fits: list[Fit]) -> dict[str, float]:
     """Of each kind of work the seconds, none negative, that leave the least sum of squared relative errors."""
     kinds = list(durations.SECONDS)
-    shares = np.array([[work[kind] for kind in kinds] for work in works]) / np.array(seconds)[:, None]
+    shares = np.array([[fit.work[kind] / fit.processor_s for kind in kinds] for fit in fits])
     scale = shares.max(axis=0).clip(1e-30)
     found, _ = nnls(shares / scale, np.ones(len(shares)))
     return dict(zip(kinds, (found / scale).tolist(), strict=True))
@@ -109,27 +119,41 @@ def constants(works: list[dict[str, float]], seconds: list[float]) -> dict[str, 
 
 def run(largest: int, repetitions: int) -> bool:
     """Print the table, and the constants that would fit it best; whether all estimates are within the factor."""
-    rows, works, seconds = [], [], []
     cases = [case for case in CASES if case[0] <= largest]
-    for count, with_intensities, preset, changes in cases:
-        estimate, work, took_s = measured(count, with_intensities, preset, changes, repetitions)
-        works.append(work)
-        seconds.append(took_s)
+    fits = []
+    for case in cases:
+        fits.append(measured(*case, repetitions))
+        print(f"{case}: {fits[-1].wall_s:.1f} s", flush=True)
+    anew = constants(fits)
+    rows, good = [], True
+    for (count, with_intensities, preset, changes), fit in zip(cases, fits, strict=True):
         settings = ", ".join([preset, *(f"{k} {v}" for k, v in changes.items())])
-        rows.append([f"{count:,}", "yes" if with_intensities else "no", settings, f"{took_s:.2f}"])
-        rows[-1] += [f"{estimate.seconds:.2f}", f"{estimate.seconds / took_s:.2f}"]
-        print(" | ".join(rows[-1]), flush=True)
-    anew = constants(works, seconds)
-    for row, work, took_s in zip(rows, works, seconds, strict=True):
-        row.append(f"{sum(anew[kind] * work[kind] for kind in anew) / took_s:.2f}")
-    columns = ["returns", "intensities", "settings", "fit, s", "estimate, s", "ratio", "ratio, calibrated"]
-    print(markdown(columns, rows))
+        estimated_s, anew_s = (
+            sum(seconds[kind] * fit.work[kind] for kind in seconds) for seconds in (durations.SECONDS, anew)
+        )
+        ratios = [fit.estimated_s / fit.wall_s, estimated_s / fit.processor_s]
+        good &= all(1 / WITHIN < ratio < WITHIN for ratio in ratios)
+        rows.append(
+            [f"{count:,}", "yes" if with_intensities else "no", settings, f"{fit.wall_s:.2f}"]
+            + [f"{fit.estimated_s:.2f}", f"{ratios[0]:.2f}", f"{fit.processor_s:.2f}", f"{ratios[1]:.2f}"]
+            + [f"{anew_s / fit.processor_s:.2f}"]
+        )
+    columns = [
+        "returns",
+        "intensities",
+        "settings",
+        "fit, s",
+        "estimate, s",
+        "ratio",
+        "processor, s",
+        "ratio",
+    ]
+    print(markdown([*columns, "calibrated"], rows))
     print("calibrated:\n\nSECONDS = {")
     for kind, value in anew.items():
         print(f'    "{kind}": {value:.2g},')
     print("}")
-    ratios = [float(row[5]) for row in rows]
-    return all(1 / WITHIN < ratio < WITHIN for ratio in ratios)
+    return good
 
 
 if __name__ == "__main__":
