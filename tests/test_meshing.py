@@ -154,6 +154,15 @@ def test_two_meshes_of_one_map_are_the_same_bits(sharp_map):
         np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
 
 
+@pytest.mark.parametrize("voxel_size", [0.1, 0.15])
+def test_small_parts_give_the_same_bits(sharp_map, voxel_size, monkeypatch):
+    whole = sharp_map.mesh(voxel_size)
+    monkeypatch.setattr("radarsdf.meshing._PART", 1 << 12)  # of a large map, as many parts
+    parts = sharp_map.mesh(voxel_size)
+    np.testing.assert_array_equal(parts.vertices, whole.vertices)
+    np.testing.assert_array_equal(parts.faces, whole.faces)
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 def test_the_number_of_threads_changes_nothing_but_rounding(sharp_map, mesh, threads):
     before = torch.get_num_threads()
