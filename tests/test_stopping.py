@@ -182,16 +182,27 @@ assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 def test_the_command_saves_the_map_so_far_and_says_so_in_one_line(tmp_path):
     scene = ground_and_wall()
     write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
+    code = """
+import sys
+from radarsdf.cli import main
+from radarsdf.training import Training
+run = Training.run
+def announced(*arguments):
+    print("ready", flush=True)
+    run(*arguments)
+Training.run = announced
+sys.exit(main())
+"""
     process = subprocess.Popen(
-        [sys.executable, "-m", "radarsdf", "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
+        [sys.executable, "-c", code, "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
         + ["--quiet", "--set", "sdf_iterations=1000000", "--checkpoint", str(tmp_path / "state")],
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )  # fmt: skip
-    time.sleep(6)
-    while not (tmp_path / "map.safetensors").exists() and process.poll() is None:
-        process.send_signal(signal.SIGINT)  # again where it came before the training
-        time.sleep(3)
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(2)
+    process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130
     assert (
