@@ -43,6 +43,7 @@ CASES: list[tuple[int, bool, str, dict[str, Any]]] = [
     (100_000, False, "default", {"num_threads": 1}),
     (100_000, False, "quick", {}),
     (300_000, False, "default", {"sdf_iterations": 300}),
+    (300_000, False, "default", {"sdf_iterations": 50, "row_updates": False}),
     (300_000, False, "quick", {"num_threads": 1}),
     (1_000_000, False, "quick", {}),
     (1_000_000, False, "default", {"sdf_iterations": 100, "drop_ghosts": False}),
