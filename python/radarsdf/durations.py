@@ -30,7 +30,7 @@ SECONDS = {
 def work_of(
     config: FitConfig, schedule: Schedule, *, returns: int, cells: int, rows: int, with_intensity: bool
 ) -> dict[str, float]:
-    """How often a fit does what :data:`SECONDS` has, once for each thread that shares it."""
+    """How often a fit does each of the things that :data:`SECONDS` has, all threads together."""
     iterations = schedule.sdf_iterations
     joint = iterations if with_intensity and config.joint else 0
     later = max(0, schedule.intensity_iterations - joint)
@@ -39,13 +39,8 @@ def work_of(
     of_both = schedule.batch_size * (1 if config.intensity_in_free_space else config.near_samples / samples)
     # Forward and backward is three times forward alone, a normal is a backward pass, and its own gradient two more.
     passes, of_frozen = (9, 3) if config.normals and with_intensity else (3, 1)
-    encoded: float = encoding * (
-        passes * iterations * schedule.batch_size + of_frozen * later * config.intensity_batch_size
-    )
-    multiplied: float = sdf * (
-        passes * iterations * schedule.batch_size + of_frozen * later * config.intensity_batch_size
-    )
-    multiplied += intensity * 3 * (joint * of_both + later * config.intensity_batch_size)
+    ways = passes * iterations * schedule.batch_size + of_frozen * later * config.intensity_batch_size
+    multiplied = sdf * ways + intensity * 3 * (joint * of_both + later * config.intensity_batch_size)
     all_rows_move = not config.row_updates or (config.normals and joint > 0)
     return {
         "always": 1.0,
@@ -56,8 +51,8 @@ def work_of(
         "row": float(rows),
         "moved row": float(rows * iterations * all_rows_move),
         "iteration": float(iterations + later),
-        "encoded number": encoded,
-        "multiplication": multiplied,
+        "encoded number": float(encoding * ways),
+        "multiplication": float(multiplied),
     }
 
 
