@@ -78,7 +78,9 @@ std::vector<std::uint64_t> CellSet::sorted_keys(int num_threads) const {
 void parallel_sort(std::vector<std::uint64_t>& keys, int num_threads) {
   const auto size = static_cast<std::int64_t>(keys.size());
   std::int64_t blocks = 1;
-  while (blocks * 2 <= resolve_num_threads(num_threads) && size / blocks > (1 << 15)) blocks *= 2;
+  const std::int64_t threads = resolve_num_threads(num_threads);
+  // Several for a thread where one would keep whoever wants to interrupt the call waiting.
+  while (size / blocks > (blocks * 2 <= threads ? 1 << 15 : 1 << 22)) blocks *= 2;
   const auto at = [&](std::int64_t i) { return keys.begin() + size * i / blocks; };
   parallel_tasks(blocks, num_threads, [&](std::int64_t i) { std::sort(at(i), at(i + 1)); });
   for (std::int64_t width = 1; width < blocks; width *= 2) {

@@ -7,11 +7,15 @@
 #include <numeric>
 #include <stdexcept>
 
+#include "parallel.hpp"
+
 namespace radarsdf {
 namespace {
 
 using std::int32_t;
 using std::int64_t;
+
+constexpr int64_t faces_between_checks = 1 << 16;
 
 // Union-find; halving the path on the way keeps the chains short.
 int32_t find_root(int32_t* parents, int32_t vertex) {
@@ -33,6 +37,7 @@ MeshComponents mesh_components(const int32_t* faces, int64_t num_faces, int64_t 
   std::vector<int32_t> parents(static_cast<std::size_t>(num_vertices));
   std::iota(parents.begin(), parents.end(), 0);
   for (int64_t f = 0; f < num_faces; ++f) {
+    if (f % faces_between_checks == 0) check_interrupt();
     int32_t root = find_root(parents.data(), faces[3 * f]);
     for (int64_t i = 1; i < 3; ++i) {
       const int32_t other = find_root(parents.data(), faces[3 * f + i]);
@@ -44,6 +49,7 @@ MeshComponents mesh_components(const int32_t* faces, int64_t num_faces, int64_t 
   components.labels.reset(new int32_t[static_cast<std::size_t>(num_faces)]);
   std::vector<int32_t> label_of_root(parents.size(), -1);
   for (int64_t f = 0; f < num_faces; ++f) {
+    if (f % faces_between_checks == 0) check_interrupt();
     int32_t& label = label_of_root[static_cast<std::size_t>(find_root(parents.data(), faces[3 * f]))];
     if (label < 0) {
       label = static_cast<int32_t>(components.sizes.size());

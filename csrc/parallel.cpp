@@ -42,6 +42,9 @@ void set_interrupt_check(void (*check)()) { interrupt_check = check; }
 void check_interrupt() {
   using Clock = std::chrono::steady_clock;
   thread_local Clock::time_point next;
+#ifdef _OPENMP
+  if (omp_get_thread_num() != 0) return;
+#endif
   void (*const check)() = interrupt_check;
   if (check == nullptr || Clock::now() < next) return;
   next = Clock::now() + std::chrono::milliseconds(100);

@@ -9,7 +9,6 @@
 #include <atomic>
 #include <cstdint>
 #include <exception>
-#include <thread>
 
 namespace radarsdf {
 
@@ -17,7 +16,8 @@ namespace radarsdf {
 // In a process that was forked, 1: OpenMP's threads stayed with the parent, and to wait for them would be for ever.
 int resolve_num_threads(int num_threads);
 
-// What a long call asks, at most ten times a second, on the thread that made it: `check` may throw to end the call.
+// What a long call asks, at most ten times a second, on the thread that made it: `check` may throw to end the call. On
+// the threads that help it, check_interrupt does nothing: a task that takes long may ask on whichever it runs.
 void set_interrupt_check(void (*check)());
 void check_interrupt();
 
@@ -36,12 +36,11 @@ void parallel_tasks(std::int64_t num_tasks, int num_threads, const Task& task) {
   }
   std::exception_ptr error;
   std::atomic<bool> failed{false};
-  const std::thread::id caller = std::this_thread::get_id();
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
   for (std::int64_t i = 0; i < num_tasks; ++i) {
     if (failed) continue;
     try {
-      if (std::this_thread::get_id() == caller) check_interrupt();
+      check_interrupt();
       task(i);
     } catch (...) {
       failed = true;
@@ -52,12 +51,15 @@ void parallel_tasks(std::int64_t num_tasks, int num_threads, const Task& task) {
   if (error) std::rethrow_exception(error);
 }
 
-// Runs body(begin, end) over [0, size) in blocks; no thread is woken for less than min_block items.
+// Runs body(begin, end) over [0, size) in blocks; no thread is woken for less than min_block items. A block is so short
+// that whoever wants to interrupt the call does not wait for its end.
 template <typename Body>
 void parallel_blocks(std::int64_t size, std::int64_t min_block, int num_threads, const Body& body) {
   if (size <= 0) return;
+  constexpr std::int64_t max_block = 1 << 18;
   const std::int64_t threads = resolve_num_threads(num_threads);
-  const std::int64_t blocks = std::clamp<std::int64_t>(size / std::max<std::int64_t>(min_block, 1), 1, threads);
+  const std::int64_t wanted = std::clamp<std::int64_t>(size / std::max<std::int64_t>(min_block, 1), 1, threads);
+  const std::int64_t blocks = std::max(wanted, (size + max_block - 1) / max_block);
   parallel_tasks(blocks, num_threads, [&](std::int64_t i) { body(size * i / blocks, size * (i + 1) / blocks); });
 }
 

@@ -77,6 +77,7 @@ void radix_sort(Keys& keys, int bits) {
   constexpr uint64_t digit_mask = (1 << digit_bits) - 1;
   Keys sorted(keys.size());
   for (int shift = 0; shift < bits; shift += digit_bits) {
+    check_interrupt();
     std::array<size_t, digit_mask + 2> first{};
     for (const uint64_t key : keys) ++first[(key >> shift & digit_mask) + 1];
     for (size_t digit = 1; digit < first.size(); ++digit) first[digit] += first[digit - 1];

@@ -5,6 +5,8 @@
 import itertools
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 
 def grid(n, low=-1.0, high=1.0):
@@ -38,37 +40,42 @@ def directed_edges(faces):
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
+def pair_keys(pairs):
+    """A number for each pair of vertices (N, 2): NumPy compares numbers many times as fast as rows."""
+    return pairs[:, 0].astype(np.int64) << 32 | pairs[:, 1].astype(np.int64)
+
+
 def single_edges(faces):
     """Edges of one triangle only; fails unless all others have two, which run along them in opposite directions."""
     edges = directed_edges(faces)
-    assert len(np.unique(edges, axis=0)) == len(edges), (
+    assert len(np.unique(pair_keys(edges))) == len(edges), (
         "two triangles run along an edge in the same direction"
     )
-    unique, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    edges = np.sort(edges, axis=1)
+    _, first, counts = np.unique(pair_keys(edges), return_index=True, return_counts=True)
     assert counts.max(initial=0) <= 2
-    return unique[counts == 1]
+    return edges[first[counts == 1]]
 
 
 def has_single_cycle_links(faces, num_vertices):
     """True for each vertex whose triangles form one fan, closed or open."""
-    following = {}
-    for a, b, c in faces.tolist():
-        for v, p, q in ((a, b, c), (b, c, a), (c, a, b)):
-            following.setdefault(v, {})[p] = q
-    good = np.zeros(num_vertices, dtype=bool)
-    for v, links in following.items():
-        starts = set(links) - set(links.values())
-        start = next(iter(starts)) if starts else next(iter(links))
-        count, node = 0, start
-        while node in links and count < len(links):
-            node = links[node]
-            count += 1
-        good[v] = count == len(links) and len(starts) <= 1
+    # Corner i of a triangle has an edge to the next corner and one from the last; the corner beyond either shares it.
+    vertices = faces.T.reshape(-1)
+    to_next = pair_keys(np.stack([vertices, np.roll(faces, -1, axis=1).T.reshape(-1)], 1))
+    from_last = pair_keys(np.stack([vertices, np.roll(faces, 1, axis=1).T.reshape(-1)], 1))
+    _, a, b = np.intersect1d(to_next, from_last, return_indices=True)
+    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(vertices), len(vertices)))
+    _, fans = connected_components(graph, directed=False)
+    _, one_each = np.unique(fans, return_index=True)
+    good = np.bincount(vertices[one_each], minlength=num_vertices) == 1
+    for keys in (to_next, from_last):
+        unique, counts = np.unique(keys, return_counts=True)
+        good[unique[counts > 1] >> 32] = False  # two triangles run along an edge in the same direction
     return good
 
 
 def euler_characteristic(vertices, faces):
-    return len(vertices) - len(np.unique(np.sort(directed_edges(faces), axis=1), axis=0)) + len(faces)
+    return len(vertices) - len(np.unique(pair_keys(np.sort(directed_edges(faces), axis=1)))) + len(faces)
 
 
 def normals(vertices, faces):

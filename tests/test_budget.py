@@ -26,7 +26,7 @@ QUICK = FitConfig(sdf_iterations=6, intensity_iterations=6, batch_size=512)
 @LINUX
 @pytest.mark.parametrize(
     ("count", "with_intensities", "changes"),
-    [(10_000, True, {}), (100_000, True, {}), (50_000, False, {"encoding": "octree"})],
+    [(10_000, True, {}), (100_000, True, {}), (25_000, False, {"encoding": "octree"})],
 )
 def test_the_peak_is_within_half_as_much_again(count, with_intensities, changes):
     estimate, peak = peak_of_a_fit(count, with_intensities, changes)

@@ -136,7 +136,8 @@ def test_frozen_geometry_does_not_move(scene):
     assert not torch.equal(*weights)
 
 
-def test_the_more_often_samples_are_seen_the_more_is_hidden(scene, monkeypatch):
+def test_the_more_often_samples_are_seen_the_more_is_hidden(monkeypatch):
+    scene = ground_and_wall(scans=2, returns_per_scan=128)
     shares = []
 
     def record(rows, columns, dropout, generator):
@@ -149,8 +150,8 @@ def test_the_more_often_samples_are_seen_the_more_is_hidden(scene, monkeypatch):
         shares.clear()
         config = dataclasses.replace(
             QUICK,
-            intensity_batch_size=1024,
-            intensity_iterations=math.ceil(passes * samples / 1024),
+            intensity_batch_size=128,
+            intensity_iterations=math.ceil(passes * samples / 128),
             sdf_iterations=1,
             feature_dropout=0.8,
             fourier_dropout=0.4,

@@ -27,7 +27,7 @@ def instruction_set(request):
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("encoding", stress.ENCODINGS.values(), ids=stress.ENCODINGS)
-@pytest.mark.parametrize("place", ["anywhere", "on borders", "500 m away"])
+@pytest.mark.parametrize("place", stress.PLACES)
 def test_interpolation_and_its_derivatives_are_good_to_a_few_roundings(dtype, encoding, place):
     for count in (0, 1, 7, 1031):
         errors = stress.interpolation_errors(place, count, dtype, encoding)

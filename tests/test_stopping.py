@@ -143,7 +143,6 @@ from tests.conftest import ground_and_wall
 scene = ground_and_wall()
 config = radarsdf.FitConfig(sdf_iterations=5)
 radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
-radar_map.mesh()  # imports trimesh, which would take Ctrl-C for a library that is missing
 print("ready", flush=True)
 try:
     while True:
@@ -154,19 +153,56 @@ except KeyboardInterrupt:
     assert interrupted_python(code, delay_s=1.0) == ("", 0)
 
 
+@pytest.mark.parametrize("part", ["networkx", "scipy", "shapely"])
+def test_ctrl_c_during_the_import_of_trimesh_is_not_taken_for_a_missing_part(part):
+    code = f"""
+import importlib.abc, signal, sys
+class Press(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "{part}" and not presses:
+            presses.append(name)
+            signal.raise_signal(signal.SIGINT)
+presses = []
+import radarsdf
+assert "trimesh" not in sys.modules and "{part}" not in sys.modules
+sys.meta_path.insert(0, Press())
+try:
+    import radarsdf.meshing
+    print("lost")
+except KeyboardInterrupt:
+    print("stopped")
+assert presses
+import radarsdf.meshing  # and now it is whole
+assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == "stopped\n"
+
+
 def test_the_command_saves_the_map_so_far_and_says_so_in_one_line(tmp_path):
     scene = ground_and_wall()
     write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
+    code = """
+import sys
+from radarsdf.cli import main
+from radarsdf.training import Training
+run = Training.run
+def announced(*arguments):
+    print("ready", flush=True)
+    run(*arguments)
+Training.run = announced
+sys.exit(main())
+"""
     process = subprocess.Popen(
-        [sys.executable, "-m", "radarsdf", "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
+        [sys.executable, "-c", code, "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
         + ["--quiet", "--set", "sdf_iterations=1000000", "--checkpoint", str(tmp_path / "state")],
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )  # fmt: skip
-    time.sleep(6)
-    while not (tmp_path / "map.safetensors").exists() and process.poll() is None:
-        process.send_signal(signal.SIGINT)  # again where it came before the training
-        time.sleep(3)
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(2)
+    process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130
     assert (

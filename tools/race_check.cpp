@@ -2,19 +2,28 @@
 // SPDX-License-Identifier: MIT
 //
 // Every parallel function of the core on more threads than there are processors, for ThreadSanitizer
-// (tools/sanitize.sh thread), and the same results as on one thread.
+// (tools/sanitize.sh thread), and the same results as on one thread; then from several threads at once, as where each
+// fits a map of its own.
+#include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <random>
+#include <stdexcept>
+#include <thread>
 #include <vector>
 
+#include "cell_blocks.hpp"
 #include "cell_set.hpp"
+#include "cell_sums.hpp"
 #include "encodings.hpp"
 #include "instruction_set.hpp"
 #include "marching_cubes.hpp"
+#include "parallel.hpp"
 #include "sparse_lattice.hpp"
+#include "surface_crossings.hpp"
 #include "vertex_table.hpp"
 
 namespace {
@@ -84,6 +93,93 @@ void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
   results.add(harmonics.data(), kPoints * 16);
 }
 
+// Two steps of Adam, each by threads of the caller's own that take a part of the rows, as a fit's do.
+template <typename T>
+void adam(radarsdf::Encoding encoding, int threads, Results& results) {
+  const auto points = random_numbers<T>(3 * kPoints, 4.0, 1);
+  radarsdf::CellSet cells(0.2);
+  cells.insert(points.data(), kPoints, threads);
+  const radarsdf::VertexTable table(cells.sorted_keys(threads), 0.2, kLevels, encoding, threads);
+  auto features = random_numbers<T>(8 * table.num_rows(), 1.0, 2);
+  const auto grad = random_numbers<T>(8 * kLevels * kPoints, 1.0, 3);
+  std::vector<std::int32_t> located(kLevels * kPoints), last_step(features.size() / 8), slots(features.size() / 8);
+  radarsdf::locate(table, points.data(), kPoints, located.data(), threads);
+  std::vector<T> moments(2 * features.size());
+  const std::vector<T> decays{1, 1, T(0.9), T(0.99), T(0.81), T(0.98)};
+  const std::int64_t half = kPoints / 2, stride = 8 * kLevels;
+  const radarsdf::PointBatch<T> whole{points.data(), nullptr, located.data(), half};
+  const radarsdf::PointBatch<T> rest{points.data() + 3 * half, nullptr, located.data() + kLevels * half, half};
+  for (std::int32_t step = 1; step <= 2; ++step) {
+    const radarsdf::AdamStep<T> adam{features.data(), moments.data(), last_step.data(), decays.data(), step,
+                                     T(0.01),         T(1),           T(1e-8)};
+    std::vector<std::thread> workers;
+    for (int part = 0; part < threads; ++part) {
+      workers.emplace_back([&, part] {
+        radarsdf::adam_step(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
+                            slots.data(), part, threads);
+      });
+    }
+    for (std::thread& worker : workers) worker.join();
+  }
+  results.add(features.data(), 8 * table.num_rows());
+  results.add(moments.data(), 16 * table.num_rows());
+}
+
+// Sums over cells, and rays through surfels.
+void sums_and_rays(int threads, Results& results) {
+  const auto points = random_numbers<float>(3 * kPoints, 3.0, 9);
+  auto directions = random_numbers<float>(3 * kPoints, 1.0, 10);
+  for (std::int64_t i = 0; i < kPoints; ++i) {
+    float* d = directions.data() + 3 * i;
+    const float length = std::sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+    for (int axis = 0; axis < 3; ++axis) d[axis] /= length;
+  }
+  std::vector<std::uint64_t> keys(kPoints);
+  radarsdf::cell_keys(points.data(), kPoints, 0.4, keys.data(), threads);
+  std::vector<std::uint64_t> sorted = keys;
+  radarsdf::parallel_sort(sorted, threads);
+  sorted.erase(std::unique(sorted.begin(), sorted.end()), sorted.end());
+  results.add(sorted.data(), static_cast<std::int64_t>(sorted.size()));
+  const auto num_cells = static_cast<std::int64_t>(sorted.size());
+
+  const radarsdf::CellBlocks blocks(sorted.data(), num_cells);
+  std::vector<std::int32_t> rows(kPoints);
+  blocks.rows(keys.data(), kPoints, rows.data(), threads);
+  results.add(rows.data(), kPoints);
+  std::vector<double> moments(static_cast<std::size_t>(radarsdf::kMoments * num_cells)), round(moments.size());
+  radarsdf::sum_moments(points.data(), directions.data(), rows.data(), kPoints, num_cells, moments.data(), threads);
+  radarsdf::sum_round(blocks, sorted.data(), num_cells, moments.data(), radarsdf::kMoments, 0.5, round.data(), threads);
+  results.add(moments.data(), radarsdf::kMoments * num_cells);
+  results.add(round.data(), radarsdf::kMoments * num_cells);
+
+  std::vector<radarsdf::Surfel> surfels;
+  for (std::int64_t cell = 0; cell < num_cells; ++cell) {
+    const double* m = moments.data() + radarsdf::kMoments * cell;
+    const auto mean = [&](int k) { return static_cast<float>(m[k] / m[0]); };
+    surfels.push_back({{mean(1), mean(2), mean(3)}, {0, 0, 1}, 0.05F});
+  }
+  const radarsdf::SurfelMap map(sorted.data(), surfels.data(), num_cells, 0.4);
+  const std::vector<float> ranges(kPoints, 6.0F);
+  std::vector<std::int32_t> crossed(kPoints);
+  map.first_crossings(points.data(), directions.data(), ranges.data(), kPoints, {0.1F, 0.01F}, 0.1F, 2.0F,
+                      crossed.data(), threads);
+  if (std::all_of(crossed.begin(), crossed.end(), [](std::int32_t c) { return c < 0; })) std::abort();
+  results.add(crossed.data(), kPoints);
+}
+
+// An exception of one task ends the others and is the caller's.
+void failure(int threads) {
+  bool caught = false;
+  try {
+    radarsdf::parallel_tasks(100, threads, [](std::int64_t task) {
+      if (task % 10 == 7) throw std::runtime_error("seven");
+    });
+  } catch (const std::runtime_error&) {
+    caught = true;
+  }
+  if (!caught) std::abort();
+}
+
 template <typename T>
 void surfaces(int threads, Results& results) {
   const std::array<std::int64_t, 3> shape{40, 33, 47};
@@ -114,6 +210,10 @@ Results all(int threads) {
   Results results;
   encodings<T>(radarsdf::Encoding::kTriQuadtree, threads, results);
   encodings<T>(radarsdf::Encoding::kOctree, threads, results);
+  adam<T>(radarsdf::Encoding::kTriQuadtree, threads, results);
+  adam<T>(radarsdf::Encoding::kOctree, threads, results);
+  sums_and_rays(threads, results);
+  failure(threads);
   surfaces<T>(threads, results);
   return results;
 }
@@ -121,6 +221,8 @@ Results all(int threads) {
 }  // namespace
 
 int main() {
+  static std::atomic<int> checks{0};
+  radarsdf::set_interrupt_check([] { ++checks; });
   for (const auto isa : radarsdf::available_instruction_sets()) {
     radarsdf::set_instruction_set(isa);
     for (const int threads : {2, 4}) {
@@ -130,5 +232,13 @@ int main() {
       if (!same) return EXIT_FAILURE;
     }
   }
+  std::vector<Results> found(3);
+  std::vector<std::thread> callers;
+  for (Results& results : found) callers.emplace_back([&results] { results = all<float>(2); });
+  for (std::thread& caller : callers) caller.join();
+  const bool same = found[0] == found[1] && found[0] == found[2] && found[0] == all<float>(1);
+  std::printf("three callers at once: %s; asked %d times for interrupts\n", same ? "same bits" : "OTHER BITS",
+              checks.load());
+  if (!same || checks == 0) return EXIT_FAILURE;
   return EXIT_SUCCESS;
 }

@@ -32,6 +32,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     memory.add_argument("--largest", type=int, default=3_000_000, help="returns; default: 3000000")
     memory.add_argument("--count", type=int, default=100, help="fits in a row; default: 100")
+    durations = commands.add_parser("durations", help="seconds of fits against their estimates")
+    durations.add_argument("--largest", type=int, default=1_000_000, help="returns; default: 1000000")
+    durations.add_argument("--repetitions", type=int, default=2, help="the fastest counts; default: 2")
     training = commands.add_parser("training", help="extreme settings, and very many iterations")
     training.add_argument("--iterations", type=int, default=1000, help="of each case; default: 1000")
     training.add_argument("--longest", type=int, default=100_000, help="of the default; default: 100000")
@@ -60,11 +63,15 @@ def main(arguments: list[str] | None = None) -> None:
     elif words.command == "interrupts":
         from .interrupts import run as run_interrupts  # noqa: PLC0415
 
-        run_interrupts(words.returns, words.count)
+        sys.exit(not run_interrupts(words.returns, words.count))
     elif words.command == "memory":
         from .memory import run as run_memory  # noqa: PLC0415
 
-        run_memory(words.largest, words.count)
+        sys.exit(not run_memory(words.largest, words.count))
+    elif words.command == "durations":
+        from .durations import run as run_durations  # noqa: PLC0415
+
+        sys.exit(not run_durations(words.largest, words.repetitions))
     elif words.command == "training":
         from .training import run as run_training  # noqa: PLC0415
 
@@ -75,10 +82,11 @@ def main(arguments: list[str] | None = None) -> None:
         run_seeds(words.scenes, words.count, quick=words.quick)
     else:
         environment = os.environ | {"RADARSDF_EXAMPLES": str(words.count)}
-        tests = Path(__file__).parents[2] / "tests" / "test_arguments.py"
+        folder = Path(__file__).parents[2] / "tests"
+        tests = [folder / "test_arguments.py", folder / "test_arguments_of_fits.py"]
         sys.exit(
             subprocess.run(
-                [sys.executable, "-m", "pytest", "-q", tests], env=environment, check=False
+                [sys.executable, "-m", "pytest", "-q", *tests], env=environment, check=False
             ).returncode
         )
 

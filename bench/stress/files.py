@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 import radarsdf
+from radarsdf.checkpoint import Checkpoint
+from radarsdf.cli import _read_mesh, _read_points
 from radarsdf.readers import read_scans
 from tqdm import tqdm
 
@@ -67,6 +69,19 @@ def _trajectory(path: Path) -> None:
     assert len(trajectory.times_s) == len(trajectory.positions) == len(trajectory.rotations) >= 2
 
 
+def _checkpoint(path: Path) -> None:
+    Checkpoint(path, *samples.fit_of_checkpoints()).resume(samples.training())
+
+
+def _points(path: Path) -> None:
+    assert isinstance(_read_points(path), np.ndarray)
+
+
+def _mesh(path: Path) -> None:
+    mesh = _read_mesh(path)
+    assert np.asarray(mesh.faces).ndim == 2
+
+
 def _folder(path: Path) -> None:
     """A folder in which everything but the file is whole; ValueErrors name files of the folder."""
     folder = path.parent if path.parent.name != "radar" else path.parent.parent
@@ -81,6 +96,11 @@ def _folder(path: Path) -> None:
 
 
 READERS = {
+    "checkpoint": Reader(_checkpoint, "state", samples.checkpoints),
+    "eval: text": Reader(_points, "truth.xyz", samples.tables),
+    "eval: array": Reader(_points, "truth.npy", samples.arrays),
+    "eval: points": Reader(_points, "truth.ply", samples.meshes),
+    "eval: mesh": Reader(_mesh, "mesh.ply", samples.meshes),
     "load": Reader(_load, "map.safetensors", samples.maps, samples.hostile_map),
     "read_scans": Reader(_scans, "scans.npz", samples.scans, samples.hostile_scans),
     "read_pcd": Reader(_pcd, "scan.pcd", samples.clouds),

@@ -26,12 +26,17 @@ ENCODINGS = {"tri-quadtree": _core.Encoding.TRI_QUADTREE, "octree": _core.Encodi
 _SURFACE_POINTS = 8000
 _OFTEN = 100_000  # larger batches only once for each type: the reference takes a minute for a million points
 _EXTENT_M = 8.0
+_LAST_M = ((1 << 20) - (1 << 12) - 1) * LEAF_M  # in the last cell of the lattice, as all levels have it
+OFFSETS_M = {"500 m away": 500.0, "last cells": _LAST_M}
+PLACES = ("anywhere", "on borders", "500 m away", "last cells")
 
 
 def points_of(place: str, count: int, dtype: Any, seed: int = 0) -> Array:
-    """Points (count, 3), m, on or beside occupied cells: anywhere, or on borders of cells and next to them."""
+    """Points (count, 3), m, on or beside occupied cells: anywhere, on borders of cells and next to them, or far out."""
     rng = np.random.default_rng([seed, count])
-    points = surface(rng, count, offset_m=500.0 if place == "500 m away" else 0.0).astype(dtype)
+    points = surface(rng, count, offset_m=OFFSETS_M.get(place, 0.0)).astype(dtype)
+    if place == "last cells":
+        points = np.minimum(points, dtype(_LAST_M))
     if place == "on borders":
         near = np.round(points / LEAF_M) * LEAF_M
         kind = rng.integers(4, size=points.shape)
@@ -186,7 +191,7 @@ def run(batches: tuple[int, ...] = BATCHES) -> None:
         print(f"\n## {isa}: interpolation, largest |error| / Σ|terms| over batches of {batches}\n")
         rows = []
         for (name, encoding), dtype, place in itertools.product(
-            ENCODINGS.items(), (np.float32, np.float64), ("anywhere", "on borders", "500 m away")
+            ENCODINGS.items(), (np.float32, np.float64), PLACES
         ):
             worst: dict[str, float] = {}
             for count in batches:

@@ -31,6 +31,8 @@ CASES: list[tuple[int, bool, dict[str, Any]]] = [
     (3_000_000, True, {}),
 ]
 """Returns, whether with intensities, settings."""
+WITHIN = 1.5
+MAX_GROWTH_MB = 8.0  # from a tenth of the fits to the last
 SHORT: dict[str, Any] = {"sdf_iterations": 60, "intensity_iterations": 72, "batch_size": 16384}
 """The peak is reached once most rows have moved: pages of zeros take no memory."""
 
@@ -75,12 +77,13 @@ def memory_of_fits(count: int, returns: int = 2000) -> list[float]:
     return found
 
 
-def run(largest: int, fits: int) -> None:
-    """Print the two tables."""
-    rows = []
+def run(largest: int, fits: int) -> bool:
+    """Print the two tables; whether the estimates are within the factor, and the fits leave nothing behind."""
+    rows, good = [], True
     for count, with_intensities, changes in CASES:
         if count <= largest:
             estimate, peak = peak_of_a_fit(count, with_intensities, changes)
+            good &= 1 / WITHIN < estimate.peak_memory_bytes / peak < WITHIN
             settings = ", ".join(f"{k} {v}" for k, v in changes.items()) or "default"
             rows.append(
                 [f"{count:,}", "yes" if with_intensities else "no", settings, f"{estimate.leaf_cells:,}"]
@@ -100,6 +103,7 @@ def run(largest: int, fits: int) -> None:
     found = memory_of_fits(fits)
     after = sorted({1, 2, max(1, fits // 10), max(1, fits // 2), fits})
     print(markdown(["fits in a row", "MB"], [[str(n), f"{found[n - 1]:.1f}"] for n in after]))
+    return good and found[-1] - max(found[: max(1, fits // 10)]) < MAX_GROWTH_MB
 
 
 if __name__ == "__main__":

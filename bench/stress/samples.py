@@ -16,7 +16,14 @@ import numpy as np
 import radarsdf
 import trimesh
 from radarsdf import FitConfig
+from radarsdf.checkpoint import Checkpoint
+from radarsdf.field import Field
+from radarsdf.fitting import occupied_leaf_keys
+from radarsdf.map import IntensityScale
 from radarsdf.readers import Scans, write_scans
+from radarsdf.scans import Rays, prepare
+from radarsdf.threads import Workers
+from radarsdf.training import Training
 
 _CONFIG = FitConfig(
     sdf_iterations=2, intensity_iterations=2, batch_size=64, intensity_batch_size=64, sdf_hidden=(4,),
@@ -51,6 +58,47 @@ def maps() -> list[bytes]:
             )
             found.append(path.read_bytes())
     return found
+
+
+@functools.cache
+def training() -> Training:
+    """One that the files of :func:`checkpoints` belong to, of the scans and the configuration of :func:`fit_of_checkpoints`."""
+    rays, config = fit_of_checkpoints()
+    keys = occupied_leaf_keys(rays, config, 1)
+    field = Field(keys, config, with_intensity=True, num_threads=1)
+    return Training(field, rays, rays, IntensityScale.of(rays.intensities), config, Workers(1))
+
+
+@functools.cache
+def fit_of_checkpoints() -> tuple[Rays, FitConfig]:
+    """Rays and configuration."""
+    scans = _small_scans(True)
+    return prepare(scans.points, scans.poses, scans.intensities, **_CONFIG.preparation), _CONFIG
+
+
+@functools.cache
+def checkpoints() -> list[bytes]:
+    """The state of a training before its first iteration."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "state"
+        Checkpoint(path, *fit_of_checkpoints()).write(training().state())
+        return [path.read_bytes()]
+
+
+@functools.cache
+def tables() -> list[bytes]:
+    """Points as text."""
+    rows = np.random.default_rng(3).normal(size=(9, 3)).tolist()
+    return [
+        "".join(" ".join(map(str, row)) + "\n" for row in rows).encode(),
+        b"# x y z r\n1 2 3 4\n5 6 7 8e-3\n",
+    ]
+
+
+def arrays() -> list[bytes]:
+    """Points as a NumPy file."""
+    rng = np.random.default_rng(4)
+    return [_npy(rng.normal(size=(9, 3)).astype(dtype)) for dtype in (np.float32, np.float64, np.int16)]
 
 
 def hostile_map(rng: np.random.Generator) -> bytes:

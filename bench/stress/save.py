@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A process that saves two maps to one file by turns is killed: the file is always one of the two, whole."""
+"""A process that saves two maps to one file by turns is killed, and disks are full: the file is always one of the two."""
 
 from __future__ import annotations
 
+import errno
+import os
 import signal
 import subprocess
 import sys
@@ -74,11 +76,55 @@ def _content(path: Path) -> bytes:
     return b"".join(array.tobytes() for array in numbers)
 
 
+def fill_disk(folder: Path) -> list[int]:
+    """Saves a map onto disks of ever more pages, on each of which an older one lies; the sizes for which there was no room.
+
+    Raises
+    ------
+    AssertionError
+        If after an error the old map is not whole, or anything else is there; or after none, the new one.
+    PermissionError
+        If this process may not mount a disk.
+    """
+    old, new = samples.maps()
+    (folder / "new").write_bytes(new)
+    radar_map = radarsdf.load(folder / "new")
+    disk, refused = folder / "disk", []
+    disk.mkdir()
+    target, page = disk / "map.safetensors", os.sysconf("SC_PAGESIZE")
+    for pages in range(-(-len(old) // page), -(-(len(old) + len(new)) // page) + 3):
+        options = ["mount", "-t", "tmpfs", "-o", f"size={pages * page}", "tmpfs", str(disk)]
+        if subprocess.run(options, check=False, capture_output=True).returncode:
+            raise PermissionError(*options)
+        try:
+            target.write_bytes(old)
+            try:
+                radar_map.save(target)
+            except OSError as error:
+                if error.errno != errno.ENOSPC:
+                    raise
+                assert target.read_bytes() == old
+                refused.append(pages)
+            else:
+                assert _content(target) == _content(folder / "new")
+            assert [path.name for path in disk.iterdir()] == [target.name]
+        finally:
+            subprocess.run(["umount", str(disk)], check=True)
+    return refused
+
+
 def run(kills: int) -> None:
-    """Print what the file was after each kill."""
+    """Print what the file was after each kill, and on full disks."""
     with tempfile.TemporaryDirectory() as folder:
         found, left = kill_savers(Path(folder), kills)
     rows = [[str(kills), *map(str, found), "0", str(left)]]
     print(
         markdown(["kills", "first version", "second version", "anything else", "temporary files left"], rows)
     )
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            refused = fill_disk(Path(folder))
+        except (PermissionError, FileNotFoundError) as error:
+            print(f"no full disk: {error}")
+            return
+    print(f"disks of {refused[0]} to {refused[-1]} pages were full: the old map stayed, and nothing else")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.config import FitConfig
+from radarsdf.durations import SECONDS, shared, work_of
 from radarsdf.kernels import FEATURE_DIM
 from radarsdf.scans import Rays, prepare
 from radarsdf.schedule import Schedule
@@ -32,9 +33,6 @@ _COPIES = 4  # of each parameter: itself, two moments, the last good one; where 
 _PER_ROW = 8.0  # where only the touched rows do
 _PER_VOXEL = 220.0
 
-# Orders of magnitude, of one processor of 2023 on a quiet machine. Seconds.
-_RETURN_S, _CELL_S, _SAMPLE_S, _ROW_S = 1e-6, 1.5e-6, 1.2e-6, 2e-8
-
 _SAMPLE = 50_000  # returns whose cells are counted
 _COLUMN = 16  # leaf cells: edge of the pieces of space that are in the sample as a whole
 
@@ -46,7 +44,8 @@ class Estimate:
     peak_memory_bytes: int
     """Over what the process has before; within a factor of 1.5 on scans like those it was measured on."""
     seconds: float
-    """An order of magnitude: nothing is known of the machine but its threads."""
+    """On a quiet machine like the one it was measured on within a factor of 2; of others only the number of processors is
+    known."""
     returns: int
     """Within the ranges."""
     leaf_cells: int
@@ -92,16 +91,16 @@ def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
     count, threads = len(rays), resolve_num_threads(config.num_threads)
     cells, rows = _count_cells(rays, config)
     schedule = _schedule(rays, rows, config)
-    iterations = schedule.iterations
-    samples = iterations["sdf"] * schedule.batch_size + iterations["intensity"] * config.intensity_batch_size
-    seconds = count * _RETURN_S + cells * _CELL_S + samples * _SAMPLE_S * _sample_bytes(config) / 1700
+    work = work_of(
+        config, schedule, returns=count, cells=cells, rows=rows, with_intensity=rays.intensities is not None
+    )
     return Estimate(
         peak_memory_bytes=_fit_bytes(rays, cells, rows, config),
-        seconds=seconds / threads + rows * _ROW_S * iterations["sdf"],
+        seconds=sum(SECONDS[kind] * amount for kind, amount in shared(work, threads).items()),
         returns=count,
         leaf_cells=cells,
         vertices=rows,
-        iterations=iterations,
+        iterations=schedule.iterations,
     )
 
 

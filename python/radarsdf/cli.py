@@ -9,19 +9,22 @@ import ast
 import platform
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 
 import radarsdf
 from radarsdf import FitConfig, Interrupted, RadarMap, _core
 from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
 from radarsdf.picture import save_picture
 from radarsdf.readers import Scans, read_scans, write_scans
+from radarsdf.stopping import whole_import
+
+with whole_import():
+    import trimesh
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -254,7 +257,7 @@ def _eval(options: argparse.Namespace) -> None:
         msg = f"{options.truth} has no lidar_points; --holdout N evaluates intensities"
         raise ValueError(msg)
     if ground_truth is not None:
-        mesh = radar_map.mesh() if radar_map else trimesh.load_mesh(options.what, process=False)
+        mesh = radar_map.mesh() if radar_map else _read_mesh(options.what)
         print(format_metrics(surface_metrics(mesh, ground_truth, box=_box(options), samples=options.samples)))
     if options.holdout and radar_map is not None and scans is not None:
         train, test = holdout(len(scans.points), options.holdout)
@@ -263,14 +266,34 @@ def _eval(options: argparse.Namespace) -> None:
 
 def _read_points(path: Path) -> np.ndarray[Any, Any]:
     if path.suffix == ".npy":
-        return np.asarray(np.load(path, allow_pickle=False), np.float64)
+        return np.asarray(_whole(path, lambda: np.asarray(np.load(path, allow_pickle=False), np.float64)))
     if path.suffix in (".xyz", ".txt", ".csv"):
-        return np.loadtxt(path, delimiter="," if path.suffix == ".csv" else None, ndmin=2)[:, :3]
-    vertices = getattr(trimesh.load(path, process=False), "vertices", None)
+        delimiter = "," if path.suffix == ".csv" else None
+        return np.asarray(_whole(path, lambda: np.loadtxt(path, delimiter=delimiter, ndmin=2)[:, :3]))
+    vertices = _whole(path, lambda: getattr(trimesh.load(path, process=False), "vertices", None))
     if vertices is None:  # a scene of several geometries
         msg = f"{path} is not one cloud or mesh"
         raise ValueError(msg)
     return np.asarray(vertices)
+
+
+def _read_mesh(path: Path) -> trimesh.Trimesh:
+    mesh = _whole(path, lambda: trimesh.load_mesh(path, process=False))
+    if isinstance(mesh, trimesh.Trimesh) and np.ndim(mesh.faces) == 2:
+        return mesh
+    msg = f"{path} is not one mesh"
+    raise ValueError(msg)
+
+
+def _whole(path: Path, read: Callable[[], Any]) -> Any:
+    """What `read` gives; other libraries raise anything where a damaged file breaks off."""
+    try:
+        return read()
+    except OSError:
+        raise
+    except Exception as error:
+        msg = f"{path} cannot be read: {error}"
+        raise ValueError(msg) from error
 
 
 def _world(scans: Scans, config: FitConfig) -> tuple[Any, Any, Any]:

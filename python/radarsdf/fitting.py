@@ -81,7 +81,7 @@ def fit(
     --------
     >>> import radarsdf
     >>> scans = radarsdf.simulate.wall(frames=4)
-    >>> radar_map = radarsdf.fit(scans.points, scans.poses, scans.intensities)
+    >>> radar_map = radarsdf.fit(scans.points, scans.poses)  # and scans.intensities, for radar_map.intensity(...)
     >>> distance_m = radar_map.sdf(scans.poses[:, :3, 3])  # of the sensor's positions: all in free space
     >>> bool((distance_m > 0).all())
     True

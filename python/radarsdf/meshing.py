@@ -5,11 +5,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._checks import MAX_POSITION_M, positive, real_array
@@ -17,6 +17,10 @@ from radarsdf.budget import check_mesh
 from radarsdf.isosurface import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map import evaluate
 from radarsdf.picture import intensity_colors
+from radarsdf.stopping import whole_import
+
+with whole_import():
+    import trimesh
 
 if TYPE_CHECKING:
     from radarsdf.config import FitConfig
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
 
 _MAX_VOXELS = 2**30  # of which some are the same; coordinates, and rows of corners, are int32
 _CLEARLY = 0.25  # of a leaf cell. Measured on four scenes: 0.1 loses no triangle that 0 lost, and 0.25 keeps half the cells
+_PART = 1 << 21  # numbers that NumPy is given at a time
 _INWARD = 1e-3  # of a voxel: how far corners on the map's border are moved into it to be evaluated
 
 
@@ -162,13 +167,18 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
         raise ValueError(msg)
     even = math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
     check_mesh(len(cells) * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
-    if even:
-        part = np.stack(np.meshgrid(*[np.arange(parts, dtype=np.int32)] * 3, indexing="ij"), -1)
-        return (cells[:, None, :] * np.int32(parts) + part.reshape(1, -1, 3)).reshape(-1, 3)
-    # Points of the cell no further apart than a voxel, from one end to the other, fall into each voxel that overlaps it.
+    # Where they are not even: points of the cell no further apart than a voxel, from one end to the other, fall into each
+    # voxel that overlaps it.
     ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
-    inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    return np.floor((cells[:, None, :] + inside) * (leaf_size_m / voxel_size)).astype(np.int32).reshape(-1, 3)
+    steps = np.arange(parts, dtype=np.int32) if even else ends
+    inside = np.stack(np.meshgrid(*[steps] * 3, indexing="ij"), -1).reshape(1, -1, 3)
+    voxels = np.zeros((len(cells), *inside.shape[1:]), np.int32)
+    for some in _parts(len(cells), inside.size):
+        if even:
+            voxels[some] = cells[some, None, :] * np.int32(parts) + inside
+        else:
+            voxels[some] = np.floor((cells[some, None, :] + inside) * (leaf_size_m / voxel_size))
+    return voxels.reshape(-1, 3)
 
 
 def _corner_distances(
@@ -185,24 +195,37 @@ def _corner_distances(
     jump. It is evaluated a hair inside one of its own voxels instead. A corner further out, as voxels have that do not
     divide the cells, is moved until it is inside, and the way is added to its distance.
     """
-    field = radar_map.field
-    corner_points = corners.astype(np.float32) * np.float32(voxel_size)
-    points = corner_points.copy()
-    outside = ~evaluate(field.cells.occupied, torch.from_numpy(points)).numpy()
-    on_border = outside[voxel_corners].any(axis=1)
-    voxels, voxel_corners = voxels[on_border], voxel_corners[on_border]
-    for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
-        voxel, corner = np.nonzero(outside[voxel_corners])
-        moved = voxel_corners[voxel, corner]  # a corner of several voxels several times: the last one counts
-        centres = (voxels[voxel].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-        points[moved] = corner_points[moved] + np.float32(share) * (centres - corner_points[moved])
-        outside[moved] = ~evaluate(field.cells.occupied, torch.from_numpy(points[moved])).numpy()
-    way_m = np.linalg.norm(points - corner_points, axis=1).astype(np.float32)
+    occupied = radar_map.field.cells.occupied
+    points = corners.astype(np.float32) * np.float32(voxel_size)
+    outside = ~evaluate(occupied, torch.from_numpy(points)).numpy()
+    # The voxel that a corner is moved into: of several the last. NumPy lets the last of equal indices count.
+    owners = np.zeros(len(corners), np.int32)
+    for part in _parts(len(voxels)):
+        owners[voxel_corners[part].reshape(-1)] = np.repeat(
+            np.arange(part.start, part.stop, dtype=np.int32), 8
+        )
+    moved = np.flatnonzero(outside)
+    way_m = np.zeros(len(moved), np.float32)
+    for part in _parts(len(moved)):
+        corner = points[moved[part]]
+        centres = (voxels[owners[moved[part]]].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+        place, left = corner.copy(), np.arange(len(corner))
+        for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
+            place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
+            left = left[~evaluate(occupied, torch.from_numpy(place[left])).numpy()]
+        points[moved[part]] = place
+        way_m[part] = np.linalg.norm(place - corner, axis=1)
     values: NDArray[np.float32] = evaluate(
         radar_map.local_sdf, torch.from_numpy(points), description="mesh", progress=progress
     ).numpy()
-    values += np.copysign(way_m, values)
+    values[moved] += np.copysign(way_m, values[moved])
     return values
+
+
+def _parts(count: int, numbers: int = 8) -> Iterator[slice]:
+    """Slices of [0, count), of so many numbers for each, that are short enough for Ctrl-C not to wait for NumPy."""
+    step = max(1, _PART // numbers)
+    return (slice(first, min(first + step, count)) for first in range(0, count, step))
 
 
 def _without_small_components(

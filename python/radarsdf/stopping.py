@@ -65,3 +65,15 @@ def deferred_interrupts() -> Iterator[Callable[[], bool]]:
         yield lambda: pressed
     finally:
         signal.signal(signal.SIGINT, usual)
+
+
+@contextmanager
+def whole_import() -> Iterator[None]:
+    """For the import of a library that takes any exception within for a part that is missing: Ctrl-C comes after it.
+
+    trimesh does so. It would go on without the part, and nobody would learn that Ctrl-C was pressed.
+    """
+    with deferred_interrupts() as pressed:
+        yield
+    if pressed():
+        raise KeyboardInterrupt

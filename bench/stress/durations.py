@@ -1,0 +1,161 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""How long fits take, against the estimate that is made before; and the constants of the estimate, measured anew."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import radarsdf
+from radarsdf import FitConfig, durations
+from radarsdf.schedule import Schedule
+from scipy.optimize import nnls
+
+from bench.growth.street import street
+from bench.paper.report import markdown
+
+WITHIN = 2.0
+PRESETS: dict[str, Callable[..., FitConfig]] = {
+    "default": FitConfig,
+    "quick": FitConfig.quick,
+    "paper": FitConfig.paper,
+}
+SHORT: dict[str, Any] = {"sdf_iterations": 100, "intensity_iterations": 300}
+CASES: list[tuple[int, bool, str, dict[str, Any]]] = [
+    (10_000, True, "default", {}),
+    (30_000, False, "default", {}),
+    (30_000, True, "default", {"num_threads": 1}),
+    (30_000, True, "default", {"joint": False}),
+    (30_000, True, "default", SHORT | {"encoding": "octree"}),
+    (30_000, True, "default", SHORT | {"sdf_hidden": (128, 128), "intensity_hidden": (128, 128, 128)}),
+    (30_000, True, "default", SHORT | {"num_levels": 6, "fourier_count": 16}),
+    (30_000, True, "default", SHORT | {"batch_size": 32768, "intensity_batch_size": 32768}),
+    (10_000, True, "paper", SHORT),
+    (100_000, False, "paper", SHORT | {"num_threads": 1}),
+    (100_000, True, "default", {}),
+    (100_000, False, "default", {"num_threads": 1}),
+    (100_000, False, "quick", {}),
+    (300_000, False, "default", {"sdf_iterations": 300}),
+    (300_000, False, "default", {"sdf_iterations": 50, "row_updates": False}),
+    (300_000, False, "quick", {"num_threads": 1}),
+    (1_000_000, False, "quick", {}),
+    (1_000_000, False, "default", {"sdf_iterations": 100, "drop_ghosts": False}),
+    (1_000_000, True, "default", SHORT),
+    (1_000_000, False, "default", {"sdf_iterations": 20, "leaf_size_m": 0.8, "num_threads": 1}),
+]
+"""Returns, whether with intensities, preset, settings."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """What was expected of a fit, and what it took."""
+
+    estimated_s: float
+    work: dict[str, float]
+    """As counted before."""
+    wall_s: float
+    processor_s: float
+    """Of all threads: it hardly depends on what else the machine does."""
+
+
+def measured(
+    count: int, with_intensities: bool, preset: str, changes: dict[str, Any], repetitions: int
+) -> Fit:
+    """The fastest of so many fits, each in its own process."""
+    case = json.dumps([count, with_intensities, preset, changes])
+    command = [sys.executable, "-m", "bench.stress.durations", case]
+    fits = []
+    for _ in range(repetitions):
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        fits.append(Fit(**json.loads(done.stdout)))
+    least_s = min(fit.processor_s for fit in fits)
+    return dataclasses.replace(min(fits, key=lambda fit: fit.wall_s), processor_s=least_s)
+
+
+def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str, Any]) -> None:
+    scene = street(count)
+    returns = (scene.points, scene.poses, scene.intensities if with_intensities else None)
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
+    config = PRESETS[preset](**settings)
+    estimate = radarsdf.estimate(*returns, config=config)
+    schedule = Schedule.of(
+        config,
+        surface_returns=estimate.returns,
+        returns=estimate.returns,
+        vertices=estimate.vertices,
+        with_intensity=with_intensities,
+    )
+    work = durations.work_of(
+        config,
+        schedule,
+        returns=estimate.returns,
+        cells=estimate.leaf_cells,
+        rows=estimate.vertices,
+        with_intensity=with_intensities,
+    )
+    # What PyTorch sets up in a process's first steps is no part of the estimate.
+    small, tiny = street(2000), FitConfig(sdf_iterations=5, intensity_iterations=10)
+    radarsdf.fit(small.points, small.poses, small.intensities, config=tiny, progress=False)
+    wall_s, processor_s = time.perf_counter(), time.process_time()
+    radarsdf.fit(*returns, config=config, progress=False)
+    wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s
+    print(json.dumps(dataclasses.asdict(Fit(estimate.seconds, work, wall_s, processor_s))))
+
+
+def constants(fits: list[Fit]) -> dict[str, float]:
+    """Of each kind of work the seconds, none negative, that leave the least sum of squared relative errors."""
+    kinds = list(durations.SECONDS)
+    shares = np.array([[fit.work[kind] / fit.processor_s for kind in kinds] for fit in fits])
+    scale = shares.max(axis=0).clip(1e-30)
+    found, _ = nnls(shares / scale, np.ones(len(shares)))
+    return dict(zip(kinds, (found / scale).tolist(), strict=True))
+
+
+def run(largest: int, repetitions: int) -> bool:
+    """Print the table, and the constants that would fit it best; whether all estimates are within the factor."""
+    cases = [case for case in CASES if case[0] <= largest]
+    fits = []
+    for case in cases:
+        fits.append(measured(*case, repetitions))
+        print(f"{case}: {fits[-1].wall_s:.1f} s", flush=True)
+    anew = constants(fits)
+    rows, good = [], True
+    for (count, with_intensities, preset, changes), fit in zip(cases, fits, strict=True):
+        settings = ", ".join([preset, *(f"{k} {v}" for k, v in changes.items())])
+        estimated_s, anew_s = (
+            sum(seconds[kind] * fit.work[kind] for kind in seconds) for seconds in (durations.SECONDS, anew)
+        )
+        ratios = [fit.estimated_s / fit.wall_s, estimated_s / fit.processor_s]
+        good &= all(1 / WITHIN < ratio < WITHIN for ratio in ratios)
+        rows.append(
+            [f"{count:,}", "yes" if with_intensities else "no", settings, f"{fit.wall_s:.2f}"]
+            + [f"{fit.estimated_s:.2f}", f"{ratios[0]:.2f}", f"{fit.processor_s:.2f}", f"{ratios[1]:.2f}"]
+            + [f"{anew_s / fit.processor_s:.2f}"]
+        )
+    columns = [
+        "returns",
+        "intensities",
+        "settings",
+        "fit, s",
+        "estimate, s",
+        "ratio",
+        "processor, s",
+        "ratio",
+    ]
+    print(markdown([*columns, "calibrated"], rows))
+    print("calibrated:\n\nSECONDS = {")
+    for kind, value in anew.items():
+        print(f'    "{kind}": {value:.2g},')
+    print("}")
+    return good
+
+
+if __name__ == "__main__":
+    _measure(*json.loads(sys.argv[1]))

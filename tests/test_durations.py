@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a fit has to do is counted as it is done; how long that takes is for `python -m bench.stress durations`."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig, durations
+from radarsdf.schedule import Schedule
+from torch import nn
+
+BOTH = FitConfig(sdf_iterations=100, intensity_iterations=300, batch_size=1000, intensity_batch_size=500)
+NAMES = [f.name for f in dataclasses.fields(FitConfig)]
+
+
+def work(config=BOTH, *, with_intensity=True, **changes):
+    settings = {k: v for k, v in changes.items() if k in NAMES}
+    counts = {"returns": 1000, "cells": 3000, "rows": 2000} | {
+        k: v for k, v in changes.items() if k not in NAMES
+    }
+    config = dataclasses.replace(config, **settings)
+    schedule = Schedule.of(
+        config, surface_returns=counts["returns"], returns=counts["returns"], vertices=counts["rows"],
+        with_intensity=with_intensity,
+    )  # fmt: skip
+    return durations.work_of(config, schedule, with_intensity=with_intensity, **counts)
+
+
+def test_all_that_is_counted_has_its_seconds():
+    assert work().keys() == durations.SECONDS.keys()
+    assert all(seconds >= 0 for seconds in durations.SECONDS.values())
+    assert all(np.isfinite(amount) and amount >= 0 for amount in work().values())
+
+
+@pytest.mark.parametrize("config", [FitConfig(), FitConfig.paper(), FitConfig(encoding="octree")])
+def test_multiplications_are_those_of_the_networks(scene, config):
+    config = dataclasses.replace(
+        config, sdf_iterations=1, intensity_iterations=1, normals=False, batch_size=64
+    )
+    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+    encoding, *products = durations.widths(config)
+    assert encoding == radar_map.field.cells.dim + radar_map.field.fourier.dim
+    for network, product in zip(
+        (radar_map.field.sdf_network, radar_map.field.intensity_network), products, strict=True
+    ):
+        found = sum(layer.weight.numel() for layer in network.modules() if isinstance(layer, nn.Linear))
+        assert product == pytest.approx(found, rel=0.05)  # of inputs that few numbers make, all are counted
+
+
+def test_what_makes_more_work():
+    base = work()
+    assert work(sdf_iterations=200, intensity_iterations=600)["iteration"] == 2 * base["iteration"]
+    assert base["iteration"] == 300  # the first 100 are of both networks
+    assert work(joint=False)["iteration"] == 400
+    assert work(with_intensity=False)["iteration"] == 100
+    for changes in (
+        {"batch_size": 2000},
+        {"intensity_batch_size": 1000},
+        {"sdf_hidden": (64, 64)},
+        {"intensity_hidden": (128, 128)},
+        {"normals": True},
+        {"intensity_in_free_space": True},
+    ):
+        assert work(**changes)["multiplication"] > base["multiplication"], changes
+    for changes in ({"num_levels": 6}, {"fourier_count": 16}, {"batch_size": 2000}):
+        assert work(**changes)["encoded number"] > base["encoded number"], changes
+    assert base["moved row"] == 0 < work(row_updates=False)["moved row"] == 100 * 2000
+    assert work(normals=True)["moved row"] > 0  # as Training does
+    assert (work(drop_ghosts=False)["ghost"], base["ghost"]) == (0, 1000)
+    quick = FitConfig.quick()
+    assert work(quick, with_intensity=False)["averaged return"] == 1000
+    assert work(quick, with_intensity=False)["iteration"] == 0
+
+
+def test_threads_share_what_can_be_shared_as_far_as_there_are_processors(monkeypatch):
+    monkeypatch.setattr(durations, "processors", lambda: 4)
+    base = work()
+    for threads, share in ((1, 1), (2, 2), (4, 4), (64, 4)):
+        shared = durations.shared(base, threads)
+        assert shared["multiplication"] == base["multiplication"] / share
+        assert shared["iteration"] == base["iteration"]
+
+
+def test_the_estimate_is_the_sum(scene):
+    config = dataclasses.replace(BOTH, num_threads=1, drop_ghosts=False)
+    estimate = radarsdf.estimate(scene.points, scene.poses, scene.intensities, config=config)
+    counted = work(config, returns=estimate.returns, cells=estimate.leaf_cells, rows=estimate.vertices)
+    assert estimate.seconds == pytest.approx(sum(durations.SECONDS[k] * v for k, v in counted.items()))
