@@ -44,8 +44,9 @@ class _MLP(torch.autograd.Function):
         inputs = tensors[2 * num_layers :]
         out = inputs[0].new_empty((inputs[0].shape[0], tensors[2 * num_layers - 1].shape[0]))
         keep = any(ctx.needs_input_grad)
-        ctx.views = _views(num_layers, tensors)
-        ctx.hidden = _core.mlp(*ctx.views, out.numpy(), keep, threads())
+        views = _views(num_layers, tensors)
+        ctx.hidden = _core.mlp(*views, out.numpy(), keep, threads())
+        ctx.views = views
         ctx.save_for_backward(*tensors)
         ctx.num_layers = num_layers
         return out
@@ -69,8 +70,9 @@ class _MLP(torch.autograd.Function):
             for i, (t, w) in enumerate(zip(tensors, wanted, strict=True))
         ]
         views: list[Any] = [None if g is None else g.numpy() for g in grads]
+        given: tuple[list[Any], list[Any], list[Any]] = ctx.views
         _core.mlp_backward(
-            *ctx.views,
+            *given,
             ctx.hidden,
             rows_view(out_grad),
             views[:split:2] if by_layers else None,
