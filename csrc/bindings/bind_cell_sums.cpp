@@ -62,7 +62,28 @@ void bind_cell_sums(py::module_& m) {
           },
           "keys"_a.noconvert(), "values"_a.noconvert(), "weight"_a, "num_threads"_a = 0,
           "For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that "
-          "shares a face counts `weight` times, an edge its square, a corner its cube.");
+          "shares a face counts `weight` times, an edge its square, a corner its cube.")
+      .def(
+          "interpolate",
+          [](const CellBlocks& cells, double cell_size_m, const Array<float>& values, const Array<float>& points,
+             int num_threads) {
+            const py::ssize_t count = points.ndim() == 2 ? points.shape(0) : 0;
+            check_shape(points, count, 3, "points");
+            if (check_column(values, "values") != cells.size()) {
+              throw std::invalid_argument("values must be one for each cell");
+            }
+            py::array_t<float> interpolated(count);
+            const float *v = values.data(), *p = points.data();
+            float* result = interpolated.mutable_data();
+            {
+              const py::gil_scoped_release release;
+              interpolate_cells(cells, cell_size_m, v, p, count, result, num_threads);
+            }
+            return interpolated;
+          },
+          "cell_size_m"_a, "values"_a.noconvert(), "points"_a.noconvert(), "num_threads"_a = 0,
+          "`values` (C,) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 where "
+          "there is no cell: (N,).");
   m.def(
       "sum_moments",
       [](const Array<float>& points, const Array<float>& directions, const Array<std::int32_t>& cells,

@@ -37,6 +37,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "near_samples": (1, MAX_SAMPLES),
     "free_samples": (0, MAX_SAMPLES),
     "near_band_m": _POSITIVE,
+    "truncation_m": _POSITIVE,
     "free_from": (0, 1 - sys.float_info.epsilon),
     "free_beyond_m": _FROM_0,
     "cross_range_noise_rad": _FROM_0,
@@ -126,6 +127,8 @@ class FitConfig:
     with `enough_sdf_iterations` 0.5 and 0.8 on real scans, 0.0 to -0.2 on whole simulated ones)."""
     start: Literal["noise", "average"] = "noise"
     """What training starts from: noise (3QFP), or the rays' average of truncated distances, which only an octree holds."""
+    truncation_m: float = 0.6
+    """How far before and behind its return a ray counts in that average, and where it cuts distances, m."""
     fourier_half_width_m: float = 409.6
     """Half of the longest Fourier wavelength, m (3QFP: 2^12 · 0.2 m / 2)."""
     fourier_first: int = 0
@@ -295,7 +298,7 @@ class FitConfig:
             "fourier_count": 0,
             "bridge_cells": 0,
             "sdf_hidden": (2,),
-            "near_band_m": 0.6,
+            "near_band_m": 0.4,
             "start": "average",
             "sdf_iterations": 0,
             "joint": False,

@@ -117,14 +117,24 @@ def _check_scans(
             if value.shape != (len(scan),):
                 msg = f"intensities of scan {i} must have shape ({len(scan)},), not {value.shape}"
                 raise ValueError(msg)
-    bad = [~(np.abs(scan) <= MAX_POSITION_M).all(axis=1) for scan in scans]
-    if values is not None:
-        bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
-    if count := sum(int(b.sum()) for b in bad):
+    if not all((np.abs(scan) <= MAX_POSITION_M).all() for scan in scans) or not all(
+        np.isfinite(value).all() for value in values or ()
+    ):
+        bad = [~(np.abs(scan) <= MAX_POSITION_M).all(axis=1) for scan in scans]
+        if values is not None:
+            bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
+        count = sum(int(b.sum()) for b in bad)
         first = next(i for i, b in enumerate(bad) if b.any())
         msg = f"{count} of {sum(map(len, scans))} returns are not finite, the first in scan {first}: remove them"
         raise ValueError(msg)
     return scans, values
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of vectors (N, 3): the same numbers as np.linalg.norm's, whose sums over three numbers take five times as long."""
+    x, y, z = vectors.T
+    lengths: NDArray[np.float64] = np.sqrt(x * x + y * y + z * z)
+    return lengths
 
 
 def prepare(
@@ -176,7 +186,7 @@ def prepare(
     for i, scan in enumerate(scans):
         first = i - i % accumulate_frames
         middle = (first + min(first + accumulate_frames, len(scans)) - 1) // 2
-        ranges = np.linalg.norm(scan, axis=1)
+        ranges = _lengths(scan)
         # A return at the sensor itself has no direction.
         keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= max_range_m)
         local = scan[keep] @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
@@ -190,7 +200,7 @@ def prepare(
         msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {max_range_m} m"
         raise ValueError(msg)
     rays = local_points - np.concatenate(kept_origins)
-    ranges = np.maximum(np.linalg.norm(rays, axis=1), 1e-6)
+    ranges = np.maximum(_lengths(rays), 1e-6)
     intensity = np.concatenate(kept_values) if values is not None else None
     if intensity is not None and intensity.min() == intensity.max():
         msg = f"all intensities are {intensity[0]}: leave them out where the sensor does not measure them"

@@ -192,6 +192,8 @@ class Training:
         self.iterations = schedule.iterations
         self.passes = schedule.passes
         parts = min(workers.num_threads, len(surface), schedule.batch_size, config.intensity_batch_size)
+        if not any(self.iterations.values()):
+            parts = 0  # nobody will draw a sample
         self._shards = [
             _Shard(field, surface, returns, scale, config, schedule, part, parts) for part in range(parts)
         ]
@@ -295,6 +297,8 @@ class Training:
         pauses: _Pauses,
         rows: RowAdam | None = None,
     ) -> None:
+        if iterations == 0:
+            return
         parameters = [p for adam in adams for p in adam.parameters]
         changing = [*parameters, *([] if rows is None else [rows.features])]
         kept = [p.detach().clone() for p in changing]
