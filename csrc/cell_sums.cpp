@@ -10,7 +10,6 @@
 
 #include "bits.hpp"
 #include "cell.hpp"
-#include "cell_walk.hpp"
 #include "morton.hpp"
 #include "parallel.hpp"
 
@@ -160,10 +159,12 @@ void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float*
   const auto size_m = static_cast<float>(cell_size_m);
   std::atomic<bool> inside{true};
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    BlocksRound round(cells);
+    std::uint64_t block_key = kEmptyKey;  // neighbours are often of the same block
+    const Occupancy* block = nullptr;
     for (std::int64_t i = begin; i < end; ++i) {
       float share[3];
       std::int32_t lower[3];
+      std::uint64_t parts[3][2];  // of keys
       for (int axis = 0; axis < 3; ++axis) {
         const float u = points[3 * i + axis] / size_m - 0.5F;
         if (!(std::abs(u) < static_cast<float>(kAxisBias - (1 << kMaxLevels)))) {
@@ -172,19 +173,26 @@ void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float*
         }
         const float whole = std::floor(u);
         share[axis] = u - whole;
-        lower[axis] = static_cast<std::int32_t>(whole);
+        lower[axis] = static_cast<std::int32_t>(whole) + kAxisBias;
+        for (std::uint32_t step = 0; step < 2; ++step) {
+          parts[axis][step] = spread_bits(static_cast<std::uint32_t>(lower[axis]) + step) << axis;
+        }
       }
-      round.move_to(CellBlocks::block_key(lattice_key(lower)));
       float sum = 0;
       for (int corner = 0; corner < 8; ++corner) {
         float weight = 1;
-        std::int32_t cell[3];
+        std::uint64_t key = 0;
         for (int axis = 0; axis < 3; ++axis) {
           const int step = corner >> (2 - axis) & 1;
           weight *= step != 0 ? share[axis] : 1 - share[axis];
-          cell[axis] = ((lower[axis] + kAxisBias) & (kEdge - 1)) + step;
+          key |= parts[axis][step];
         }
-        const std::int32_t row = round.row(cell[0], cell[1], cell[2]);
+        if (CellBlocks::block_key(key) != block_key) {
+          block_key = CellBlocks::block_key(key);
+          const Occupancy* region = cells.region(CellBlocks::region_key(key));
+          block = region != nullptr ? cells.block(*region, block_key) : nullptr;
+        }
+        const std::int32_t row = block != nullptr ? block->row(key) : -1;
         if (row >= 0) sum += weight * values[row];
       }
       interpolated[i] = sum;

@@ -6,6 +6,7 @@
 #include "arrays.hpp"
 #include "cell_blocks.hpp"
 #include "cell_sums.hpp"
+#include "principal_axes.hpp"
 
 namespace radarsdf {
 namespace {
@@ -108,6 +109,25 @@ void bind_cell_sums(py::module_& m) {
       "Sums over the returns of each cell, (num_cells, 13): 1, x, y, z, xx, xy, xz, yy, yz, zz, direction. `points` "
       "and "
       "`directions` (N, 3) float32; `cells` (N,) int32, the row of each return's cell.");
+  m.def(
+      "principal_axes",
+      [](const Array<double>& matrices, int num_threads) {
+        if (matrices.ndim() != 3 || matrices.shape(1) != 3 || matrices.shape(2) != 3) {
+          throw std::invalid_argument("matrices must have shape (N, 3, 3)");
+        }
+        const py::ssize_t count = matrices.shape(0);
+        py::array_t<double> values({count, py::ssize_t{3}}), vectors({count, py::ssize_t{3}, py::ssize_t{3}});
+        const double* a = matrices.data();
+        double *w = values.mutable_data(), *v = vectors.mutable_data();
+        {
+          const py::gil_scoped_release release;
+          principal_axes(a, count, w, v, num_threads);
+        }
+        return std::make_pair(values, vectors);
+      },
+      "matrices"_a.noconvert(), "num_threads"_a = 0,
+      "Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3), in columns, of symmetric `matrices` (N, 3, 3) "
+      "float64.");
 }
 
 }  // namespace radarsdf

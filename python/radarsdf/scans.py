@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,13 +47,24 @@ class Rays:
 
     def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
         """Some of the rays."""
+        if isinstance(part, np.ndarray):  # rows that are taken by number: a third of the time of a mask or index
+            rows = np.flatnonzero(part) if part.dtype == np.bool_ else part
+
+            def chosen(array: NDArray[Any]) -> NDArray[Any]:
+                return array.take(rows, axis=0)
+
+        else:
+
+            def chosen(array: NDArray[Any]) -> NDArray[Any]:
+                return array[part]
+
         return dataclasses.replace(
             self,
-            points=self.points[part],
-            directions=np.ascontiguousarray(self.directions[part]),
-            ranges_m=np.ascontiguousarray(self.ranges_m[part]),
-            intensities=None if self.intensities is None else self.intensities[part],
-            scans=self.scans[part],
+            points=chosen(self.points),
+            directions=np.ascontiguousarray(chosen(self.directions)),
+            ranges_m=np.ascontiguousarray(chosen(self.ranges_m)),
+            intensities=None if self.intensities is None else chosen(self.intensities),
+            scans=chosen(self.scans),
         )
 
     def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -189,7 +201,9 @@ def prepare(
         ranges = _lengths(scan)
         # A return at the sensor itself has no direction.
         keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= max_range_m)
-        local = scan[keep] @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
+        if not keep.all():
+            scan = scan[keep]
+        local = scan @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
         kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))
         kept_scans.append(np.full(len(local), i, np.int32))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, CellSet, SurfelMap, cell_keys, sum_moments
+from radarsdf._core import CellBlocks, CellSet, SurfelMap, cell_keys, principal_axes, sum_moments
 from radarsdf.scans import Rays
 
 # Measured on simulated and real scans; see "What the levers of the surface are worth" in BENCHMARK.md.
@@ -18,6 +18,7 @@ _NEIGHBOUR_WEIGHT = 0.7  # of a cell that shares a face; its square over an edge
 _MIN_RETURNS = 12.0  # weighted, in the 27 cells of a plane
 _MAX_FLATNESS = 0.5  # smallest over middle variance: more is no plane
 _NOISE_RETURNS = 1_000_000  # tell the noise as well as more of them do
+_NOISE_RETURNS_TRIED = 20_000  # to 2 %, where time counts
 _GHOST_MARGIN_M = 0.1  # and
 _GHOST_SIGMAS = 2.0  # behind a surface: these two together keep noisy returns of the surface itself
 _MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there; a hedge lets most of them through
@@ -81,7 +82,7 @@ class Surfels:
         covariance = np.empty((len(means), 3, 3))
         for mean, (i, j) in zip(means[:, 3:].T, upper, strict=True):
             covariance[:, i, j] = covariance[:, j, i] = mean - centres[:, i] * centres[:, j]
-        variances, axes = np.linalg.eigh(covariance)
+        variances, axes = principal_axes(covariance, num_threads)
         normals = axes[:, :, 0]
         normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
         return cls(
@@ -120,7 +121,8 @@ class Surfels:
         flat = np.flatnonzero(self._is_flat(0.1))
         plane = self._plane_of_cell(flat)[self.cell_of_ray if cell_of_ray is None else cell_of_ray]
         used_rays = np.flatnonzero(plane >= 0)
-        used_rays = used_rays[:: -(-len(used_rays) // _NOISE_RETURNS) or 1]
+        most = _NOISE_RETURNS if cell_of_ray is None else _NOISE_RETURNS_TRIED
+        used_rays = used_rays[:: -(-len(used_rays) // most) or 1]
         sigma2 = np.array([0.1**2, 0.01**2])
         if len(used_rays) < 100:
             return BeamNoise(*np.sqrt(sigma2).tolist())
@@ -158,7 +160,7 @@ class Surfels:
         if tried is not None:
             rays, cell_of_ray, weights = rays.select(tried), cell_of_ray[tried], counts
             returns = np.bincount(cell_of_ray, weights, len(self.keys))
-        noise = self.noise(rays, cell_of_ray)
+        noise = self.noise(rays, None if tried is None else cell_of_ray)
         table = np.concatenate([self.centres, self.normals, np.sqrt(self.variances[:, :1])], 1)
         table = table.astype(np.float32)
 
