@@ -43,14 +43,14 @@ class CellRays:
         occupied.insert(points, num_threads)
         keys = occupied.sorted_keys(num_threads)
         rows = CellBlocks(keys).rows(cell_keys(points, cell_size_m, num_threads), num_threads)
-        moments = sum_moments(
-            points, np.ascontiguousarray(rays.directions), rows, len(keys), num_threads
-        )
+        moments = sum_moments(points, np.ascontiguousarray(rays.directions), rows, len(keys), num_threads)
         first = np.empty(len(keys), np.int64)
         first[rows[::-1]] = np.arange(len(rows) - 1, -1, -1)  # of several, the last one written counts
         # Of rays that cancel each other, the first.
         lengths = np.linalg.norm(moments[:, 10:], axis=1)[:, None]
-        directions = np.where(lengths > 1e-3, moments[:, 10:] / np.maximum(lengths, 1e-3), rays.directions[first])
+        directions = np.where(
+            lengths > 1e-3, moments[:, 10:] / np.maximum(lengths, 1e-3), rays.directions[first]
+        )
         return cls(
             keys=keys,
             first=first,
@@ -81,7 +81,11 @@ def start_from_average(
     the distance to the plane through the returns round its end; where they make no plane, to the plane across the ray.
     """
     plane = surfels.flat_plane_of(surfels.cell_of_ray[rays.first])
-    normals = np.where(plane[:, None] >= 0, surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0, -rays.directions)
+    normals = np.where(
+        plane[:, None] >= 0,
+        surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0,
+        -rays.directions,
+    )
     distances_m = field.cells.table.average_rays(
         rays.points,
         rays.directions,

@@ -95,7 +95,11 @@ def fit(
         clock.lap("prepare_s")
         with Workers(config.num_threads) as workers:
             surface, surfels = rays, None
-            averaged = CellRays.of(rays, config.leaf_size_m, workers.num_threads) if config.start == "average" else None
+            averaged = (
+                CellRays.of(rays, config.leaf_size_m, workers.num_threads)
+                if config.start == "average"
+                else None
+            )
             if config.drop_ghosts or averaged is not None:
                 surfels = Surfels.of(rays, workers.num_threads)
             if config.drop_ghosts and surfels is not None:
@@ -219,7 +223,9 @@ def _new_field(rays: Rays, averaged: CellRays | None, config: FitConfig, num_thr
         torch.manual_seed(config.seed)
         field = Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
         if averaged is None or config.sdf_iterations != 0 or rays.intensities is not None:
-            field.cells.initialise(config.feature_std)  # where nothing else is learnt, the average is all there is
+            field.cells.initialise(
+                config.feature_std
+            )  # where nothing else is learnt, the average is all there is
     return field
 
 

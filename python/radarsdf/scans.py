@@ -47,7 +47,9 @@ class Rays:
 
     def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
         """Some of the rays."""
-        if isinstance(part, np.ndarray):  # rows that are taken by number: a third of the time of a mask or index
+        if isinstance(
+            part, np.ndarray
+        ):  # rows that are taken by number: a third of the time of a mask or index
             rows = np.flatnonzero(part) if part.dtype == np.bool_ else part
 
             def chosen(array: NDArray[Any]) -> NDArray[Any]:
@@ -201,9 +203,8 @@ def prepare(
         ranges = _lengths(scan)
         # A return at the sensor itself has no direction.
         keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= max_range_m)
-        if not keep.all():
-            scan = scan[keep]
-        local = scan @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
+        kept = scan if keep.all() else scan[keep]
+        local = kept @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
         kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))
         kept_scans.append(np.full(len(local), i, np.int32))

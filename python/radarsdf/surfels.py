@@ -159,7 +159,7 @@ class Surfels:
         cell_of_ray, weights, returns = self.cell_of_ray, None, self.counts
         if tried is not None:
             rays, cell_of_ray, weights = rays.select(tried), cell_of_ray[tried], counts
-            returns = np.bincount(cell_of_ray, weights, len(self.keys))
+            returns = np.bincount(cell_of_ray, weights, len(self.keys)).astype(np.float64)
         noise = self.noise(rays, None if tried is None else cell_of_ray)
         table = np.concatenate([self.centres, self.normals, np.sqrt(self.variances[:, :1])], 1)
         table = table.astype(np.float32)
@@ -178,8 +178,8 @@ class Surfels:
             )
 
         def count(rows: NDArray[np.int32], of: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
-            result: NDArray[np.float64] = np.bincount(rows[of], None if weights is None else weights[of], size)
-            return result
+            counted = np.bincount(rows[of], None if weights is None else weights[of], size)
+            return counted.astype(np.float64)
 
         flat = np.flatnonzero(self._is_flat(_MAX_FLATNESS))
         first = crossed(flat, rays)
@@ -218,6 +218,6 @@ def support_of_cells(
     cells = CellBlocks(leaf_keys)
     rows = cells.rows(keys, num_threads)
     inside = rows >= 0
-    counts = np.bincount(rows[inside], None if counts is None else counts[inside], len(leaf_keys)).astype(np.float64)
-    sums = cells.sum_round(leaf_keys, counts[:, None], 1.0, num_threads)[:, 0]
+    returns = np.bincount(rows[inside], None if counts is None else counts[inside], len(leaf_keys))
+    sums = cells.sum_round(leaf_keys, returns.astype(np.float64)[:, None], 1.0, num_threads)[:, 0]
     return np.minimum(sums, np.iinfo(np.uint16).max).astype(np.uint16)
