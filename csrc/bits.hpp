@@ -23,6 +23,11 @@ inline int lowest_bit(std::uint32_t bits) {
 #endif
 }
 
+inline int lowest_bit(std::uint64_t bits) {
+  const auto low = static_cast<std::uint32_t>(bits);
+  return low != 0 ? lowest_bit(low) : 32 + lowest_bit(static_cast<std::uint32_t>(bits >> 32));
+}
+
 // Sums pairs, then fours, then bytes: the x86-64 baseline has no instruction for it and its library call is slower.
 inline int count_bits(std::uint64_t bits) {
   bits -= (bits >> 1) & 0x5555555555555555u;

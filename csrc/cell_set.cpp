@@ -7,7 +7,10 @@
 #include <cmath>
 #include <stdexcept>
 
+#include "bits.hpp"
 #include "cell.hpp"
+#include "cell_blocks.hpp"
+#include "cell_walk.hpp"
 #include "morton.hpp"
 #include "parallel.hpp"
 
@@ -40,38 +43,88 @@ void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uin
   if (!inside) throw std::invalid_argument("points must be finite and within a million cells of the origin");
 }
 
-template <typename T>
-void CellSet::insert(const T* points, std::int64_t count, int num_threads) {
-  std::vector<std::uint64_t> keys(static_cast<std::size_t>(count));
-  cell_keys(points, count, leaf_size_m_, keys.data(), num_threads);
+void CellSet::insert_keys(const std::vector<std::vector<std::uint64_t>>& parts, int num_threads) {
   const std::int64_t threads = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
   parallel_tasks(threads, num_threads, [&](std::int64_t task) {
-    std::uint64_t previous = kEmptyKey;  // points along one ray often share a cell
-    for (const std::uint64_t key : keys) {
-      if (key == previous) continue;
-      previous = key;
-      // Bits that FlatMap does not use for the slot, or the partitions would fill unevenly.
-      const std::uint64_t partition = (hash_key(key) >> 16) % kPartitions;
-      if (static_cast<std::int64_t>(partition) % threads == task) partitions_[partition].insert(key, 0);
+    std::uint64_t previous = kEmptyKey;  // points along one ray often share a block
+    std::uint64_t* mask = nullptr;
+    for (const std::vector<std::uint64_t>& keys : parts) {
+      for (const std::uint64_t key : keys) {
+        const std::uint64_t block = CellBlocks::block_key(key);
+        if (block != previous) {
+          previous = block;
+          // Bits that FlatMap does not use for the slot, or the partitions would fill unevenly.
+          const std::uint64_t number = (hash_key(block) >> 16) % kPartitions;
+          mask = nullptr;
+          if (static_cast<std::int64_t>(number) % threads == task) {
+            Partition& own = partitions_[number];
+            std::int32_t found = own.numbers.find(block);
+            if (found < 0) {
+              own.masks.push_back(0);
+              found = static_cast<std::int32_t>(own.masks.size()) - 1;
+              own.numbers.insert(block, found);
+            }
+            mask = &own.masks[static_cast<std::size_t>(found)];
+          }
+        }
+        if (mask != nullptr) *mask |= std::uint64_t{1} << (key & 63);
+      }
     }
   });
 }
 
+template <typename T>
+void CellSet::insert(const T* points, std::int64_t count, int num_threads) {
+  std::vector<std::vector<std::uint64_t>> keys(1);
+  keys[0].resize(static_cast<std::size_t>(count));
+  cell_keys(points, count, leaf_size_m_, keys[0].data(), num_threads);
+  insert_keys(keys, num_threads);
+}
+
+void CellSet::insert_rays(const float* points, const float* directions, std::int64_t count, double reach_m,
+                          int num_threads) {
+  check_rays(points, directions, count, leaf_size_m_, reach_m);
+  constexpr std::int64_t kRays = 1 << 15;  // at a time: the keys of all would be much memory
+  for (std::int64_t first = 0; first < count; first += kRays) {
+    const std::int64_t size = std::min(kRays, count - first);
+    const std::int64_t num_parts = std::min<std::int64_t>(resolve_num_threads(num_threads), size);
+    std::vector<std::vector<std::uint64_t>> parts(static_cast<std::size_t>(num_parts));
+    parallel_tasks(num_parts, num_threads, [&](std::int64_t part) {
+      std::vector<std::uint64_t>& keys = parts[static_cast<std::size_t>(part)];
+      for (std::int64_t i = first + size * part / num_parts; i < first + size * (part + 1) / num_parts; ++i) {
+        walk_cells(points + 3 * i, directions + 3 * i, -reach_m, reach_m, 1 / leaf_size_m_,
+                   [&](const std::int32_t* cell) { keys.push_back(lattice_key(cell)); });
+      }
+    });
+    insert_keys(parts, num_threads);
+  }
+}
+
 std::int64_t CellSet::size() const {
   std::int64_t total = 0;
-  for (const FlatMap& partition : partitions_) total += static_cast<std::int64_t>(partition.size());
+  for (const Partition& partition : partitions_) {
+    for (const std::uint64_t mask : partition.masks) total += count_bits(mask);
+  }
   return total;
 }
 
 std::vector<std::uint64_t> CellSet::sorted_keys(int num_threads) const {
-  std::vector<std::uint64_t> keys;
-  keys.reserve(static_cast<std::size_t>(size()));
-  for (const FlatMap& partition : partitions_) {
-    for (const Slot& slot : partition.slots()) {
-      if (slot.key != kEmptyKey) keys.push_back(slot.key);
+  std::vector<std::uint64_t> blocks;
+  for (const Partition& partition : partitions_) {
+    for (const Slot& slot : partition.numbers.slots()) {
+      if (slot.key != kEmptyKey) blocks.push_back(slot.key);
     }
   }
-  parallel_sort(keys, num_threads);
+  parallel_sort(blocks, num_threads);
+  std::vector<std::uint64_t> keys;
+  keys.reserve(static_cast<std::size_t>(size()));
+  for (const std::uint64_t block : blocks) {
+    const Partition& own = partitions_[(hash_key(block) >> 16) % kPartitions];
+    std::uint64_t mask = own.masks[static_cast<std::size_t>(own.numbers.find(block))];
+    for (; mask != 0; mask &= mask - 1) {
+      keys.push_back(block << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(mask)));
+    }
+  }
   return keys;
 }
 

@@ -25,17 +25,29 @@ class CellSet {
   template <typename T>
   void insert(const T* points, std::int64_t count, int num_threads);
 
+  // Marks the cells that rays go through within reach_m before and behind their returns. points, directions: (count,
+  // 3), local frame, m, directions of unit length. Throws likewise.
+  void insert_rays(const float* points, const float* directions, std::int64_t count, double reach_m, int num_threads);
+
   std::int64_t size() const;
 
   // Morton keys of the cells, ascending: the same for any number of threads and any order of insertion.
   std::vector<std::uint64_t> sorted_keys(int num_threads) const;
 
  private:
-  // A key's partition is a function of its hash, so threads fill different partitions and need no locks.
+  // Cells by blocks of 4 x 4 x 4, a bit for each: neighbours share a look-up, and only blocks have to be sorted.
+  struct Partition {
+    FlatMap numbers;  // of blocks
+    std::vector<std::uint64_t> masks;
+  };
+
+  // A block's partition is a function of its hash, so threads fill different partitions and need no locks.
   static constexpr int kPartitions = 64;
 
+  void insert_keys(const std::vector<std::vector<std::uint64_t>>& parts, int num_threads);
+
   double leaf_size_m_;
-  std::array<FlatMap, kPartitions> partitions_;
+  std::array<Partition, kPartitions> partitions_;
 };
 
 // Sorts in place: blocks on threads, then merged pairwise.

@@ -3,8 +3,13 @@
 #include "cell_sums.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
+#include <stdexcept>
+#include <vector>
 
+#include "bits.hpp"
+#include "cell.hpp"
 #include "morton.hpp"
 #include "parallel.hpp"
 
@@ -37,6 +42,12 @@ class BlocksRound {
     }
   }
 
+  // The middle block, where there is one.
+  const Occupancy* middle() const { return blocks_[13]; }
+
+  // How many cells the middle block has.
+  int num_cells() const { return blocks_[13] != nullptr ? count_bits(blocks_[13]->mask) : 0; }
+
   // The row of the cell at these coordinates, counted from the middle block's first cell; -1 where there is none.
   std::int32_t row(std::int32_t x, std::int32_t y, std::int32_t z) const {
     const auto block = [](std::int32_t v) { return (v + kEdge) >> kBlockBits; };
@@ -53,6 +64,36 @@ class BlocksRound {
   const Occupancy* region_ = nullptr;
   const Occupancy* blocks_[27] = {};
 };
+
+// From how many cells of a block on it is less work to add up round all 64, axis after axis.
+constexpr int kManyCells = 8;
+
+// sums: (64, columns), in Morton order, of the values in the 27 cells round each of a block's.
+void sum_round_block(const BlocksRound& round, const double* values, int columns, double* sums) {
+  constexpr std::int32_t kWide = kEdge + 2;
+  for (int k = 0; k < columns; ++k) {
+    double along_z[kWide][kWide][kEdge], along_y[kWide][kEdge][kEdge];
+    for (std::int32_t x = 0; x < kWide; ++x) {
+      for (std::int32_t y = 0; y < kWide; ++y) {
+        double line[kWide];
+        for (std::int32_t z = 0; z < kWide; ++z) {
+          const std::int32_t row = round.row(x - 1, y - 1, z - 1);
+          line[z] = row >= 0 ? values[columns * std::int64_t{row} + k] : 0;
+        }
+        for (std::int32_t z = 0; z < kEdge; ++z) along_z[x][y][z] = line[z] + line[z + 1] + line[z + 2];
+      }
+      for (std::int32_t y = 0; y < kEdge; ++y) {
+        for (std::int32_t z = 0; z < kEdge; ++z) {
+          along_y[x][y][z] = along_z[x][y][z] + along_z[x][y + 1][z] + along_z[x][y + 2][z];
+        }
+      }
+    }
+    for (std::uint32_t i = 0; i < 64; ++i) {
+      const std::uint32_t x = morton_coordinate(i, 0), y = morton_coordinate(i, 1), z = morton_coordinate(i, 2);
+      sums[columns * std::int64_t{i} + k] = along_y[x][y][z] + along_y[x + 1][y][z] + along_y[x + 2][y][z];
+    }
+  }
+}
 
 }  // namespace
 
@@ -80,8 +121,21 @@ void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t 
   std::fill(sums, sums + columns * count, 0.0);
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
     BlocksRound round(cells);
+    std::uint64_t block_key = kEmptyKey;
+    bool add_up_block = false;
+    std::vector<double> block_sums(static_cast<std::size_t>(64 * columns));
     for (std::int64_t i = begin; i < end; ++i) {
-      round.move_to(CellBlocks::block_key(keys[i]));
+      if (CellBlocks::block_key(keys[i]) != block_key) {
+        block_key = CellBlocks::block_key(keys[i]);
+        round.move_to(block_key);
+        add_up_block = weight == 1 && round.num_cells() >= kManyCells;
+        if (add_up_block) sum_round_block(round, values, columns, block_sums.data());
+      }
+      if (add_up_block) {
+        const double* own = block_sums.data() + columns * static_cast<std::int64_t>(keys[i] & 63);
+        std::copy(own, own + columns, sums + columns * i);
+        continue;
+      }
       std::int32_t cell[3];
       for (int axis = 0; axis < 3; ++axis) {
         cell[axis] = static_cast<std::int32_t>(morton_coordinate(keys[i], axis)) & (kEdge - 1);
@@ -98,6 +152,53 @@ void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t 
       }
     }
   });
+}
+
+void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, const float* points,
+                       std::int64_t count, float* interpolated, int num_threads) {
+  const auto size_m = static_cast<float>(cell_size_m);
+  std::atomic<bool> inside{true};
+  parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    std::uint64_t block_key = kEmptyKey;  // neighbours are often of the same block
+    const Occupancy* block = nullptr;
+    for (std::int64_t i = begin; i < end; ++i) {
+      float share[3];
+      std::int32_t lower[3];
+      std::uint64_t parts[3][2];  // of keys
+      for (int axis = 0; axis < 3; ++axis) {
+        const float u = points[3 * i + axis] / size_m - 0.5F;
+        if (!(std::abs(u) < static_cast<float>(kAxisBias - (1 << kMaxLevels)))) {
+          inside = false;
+          return;
+        }
+        const float whole = std::floor(u);
+        share[axis] = u - whole;
+        lower[axis] = static_cast<std::int32_t>(whole) + kAxisBias;
+        for (std::uint32_t step = 0; step < 2; ++step) {
+          parts[axis][step] = spread_bits(static_cast<std::uint32_t>(lower[axis]) + step) << axis;
+        }
+      }
+      float sum = 0;
+      for (int corner = 0; corner < 8; ++corner) {
+        float weight = 1;
+        std::uint64_t key = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+          const int step = corner >> (2 - axis) & 1;
+          weight *= step != 0 ? share[axis] : 1 - share[axis];
+          key |= parts[axis][step];
+        }
+        if (CellBlocks::block_key(key) != block_key) {
+          block_key = CellBlocks::block_key(key);
+          const Occupancy* region = cells.region(CellBlocks::region_key(key));
+          block = region != nullptr ? cells.block(*region, block_key) : nullptr;
+        }
+        const std::int32_t row = block != nullptr ? block->row(key) : -1;
+        if (row >= 0) sum += weight * values[row];
+      }
+      interpolated[i] = sum;
+    }
+  });
+  if (!inside) throw std::invalid_argument("points must be finite and within a million cells of the origin");
 }
 
 }  // namespace radarsdf

@@ -9,6 +9,8 @@
 #include <stdexcept>
 #include <utility>
 
+#include "bits.hpp"
+#include "cell_blocks.hpp"
 #include "cell_set.hpp"
 #include "morton.hpp"
 #include "parallel.hpp"
@@ -51,10 +53,83 @@ const std::vector<VertexGroup>& vertex_groups(Encoding encoding) {
   return encoding == Encoding::kTriQuadtree ? planes : space;
 }
 
-void sort_unique(std::vector<std::uint64_t>& keys, int num_threads) {
-  parallel_sort(keys, num_threads);
-  keys.erase(std::unique(keys.begin(), keys.end()), keys.end());
+// Cells or vertices by blocks of 4 x 4 x 4: a bit for each. What is in a block, and its vertices, are a few operations
+// on one number.
+class BlockMasks {
+ public:
+  explicit BlockMasks(std::size_t expected_blocks) : numbers_(expected_blocks) {}
+
+  void add(std::uint64_t block_key, std::uint64_t mask) {
+    if (mask == 0) return;
+    std::int32_t found = numbers_.find(block_key);
+    if (found < 0) {
+      found = static_cast<std::int32_t>(blocks_.size());
+      blocks_.push_back({block_key, {0, 0}});
+      numbers_.insert(block_key, found);
+    }
+    blocks_[static_cast<std::size_t>(found)].parts.mask |= mask;
+  }
+
+  // Numbers what is there from `first_row` on, in the order of the keys, and returns how much that is.
+  std::int64_t number(std::int64_t first_row, int num_threads) {
+    std::vector<std::uint64_t> keys;
+    keys.reserve(blocks_.size());
+    std::int64_t count = 0;
+    for (const Block& block : blocks_) {
+      keys.push_back(block.key);
+      count += count_bits(block.parts.mask);
+    }
+    if (first_row + count > std::numeric_limits<std::int32_t>::max()) {
+      throw std::invalid_argument("the map needs more than 2^31 vertices: use larger cells");
+    }
+    parallel_sort(keys, num_threads);
+    std::int64_t row = first_row;
+    for (const std::uint64_t key : keys) {
+      Occupancy& parts = blocks_[static_cast<std::size_t>(numbers_.find(key))].parts;
+      parts.first = static_cast<std::int32_t>(row);
+      row += count_bits(parts.mask);
+    }
+    return count;
+  }
+
+  const Occupancy* find(std::uint64_t block_key) const {
+    const std::int32_t found = numbers_.find(block_key);
+    return found >= 0 ? &blocks_[static_cast<std::size_t>(found)].parts : nullptr;
+  }
+
+  struct Block {
+    std::uint64_t key;
+    Occupancy parts;
+  };
+  const std::vector<Block>& blocks() const { return blocks_; }
+
+ private:
+  FlatMap numbers_;
+  std::vector<Block> blocks_;
+};
+
+// The parts of a block whose coordinate along an axis is 0 and 2; 1; 3. In Morton order its bits are `axis` and `axis`
+// + 3.
+constexpr std::uint64_t parts_where(int axis, bool low_bit, bool any_high_bit, bool high_bit) {
+  std::uint64_t mask = 0;
+  for (int i = 0; i < 64; ++i) {
+    if ((i >> axis & 1) == low_bit && (any_high_bit || (i >> (axis + 3) & 1) == high_bit))
+      mask |= std::uint64_t{1} << i;
+  }
+  return mask;
 }
+constexpr std::uint64_t kEven[3] = {parts_where(0, false, true, false), parts_where(1, false, true, false),
+                                    parts_where(2, false, true, false)};
+constexpr std::uint64_t kOne[3] = {parts_where(0, true, false, false), parts_where(1, true, false, false),
+                                   parts_where(2, true, false, false)};
+constexpr std::uint64_t kThree[3] = {parts_where(0, true, false, true), parts_where(1, true, false, true),
+                                     parts_where(2, true, false, true)};
+
+// All parts one further along the axis: those that stay in the block, and those that are in the next one.
+std::uint64_t shifted(std::uint64_t mask, int axis) {
+  return (mask & kEven[axis]) << (1 << axis) | (mask & kOne[axis]) << (7 << axis);
+}
+std::uint64_t carried(std::uint64_t mask, int axis) { return (mask & kThree[axis]) >> (9 << axis); }
 
 // Gives every vertex of the group at this level a row, from first_row on, and writes the rows into the cells at
 // slot `first_corner`. Returns the number of vertices.
@@ -66,29 +141,60 @@ std::int64_t assign_rows(const VertexGroup& group, const std::vector<std::uint64
     for (auto i = static_cast<std::size_t>(begin); i < static_cast<std::size_t>(end); ++i)
       projected[i] = group.project(keys[i]);
   });
-  std::vector<std::uint64_t> columns = projected;
-  sort_unique(columns, num_threads);
-
-  check_interrupt();
-  std::vector<std::uint64_t> vertices;
-  vertices.reserve(columns.size() * static_cast<std::size_t>(group.num_corners));
-  for (const std::uint64_t column : columns) {
-    for (int c = 0; c < group.num_corners; ++c) vertices.push_back(group.corner(column, c));
-  }
-  sort_unique(vertices, num_threads);
-  const auto num_vertices = static_cast<std::int64_t>(vertices.size());
-  if (first_row + num_vertices > std::numeric_limits<std::int32_t>::max()) {
-    throw std::invalid_argument("the map needs more than 2^31 vertices: use larger cells");
+  BlockMasks columns(0);
+  for (std::size_t i = 0; i < projected.size();) {
+    const std::uint64_t block_key = CellBlocks::block_key(projected[i]);
+    std::uint64_t mask = 0;
+    for (; i < projected.size() && CellBlocks::block_key(projected[i]) == block_key; ++i) {
+      mask |= std::uint64_t{1} << (projected[i] & 63);
+    }
+    columns.add(block_key, mask);
   }
 
   check_interrupt();
-  FlatMap row_of(vertices.size());
-  for (std::size_t i = 0; i < vertices.size(); ++i)
-    row_of.insert(vertices[i], static_cast<std::int32_t>(first_row) + static_cast<std::int32_t>(i));
+  const int num_corners = group.num_corners;
+  BlockMasks vertices(2 * columns.blocks().size());
+  for (const BlockMasks::Block& block : columns.blocks()) {
+    // Parts of the block itself and of those after it, numbered as the corners of a cell are.
+    std::uint64_t masks[8] = {block.parts.mask};
+    int bit = 1;
+    for (int axis = 0; axis < 3; ++axis) {
+      if (!group.uses_axis[static_cast<std::size_t>(axis)]) continue;
+      for (int c = 0; c < bit; ++c) {
+        masks[c + bit] = carried(masks[c], axis);
+        masks[c] |= shifted(masks[c], axis);
+      }
+      bit *= 2;
+    }
+    for (int c = 0; c < num_corners; ++c) {
+      if (masks[c] != 0) vertices.add(group.corner(block.key, c), masks[c]);
+    }
+  }
+
+  check_interrupt();
+  const std::int64_t num_vertices = vertices.number(first_row, num_threads);
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    std::uint64_t block_key = kEmptyKey;
+    const Occupancy* blocks[8] = {};
     for (std::int64_t i = begin; i < end; ++i) {
-      for (int c = 0; c < group.num_corners; ++c) {
-        cells[i].rows[first_corner + c] = row_of.find(group.corner(projected[static_cast<std::size_t>(i)], c));
+      const std::uint64_t key = projected[static_cast<std::size_t>(i)];
+      if (CellBlocks::block_key(key) != block_key) {
+        block_key = CellBlocks::block_key(key);
+        for (int c = 0; c < num_corners; ++c) blocks[c] = vertices.find(group.corner(block_key, c));
+      }
+      for (int c = 0; c < num_corners; ++c) {
+        std::uint64_t part = key & 63;
+        int block = 0, bit = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+          if (!group.uses_axis[static_cast<std::size_t>(axis)]) continue;
+          if (c >> bit & 1) {
+            const bool low = part >> axis & 1, high = part >> (axis + 3) & 1;
+            part += static_cast<std::uint64_t>(!low ? 1 : high ? -9 : 7) << axis;
+            if (low && high) block |= 1 << bit;
+          }
+          ++bit;
+        }
+        cells[i].rows[first_corner + c] = blocks[block]->row(part);
       }
     }
   });
@@ -111,7 +217,7 @@ std::int32_t floor_to_int(T value) {
   return truncated - static_cast<std::int32_t>(value < static_cast<T>(truncated));
 }
 
-inline int count_bits(std::uint32_t eight_bits) {
+inline int count_eight_bits(std::uint32_t eight_bits) {
   std::uint32_t v = eight_bits - ((eight_bits >> 1) & 0x55u);
   v = (v & 0x33u) + ((v >> 2) & 0x33u);
   return static_cast<int>((v + (v >> 4)) & 0x0fu);
@@ -206,7 +312,7 @@ void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cell
         const auto bit = [&](int axis) { return leaf[i][axis] >> level & 1u; };
         const std::uint32_t child = bit(0) | bit(1) << 1 | bit(2) << 2;
         if (!(parent.child_mask >> child & 1u)) continue;
-        found[0] = parent.first_child + count_bits(parent.child_mask & ((1u << child) - 1));
+        found[0] = parent.first_child + count_eight_bits(parent.child_mask & ((1u << child) - 1));
         prefetch(&cells_[static_cast<std::size_t>(found[0])]);
       }
     }
@@ -221,6 +327,33 @@ std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& lea
       coordinates.push_back(static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias);
   }
   return coordinates;
+}
+
+LeafVertices leaf_vertices(const VertexTable& table) {
+  if (table.encoding() != Encoding::kOctree) throw std::invalid_argument("only an octree has vertices in space");
+  const std::vector<std::int32_t> cells = leaf_coordinates(table.leaf_keys());
+  const std::size_t num_cells = table.leaf_keys().size();
+  LeafVertices vertices;
+  vertices.of_cells.resize(8 * num_cells);
+  std::int32_t num_rows = 0;
+  for (std::size_t i = 0; i < num_cells; ++i) {
+    for (std::size_t c = 0; c < 8; ++c) {
+      // The table's corners step along x first, those in C order along z.
+      const std::int32_t row = table.cells()[i].rows[(c & 1) << 2 | (c & 2) | c >> 2];
+      vertices.of_cells[8 * i + c] = row;
+      num_rows = std::max(num_rows, row + 1);
+    }
+  }
+  vertices.coordinates.resize(3 * static_cast<std::size_t>(num_rows));
+  for (std::size_t i = 0; i < num_cells; ++i) {
+    for (std::size_t c = 0; c < 8; ++c) {
+      std::int32_t* at = &vertices.coordinates[3 * static_cast<std::size_t>(vertices.of_cells[8 * i + c])];
+      for (std::size_t axis = 0; axis < 3; ++axis) {
+        at[axis] = cells[3 * i + axis] + static_cast<std::int32_t>(c >> (2 - axis) & 1);
+      }
+    }
+  }
+  return vertices;
 }
 
 template void VertexTable::locate(const float*, std::int64_t, std::int32_t*) const;

@@ -46,6 +46,13 @@ class VertexTable {
   std::int64_t num_rows_ = 0;
 };
 
+// Of a table of an octree, the vertices of the leaf cells: the coordinates (rows, 3) of those that the first rows of
+// the feature matrix belong to, and the rows (leaf cells, 8) of each cell's, in C order. Throws std::invalid_argument.
+struct LeafVertices {
+  std::vector<std::int32_t> coordinates, of_cells;
+};
+LeafVertices leaf_vertices(const VertexTable& table);
+
 // Lattice coordinates (size, 3) of the cells: cell i spans [i, i + 1) * leaf_size_m.
 std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& leaf_keys);
 

@@ -9,7 +9,11 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
+from radarsdf._core import cell_keys
+from radarsdf.averaging import CellRays
 from radarsdf.networks import SDFNetwork
+from radarsdf.scans import prepare
+from scipy.spatial import cKDTree
 
 from .conftest import ground_and_wall
 
@@ -44,15 +48,40 @@ def test_rays_that_differ_are_averaged():
     np.testing.assert_allclose(fit(*rays_down([0.0, 0.12, 0.12])).sdf(x), expected, atol=0.02)
 
 
-def test_free_space_of_other_rays_removes_what_floats_in_it():
+def test_rays_count_behind_what_floats_before_their_ends():
+    """Returns a little before the surface, fewer than the rays that go on: these outvote them, as far as they count."""
     points, poses = rays_down([0.0])
-    clutter = np.column_stack(
-        [np.random.default_rng(0).uniform(-0.3, 0.3, (40, 2)), np.full(40, 2.0 - 300.0)]
-    )
+    rng = np.random.default_rng(0)
+    clutter = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.full(20, 0.9 - 300.0)])
     points = [np.concatenate([points[0], clutter])]
-    x = np.column_stack([np.zeros((9, 2)), np.linspace(1.7, 2.3, 9)])
-    assert (fit(points, poses, free_from=0.95, free_samples=40).sdf(x) > 0).all()
-    assert (fit(points, poses, free_samples=0).sdf(x) < 0).any()
+    x = np.column_stack([np.zeros((5, 2)), np.linspace(0.75, 0.85, 5)])
+    assert (fit(points, poses, truncation_m=1.2).sdf(x) > 0).all()
+    assert (fit(points, poses, truncation_m=0.4).sdf(x) < 0).any()
+
+
+def test_one_ray_of_a_cell_is_the_mean_of_its_rays():
+    rng = np.random.default_rng(0)
+    points, poses = [rng.normal(0, 3, (3000, 3))], np.eye(4)[None]
+    rays = prepare(points, poses)
+    averaged = CellRays.of(rays, 0.8)
+    keys = cell_keys(rays.points, 0.8)
+    assert averaged.keys.tolist() == np.unique(keys).tolist()
+    assert averaged.counts.sum() == len(rays)
+    for i in (0, 5, len(averaged.keys) - 1):
+        own = np.flatnonzero(keys == averaged.keys[i])
+        assert averaged.first[i] == own[0]
+        assert averaged.counts[i] == len(own)
+        np.testing.assert_allclose(averaged.points[i], rays.points[own].mean(axis=0), atol=1e-5)
+        direction = rays.directions[own].sum(axis=0)
+        np.testing.assert_allclose(averaged.directions[i], direction / np.linalg.norm(direction), atol=1e-5)
+
+
+def test_rays_that_cancel_each_other_have_a_direction():
+    poses = np.stack([np.eye(4), np.eye(4)])
+    poses[1, 0, 3] = 10.0
+    rays = prepare([[[5.0, 0.0, 0.0]], [[-5.0, 0.0, 0.0]]], poses)
+    averaged = CellRays.of(rays, 0.4)
+    np.testing.assert_allclose(averaged.directions, rays.directions[:1])
 
 
 def test_the_quick_mesh_lies_on_the_surface():
@@ -82,6 +111,22 @@ def test_training_goes_on_from_the_average():
     assert 0 < np.median(change) < 0.05
 
 
+@pytest.mark.parametrize("hidden", [(2,), (4, 4)])
+def test_the_mesh_from_vertices_is_that_of_the_field(hidden):
+    scene = ground_and_wall()
+    radar_map = radarsdf.fit(
+        scene.points, scene.poses, config=FitConfig.quick(sdf_hidden=hidden), progress=False
+    )
+    everywhere = [[-100.0] * 3, [100.0] * 3]  # a box: vertices are looked up one by one
+    one, other = radar_map.mesh(0.2), radar_map.mesh(0.2, box=everywhere)
+    assert len(one.faces) == len(other.faces) > 1000
+    for a, b in ((one, other), (other, one)):
+        off_m = cKDTree(a.vertices).query(b.vertices)[0]
+        assert np.median(off_m) < 1e-4
+        assert off_m.max() < 0.005  # on the border, where the other is evaluated a hair inside
+    assert one.metadata["leaf_cells"] == one.metadata["leaf_cells_searched"]
+
+
 @pytest.mark.parametrize("hidden", [(2,), (5, 3), (4, 4, 4)])
 def test_the_network_starts_as_one_input(hidden):
     torch.manual_seed(0)
@@ -101,3 +146,5 @@ def test_only_an_octree_holds_an_average():
         FitConfig(start="zero")
     with pytest.raises(ValueError, match="at least two"):
         FitConfig.quick(sdf_hidden=(1,))
+    with pytest.raises(ValueError, match="truncation_m"):
+        FitConfig.quick(truncation_m=0.3)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf._core import CellBlocks, cell_keys, sum_moments
+from radarsdf._core import CellBlocks, cell_keys, principal_axes, sum_moments
 
 
 def keys_of(cells):
@@ -79,3 +79,70 @@ def test_arguments_are_checked():
             sum_moments(points, points, np.array([0, cell], np.int32), 5)
     with pytest.raises(ValueError, match="directions"):
         sum_moments(points, points[:1], np.zeros(2, np.int32), 5)
+
+
+def test_values_between_the_centres_of_cells():
+    rng = np.random.default_rng(0)
+    size_m, cells = 0.2, some_cells()
+    blocks = CellBlocks(keys_of(cells))
+    values = rng.uniform(0, 5, len(cells)).astype(np.float32)
+    points = rng.uniform(-1.5, 1.5, (2000, 3)).astype(np.float32)
+    value_of = {tuple(cell): value for cell, value in zip(cells.tolist(), values.astype(float), strict=True)}
+    expected = []
+    for u in points.astype(np.float64) / size_m - 0.5:
+        lower = np.floor(u).astype(int)
+        steps = np.array(list(np.ndindex(2, 2, 2)))
+        weights = np.where(steps > 0, u - lower, 1 - (u - lower)).prod(axis=1)
+        found = [value_of.get(tuple(cell), 0.0) for cell in (lower + steps).tolist()]
+        expected.append(weights @ found)
+    assert np.ptp(expected) > 3
+    result = blocks.interpolate(size_m, values, points)
+    np.testing.assert_allclose(result, expected, atol=1e-4)
+    for num_threads in (1, 3):
+        assert blocks.interpolate(size_m, values, points, num_threads).tobytes() == result.tobytes()
+    points[7] = np.nan
+    with pytest.raises(ValueError, match="million cells"):
+        blocks.interpolate(size_m, values, points)
+    with pytest.raises(ValueError, match="one for each cell"):
+        blocks.interpolate(size_m, values[1:], points)
+
+
+def test_principal_axes_are_those_of_lapack():
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=(3000, 3, 3)) * 10.0 ** rng.uniform(-4, 4, (3000, 1, 3))
+    matrices = np.concatenate(
+        [
+            a @ a.transpose(0, 2, 1),
+            a + a.transpose(0, 2, 1),  # of both signs
+            np.zeros((1, 3, 3)),
+            np.eye(3)[None],
+            np.diag([3.0, 1.0, 2.0])[None],
+            np.ones((1, 3, 3)),
+            1e-300 * (a[:1] @ a[:1].transpose(0, 2, 1)),
+        ]
+    )
+    values, vectors = principal_axes(matrices)
+    scale = np.abs(matrices).max(axis=(1, 2))[:, None]
+    np.testing.assert_allclose(
+        values / (scale + 1e-320), np.linalg.eigvalsh(matrices) / (scale + 1e-320), atol=1e-13
+    )
+    assert (np.diff(values, axis=1) >= 0).all()
+    np.testing.assert_allclose(
+        vectors.transpose(0, 2, 1) @ vectors, np.tile(np.eye(3), (len(a) * 2 + 5, 1, 1)), atol=1e-13
+    )
+    residual = matrices @ vectors - vectors * values[:, None, :]
+    assert (np.abs(residual) <= 1e-13 * scale[:, None] + 1e-320).all()
+    for num_threads in (1, 3):
+        again = principal_axes(matrices, num_threads)
+        assert all(x.tobytes() == y.tobytes() for x, y in zip(again, (values, vectors), strict=True))
+
+
+def test_axes_of_what_is_not_finite_are_not_numbers():
+    matrices = np.stack([np.eye(3)] * 3)
+    matrices[1, 0, 2] = np.nan
+    values, vectors = principal_axes(matrices)
+    assert np.isnan(values[1]).all()
+    assert np.isnan(vectors[1]).all()
+    assert (values[[0, 2]] == 1).all()
+    with pytest.raises(ValueError, match="shape"):
+        principal_axes(np.zeros((2, 3)))

@@ -11,6 +11,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
+from radarsdf.averaging import CellRays
 from radarsdf.scans import prepare
 from radarsdf.surfels import Surfels, support_of
 
@@ -59,6 +60,30 @@ def test_ghosts_are_found_and_the_surface_is_kept():
     assert dropped[~is_ghost].mean() < 0.005
     np.testing.assert_array_equal(dropped, surfels.ghosts(rays, num_threads=1))
     np.testing.assert_array_equal(dropped, surfels.ghosts(rays, num_threads=3))
+
+
+def test_one_ray_of_a_cell_finds_them_too():
+    points, poses, is_ghost = a_wall(ghosts=40)
+    rays = prepare(points, poses)
+    surfels = Surfels.of(rays)
+    averaged = CellRays.of(rays, 0.2)
+    assert len(averaged.first) < 0.7 * len(rays)
+    dropped = surfels.ghosts(rays, tried=averaged.first, counts=averaged.counts)
+    assert dropped[is_ghost].mean() > 0.9
+    assert dropped[~is_ghost].mean() < 0.005
+    everyone = surfels.ghosts(rays, tried=np.arange(len(rays)), counts=np.ones(len(rays), np.float32))
+    assert (everyone != surfels.ghosts(rays)).mean() < 0.001  # but for the noise of fewer of them
+
+
+def test_planes_of_cells():
+    points, poses, _ = a_wall()
+    rays = prepare(points, poses)
+    surfels = Surfels.of(rays)
+    plane = surfels.flat_plane_of(surfels.cell_of_ray)
+    assert (plane >= 0).mean() > 0.9
+    np.testing.assert_array_equal(surfels.cell_of_plane[plane[plane >= 0]], surfels.cell_of_ray[plane >= 0])
+    on_ground = (np.abs(rays.in_world()[0][:, 2]) < 0.05) & (rays.in_world()[0][:, 0] < 14) & (plane >= 0)
+    assert np.median(surfels.normals[plane[on_ground], 2]) > 0.98
 
 
 def test_a_fit_drops_and_counts_them():

@@ -6,6 +6,7 @@
 #include "arrays.hpp"
 #include "cell_blocks.hpp"
 #include "cell_sums.hpp"
+#include "principal_axes.hpp"
 
 namespace radarsdf {
 namespace {
@@ -62,7 +63,28 @@ void bind_cell_sums(py::module_& m) {
           },
           "keys"_a.noconvert(), "values"_a.noconvert(), "weight"_a, "num_threads"_a = 0,
           "For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that "
-          "shares a face counts `weight` times, an edge its square, a corner its cube.");
+          "shares a face counts `weight` times, an edge its square, a corner its cube.")
+      .def(
+          "interpolate",
+          [](const CellBlocks& cells, double cell_size_m, const Array<float>& values, const Array<float>& points,
+             int num_threads) {
+            const py::ssize_t count = points.ndim() == 2 ? points.shape(0) : 0;
+            check_shape(points, count, 3, "points");
+            if (check_column(values, "values") != cells.size()) {
+              throw std::invalid_argument("values must be one for each cell");
+            }
+            py::array_t<float> interpolated(count);
+            const float *v = values.data(), *p = points.data();
+            float* result = interpolated.mutable_data();
+            {
+              const py::gil_scoped_release release;
+              interpolate_cells(cells, cell_size_m, v, p, count, result, num_threads);
+            }
+            return interpolated;
+          },
+          "cell_size_m"_a, "values"_a.noconvert(), "points"_a.noconvert(), "num_threads"_a = 0,
+          "`values` (C,) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 where "
+          "there is no cell: (N,).");
   m.def(
       "sum_moments",
       [](const Array<float>& points, const Array<float>& directions, const Array<std::int32_t>& cells,
@@ -87,6 +109,25 @@ void bind_cell_sums(py::module_& m) {
       "Sums over the returns of each cell, (num_cells, 13): 1, x, y, z, xx, xy, xz, yy, yz, zz, direction. `points` "
       "and "
       "`directions` (N, 3) float32; `cells` (N,) int32, the row of each return's cell.");
+  m.def(
+      "principal_axes",
+      [](const Array<double>& matrices, int num_threads) {
+        if (matrices.ndim() != 3 || matrices.shape(1) != 3 || matrices.shape(2) != 3) {
+          throw std::invalid_argument("matrices must have shape (N, 3, 3)");
+        }
+        const py::ssize_t count = matrices.shape(0);
+        py::array_t<double> values({count, py::ssize_t{3}}), vectors({count, py::ssize_t{3}, py::ssize_t{3}});
+        const double* a = matrices.data();
+        double *w = values.mutable_data(), *v = vectors.mutable_data();
+        {
+          const py::gil_scoped_release release;
+          principal_axes(a, count, w, v, num_threads);
+        }
+        return std::make_pair(values, vectors);
+      },
+      "matrices"_a.noconvert(), "num_threads"_a = 0,
+      "Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3), in columns, of symmetric `matrices` (N, 3, 3) "
+      "float64.");
 }
 
 }  // namespace radarsdf

@@ -10,6 +10,7 @@
 #include "arrays.hpp"
 #include "cell_set.hpp"
 #include "encodings.hpp"
+#include "ray_average.hpp"
 #include "vertex_table.hpp"
 
 namespace radarsdf {
@@ -219,6 +220,19 @@ void bind_vertex_table(py::module_& m) {
   cell_set.def(py::init<double>(), "leaf_size_m"_a)
       .def("__len__", &CellSet::size)
       .def(
+          "insert_rays",
+          [](CellSet& cells, const Array<float>& points, const Array<float>& directions, double reach_m,
+             int num_threads) {
+            const std::int64_t count = check_points(points);
+            check_shape(directions, count, 3, "directions");
+            const float *p = points.data(), *d = directions.data();
+            const py::gil_scoped_release release;
+            cells.insert_rays(p, d, count, reach_m, num_threads);
+          },
+          "points"_a.noconvert(), "directions"_a.noconvert(), "reach_m"_a, "num_threads"_a = 0,
+          "Marks the leaf cells that rays go through within `reach_m` before and behind their points (N, 3) float32, "
+          "local frame, m; `directions` are unit vectors (N, 3) float32.")
+      .def(
           "sorted_keys",
           [](const CellSet& cells, int num_threads) {
             std::vector<std::uint64_t> keys;
@@ -263,6 +277,48 @@ void bind_vertex_table(py::module_& m) {
             return Array<std::int32_t>(to_array(std::move(cells)).reshape({count, py::ssize_t{3}}));
           },
           "Lattice coordinates of the occupied leaf cells (C, 3) int32: cell i spans [i, i + 1) * leaf_size_m.");
+  table
+      .def(
+          "leaf_vertices",
+          [](const VertexTable& t) {
+            LeafVertices vertices;
+            {
+              const py::gil_scoped_release release;
+              vertices = leaf_vertices(t);
+            }
+            const auto rows = static_cast<py::ssize_t>(vertices.coordinates.size() / 3);
+            const auto cells = static_cast<py::ssize_t>(vertices.of_cells.size() / 8);
+            return std::make_pair(
+                Array<std::int32_t>(to_array(std::move(vertices.coordinates)).reshape({rows, py::ssize_t{3}})),
+                Array<std::int32_t>(to_array(std::move(vertices.of_cells)).reshape({cells, py::ssize_t{8}})));
+          },
+          "Of an octree: lattice coordinates (V, 3) int32 of the leaf cells' vertices, in the order of the feature "
+          "matrix, whose first V rows are theirs, and the vertices (C, 8) int32 of each cell, in C order.")
+      .def(
+          "average_rays",
+          [](const VertexTable& t, const Array<float>& points, const Array<float>& directions,
+             const Array<float>& normals, const Array<float>& weights, double truncation_m, int num_threads) {
+            const std::int64_t count = check_points(points);
+            check_shape(directions, count, 3, "directions");
+            check_shape(normals, count, 3, "normals");
+            if (weights.ndim() != 1 || weights.shape(0) != count) {
+              throw std::invalid_argument("weights must have shape (N,)");
+            }
+            Array<float> distances(static_cast<py::ssize_t>(t.num_rows()));
+            float* result = distances.mutable_data();
+            const AveragedRays rays{points.data(), directions.data(), normals.data(), weights.data(), count};
+            {
+              const py::gil_scoped_release release;
+              average_rays(t, rays, truncation_m, result, num_threads);
+            }
+            return distances;
+          },
+          "points"_a.noconvert(), "directions"_a.noconvert(), "normals"_a.noconvert(), "weights"_a.noconvert(),
+          "truncation_m"_a, "num_threads"_a = 0,
+          "Of an octree: for each vertex (num_rows,) float32 the mean of its signed distances, m, to planes through "
+          "the "
+          "`points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of "
+          "its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame.");
   bind_kernels<float>(table);
   bind_kernels<double>(table);
 }

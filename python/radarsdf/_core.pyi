@@ -27,6 +27,7 @@ __all__: list[str] = [
     "mlp_backward",
     "num_threads",
     "openmp_version",
+    "principal_axes",
     "set_instruction_set",
     "sparse_lattice",
     "spherical_harmonics",
@@ -91,6 +92,16 @@ class CellSet:
     ) -> None:
         """
         Marks the leaf cells that hold the points (N, 3), local frame, m.
+        """
+    def insert_rays(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        directions: numpy.typing.NDArray[numpy.float32],
+        reach_m: typing.SupportsFloat | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> None:
+        """
+        Marks the leaf cells that rays go through within `reach_m` before and behind their points (N, 3) float32, local frame, m; `directions` are unit vectors (N, 3) float32.
         """
     def sorted_keys(
         self, num_threads: typing.SupportsInt | typing.SupportsIndex = 0
@@ -158,6 +169,18 @@ class VertexTable:
     ) -> None:
         """
         Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `sums` (num_rows, 8) zeros, as they are left.
+        """
+    def average_rays(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        directions: numpy.typing.NDArray[numpy.float32],
+        normals: numpy.typing.NDArray[numpy.float32],
+        weights: numpy.typing.NDArray[numpy.float32],
+        truncation_m: typing.SupportsFloat | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.float32]:
+        """
+        Of an octree: for each vertex (num_rows,) float32 the mean of its signed distances, m, to planes through the `points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame.
         """
     @typing.overload
     def coordinate_gradient(
@@ -245,6 +268,10 @@ class VertexTable:
         """
         Morton keys of the occupied leaf cells (C,) uint64, ascending.
         """
+    def leaf_vertices(self) -> tuple[numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int32]]:
+        """
+        Of an octree: lattice coordinates (V, 3) int32 of the leaf cells' vertices, in the order of the feature matrix, whose first V rows are theirs, and the vertices (C, 8) int32 of each cell, in C order.
+        """
     @typing.overload
     def locate(
         self,
@@ -311,6 +338,16 @@ class CellBlocks:
         `keys` (C,) uint64 of `cell_keys`, ascending, each once.
         """
     def __len__(self) -> int: ...
+    def interpolate(
+        self,
+        cell_size_m: typing.SupportsFloat | typing.SupportsIndex,
+        values: numpy.typing.NDArray[numpy.float32],
+        points: numpy.typing.NDArray[numpy.float32],
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.float32]:
+        """
+        `values` (C,) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 where there is no cell: (N,).
+        """
     def rows(
         self,
         keys: numpy.typing.NDArray[numpy.uint64],
@@ -542,6 +579,13 @@ def num_threads(num_threads: typing.SupportsInt | typing.SupportsIndex = 0) -> i
 def openmp_version() -> int:
     """
     OpenMP version as yyyymm, 0 for a serial build.
+    """
+
+def principal_axes(
+    matrices: numpy.typing.NDArray[numpy.float64], num_threads: typing.SupportsInt | typing.SupportsIndex = 0
+) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.float64]]:
+    """
+    Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3), in columns, of symmetric `matrices` (N, 3, 3) float64.
     """
 
 def set_instruction_set(name: str) -> None:

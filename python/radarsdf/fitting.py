@@ -15,20 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf import threads
 from radarsdf._core import CellSet
-from radarsdf.averaging import start_from_average
+from radarsdf.averaging import CellRays, start_from_average
 from radarsdf.budget import check_fit
 from radarsdf.checkpoint import Checkpoint
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
 from radarsdf.gaps import bridged
-from radarsdf.map import IntensityScale, RadarMap
+from radarsdf.map import MAX_CELLS_FROM_ORIGIN, IntensityScale, RadarMap
 from radarsdf.scans import Rays, prepare
 from radarsdf.stopping import Diverged, Interrupted
-from radarsdf.surfels import SURFEL_CELL_M, Surfels, support_of
+from radarsdf.surfels import SURFEL_CELL_M, Surfels, support_of, support_of_cells
 from radarsdf.threads import Workers
 from radarsdf.training import Training
-
-_MAX_CELLS = 1_000_000  # from the origin along each axis: keys of cells have 21 bits for each
 
 
 def fit(
@@ -96,18 +94,26 @@ def fit(
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
         clock.lap("prepare_s")
         with Workers(config.num_threads) as workers:
-            surface = rays
-            if config.drop_ghosts:
-                is_ghost = Surfels.of(rays, workers.num_threads).ghosts(rays, workers.num_threads)
-                surface = rays.select(~is_ghost)
+            surface, surfels = rays, None
+            averaged = (
+                CellRays.of(rays, config.leaf_size_m, workers.num_threads)
+                if config.start == "average"
+                else None
+            )
+            if config.drop_ghosts or averaged is not None:
+                surfels = Surfels.of(rays, workers.num_threads)
+            if config.drop_ghosts and surfels is not None:
+                surface, averaged = _without_ghosts(rays, averaged, surfels, workers.num_threads)
                 clock.lap("ghosts_s")
-            field = _new_field(surface, config, workers.num_threads)
+            field = _new_field(surface, averaged, config, workers.num_threads)
             leaf_keys = field.cells.table.leaf_keys()
             clock.lap("occupied_cells_s")
-            if config.start == "average":
-                start_from_average(field, surface, config, workers.num_threads)
+            if averaged is not None and surfels is not None:
+                start_from_average(field, averaged, surfels, config, workers.num_threads)
                 clock.lap("average_s")
-            support = support_of(surface.points, leaf_keys, config.leaf_size_m, workers.num_threads)
+                support = support_of_cells(averaged.keys, averaged.counts, leaf_keys, workers.num_threads)
+            else:
+                support = support_of(surface.points, leaf_keys, config.leaf_size_m, workers.num_threads)
             clock.lap("support_s")
             scale = IntensityScale.of(rays.intensities)
             training = Training(field, surface, rays, scale, config, workers)
@@ -164,6 +170,15 @@ def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None
     return skipped
 
 
+def _without_ghosts(
+    rays: Rays, averaged: CellRays | None, surfels: Surfels, num_threads: int
+) -> tuple[Rays, CellRays | None]:
+    if averaged is None:
+        return rays.select(~surfels.ghosts(rays, num_threads)), None
+    is_ghost = surfels.ghosts(rays, num_threads, tried=averaged.first, counts=averaged.counts)
+    return rays.select(~is_ghost), averaged.select(~is_ghost[averaged.first])
+
+
 def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
     """Leaf cells that a near-surface sample can fall into: Morton keys, ascending.
 
@@ -180,8 +195,11 @@ def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArr
 def _check_extent(rays: Rays, config: FitConfig) -> None:
     """A single outlier must not be met in the middle of the work, nor by an error that does not say what it is."""
     cell_m = min(config.leaf_size_m, SURFEL_CELL_M) if config.drop_ghosts else config.leaf_size_m
-    distance_m = np.abs(rays.points).max(axis=1) + config.near_band_m
-    if outside := int((distance_m > _MAX_CELLS * cell_m).sum()):
+    limit_m = MAX_CELLS_FROM_ORIGIN * cell_m
+    reach_m = max(config.near_band_m, config.truncation_m if config.start == "average" else 0.0)
+    if np.abs(rays.points).max() + reach_m > limit_m:
+        distance_m = np.abs(rays.points).max(axis=1) + reach_m
+        outside = int((distance_m > limit_m).sum())
         msg = (
             f"{outside} of {len(rays)} returns are not within a million cells of {cell_m} m of the sensors' mean "
             f"position, the furthest {distance_m.max():.3g} m away: drop them (max_range_m), use larger cells, or split "
@@ -190,9 +208,11 @@ def _check_extent(rays: Rays, config: FitConfig) -> None:
         raise ValueError(msg)
 
 
-def _new_field(rays: Rays, config: FitConfig, num_threads: int) -> Field:
+def _new_field(rays: Rays, averaged: CellRays | None, config: FitConfig, num_threads: int) -> Field:
     leaf_keys = bridged(
-        occupied_leaf_keys(rays, config, num_threads),
+        occupied_leaf_keys(rays, config, num_threads)
+        if averaged is None
+        else averaged.leaf_keys(config, num_threads),
         rays,
         config.leaf_size_m,
         config.bridge_cells,
@@ -202,7 +222,10 @@ def _new_field(rays: Rays, config: FitConfig, num_threads: int) -> Field:
     with threads.global_generator, torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         field = Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
-        field.cells.initialise(config.feature_std)
+        if averaged is None or config.sdf_iterations != 0 or rays.intensities is not None:
+            field.cells.initialise(
+                config.feature_std
+            )  # where nothing else is learnt, the average is all there is
     return field
 
 

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
@@ -16,16 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from radarsdf import kernels
 from radarsdf._checks import real_array
+from radarsdf._core import CellBlocks
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
-from radarsdf.threads import Workers
+from radarsdf.threads import Workers, resolve_num_threads
 
 if TYPE_CHECKING:
     import trimesh
 
 _HALF_SUPPORT = 10.0  # returns round a cell that are worth a confidence of one half
+MAX_CELLS_FROM_ORIGIN = 1_000_000  # along each axis: keys of cells have 21 bits for each
 _CHUNK = 1 << 13  # points evaluated at a time: hidden layers stay in the second-level cache
 
 
@@ -208,25 +208,17 @@ class RadarMap:
             msg = "this map was saved by an earlier version, without confidence: fit it again"
             raise ValueError(msg)
         points, answer = self._local(x)
+        # Trilinear between the centres of cells: a vertex on a cell's face is of both sides.
         table = self._field.cells.table
-        leaf_size_m = table.leaf_size_m
-        # In the order of the leaf cells' numbers; the one more is that of no cell, -1.
-        support = torch.from_numpy(np.append(self.support, 0).astype(np.float32))
-
-        def confidence(chunk: Tensor) -> Tensor:
-            # Trilinear between the centres of cells: a vertex on a cell's face is of both sides.
-            u = chunk / leaf_size_m - 0.5
-            lower = u.floor()
-            share = u - lower
-            returns = torch.zeros(len(chunk))
-            for corner in itertools.product((0.0, 1.0), repeat=3):
-                at = torch.tensor(corner)
-                cells = kernels.locate((lower + at + 0.5) * leaf_size_m, table)[:, 0]
-                weight = torch.where(at > 0, share, 1 - share).prod(1)
-                returns += weight * support[cells]
-            return returns / (returns + _HALF_SUPPORT)
-
-        return answer(evaluate(confidence, points))
+        support = self.support.astype(np.float32)
+        # What is too far away for a key has no cell.
+        limit_m = MAX_CELLS_FROM_ORIGIN * table.leaf_size_m
+        near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
+        cells = CellBlocks(table.leaf_keys())
+        returns = torch.from_numpy(
+            cells.interpolate(table.leaf_size_m, support, near.numpy(), resolve_num_threads(0))
+        )
+        return answer(returns / (returns + _HALF_SUPPORT))
 
     @overload
     def intensity(self, x: Tensor, sensor_positions: Tensor) -> Tensor: ...

@@ -90,16 +90,20 @@ def extract_mesh(
     if box is not None:
         lower, upper = _check_box(box) - radar_map.origin
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
-    if voxel_size < leaf_size_m and _smooth_in_cells(radar_map.config):
-        cells = _crossed(radar_map, cells)
-    searched = len(cells)
-    voxels = _voxels_of(cells, voxel_size, radar_map.config)
-    if box is not None:
-        centres = (voxels + 0.5) * voxel_size
-        voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     num_threads = torch.get_num_threads()
-    voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
-    values = _corner_distances(radar_map, voxel_size, voxels, corners, voxel_corners, progress)
+    if voxel_size == leaf_size_m and box is None and _is_grid(radar_map.config):
+        searched = len(cells)
+        corners, voxel_corners, values = _grid(radar_map, progress)
+    else:
+        if voxel_size < leaf_size_m and _smooth_in_cells(radar_map.config):
+            cells = _crossed(radar_map, cells)
+        searched = len(cells)
+        voxels = _voxels_of(cells, voxel_size, radar_map.config)
+        if box is not None:
+            centres = (voxels + 0.5) * voxel_size
+            voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
+        voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
+        values = _corner_distances(radar_map, voxel_size, voxels, corners, voxel_corners, progress)
     vertices, faces = extract_cells(
         corners, values, voxel_corners, spacing=[voxel_size] * 3, num_threads=num_threads
     )
@@ -146,6 +150,29 @@ def _smooth_in_cells(config: FitConfig) -> bool:
     """Whether nothing in the encoding swings more than once within two leaf cells."""
     finest = config.fourier_first + config.fourier_count - 1
     return config.fourier_count == 0 or 2 * config.fourier_half_width_m / 2**finest >= 2 * config.leaf_size_m
+
+
+def _is_grid(config: FitConfig) -> bool:
+    """Whether the field at a vertex of the leaf cells is that of its features alone."""
+    return config.encoding == "octree" and config.num_levels == 1 and config.fourier_count == 0
+
+
+def _grid(
+    radar_map: RadarMap, progress: bool | None
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    """Vertices (V, 3) of the leaf cells, those (C, 8) of each cell, and the signed distances (V,), m, where :func:`_is_grid`.
+
+    The features are what would be interpolated there, so nothing has to be looked up.
+    """
+    field = radar_map.field
+    corners, cell_corners = field.cells.table.leaf_vertices()
+    values: NDArray[np.float32] = evaluate(
+        lambda features: field.sdf_network([features])[0] * field.sigma_m,
+        field.cells.features.detach(),
+        description="mesh",
+        progress=progress,
+    ).numpy()
+    return corners, cell_corners, values
 
 
 def _crossed(radar_map: RadarMap, cells: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,13 +43,26 @@ class Rays:
 
     def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
         """Some of the rays."""
+        if isinstance(
+            part, np.ndarray
+        ):  # rows that are taken by number: a third of the time of a mask or index
+            rows = np.flatnonzero(part) if part.dtype == np.bool_ else part
+
+            def chosen(array: NDArray[Any]) -> NDArray[Any]:
+                return array.take(rows, axis=0)
+
+        else:
+
+            def chosen(array: NDArray[Any]) -> NDArray[Any]:
+                return array[part]
+
         return dataclasses.replace(
             self,
-            points=self.points[part],
-            directions=np.ascontiguousarray(self.directions[part]),
-            ranges_m=np.ascontiguousarray(self.ranges_m[part]),
-            intensities=None if self.intensities is None else self.intensities[part],
-            scans=self.scans[part],
+            points=chosen(self.points),
+            directions=np.ascontiguousarray(chosen(self.directions)),
+            ranges_m=np.ascontiguousarray(chosen(self.ranges_m)),
+            intensities=None if self.intensities is None else chosen(self.intensities),
+            scans=chosen(self.scans),
         )
 
     def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -113,14 +127,24 @@ def _check_scans(
             if value.shape != (len(scan),):
                 msg = f"intensities of scan {i} must have shape ({len(scan)},), not {value.shape}"
                 raise ValueError(msg)
-    bad = [~(np.abs(scan) <= MAX_POSITION_M).all(axis=1) for scan in scans]
-    if values is not None:
-        bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
-    if count := sum(int(b.sum()) for b in bad):
+    if not all((np.abs(scan) <= MAX_POSITION_M).all() for scan in scans) or not all(
+        np.isfinite(value).all() for value in values or ()
+    ):
+        bad = [~(np.abs(scan) <= MAX_POSITION_M).all(axis=1) for scan in scans]
+        if values is not None:
+            bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
+        count = sum(int(b.sum()) for b in bad)
         first = next(i for i, b in enumerate(bad) if b.any())
         msg = f"{count} of {sum(map(len, scans))} returns are not finite, the first in scan {first}: remove them"
         raise ValueError(msg)
     return scans, values
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of vectors (N, 3): the same numbers as np.linalg.norm's, whose sums over three numbers take five times as long."""
+    x, y, z = vectors.T
+    lengths: NDArray[np.float64] = np.sqrt(x * x + y * y + z * z)
+    return lengths
 
 
 def prepare(
@@ -172,10 +196,11 @@ def prepare(
     for i, scan in enumerate(scans):
         first = i - i % accumulate_frames
         middle = (first + min(first + accumulate_frames, len(scans)) - 1) // 2
-        ranges = np.linalg.norm(scan, axis=1)
+        ranges = _lengths(scan)
         # A return at the sensor itself has no direction.
         keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= max_range_m)
-        local = scan[keep] @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
+        kept = scan if keep.all() else scan[keep]
+        local = kept @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
         kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))
         kept_scans.append(np.full(len(local), i, np.int32))
@@ -186,7 +211,7 @@ def prepare(
         msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {max_range_m} m"
         raise ValueError(msg)
     rays = local_points - np.concatenate(kept_origins)
-    ranges = np.maximum(np.linalg.norm(rays, axis=1), 1e-6)
+    ranges = np.maximum(_lengths(rays), 1e-6)
     intensity = np.concatenate(kept_values) if values is not None else None
     if intensity is not None and intensity.min() == intensity.max():
         msg = f"all intensities are {intensity[0]}: leave them out where the sensor does not measure them"

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, CellSet, SurfelMap, cell_keys, sum_moments
+from radarsdf._core import CellBlocks, CellSet, SurfelMap, cell_keys, principal_axes, sum_moments
 from radarsdf.scans import Rays
 
 # Measured on simulated and real scans; see "What the levers of the surface are worth" in BENCHMARK.md.
@@ -18,6 +18,7 @@ _NEIGHBOUR_WEIGHT = 0.7  # of a cell that shares a face; its square over an edge
 _MIN_RETURNS = 12.0  # weighted, in the 27 cells of a plane
 _MAX_FLATNESS = 0.5  # smallest over middle variance: more is no plane
 _NOISE_RETURNS = 1_000_000  # tell the noise as well as more of them do
+_NOISE_RETURNS_TRIED = 20_000  # to 2 %, where time counts
 _GHOST_MARGIN_M = 0.1  # and
 _GHOST_SIGMAS = 2.0  # behind a surface: these two together keep noisy returns of the surface itself
 _MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there; a hedge lets most of them through
@@ -81,7 +82,7 @@ class Surfels:
         covariance = np.empty((len(means), 3, 3))
         for mean, (i, j) in zip(means[:, 3:].T, upper, strict=True):
             covariance[:, i, j] = covariance[:, j, i] = mean - centres[:, i] * centres[:, j]
-        variances, axes = np.linalg.eigh(covariance)
+        variances, axes = principal_axes(covariance, num_threads)
         normals = axes[:, :, 0]
         normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
         return cls(
@@ -96,17 +97,32 @@ class Surfels:
             np.maximum(variances, 1e-6),  # below what float32 leaves of coordinates
         )
 
-    def noise(self, rays: Rays) -> BeamNoise:
+    def flat_plane_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Row of the plane of each cell (N,), -1 where it has none, or none that is flat."""
+        flat = np.flatnonzero(self._is_flat(_MAX_FLATNESS))
+        return self._plane_of_cell(flat)[cells]
+
+    def _is_flat(self, flatness: float) -> NDArray[np.bool_]:
+        result: NDArray[np.bool_] = self.variances[:, 0] < flatness * self.variances[:, 1]
+        return result
+
+    def _plane_of_cell(self, planes: NDArray[np.int64]) -> NDArray[np.int32]:
+        plane_of_cell = np.full(len(self.keys), -1, np.int32)
+        plane_of_cell[self.cell_of_plane[planes]] = planes
+        return plane_of_cell
+
+    def noise(self, rays: Rays, cell_of_ray: NDArray[np.int32] | None = None) -> BeamNoise:
         """The sensor's noise: squared distances to the planes, fitted by its two parts.
+
+        Of other rays than those that made the planes, `cell_of_ray` (N,) are the cells' rows.
 
         At an angle of incidence θ the variance across the plane is (σ_range cosθ)² + (σ_angle range sinθ)².
         """
-        flat = np.flatnonzero(self.variances[:, 0] < 0.1 * self.variances[:, 1])
-        plane_of_cell = np.full(len(self.keys), -1, np.int32)
-        plane_of_cell[self.cell_of_plane[flat]] = flat
-        plane = plane_of_cell[self.cell_of_ray]
+        flat = np.flatnonzero(self._is_flat(0.1))
+        plane = self._plane_of_cell(flat)[self.cell_of_ray if cell_of_ray is None else cell_of_ray]
         used_rays = np.flatnonzero(plane >= 0)
-        used_rays = used_rays[:: -(-len(used_rays) // _NOISE_RETURNS) or 1]
+        most = _NOISE_RETURNS if cell_of_ray is None else _NOISE_RETURNS_TRIED
+        used_rays = used_rays[:: -(-len(used_rays) // most) or 1]
         sigma2 = np.array([0.1**2, 0.01**2])
         if len(used_rays) < 100:
             return BeamNoise(*np.sqrt(sigma2).tolist())
@@ -125,13 +141,26 @@ class Surfels:
             sigma2 = 1.05 * np.maximum(solution, [1e-4, 1e-6])  # 1.05: a normal distribution beyond the limit
         return BeamNoise(*np.sqrt(sigma2).tolist())
 
-    def ghosts(self, rays: Rays, num_threads: int = 0) -> NDArray[np.bool_]:
+    def ghosts(
+        self,
+        rays: Rays,
+        num_threads: int = 0,
+        *,
+        tried: NDArray[np.int64] | None = None,
+        counts: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.bool_]:
         """(N,) whether a return is among those behind a surface that their own rays passed through.
 
         A radar sees by way of a mirror, and places what it sees straight on, behind the mirror. Such returns agree
         with each other from every position, so that neither their number nor what other rays passed betrays them.
+
+        For less work, only the rays `tried` (M,) are followed, each of which stands for so many as `counts` (M,) says.
         """
-        noise = self.noise(rays)
+        cell_of_ray, weights, returns = self.cell_of_ray, None, self.counts
+        if tried is not None:
+            rays, cell_of_ray, weights = rays.select(tried), cell_of_ray[tried], counts
+            returns = np.bincount(cell_of_ray, weights, len(self.keys)).astype(np.float64)
+        noise = self.noise(rays, None if tried is None else cell_of_ray)
         table = np.concatenate([self.centres, self.normals, np.sqrt(self.variances[:, :1])], 1)
         table = table.astype(np.float32)
 
@@ -148,10 +177,14 @@ class Surfels:
                 num_threads,
             )
 
-        flat = np.flatnonzero(self.variances[:, 0] < _MAX_FLATNESS * self.variances[:, 1])
+        def count(rows: NDArray[np.int32], of: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
+            counted = np.bincount(rows[of], None if weights is None else weights[of], size)
+            return counted.astype(np.float64)
+
+        flat = np.flatnonzero(self._is_flat(_MAX_FLATNESS))
         first = crossed(flat, rays)
         passed = np.zeros((len(self.keys), 1))
-        passed[self.cell_of_plane[flat], 0] = np.bincount(first[first >= 0], minlength=len(flat))
+        passed[self.cell_of_plane[flat], 0] = count(first, first >= 0, len(flat))
         cells = self.cell_of_plane[flat]
         support = self.support[cells]
         passed_round = self.cells.sum_round(self.keys[cells], passed, _NEIGHBOUR_WEIGHT, num_threads)[:, 0]
@@ -160,8 +193,8 @@ class Surfels:
         behind = first >= 0
         through = np.flatnonzero(behind)[~opaque[first[behind]]]
         behind[through] = crossed(flat[opaque], rays.select(through)) >= 0
-        behind_in_cell = np.bincount(self.cell_of_ray[behind], minlength=len(self.keys))
-        sums = self.cells.sum_round(self.keys, np.stack([behind_in_cell, self.counts], 1), 1.0, num_threads)
+        behind_in_cell = count(cell_of_ray, behind, len(self.keys))
+        sums = self.cells.sum_round(self.keys, np.stack([behind_in_cell, returns], 1), 1.0, num_threads)
         result: NDArray[np.bool_] = (sums[:, 0] > _GHOST_SHARE * sums[:, 1])[self.cell_of_ray]
         return result
 
@@ -170,8 +203,21 @@ def support_of(
     points: NDArray[np.float32], leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_threads: int = 0
 ) -> NDArray[np.uint16]:
     """(C,) returns in each leaf cell and the 26 round it; 65535 stands for all that are more."""
+    return support_of_cells(
+        cell_keys(np.ascontiguousarray(points), leaf_size_m, num_threads), None, leaf_keys, num_threads
+    )
+
+
+def support_of_cells(
+    keys: NDArray[np.uint64],
+    counts: NDArray[np.float32] | None,
+    leaf_keys: NDArray[np.uint64],
+    num_threads: int = 0,
+) -> NDArray[np.uint16]:
+    """:func:`support_of` for `counts` (M,) returns in leaf cells with these `keys` (M,); one in each without `counts`."""
     cells = CellBlocks(leaf_keys)
-    rows = cells.rows(cell_keys(np.ascontiguousarray(points), leaf_size_m, num_threads), num_threads)
-    counts = np.bincount(rows[rows >= 0], minlength=len(leaf_keys)).astype(np.float64)
-    sums = cells.sum_round(leaf_keys, counts[:, None], 1.0, num_threads)[:, 0]
+    rows = cells.rows(keys, num_threads)
+    inside = rows >= 0
+    returns = np.bincount(rows[inside], None if counts is None else counts[inside], len(leaf_keys))
+    sums = cells.sum_round(leaf_keys, returns.astype(np.float64)[:, None], 1.0, num_threads)[:, 0]
     return np.minimum(sums, np.iinfo(np.uint16).max).astype(np.uint16)

@@ -187,8 +187,11 @@ class Training:
         self.iterations = schedule.iterations
         self.passes = schedule.passes
         parts = min(workers.num_threads, schedule.batch_size, config.intensity_batch_size)
-        self._draws = _Draws(surface, returns, scale, config, schedule, parts)
-        self._shards = [_Shard(field, config, schedule, part) for part in range(parts)]
+        self._draws: _Draws | None = None  # where nothing is trained: the returns need not be put in order
+        self._shards: list[_Shard] = []
+        if any(self.iterations.values()):
+            self._draws = _Draws(surface, returns, scale, config, schedule, parts)
+            self._shards = [_Shard(field, config, schedule, part) for part in range(parts)]
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         geometry = list(field.sdf_network.parameters())
@@ -221,7 +224,8 @@ class Training:
             state |= {f"adam.{name}.{k}": v for k, v in adam.state().items()}
         if self._rows is not None:
             state |= {f"rows.{k}": v for k, v in self._rows.state().items()}
-        state |= {f"draws.{k}": v for k, v in self._draws.state().items()}
+        if self._draws is not None:
+            state |= {f"draws.{k}": v for k, v in self._draws.state().items()}
         for i, shard in enumerate(self._shards):
             state |= {f"shard.{i}.{k}": v for k, v in shard.state().items()}
         return state
@@ -241,7 +245,8 @@ class Training:
             adam.restore(_part(state, f"adam.{name}"))
         if self._rows is not None:
             self._rows.restore(_part(state, "rows"))
-        self._draws.restore(_part(state, "draws"))
+        if self._draws is not None:
+            self._draws.restore(_part(state, "draws"))
         for i, shard in enumerate(self._shards):
             shard.restore(_part(state, f"shard.{i}"))
 
@@ -272,12 +277,12 @@ class Training:
             adams = [geometry, reflectance] if joint and reflectance is not None else [geometry]
             loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
             bar.update(sum(self.iterations_done.values()))
-            self._loop(
-                "sdf", self.iterations["sdf"], adams, self._draws.of_surface, loss_of, pauses, self._rows
-            )
+            if self._draws is not None and self.iterations["sdf"]:
+                draw = self._draws.of_surface
+                self._loop("sdf", self.iterations["sdf"], adams, draw, loss_of, pauses, self._rows)
             field.cells.requires_grad_(False)
             field.sdf_network.requires_grad_(False)
-            if reflectance is not None and rest:
+            if self._draws is not None and reflectance is not None and rest:
                 draw = self._draws.of_returns
                 self._loop("intensity", rest, [reflectance], draw, _Shard.reflectance_loss, pauses)
             if checkpoint is not None:
