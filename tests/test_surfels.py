@@ -215,3 +215,50 @@ def test_support_counts_the_returns_in_27_cells():
     np.testing.assert_array_equal(support, expected)
     crowd = np.full((70_000, 3), 0.1, np.float32)
     assert support_of(crowd, np.unique(cell_keys(crowd, 0.2)), 0.2).tolist() == [65535]
+
+
+def test_returns_come_onto_the_planes_that_they_make():
+    points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01)
+    rays = prepare(points, poses)
+    surfels = Surfels.of(rays)
+    moved = surfels.onto_planes(rays)
+    np.testing.assert_array_equal(moved.points, surfels.onto_planes(rays, chunk=777).points)
+
+    def error_m(rays):
+        x, _, z = rays.points.T + rays.origin[:, None]
+        wall = (
+            (np.abs(x - 15) < 0.6) & (z > 1) & (z < 3)
+        )  # far from where wall and ground meet, and from their ends
+        ground = (np.abs(z) < 0.6) & (x > 6) & (x < 13)
+        return np.sqrt(np.mean(np.concatenate([x[wall] - 15, z[ground]]) ** 2))
+
+    assert error_m(moved) < 0.35 * error_m(rays)
+    # Seen from where they were, and whole rays.
+    sensors = [r.points - r.directions * r.ranges_m[:, None] for r in (rays, moved)]
+    np.testing.assert_allclose(*sensors, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(moved.directions, axis=1), 1, atol=1e-6)
+    np.testing.assert_array_equal(moved.scans, rays.scans)
+
+
+def test_returns_that_make_no_plane_stay_where_they_are():
+    points = np.random.default_rng(0).uniform([5, -3, -3], [11, 3, 3], (4000, 3))
+    rays = prepare([points], np.eye(4)[None])
+    surfels = Surfels.of(rays)
+    moved = surfels.onto_planes(rays)
+    assert (surfels.flat_plane_of(surfels.cell_of_ray) < 0).mean() > 0.5
+    still = surfels.flat_plane_of(surfels.cell_of_ray) < 0
+    for name in ("points", "directions", "ranges_m"):
+        np.testing.assert_array_equal(getattr(moved, name)[still], getattr(rays, name)[still])
+    lone = prepare([[[5.0, 0, 0]]], np.eye(4)[None])
+    assert Surfels.of(lone).onto_planes(lone).points.tolist() == [[5, 0, 0]]
+
+
+def test_a_fit_to_planes_is_nearer_to_the_surface():
+    scene = ground_and_wall(noise_m=0.15)
+    errors_m = []
+    for onto_planes in (False, True):
+        config = FitConfig(onto_planes=onto_planes, sdf_iterations=150, num_threads=2)
+        vertices = radarsdf.fit(scene.points, scene.poses, config=config).mesh().vertices
+        on_wall = (np.abs(vertices[:, 0] - 20) < 0.8) & (vertices[:, 2] > 1) & (vertices[:, 2] < 3)
+        errors_m.append(np.sqrt(np.mean((vertices[on_wall, 0] - 20) ** 2)))
+    assert errors_m[1] < 0.7 * errors_m[0]

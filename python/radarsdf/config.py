@@ -111,6 +111,11 @@ class FitConfig:
     measured: 84 to 94 % of the surface that they cause gone, and 0.7 % of the true returns). The intensity network
     learns from them all the same."""
 
+    onto_planes: bool = True
+    """Whether returns are moved onto the plane through those round them, where these make one, for the SDF network to
+    learn from (3QFPI: no; measured: 0.8 to 1.7 points of F-score with nothing discarded on simulated scenes, whole or every
+    tenth scan, a tenth less error, and -0.2 to 0.5 on real ones; up to 1 % more error of held-out intensities)."""
+
     # Encoding
     encoding: Literal["tri-quadtree", "octree"] = "tri-quadtree"
     """Where the features live: on three planes (3QFP) or in space (SHINE-Mapping)."""
@@ -235,7 +240,7 @@ class FitConfig:
     (3QFP: no). With `normals` in a joint fit, all move in any case."""
 
     # Mesh
-    min_support: float = 0.15
+    min_support: float = 0.12
     """The mesh leaves out what fewer returns support than this share of the median (3QFP: 0). A share, since what is much
     for a sparse sensor is little for a dense one."""
     min_component_triangles: int = 30
@@ -307,6 +312,7 @@ class FitConfig:
             "num_levels": 1,
             "fourier_count": 0,
             "bridge_cells": 0,
+            "min_support": 0.15,
             "sdf_hidden": (2,),
             "near_band_m": 0.4,
             "start": "average",
@@ -321,6 +327,7 @@ class FitConfig:
         values: dict[str, Any] = {
             "accumulate_frames": 5,
             "drop_ghosts": False,
+            "onto_planes": False,
             "bridge_cells": 0,
             "fourier_count": 16,
             "cross_range_noise_rad": 0.0,

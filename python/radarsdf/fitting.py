@@ -100,10 +100,9 @@ def fit(
                 if config.start == "average"
                 else None
             )
-            if config.drop_ghosts or averaged is not None:
+            if config.drop_ghosts or config.onto_planes or averaged is not None:
                 surfels = Surfels.of(rays, workers.num_threads)
-            if config.drop_ghosts and surfels is not None:
-                surface, averaged = _without_ghosts(rays, averaged, surfels, workers.num_threads)
+                surface, averaged = _surface(rays, averaged, surfels, config, workers.num_threads)
                 clock.lap("ghosts_s")
             field = _new_field(surface, averaged, config, workers.num_threads)
             leaf_keys = field.cells.table.leaf_keys()
@@ -170,13 +169,20 @@ def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None
     return skipped
 
 
-def _without_ghosts(
-    rays: Rays, averaged: CellRays | None, surfels: Surfels, num_threads: int
+def _surface(
+    rays: Rays, averaged: CellRays | None, surfels: Surfels, config: FitConfig, num_threads: int
 ) -> tuple[Rays, CellRays | None]:
-    if averaged is None:
-        return rays.select(~surfels.ghosts(rays, num_threads)), None
-    is_ghost = surfels.ghosts(rays, num_threads, tried=averaged.first, counts=averaged.counts)
-    return rays.select(~is_ghost), averaged.select(~is_ghost[averaged.first])
+    """What the SDF is to learn from: rays without ghosts, and to the planes that their returns make."""
+    kept = None
+    if config.drop_ghosts:
+        if averaged is None:
+            kept = ~surfels.ghosts(rays, num_threads)
+        else:
+            kept = ~surfels.ghosts(rays, num_threads, tried=averaged.first, counts=averaged.counts)
+            averaged = averaged.select(kept[averaged.first])
+    if config.onto_planes and averaged is None:  # the average has distances to planes in any case
+        rays = surfels.onto_planes(rays)
+    return rays if kept is None else rays.select(kept), averaged
 
 
 def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:

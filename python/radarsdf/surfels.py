@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,6 +111,25 @@ class Surfels:
         plane_of_cell = np.full(len(self.keys), -1, np.int32)
         plane_of_cell[self.cell_of_plane[planes]] = planes
         return plane_of_cell
+
+    def onto_planes(self, rays: Rays, chunk: int = 1 << 17) -> Rays:
+        """The rays, their returns moved straight onto the plane of their cell where that is flat.
+
+        Across a surface a plane of dozens of returns is known far better than each of them; along it nothing changes.
+        """
+        plane = self.flat_plane_of(self.cell_of_ray)
+        points, directions, ranges_m = rays.points.copy(), rays.directions.copy(), rays.ranges_m.copy()
+        moved = np.flatnonzero(plane >= 0)
+        for first in range(0, len(moved), chunk):
+            row = moved[first : first + chunk]
+            point, normal = rays.points[row].astype(np.float64), self.normals[plane[row]]
+            offset_m = np.einsum("ni,ni->n", point - self.centres[plane[row]], normal)[:, None] * normal
+            ray = rays.directions[row].astype(np.float64) * rays.ranges_m[row, None] - offset_m
+            range_m = np.maximum(np.linalg.norm(ray, axis=1), 1e-6)
+            points[row] = point - offset_m
+            directions[row] = ray / range_m[:, None]
+            ranges_m[row] = range_m
+        return dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)
 
     def noise(self, rays: Rays, cell_of_ray: NDArray[np.int32] | None = None) -> BeamNoise:
         """The sensor's noise: squared distances to the planes, fitted by its two parts.
