@@ -60,7 +60,7 @@ def test_intensity_follows_the_radar_equation(radar_map):
 
 def test_observed_is_near_the_returns_only(scene, radar_map):
     world = scene.points[0] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
-    assert radar_map.observed(world).all()
+    assert radar_map.observed(world).mean() > 0.99  # some were moved onto a plane
     assert not radar_map.observed(world + [0, 0, 30.0]).any()
     assert not radar_map.observed(scene.poses[:, :3, 3]).any()
 
@@ -316,7 +316,7 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     monkeypatch.setattr(
         RaySampler, "spread", lambda self, *args: (drawn_from.append(len(self._rays)), spread(self, *args))[1]
     )
-    config = dataclasses.replace(QUICK, joint=False, drop_ghosts=True, num_threads=1)
+    config = dataclasses.replace(QUICK, joint=False, drop_ghosts=True, onto_planes=False, num_threads=1)
     with_ghosts = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     assert with_ghosts.report["ghosts"] == is_ghost.sum()
     assert set(drawn_from) == {len(is_ghost)}

@@ -18,6 +18,7 @@ from radarsdf.surfels import Surfels, support_of
 from .conftest import ground_and_wall
 
 CELL_M = 0.4
+LEAF_M = 0.2
 
 
 def a_wall(noise_range_m=0.05, noise_angle_rad=0.01, scans=8, returns=1500, ghosts=0):
@@ -46,7 +47,7 @@ def a_wall(noise_range_m=0.05, noise_angle_rad=0.01, scans=8, returns=1500, ghos
 def test_the_noise_is_found_in_the_data(range_m, angle_rad):
     points, poses, _ = a_wall(range_m, angle_rad)
     rays = prepare(points, poses)
-    noise = Surfels.of(rays).noise(rays)
+    noise = Surfels.of(rays, LEAF_M).noise(rays)
     assert noise.range_m == pytest.approx(range_m, rel=0.35)
     assert noise.angle_rad == pytest.approx(angle_rad, rel=0.35)
 
@@ -54,7 +55,7 @@ def test_the_noise_is_found_in_the_data(range_m, angle_rad):
 def test_ghosts_are_found_and_the_surface_is_kept():
     points, poses, is_ghost = a_wall(ghosts=40)
     rays = prepare(points, poses)
-    surfels = Surfels.of(rays)
+    surfels = Surfels.of(rays, LEAF_M)
     dropped = surfels.ghosts(rays)
     assert dropped[is_ghost].mean() > 0.9
     assert dropped[~is_ghost].mean() < 0.005
@@ -65,7 +66,7 @@ def test_ghosts_are_found_and_the_surface_is_kept():
 def test_one_ray_of_a_cell_finds_them_too():
     points, poses, is_ghost = a_wall(ghosts=40)
     rays = prepare(points, poses)
-    surfels = Surfels.of(rays)
+    surfels = Surfels.of(rays, LEAF_M)
     averaged = CellRays.of(rays, 0.2)
     assert len(averaged.first) < 0.7 * len(rays)
     dropped = surfels.ghosts(rays, tried=averaged.first, counts=averaged.counts)
@@ -78,7 +79,7 @@ def test_one_ray_of_a_cell_finds_them_too():
 def test_planes_of_cells():
     points, poses, _ = a_wall()
     rays = prepare(points, poses)
-    surfels = Surfels.of(rays)
+    surfels = Surfels.of(rays, LEAF_M)
     plane = surfels.flat_plane_of(surfels.cell_of_ray)
     assert (plane >= 0).mean() > 0.9
     np.testing.assert_array_equal(surfels.cell_of_plane[plane[plane >= 0]], surfels.cell_of_ray[plane >= 0])
@@ -108,13 +109,13 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     passed = [np.concatenate([p[-750:] * rng.uniform(1.3, 1.9, (750, 1)) for _ in range(5)]) for p in points]
     rays = prepare([np.concatenate(pair) for pair in zip(points, passed, strict=True)], poses)
     behind = np.concatenate([np.arange(1500 + 3750) >= 1500] * len(points))
-    assert Surfels.of(rays).ghosts(rays)[behind].mean() < 0.05
+    assert Surfels.of(rays, LEAF_M).ghosts(rays)[behind].mean() < 0.05
 
 
 def test_few_returns_make_no_plane():
     few = ground_and_wall(scans=2, returns_per_scan=20)
     rays = prepare(few.points, few.poses)
-    surfels = Surfels.of(rays)
+    surfels = Surfels.of(rays, LEAF_M)
     assert not surfels.ghosts(rays).any()
     assert np.isfinite([surfels.noise(rays).range_m, surfels.noise(rays).angle_rad]).all()
 
@@ -220,7 +221,7 @@ def test_support_counts_the_returns_in_27_cells():
 def test_returns_come_onto_the_planes_that_they_make():
     points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01)
     rays = prepare(points, poses)
-    surfels = Surfels.of(rays)
+    surfels = Surfels.of(rays, LEAF_M)
     moved = surfels.onto_planes(rays)
     np.testing.assert_array_equal(moved.points, surfels.onto_planes(rays, chunk=777).points)
 
@@ -243,14 +244,14 @@ def test_returns_come_onto_the_planes_that_they_make():
 def test_returns_that_make_no_plane_stay_where_they_are():
     points = np.random.default_rng(0).uniform([5, -3, -3], [11, 3, 3], (4000, 3))
     rays = prepare([points], np.eye(4)[None])
-    surfels = Surfels.of(rays)
+    surfels = Surfels.of(rays, LEAF_M)
     moved = surfels.onto_planes(rays)
     assert (surfels.flat_plane_of(surfels.cell_of_ray) < 0).mean() > 0.5
     still = surfels.flat_plane_of(surfels.cell_of_ray) < 0
     for name in ("points", "directions", "ranges_m"):
         np.testing.assert_array_equal(getattr(moved, name)[still], getattr(rays, name)[still])
     lone = prepare([[[5.0, 0, 0]]], np.eye(4)[None])
-    assert Surfels.of(lone).onto_planes(lone).points.tolist() == [[5, 0, 0]]
+    assert Surfels.of(lone, LEAF_M).onto_planes(lone).points.tolist() == [[5, 0, 0]]
 
 
 def test_a_fit_to_planes_is_nearer_to_the_surface():

@@ -44,7 +44,9 @@ def row(returns: int, threads: int) -> dict[str, Any]:
     rays = prepare(scans.points, scans.poses)
     del scans
     config = FitConfig()
-    is_ghost, ghosts = _measured("ghosts", lambda: Surfels.of(rays, threads).ghosts(rays, threads))
+    is_ghost, ghosts = _measured(
+        "ghosts", lambda: Surfels.of(rays, config.leaf_size_m, threads).ghosts(rays, threads)
+    )
     kept = rays.select(~is_ghost)
     leaf_keys = occupied_leaf_keys(kept, config, threads)
     counts, support = _measured(

@@ -24,7 +24,7 @@ from radarsdf.gaps import bridged
 from radarsdf.map import MAX_CELLS_FROM_ORIGIN, IntensityScale, RadarMap
 from radarsdf.scans import Rays, prepare
 from radarsdf.stopping import Diverged, Interrupted
-from radarsdf.surfels import SURFEL_CELL_M, Surfels, support_of, support_of_cells
+from radarsdf.surfels import Surfels, support_of, support_of_cells
 from radarsdf.threads import Workers
 from radarsdf.training import Training
 
@@ -101,7 +101,7 @@ def fit(
                 else None
             )
             if config.drop_ghosts or config.onto_planes or averaged is not None:
-                surfels = Surfels.of(rays, workers.num_threads)
+                surfels = Surfels.of(rays, config.leaf_size_m, workers.num_threads)
                 surface, averaged = _surface(rays, averaged, surfels, config, workers.num_threads)
                 clock.lap("ghosts_s")
             field = _new_field(surface, averaged, config, workers.num_threads)
@@ -200,14 +200,13 @@ def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArr
 
 def _check_extent(rays: Rays, config: FitConfig) -> None:
     """A single outlier must not be met in the middle of the work, nor by an error that does not say what it is."""
-    cell_m = min(config.leaf_size_m, SURFEL_CELL_M) if config.drop_ghosts else config.leaf_size_m
-    limit_m = MAX_CELLS_FROM_ORIGIN * cell_m
+    limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m
     reach_m = max(config.near_band_m, config.truncation_m if config.start == "average" else 0.0)
     if np.abs(rays.points).max() + reach_m > limit_m:
         distance_m = np.abs(rays.points).max(axis=1) + reach_m
         outside = int((distance_m > limit_m).sum())
         msg = (
-            f"{outside} of {len(rays)} returns are not within a million cells of {cell_m} m of the sensors' mean "
+            f"{outside} of {len(rays)} returns are not within a million cells of {config.leaf_size_m} m of the sensors' mean "
             f"position, the furthest {distance_m.max():.3g} m away: drop them (max_range_m), use larger cells, or split "
             "scans so far apart"
         )

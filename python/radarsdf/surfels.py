@@ -14,13 +14,13 @@ from radarsdf._core import CellBlocks, CellSet, SurfelMap, cell_keys, principal_
 from radarsdf.scans import Rays
 
 # Measured on simulated and real scans; see "What the levers of the surface are worth" in BENCHMARK.md.
-SURFEL_CELL_M = 0.4
+SURFEL_LEAVES = 2  # leaf cells along an edge of a surfel's: 0.4 m
 _NEIGHBOUR_WEIGHT = 0.7  # of a cell that shares a face; its square over an edge, its cube over a corner
 _MIN_RETURNS = 12.0  # weighted, in the 27 cells of a plane
 _MAX_FLATNESS = 0.5  # smallest over middle variance: more is no plane
 _NOISE_RETURNS = 1_000_000  # tell the noise as well as more of them do
 _NOISE_RETURNS_TRIED = 20_000  # to 2 %, where time counts
-_GHOST_MARGIN_M = 0.1  # and
+_GHOST_MARGIN = 0.25  # surfel cells, and
 _GHOST_SIGMAS = 2.0  # behind a surface: these two together keep noisy returns of the surface itself
 _MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there; a hedge lets most of them through
 _GHOST_SHARE = 0.5  # of the returns in a neighbourhood: ghosts are among ghosts, a noisy return is not
@@ -38,8 +38,9 @@ class BeamNoise:
 
 @dataclass(frozen=True)
 class Surfels:
-    """Cells of 0.4 m, and a plane for each that has returns enough in it and the 26 cells round it."""
+    """Cells twice as large as leaf cells, and a plane for each that has returns enough in it and the 26 cells round it."""
 
+    cell_size_m: float
     keys: NDArray[np.uint64]
     """(C,) Morton keys of the occupied cells, ascending."""
     cells: CellBlocks
@@ -60,15 +61,16 @@ class Surfels:
     """(P, 3) of the returns along the principal axes, ascending: the first is across the plane, m²."""
 
     @classmethod
-    def of(cls, rays: Rays, num_threads: int = 0) -> Surfels:
+    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
         """Planes through returns."""
+        cell_size_m = SURFEL_LEAVES * leaf_size_m
         points = np.ascontiguousarray(rays.points)
-        occupied = CellSet(SURFEL_CELL_M)
+        occupied = CellSet(cell_size_m)
         occupied.insert(points, num_threads)
         keys = occupied.sorted_keys(num_threads)
         del occupied
         cells = CellBlocks(keys)
-        cell_of_ray = cells.rows(cell_keys(points, SURFEL_CELL_M, num_threads), num_threads)
+        cell_of_ray = cells.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
         moments = sum_moments(
             points, np.ascontiguousarray(rays.directions), cell_of_ray, len(keys), num_threads
         )
@@ -87,6 +89,7 @@ class Surfels:
         normals = axes[:, :, 0]
         normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
         return cls(
+            cell_size_m,
             keys,
             cells,
             cell_of_ray,
@@ -95,7 +98,7 @@ class Surfels:
             cell_of_plane,
             centres,
             normals,
-            np.maximum(variances, 1e-6),  # below what float32 leaves of coordinates
+            np.maximum(variances, (0.0025 * cell_size_m) ** 2),  # below what float32 leaves of coordinates
         )
 
     def flat_plane_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -143,7 +146,7 @@ class Surfels:
         used_rays = np.flatnonzero(plane >= 0)
         most = _NOISE_RETURNS if cell_of_ray is None else _NOISE_RETURNS_TRIED
         used_rays = used_rays[:: -(-len(used_rays) // most) or 1]
-        sigma2 = np.array([0.1**2, 0.01**2])
+        sigma2 = np.array([(0.25 * self.cell_size_m) ** 2, 0.01**2])
         if len(used_rays) < 100:
             return BeamNoise(*np.sqrt(sigma2).tolist())
         plane, range_m = plane[used_rays], rays.ranges_m[used_rays].astype(np.float64)
@@ -151,6 +154,7 @@ class Surfels:
         normals = self.normals[plane]
         residual2 = np.einsum("ni,ni->n", offset_m, normals) ** 2
         cosine2 = np.einsum("ni,ni->n", rays.directions[used_rays], normals) ** 2
+        least = [(0.025 * self.cell_size_m) ** 2, 1e-6]
         parts = np.stack([cosine2, range_m**2 * (1 - cosine2)], 1)
         for _ in range(10):  # weights of the last round's variances; what is far outside does not count
             variance = parts @ sigma2
@@ -158,7 +162,7 @@ class Surfels:
             kept = parts[used]
             weighted = kept / variance[used, None] ** 2
             solution = np.linalg.lstsq(weighted.T @ kept, weighted.T @ residual2[used], rcond=None)[0]
-            sigma2 = 1.05 * np.maximum(solution, [1e-4, 1e-6])  # 1.05: a normal distribution beyond the limit
+            sigma2 = 1.05 * np.maximum(solution, least)  # 1.05: a normal distribution beyond the limit
         return BeamNoise(*np.sqrt(sigma2).tolist())
 
     def ghosts(
@@ -185,14 +189,14 @@ class Surfels:
         table = table.astype(np.float32)
 
         def crossed(planes: NDArray[np.int64], rays: Rays) -> NDArray[np.int32]:
-            surfels = SurfelMap(self.keys[self.cell_of_plane[planes]], table[planes], SURFEL_CELL_M)
+            surfels = SurfelMap(self.keys[self.cell_of_plane[planes]], table[planes], self.cell_size_m)
             return surfels.first_crossings(
                 np.ascontiguousarray(rays.points),
                 np.ascontiguousarray(rays.directions),
                 np.ascontiguousarray(rays.ranges_m),
                 noise.range_m,
                 noise.angle_rad,
-                _GHOST_MARGIN_M,
+                _GHOST_MARGIN * self.cell_size_m,
                 _GHOST_SIGMAS,
                 num_threads,
             )
