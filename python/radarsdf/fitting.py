@@ -61,7 +61,8 @@ def fit(
     -------
     RadarMap
         With the times and counts of the fit in its ``report``. The same input, seed and number of threads give the
-        same bits; another number of threads sees the same samples and rounds differently.
+        same bits; another number of threads sees the same samples, and rounds differently or, with intensities, has another
+        dropout.
 
     Raises
     ------

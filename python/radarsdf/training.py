@@ -162,7 +162,7 @@ class Training:
     """The schedule: geometry first, then, on frozen geometry, reflectance; or, as published, both from the start.
 
     Every batch is split over the threads; their gradients are added in the order of the threads, so the same number of
-    threads gives the same bits, and another number rounds differently.
+    threads gives the same bits; another number of threads rounds differently and has another dropout.
     """
 
     def __init__(
