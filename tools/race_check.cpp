@@ -21,7 +21,9 @@
 #include "encodings.hpp"
 #include "instruction_set.hpp"
 #include "marching_cubes.hpp"
+#include "mlp.hpp"
 #include "parallel.hpp"
+#include "ray_average.hpp"
 #include "sparse_lattice.hpp"
 #include "surface_crossings.hpp"
 #include "vertex_table.hpp"
@@ -102,9 +104,9 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   const radarsdf::VertexTable table(cells.sorted_keys(threads), 0.2, kLevels, encoding, threads);
   auto features = random_numbers<T>(8 * table.num_rows(), 1.0, 2);
   const auto grad = random_numbers<T>(8 * kLevels * kPoints, 1.0, 3);
-  std::vector<std::int32_t> located(kLevels * kPoints), last_step(features.size() / 8), slots(features.size() / 8);
+  std::vector<std::int32_t> located(kLevels * kPoints), last_step(features.size() / 8);
   radarsdf::locate(table, points.data(), kPoints, located.data(), threads);
-  std::vector<T> moments(2 * features.size());
+  std::vector<T> moments(2 * features.size()), sums(features.size());
   const std::vector<T> decays{1, 1, T(0.9), T(0.99), T(0.81), T(0.98)};
   const std::int64_t half = kPoints / 2, stride = 8 * kLevels;
   const radarsdf::PointBatch<T> whole{points.data(), nullptr, located.data(), half};
@@ -116,7 +118,7 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
     for (int part = 0; part < threads; ++part) {
       workers.emplace_back([&, part] {
         radarsdf::adam_step(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
-                            slots.data(), part, threads);
+                            sums.data(), part, threads);
       });
     }
     for (std::thread& worker : workers) worker.join();
@@ -125,7 +127,32 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   results.add(moments.data(), 16 * table.num_rows());
 }
 
-// Sums over cells, and rays through surfels.
+// A network of two layers on two blocks of columns, forward and backward.
+template <typename T>
+void networks(int threads, Results& results) {
+  constexpr std::int64_t kHidden = 20, kWide = 7, kNarrow = 5, kOutputs = 3;
+  const auto wide = random_numbers<T>(kWide * kPoints, 1.0, 11), narrow = random_numbers<T>(kNarrow * kPoints, 1.0, 12);
+  const auto first = random_numbers<T>(kHidden * (kWide + kNarrow + 1), 0.3, 13);
+  const auto second = random_numbers<T>(kOutputs * (kHidden + 1), 0.3, 14);
+  const auto grad = random_numbers<T>(kOutputs * kPoints, 1.0, 15);
+  const std::vector<radarsdf::Layer<T>> layers = {
+      {first.data(), first.data() + kHidden * (kWide + kNarrow), kWide + kNarrow, kHidden},
+      {second.data(), second.data() + kOutputs * kHidden, kHidden, kOutputs}};
+  const std::vector<radarsdf::Columns<const T>> inputs = {{wide.data(), kWide, kWide},
+                                                          {narrow.data(), kNarrow, kNarrow}};
+  std::vector<T> hidden(static_cast<std::size_t>(radarsdf::mlp_hidden_columns(layers) * kPoints));
+  std::vector<T> out(grad.size()), first_grad(first.size()), second_grad(second.size()), wide_grad(wide.size());
+  radarsdf::mlp(layers, inputs, kPoints, hidden.data(), out.data(), threads);
+  radarsdf::mlp_backward<T>(layers, inputs, kPoints, hidden.data(), {grad.data(), kOutputs, kOutputs},
+                            {{first_grad.data(), first_grad.data() + kHidden * (kWide + kNarrow)},
+                             {second_grad.data(), second_grad.data() + kOutputs * kHidden}},
+                            {{wide_grad.data(), kWide, kWide}, {nullptr, 0, kNarrow}}, threads);
+  for (const std::vector<T>* numbers : {&out, &first_grad, &second_grad, &wide_grad}) {
+    results.add(numbers->data(), static_cast<std::int64_t>(numbers->size()));
+  }
+}
+
+// Sums over cells, and rays through surfels and through cells.
 void sums_and_rays(int threads, Results& results) {
   const auto points = random_numbers<float>(3 * kPoints, 3.0, 9);
   auto directions = random_numbers<float>(3 * kPoints, 1.0, 10);
@@ -165,6 +192,14 @@ void sums_and_rays(int threads, Results& results) {
                       crossed.data(), threads);
   if (std::all_of(crossed.begin(), crossed.end(), [](std::int32_t c) { return c < 0; })) std::abort();
   results.add(crossed.data(), kPoints);
+
+  radarsdf::CellSet along(0.2);
+  along.insert_rays(points.data(), directions.data(), kPoints, 0.4, threads);
+  const radarsdf::VertexTable table(along.sorted_keys(threads), 0.2, 1, radarsdf::Encoding::kOctree, threads);
+  std::vector<float> weights(kPoints, 1.0F), distances(static_cast<std::size_t>(table.num_rows()));
+  radarsdf::average_rays(table, {points.data(), directions.data(), directions.data(), weights.data(), kPoints}, 0.6,
+                         distances.data(), threads);
+  results.add(distances.data(), table.num_rows());
 }
 
 // An exception of one task ends the others and is the caller's.
@@ -212,6 +247,7 @@ Results all(int threads) {
   encodings<T>(radarsdf::Encoding::kOctree, threads, results);
   adam<T>(radarsdf::Encoding::kTriQuadtree, threads, results);
   adam<T>(radarsdf::Encoding::kOctree, threads, results);
+  networks<T>(threads, results);
   sums_and_rays(threads, results);
   failure(threads);
   surfaces<T>(threads, results);
