@@ -160,8 +160,8 @@ def test_the_command_says_it_in_one_line(scene, tmp_path, capsys):
 def test_memory_does_not_grow_with_the_fits():
     code = """
 from bench.stress.memory import memory_of_fits
-found = memory_of_fits(24)
-assert max(found[16:]) - max(found[4:12]) < 8, found
+found = memory_of_fits(48)  # what freed memory the allocator keeps varies by ten megabytes in the first of them
+assert max(found[32:]) - max(found[4:32]) < 8, found
 """
     subprocess.run([sys.executable, "-c", code], check=True)
 
