@@ -181,7 +181,7 @@ def _surface(
         else:
             kept = ~surfels.ghosts(rays, num_threads, tried=averaged.first, counts=averaged.counts)
             averaged = averaged.select(kept[averaged.first])
-    if config.onto_planes and averaged is None:  # the average has distances to planes in any case
+    if config.onto_planes and config.sdf_iterations != 0:  # the average has distances to planes in any case
         rays = surfels.onto_planes(rays)
     return rays if kept is None else rays.select(kept), averaged
 
