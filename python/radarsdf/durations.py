@@ -12,7 +12,8 @@ from radarsdf.kernels import FEATURE_DIM
 from radarsdf.schedule import Schedule
 
 # `python -m bench.stress durations` measures fits and prints these anew. Seconds of one thread of BENCHMARK.md's machine;
-# what they say of twenty fits was 0.6 to 1.3 times their processor time. A 0 is what the others account for.
+# what they say of twenty fits, measured again, was 0.6 to 1.3 times their processor time and 0.76 to 1.92 times their wall
+# time on two. A 0 is what the others account for.
 SECONDS = {
     "always": 0.18,
     "return": 2.8e-06,
