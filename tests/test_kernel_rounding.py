@@ -16,14 +16,6 @@ from bench.stress import kernels as stress
 DTYPES = [np.float32, np.float64]
 
 
-@pytest.fixture(params=_core.available_instruction_sets())
-def instruction_set(request):
-    before = _core.instruction_set()
-    _core.set_instruction_set(request.param)
-    yield request.param
-    _core.set_instruction_set(before)
-
-
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("encoding", stress.ENCODINGS.values(), ids=stress.ENCODINGS)
