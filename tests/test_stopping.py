@@ -51,17 +51,22 @@ def interrupted_python(code, after="ready", delay_s=0.3):
     return said, process.returncode
 
 
-FIT = """
-import sys
-import radarsdf
-from tests.conftest import ground_and_wall
-from radarsdf import FitConfig, Interrupted
+# Says when the training begins.
+ANNOUNCED = """
 from radarsdf.training import Training
 run = Training.run
 def announced(*arguments):
     print("ready", flush=True)
     run(*arguments)
 Training.run = announced
+"""
+FIT = (
+    ANNOUNCED
+    + """
+import sys
+import radarsdf
+from tests.conftest import ground_and_wall
+from radarsdf import FitConfig, Interrupted
 scene = ground_and_wall()
 try:
     radarsdf.fit(scene.points, scene.poses, {intensities}, config=FitConfig(**{config}), progress=False)
@@ -77,6 +82,7 @@ except KeyboardInterrupt as error:
     assert len(radar_map.mesh(0.2).faces) > 100
     print("a map")
 """
+)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -182,17 +188,14 @@ assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 def test_the_command_saves_the_map_so_far_and_says_so_in_one_line(tmp_path):
     scene = ground_and_wall()
     write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
-    code = """
+    code = (
+        ANNOUNCED
+        + """
 import sys
 from radarsdf.cli import main
-from radarsdf.training import Training
-run = Training.run
-def announced(*arguments):
-    print("ready", flush=True)
-    run(*arguments)
-Training.run = announced
 sys.exit(main())
 """
+    )
     process = subprocess.Popen(
         [sys.executable, "-c", code, "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
         + ["--quiet", "--set", "sdf_iterations=1000000", "--checkpoint", str(tmp_path / "state")],

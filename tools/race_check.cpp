@@ -63,11 +63,16 @@ std::vector<T> random_numbers(std::int64_t size, double scale, unsigned seed) {
 }
 
 template <typename T>
-void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
-  const auto points = random_numbers<T>(3 * kPoints, 4.0, 1);
+radarsdf::VertexTable table_of(const std::vector<T>& points, radarsdf::Encoding encoding, int threads) {
   radarsdf::CellSet cells(0.2);
   cells.insert(points.data(), kPoints, threads);
-  const radarsdf::VertexTable table(cells.sorted_keys(threads), 0.2, kLevels, encoding, threads);
+  return radarsdf::VertexTable(cells.sorted_keys(threads), 0.2, kLevels, encoding, threads);
+}
+
+template <typename T>
+void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
+  const auto points = random_numbers<T>(3 * kPoints, 4.0, 1);
+  const radarsdf::VertexTable table = table_of(points, encoding, threads);
   results.add(table.cells().data(), table.num_cells());
 
   const auto features = random_numbers<T>(8 * table.num_rows(), 1.0, 2);
@@ -99,9 +104,7 @@ void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
 template <typename T>
 void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   const auto points = random_numbers<T>(3 * kPoints, 4.0, 1);
-  radarsdf::CellSet cells(0.2);
-  cells.insert(points.data(), kPoints, threads);
-  const radarsdf::VertexTable table(cells.sorted_keys(threads), 0.2, kLevels, encoding, threads);
+  const radarsdf::VertexTable table = table_of(points, encoding, threads);
   auto features = random_numbers<T>(8 * table.num_rows(), 1.0, 2);
   const auto grad = random_numbers<T>(8 * kLevels * kPoints, 1.0, 3);
   std::vector<std::int32_t> located(kLevels * kPoints), last_step(features.size() / 8);

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, CellSet, cell_keys, sum_moments
+from radarsdf._core import CellSet
 from radarsdf.config import FitConfig
 from radarsdf.field import Field
 from radarsdf.scans import Rays
-from radarsdf.surfels import Surfels
+from radarsdf.surfels import Surfels, cells_of
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,7 @@ class CellRays:
     @classmethod
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> CellRays:
         """The rays of cells of this size."""
-        points = np.ascontiguousarray(rays.points)
-        occupied = CellSet(cell_size_m)
-        occupied.insert(points, num_threads)
-        keys = occupied.sorted_keys(num_threads)
-        rows = CellBlocks(keys).rows(cell_keys(points, cell_size_m, num_threads), num_threads)
-        moments = sum_moments(points, np.ascontiguousarray(rays.directions), rows, len(keys), num_threads)
+        keys, _, rows, moments = cells_of(rays, cell_size_m, num_threads)
         first = np.empty(len(keys), np.int64)
         first[rows[::-1]] = np.arange(len(rows) - 1, -1, -1)  # of several, the last one written counts
         # Of rays that cancel each other, the first.

@@ -286,30 +286,10 @@ def adam_step(
     )
 
 
-def add_transposed(
-    sums: Tensor, points: Tensor, values: Tensor, table: VertexTable, num_threads: int
-) -> None:
-    """Adds the transpose of :func:`interpolate`: each vertex of a point's cells gets the point's values times its weight.
-
-    Parameters
-    ----------
-    sums : Tensor
-        (num_rows, 8), in place.
-    points, values : Tensor
-        (N, 3), local frame, m, and (N, 8 · num_levels). Points in no cell count nowhere.
-    table : VertexTable
-        Which rows belong to which cell.
-    num_threads : int
-        To use.
-    """
-    located = locate(points, table, num_threads)
-    table.scatter(view(points), located.numpy(), None, view(values), sums.numpy(), num_threads)
-
-
-def locate(points: Tensor, table: VertexTable, num_threads: int | None = None) -> Tensor:
+def locate(points: Tensor, table: VertexTable) -> Tensor:
     """Occupied cell that holds each point (N, 3), local frame, m: (N, num_levels) int32, finest first, -1 where none."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
-    table.locate(view(points), located.numpy(), threads() if num_threads is None else num_threads)
+    table.locate(view(points), located.numpy(), threads())
     return located
 
 

@@ -86,8 +86,8 @@ class RaySampler:
         self._order_from = torch.zeros_like(generator.get_state())
         """The generator's state that `_order` was drawn from."""
         self._next = 0
-        share = config.near_samples / (config.near_samples + config.free_samples)
-        self._num_near = max(1, round(batch_size * share))
+        near_share = config.near_samples / (config.near_samples + config.free_samples)
+        self._num_near = max(1, round(batch_size * near_share))
         self._num_free = batch_size - self._num_near
         self._layouts: dict[int, _Layout] = {}
 

@@ -64,16 +64,7 @@ class Surfels:
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
         """Planes through returns."""
         cell_size_m = SURFEL_LEAVES * leaf_size_m
-        points = np.ascontiguousarray(rays.points)
-        occupied = CellSet(cell_size_m)
-        occupied.insert(points, num_threads)
-        keys = occupied.sorted_keys(num_threads)
-        del occupied
-        cells = CellBlocks(keys)
-        cell_of_ray = cells.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
-        moments = sum_moments(
-            points, np.ascontiguousarray(rays.directions), cell_of_ray, len(keys), num_threads
-        )
+        keys, cells, cell_of_ray, moments = cells_of(rays, cell_size_m, num_threads)
         counts = moments[:, :1].copy()
         support = cells.sum_round(keys, counts, _NEIGHBOUR_WEIGHT, num_threads)[:, 0]
         # Many cells have hardly a return: their planes would be most of the work and of the memory.
@@ -221,6 +212,21 @@ class Surfels:
         sums = self.cells.sum_round(self.keys, np.stack([behind_in_cell, returns], 1), 1.0, num_threads)
         result: NDArray[np.bool_] = (sums[:, 0] > _GHOST_SHARE * sums[:, 1])[self.cell_of_ray]
         return result
+
+
+def cells_of(
+    rays: Rays, cell_size_m: float, num_threads: int = 0
+) -> tuple[NDArray[np.uint64], CellBlocks, NDArray[np.int32], NDArray[np.float64]]:
+    """Cells that hold returns: keys (C,), ascending; from these to their rows; each return's row (N,); ``sum_moments`` (C, 13)."""
+    points = np.ascontiguousarray(rays.points)
+    occupied = CellSet(cell_size_m)
+    occupied.insert(points, num_threads)
+    keys = occupied.sorted_keys(num_threads)
+    del occupied
+    cells = CellBlocks(keys)
+    rows = cells.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
+    directions = np.ascontiguousarray(rays.directions)
+    return keys, cells, rows, sum_moments(points, directions, rows, len(keys), num_threads)
 
 
 def support_of(
