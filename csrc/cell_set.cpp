@@ -43,6 +43,11 @@ void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uin
   if (!inside) throw std::invalid_argument("points must be finite and within a million cells of the origin");
 }
 
+// Bits that FlatMap does not use for the slot, or the partitions would fill unevenly.
+std::size_t CellSet::partition_of(std::uint64_t block) {
+  return static_cast<std::size_t>((hash_key(block) >> 16) % kPartitions);
+}
+
 void CellSet::insert_keys(const std::vector<std::vector<std::uint64_t>>& parts, int num_threads) {
   const std::int64_t threads = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
   parallel_tasks(threads, num_threads, [&](std::int64_t task) {
@@ -53,8 +58,7 @@ void CellSet::insert_keys(const std::vector<std::vector<std::uint64_t>>& parts, 
         const std::uint64_t block = CellBlocks::block_key(key);
         if (block != previous) {
           previous = block;
-          // Bits that FlatMap does not use for the slot, or the partitions would fill unevenly.
-          const std::uint64_t number = (hash_key(block) >> 16) % kPartitions;
+          const std::size_t number = partition_of(block);
           mask = nullptr;
           if (static_cast<std::int64_t>(number) % threads == task) {
             Partition& own = partitions_[number];
@@ -119,7 +123,7 @@ std::vector<std::uint64_t> CellSet::sorted_keys(int num_threads) const {
   std::vector<std::uint64_t> keys;
   keys.reserve(static_cast<std::size_t>(size()));
   for (const std::uint64_t block : blocks) {
-    const Partition& own = partitions_[(hash_key(block) >> 16) % kPartitions];
+    const Partition& own = partitions_[partition_of(block)];
     std::uint64_t mask = own.masks[static_cast<std::size_t>(own.numbers.find(block))];
     for (; mask != 0; mask &= mask - 1) {
       keys.push_back(block << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(mask)));

@@ -44,6 +44,7 @@ class CellSet {
   // A block's partition is a function of its hash, so threads fill different partitions and need no locks.
   static constexpr int kPartitions = 64;
 
+  static std::size_t partition_of(std::uint64_t block);
   void insert_keys(const std::vector<std::vector<std::uint64_t>>& parts, int num_threads);
 
   double leaf_size_m_;
