@@ -24,20 +24,20 @@ void move(const AdamStep<T>& adam, const std::int32_t* rows, T* gradients, std::
   for (std::int64_t first = 0; first < count; first += kBlock) {
     const std::int64_t size = count - first < kBlock ? count - first : kBlock;
     for (std::int64_t i = first + kBlock; i < first + 2 * kBlock && i < count; ++i) {
-      prefetch(adam.last_step + rows[i]);
+      prefetch(adam.marks + rows[i]);
       prefetch(adam.moments + rows[i] * std::int64_t{2 * kFeatureDim});
       prefetch(adam.features + rows[i] * std::int64_t{kFeatureDim});
     }
     for (std::int64_t i = 0; i < size; ++i) {
       const std::int32_t row = rows[first + i];
-      const std::int32_t steps = adam.step - adam.last_step[row];
-      adam.last_step[row] = adam.step;
+      const std::int32_t steps = adam.step - adam.marks[row].last_step;
+      adam.marks[row] = {adam.step, 0};
       const Features<T> moments[2] = {
           adam.decays[2 * steps] * load(adam.moments + row * std::int64_t{2 * kFeatureDim}),
           adam.decays[2 * steps + 1] * load(adam.moments + row * std::int64_t{2 * kFeatureDim} + kFeatureDim)};
       store(mean + i * kFeatureDim, moments[0]);
       store(square + i * kFeatureDim, moments[1]);
-      T* sum = gradients + row * std::int64_t{kFeatureDim};
+      T* sum = gradients + (first + i) * kFeatureDim;
       store(gradient + i * kFeatureDim, load(sum));
       store(sum, Features<T>{});
     }

@@ -11,23 +11,29 @@
 
 namespace radarsdf {
 
+// What Adam remembers of a row beside its moments.
+struct RowMark {
+  std::int32_t last_step;  // in which it last moved; 0: never
+  std::int32_t place;      // 1 + that of its sum among the sums of the step at hand; 0: the step has not touched it
+};
+
 // One step. What a row missed since it last moved fades as it would have with gradients of zero; only the movement that
 // those would still have caused is left out. So a step costs the rows that it touches, not the map.
 template <typename T>
 struct AdamStep {
-  T* features;              // (rows, 8)
-  T* moments;               // (rows, 2, 8): mean and mean square of a row's gradients
-  std::int32_t* last_step;  // (rows) in which a row last moved; 0: never
-  const T* decays;          // (step + 1, 2): both betas to the power of the steps since
-  std::int32_t step;        // from 1 on
-  T rate;                   // learning rate / (1 - beta1^step)
-  T square_scale;           // 1 / (1 - beta2^step)
+  T* features;        // (rows, 8)
+  T* moments;         // (rows, 2, 8): mean and mean square of a row's gradients
+  RowMark* marks;     // (rows)
+  const T* decays;    // (step + 1, 2): both betas to the power of the steps since
+  std::int32_t step;  // from 1 on
+  T rate;             // learning rate / (1 - beta1^step)
+  T square_scale;     // 1 / (1 - beta2^step)
   T epsilon;
 };
 
 template <typename T>
 struct AdamKernel {
-  // Moves rows[i], for i in [0, count), against its row of gradients (num_rows, 8), which becomes zero.
+  // Moves rows[i], for i in [0, count), against gradients[i] (count, 8), which becomes zero, as does the row's place.
   void (*move)(const AdamStep<T>&, const std::int32_t* rows, T* gradients, std::int64_t count);
 };
 

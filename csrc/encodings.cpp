@@ -77,7 +77,7 @@ void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_
 
 template <typename T>
 void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, T* sums, int part, int parts) {
+               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, int part, int parts) {
   const InterpolationKernels<T>& kernels = kernels_for<T>(table);
   const AdamKernel<T> adam_kernel = RADARSDF_KERNEL(adam_kernel<T>)();
   const int groups = num_vertex_groups(table.encoding());
@@ -86,19 +86,17 @@ void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batch
   for (const PointBatch<T>& batch : batches) points += batch.count;
   // Kept from call to call: fresh pages would cost as much as the sums.
   thread_local std::vector<std::int32_t> rows;
-  thread_local std::vector<std::uint64_t> is_touched;  // zero between calls
+  thread_local std::vector<T> sums;  // zero between calls
   const auto most = static_cast<std::size_t>(std::min(points * corners, table.num_rows())) + 1;
   if (rows.size() < most) rows.resize(most);
-  const auto words = static_cast<std::size_t>(table.num_rows() / 64 + 1);
-  if (is_touched.size() < words) is_touched.resize(words);
+  if (sums.size() < most * kFeatureDim) sums.resize(most * kFeatureDim);
   for (int task = part; task < table.num_levels() * groups; task += parts) {
-    RowSums<T> touched{is_touched.data(), rows.data(), sums, 0};
+    RowSums<T> touched{adam.marks, rows.data(), sums.data(), 0};
     for (std::size_t b = 0; b < batches.size(); ++b) {
       kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, task / groups,
                            task % groups, 0, batches[b].count);
     }
-    adam_kernel.move(adam, touched.rows, sums, touched.count);
-    for (std::int64_t i = 0; i < touched.count; ++i) is_touched[static_cast<std::size_t>(touched.rows[i] >> 6)] = 0;
+    adam_kernel.move(adam, touched.rows, touched.sums, touched.count);
   }
 }
 
@@ -156,7 +154,7 @@ void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::i
   template void interpolate(const VertexTable&, const T*, const PointBatch<T>&, T*, std::int64_t, int);             \
   template void scatter(const VertexTable&, const PointBatch<T>&, const T*, std::int64_t, T*, int);                 \
   template void adam_step(const VertexTable&, const std::vector<PointBatch<T>>&, const std::vector<const T*>&,      \
-                          const std::vector<std::int64_t>&, const AdamStep<T>&, T*, int, int);                      \
+                          const std::vector<std::int64_t>&, const AdamStep<T>&, int, int);                          \
   template void coordinate_gradient(const VertexTable&, const T*, const PointBatch<T>&, const T*, std::int64_t, T*, \
                                     int);                                                                           \
   template void fourier(const T*, std::int64_t, double, int, int, T*, std::int64_t, int);                           \

@@ -40,11 +40,10 @@ void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_
              T* features_grad, int num_threads);
 
 // One step of Adam with the gradients that `scatter` would sum over the batches, on the rows that they touch: for part
-// `part` of `parts` of all (level, group) pairs, so that each of the caller's threads can take one. `sums` (num_rows,
-// 8) is scratch: zeros before and after.
+// `part` of `parts` of all (level, group) pairs, so that each of the caller's threads can take one.
 template <typename T>
 void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, T* sums, int part, int parts);
+               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, int part, int parts);
 
 template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,

@@ -7,7 +7,8 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <vector>
+
+#include "large_array.hpp"
 
 namespace radarsdf {
 
@@ -44,7 +45,7 @@ class FlatMap {
   std::size_t size() const { return size_; }
   FlatMapView view() const { return {slots_.data(), slots_.size() - 1, shift_}; }
   std::int32_t find(std::uint64_t key) const { return view().find(key); }
-  const std::vector<Slot>& slots() const { return slots_; }
+  const LargeVector<Slot>& slots() const { return slots_; }
 
   // Returns false, and leaves the old value, where the key is present.
   bool insert(std::uint64_t key, std::int32_t value) {
@@ -70,14 +71,14 @@ class FlatMap {
   }
 
   void grow() {
-    const std::vector<Slot> old = slots_;  // copied first: if memory runs out the map is as it was
+    const LargeVector<Slot> old = slots_;  // copied first: if memory runs out the map is as it was
     reset(slots_.size());
     for (const Slot& slot : old) {
       if (slot.key != kEmptyKey) insert(slot.key, slot.value);
     }
   }
 
-  std::vector<Slot> slots_;
+  LargeVector<Slot> slots_;
   int shift_ = 60;
   std::size_t size_ = 0;
 };

@@ -128,13 +128,14 @@ template <typename T>
 struct TouchedRows {
   RowSums<T> touched;
   void add(std::int32_t row, Features<T> gradient) {
-    T* sum = touched.sums + static_cast<std::int64_t>(row) * kFeatureDim;
-    store(sum, load(sum) + gradient);
     // Without a branch: whether a row has been touched is a toss, and a wrong guess costs more than the sum.
-    const std::uint64_t word = touched.is_touched[row >> 6];
-    touched.is_touched[row >> 6] = word | std::uint64_t{1} << (row & 63);
+    const std::int32_t known = touched.marks[row].place;
     touched.rows[touched.count] = row;
-    touched.count += static_cast<std::int64_t>(~(word >> (row & 63)) & 1);
+    touched.count += known == 0;
+    const std::int32_t place = known == 0 ? static_cast<std::int32_t>(touched.count) : known;
+    touched.marks[row].place = place;
+    T* sum = touched.sums + static_cast<std::int64_t>(place - 1) * kFeatureDim;
+    store(sum, load(sum) + gradient);
   }
 };
 

@@ -8,7 +8,7 @@
 
 #include <cstdint>
 
-#include "cell.hpp"
+#include "adam_kernels.hpp"
 
 namespace radarsdf {
 
@@ -25,12 +25,13 @@ struct Interpolation {
   T inverse_leaf_size;  // 1/m
 };
 
-// Sums of the rows that a batch touches, and which these are.
+// Sums of the rows that a batch touches, and which these are, in the order in which they first were. Side by side, they
+// stay in the cache, which sums at the rows' own places would leave on a large map.
 template <typename T>
 struct RowSums {
-  std::uint64_t* is_touched;  // a bit for every row
-  std::int32_t* rows;         // those touched, in the order in which they first were; room for one more
-  T* sums;                    // (num_rows, 8), zero where not touched
+  RowMark* marks;      // of every row
+  std::int32_t* rows;  // those touched; room for one more
+  T* sums;             // (count, 8), beyond that zero
   std::int64_t count;
 };
 

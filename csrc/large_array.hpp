@@ -1,14 +1,14 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Memory for results and scratch of many megabytes. It is uninitialised on purpose: the caller writes every entry that
-// is read, and clearing first would cost a pass over memory. It asks for huge pages, as NumPy's arrays do: a quarter of
-// the time of a large mesh went into faults of small ones.
+// Memory of many megabytes. It asks for huge pages, as NumPy's arrays do: with small ones, a quarter of the time of a
+// large mesh went into their faults, and of a look-up in a large map into finding out where they are.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <vector>
 
 #ifdef __linux__
 #include <sys/mman.h>
@@ -16,18 +16,46 @@
 
 namespace radarsdf {
 
-template <typename T>
-std::unique_ptr<T[]> large_array(std::int64_t size) {
-  std::unique_ptr<T[]> array(new T[static_cast<std::size_t>(size)]);
+// Before the memory is first written to.
+inline void ask_for_huge_pages([[maybe_unused]] void* memory, [[maybe_unused]] std::size_t num_bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   constexpr std::uintptr_t page = 4096;
   constexpr std::uintptr_t huge_page = std::uintptr_t{1} << 21;
-  const auto begin = (reinterpret_cast<std::uintptr_t>(array.get()) + page - 1) / page * page;
-  const auto end = reinterpret_cast<std::uintptr_t>(array.get() + size);
+  const auto begin = (reinterpret_cast<std::uintptr_t>(memory) + page - 1) / page * page;
+  const auto end = reinterpret_cast<std::uintptr_t>(memory) + num_bytes;
   // Only a hint: it may fail where the kernel knows no huge pages.
   if (begin + 2 * huge_page <= end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
 #endif
+}
+
+// For results and scratch. It is uninitialised on purpose: the caller writes every entry that is read, and clearing
+// first would cost a pass over memory.
+template <typename T>
+std::unique_ptr<T[]> large_array(std::int64_t size) {
+  std::unique_ptr<T[]> array(new T[static_cast<std::size_t>(size)]);
+  ask_for_huge_pages(array.get(), sizeof(T) * static_cast<std::size_t>(size));
   return array;
 }
+
+template <typename T>
+struct LargeAllocator : std::allocator<T> {
+  template <typename U>
+  struct rebind {
+    using other = LargeAllocator<U>;
+  };
+
+  LargeAllocator() = default;
+  template <typename U>
+  LargeAllocator(const LargeAllocator<U>&) {}
+
+  T* allocate(std::size_t size) {
+    T* memory = std::allocator<T>::allocate(size);
+    ask_for_huge_pages(memory, sizeof(T) * size);
+    return memory;
+  }
+};
+
+template <typename T>
+using LargeVector = std::vector<T, LargeAllocator<T>>;
 
 }  // namespace radarsdf

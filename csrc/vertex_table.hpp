@@ -13,6 +13,7 @@
 
 #include "cell.hpp"
 #include "flat_map.hpp"
+#include "large_array.hpp"
 
 namespace radarsdf {
 
@@ -29,7 +30,7 @@ class VertexTable {
   double leaf_size_m() const { return leaf_size_m_; }
   Encoding encoding() const { return encoding_; }
   const std::vector<std::uint64_t>& leaf_keys() const { return leaf_keys_; }
-  const std::vector<Cell>& cells() const { return cells_; }
+  const LargeVector<Cell>& cells() const { return cells_; }
 
   // The occupied cell of every level, finest first, that holds each point, or -1: (count, num_levels). Points outside
   // the lattice and NaN are in no cell. Leaf cells have the numbers of their keys, from 0; coarser ones follow.
@@ -41,7 +42,7 @@ class VertexTable {
   double leaf_size_m_;
   int num_levels_;
   Encoding encoding_;
-  std::vector<Cell> cells_;
+  LargeVector<Cell> cells_;
   FlatMap roots_;
   std::int64_t num_rows_ = 0;
 };

@@ -130,8 +130,7 @@ def test_a_step_refuses_what_does_not_fit():
     rows = len(cells.features)
     memory = kernels.AdamMemory(
         torch.zeros(rows, 16),
-        torch.zeros(rows, 1, dtype=torch.int32),
-        torch.zeros(rows, 8),
+        torch.zeros(rows, 2, dtype=torch.int32),
     )
     _, located = kernels.encode(cells.features, points, cells.table)
     decays = torch.ones(5, 2)

@@ -107,21 +107,22 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   const radarsdf::VertexTable table = table_of(points, encoding, threads);
   auto features = random_numbers<T>(8 * table.num_rows(), 1.0, 2);
   const auto grad = random_numbers<T>(8 * kLevels * kPoints, 1.0, 3);
-  std::vector<std::int32_t> located(kLevels * kPoints), last_step(features.size() / 8);
+  std::vector<std::int32_t> located(kLevels * kPoints);
+  std::vector<radarsdf::RowMark> marks(features.size() / 8);
   radarsdf::locate(table, points.data(), kPoints, located.data(), threads);
-  std::vector<T> moments(2 * features.size()), sums(features.size());
+  std::vector<T> moments(2 * features.size());
   const std::vector<T> decays{1, 1, T(0.9), T(0.99), T(0.81), T(0.98)};
   const std::int64_t half = kPoints / 2, stride = 8 * kLevels;
   const radarsdf::PointBatch<T> whole{points.data(), nullptr, located.data(), half};
   const radarsdf::PointBatch<T> rest{points.data() + 3 * half, nullptr, located.data() + kLevels * half, half};
   for (std::int32_t step = 1; step <= 2; ++step) {
-    const radarsdf::AdamStep<T> adam{features.data(), moments.data(), last_step.data(), decays.data(), step,
+    const radarsdf::AdamStep<T> adam{features.data(), moments.data(), marks.data(), decays.data(), step,
                                      T(0.01),         T(1),           T(1e-8)};
     std::vector<std::thread> workers;
     for (int part = 0; part < threads; ++part) {
       workers.emplace_back([&, part] {
         radarsdf::adam_step(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
-                            sums.data(), part, threads);
+                            part, threads);
       });
     }
     for (std::thread& worker : workers) worker.join();

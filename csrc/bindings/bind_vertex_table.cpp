@@ -121,13 +121,12 @@ void bind_kernels(py::class_<VertexTable>& cls) {
   cls.def(
       "adam_step",
       [](const VertexTable& table, const std::vector<std::tuple<Array<T>, Located, Rows<T>>>& batches,
-         Array<T>& features, Array<T>& moments, Located& last_step, const Array<T>& decays, Array<T>& sums,
-         std::int32_t step, double learning_rate, double epsilon, int part, int parts) {
+         Array<T>& features, Array<T>& moments, Located& marks, const Array<T>& decays, std::int32_t step,
+         double learning_rate, double epsilon, int part, int parts) {
         const std::int64_t rows = table.num_rows();
         check_features(table, features);
         check_shape(moments, rows, 2 * kFeatureDim, "moments");
-        check_shape(last_step, rows, 1, "last_step");
-        check_shape(sums, rows, kFeatureDim, "sums");
+        check_shape(marks, rows, 2, "marks");
         if (step < 1) throw std::invalid_argument("step must be at least 1");
         if (decays.ndim() != 2 || decays.shape(0) <= step || decays.shape(1) != 2)
           throw std::invalid_argument("decays must have shape (more than step, 2)");
@@ -144,22 +143,21 @@ void bind_kernels(py::class_<VertexTable>& cls) {
         const T* powers = decays.data();
         const AdamStep<T> adam{features.mutable_data(),
                                moments.mutable_data(),
-                               last_step.mutable_data(),
+                               reinterpret_cast<RowMark*>(marks.mutable_data()),
                                powers,
                                step,
                                static_cast<T>(learning_rate / (1 - static_cast<double>(powers[2 * step]))),
                                static_cast<T>(1 / (1 - static_cast<double>(powers[2 * step + 1]))),
                                static_cast<T>(epsilon)};
-        T* scratch = sums.mutable_data();
         const py::gil_scoped_release release;
-        adam_step(table, points, grads, strides, adam, scratch, part, parts);
+        adam_step(table, points, grads, strides, adam, part, parts);
       },
-      "batches"_a, "features"_a.noconvert(), "moments"_a.noconvert(), "last_step"_a.noconvert(), "decays"_a.noconvert(),
-      "sums"_a.noconvert(), "step"_a, "learning_rate"_a, "epsilon"_a, "part"_a = 0, "parts"_a = 1,
+      "batches"_a, "features"_a.noconvert(), "moments"_a.noconvert(), "marks"_a.noconvert(), "decays"_a.noconvert(),
+      "step"_a, "learning_rate"_a, "epsilon"_a, "part"_a = 0, "parts"_a = 1,
       "Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums "
       "their "
-      "gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its "
-      "memory, `decays` (more than step, 2) the powers of both betas, `sums` (num_rows, 8) zeros, as they are left.");
+      "gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step "
+      "in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.");
 
   cls.def(
       "coordinate_gradient",

@@ -134,9 +134,8 @@ class VertexTable:
         ],
         features: numpy.typing.NDArray[numpy.float32],
         moments: numpy.typing.NDArray[numpy.float32],
-        last_step: numpy.typing.NDArray[numpy.int32],
+        marks: numpy.typing.NDArray[numpy.int32],
         decays: numpy.typing.NDArray[numpy.float32],
-        sums: numpy.typing.NDArray[numpy.float32],
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
@@ -144,7 +143,7 @@ class VertexTable:
         parts: typing.SupportsInt | typing.SupportsIndex = 1,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `sums` (num_rows, 8) zeros, as they are left.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
         """
     @typing.overload
     def adam_step(
@@ -158,9 +157,8 @@ class VertexTable:
         ],
         features: numpy.typing.NDArray[numpy.float64],
         moments: numpy.typing.NDArray[numpy.float64],
-        last_step: numpy.typing.NDArray[numpy.int32],
+        marks: numpy.typing.NDArray[numpy.int32],
         decays: numpy.typing.NDArray[numpy.float64],
-        sums: numpy.typing.NDArray[numpy.float64],
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
@@ -168,7 +166,7 @@ class VertexTable:
         parts: typing.SupportsInt | typing.SupportsIndex = 1,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `last_step` (num_rows, 1) int32 are its memory, `decays` (more than step, 2) the powers of both betas, `sums` (num_rows, 8) zeros, as they are left.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
         """
     def average_rays(
         self,

@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -51,7 +50,7 @@ class VertexFeatures(nn.Module):
     ) -> None:
         super().__init__()
         self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, self.encoding, num_threads)
-        self.features = nn.Parameter(torch.zeros(self.table.num_rows, kernels.FEATURE_DIM))
+        self.features = nn.Parameter(kernels.large_zeros(self.table.num_rows, kernels.FEATURE_DIM))
 
     def initialise(self, std: float) -> None:
         """Draws the features from N(0, std²)."""

@@ -93,9 +93,8 @@ class RowAdam:
         self._epsilon = epsilon
         rows, dtype = len(cells.features), cells.features.dtype
         self._memory = kernels.AdamMemory(
-            moments=torch.zeros(rows, 2 * kernels.FEATURE_DIM, dtype=dtype),
-            last_step=torch.zeros(rows, 1, dtype=torch.int32),
-            sums=torch.zeros(rows, kernels.FEATURE_DIM, dtype=dtype),
+            moments=kernels.large_zeros(rows, 2 * kernels.FEATURE_DIM, dtype=dtype),
+            marks=kernels.large_zeros(rows, 2, dtype=torch.int32),
         )
         self._decays = torch.zeros(0, 2, dtype=dtype)
 
@@ -108,7 +107,7 @@ class RowAdam:
         """What the next steps depend on beside the features. Not copies."""
         memory = self._memory
         count = torch.tensor(self.step_count)
-        return {"moments": memory.moments, "last_step": memory.last_step, "step_count": count}
+        return {"moments": memory.moments, "last_step": memory.marks[:, :1], "step_count": count}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Go on as the optimiser of the same features that gave `state`."""
@@ -119,7 +118,7 @@ class RowAdam:
             msg = f"a row cannot have moved after step {count}"  # the core trusts it
             raise ValueError(msg)
         self._memory.moments.copy_(state["moments"])
-        self._memory.last_step.copy_(last_step)
+        self._memory.marks[:, :1].copy_(last_step)
         self.step_count = count
 
     @torch.no_grad()
