@@ -21,7 +21,7 @@ from radarsdf.field import Field
 from radarsdf.losses import intensity_loss, sdf_loss
 from radarsdf.map import IntensityScale
 from radarsdf.optimiser import Adam
-from radarsdf.sampling import RaySampler, kept
+from radarsdf.sampling import Dropout, RaySampler
 from radarsdf.scans import prepare
 from radarsdf.threads import Workers
 from radarsdf.training import Training
@@ -60,7 +60,7 @@ class Step:
         dims = (self.field.cells.dim, self.field.fourier.dim)
         dropouts = (CONFIG.feature_dropout, CONFIG.fourier_dropout)
         factors = [
-            kept(samples.num_near, dim, share, self.generator)
+            Dropout.draw(samples.num_near, dim, share, self.generator).factors
             for dim, share in zip(dims, dropouts, strict=True)
         ]
         return samples, factors

@@ -23,7 +23,7 @@ void move(const AdamStep<T>& adam, const std::int32_t* rows, T* gradients, std::
   T mean[kNumbers] = {}, square[kNumbers] = {}, gradient[kNumbers] = {}, way[kNumbers];
   for (std::int64_t first = 0; first < count; first += kBlock) {
     const std::int64_t size = count - first < kBlock ? count - first : kBlock;
-    for (std::int64_t i = first + kBlock; i < first + 2 * kBlock && i < count; ++i) {
+    for (std::int64_t i = first + 2 * kBlock; i < first + 3 * kBlock && i < count; ++i) {
       prefetch(adam.marks + rows[i]);
       prefetch(adam.moments + rows[i] * std::int64_t{2 * kFeatureDim});
       prefetch(adam.features + rows[i] * std::int64_t{kFeatureDim});

@@ -77,7 +77,7 @@ void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_
 
 template <typename T>
 void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, int part, int parts) {
+               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, TaskQueue& queue) {
   const InterpolationKernels<T>& kernels = kernels_for<T>(table);
   const AdamKernel<T> adam_kernel = RADARSDF_KERNEL(adam_kernel<T>)();
   const int groups = num_vertex_groups(table.encoding());
@@ -90,11 +90,12 @@ void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batch
   const auto most = static_cast<std::size_t>(std::min(points * corners, table.num_rows())) + 1;
   if (rows.size() < most) rows.resize(most);
   if (sums.size() < most * kFeatureDim) sums.resize(most * kFeatureDim);
-  for (int task = part; task < table.num_levels() * groups; task += parts) {
+  for (int task = queue.take(); task < table.num_levels() * groups; task = queue.take()) {
+    const int level = table.num_levels() - 1 - task / groups;  // coarse ones first: they take longest
     RowSums<T> touched{adam.marks, rows.data(), sums.data(), 0};
     for (std::size_t b = 0; b < batches.size(); ++b) {
-      kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, task / groups,
-                           task % groups, 0, batches[b].count);
+      kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, level, task % groups, 0,
+                           batches[b].count);
     }
     adam_kernel.move(adam, touched.rows, touched.sums, touched.count);
   }
@@ -154,7 +155,7 @@ void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::i
   template void interpolate(const VertexTable&, const T*, const PointBatch<T>&, T*, std::int64_t, int);             \
   template void scatter(const VertexTable&, const PointBatch<T>&, const T*, std::int64_t, T*, int);                 \
   template void adam_step(const VertexTable&, const std::vector<PointBatch<T>>&, const std::vector<const T*>&,      \
-                          const std::vector<std::int64_t>&, const AdamStep<T>&, int, int);                          \
+                          const std::vector<std::int64_t>&, const AdamStep<T>&, TaskQueue&);                        \
   template void coordinate_gradient(const VertexTable&, const T*, const PointBatch<T>&, const T*, std::int64_t, T*, \
                                     int);                                                                           \
   template void fourier(const T*, std::int64_t, double, int, int, T*, std::int64_t, int);                           \

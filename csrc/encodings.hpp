@@ -5,6 +5,7 @@
 // `stride` is the distance between rows, so that encodings can be written side by side into one matrix.
 #pragma once
 
+#include <atomic>
 #include <cstdint>
 #include <vector>
 
@@ -39,11 +40,20 @@ template <typename T>
 void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
              T* features_grad, int num_threads);
 
-// One step of Adam with the gradients that `scatter` would sum over the batches, on the rows that they touch: for part
-// `part` of `parts` of all (level, group) pairs, so that each of the caller's threads can take one.
+// Numbers from 0 on for whoever comes first, so that threads of the caller's own share work.
+class TaskQueue {
+ public:
+  int take() { return next_.fetch_add(1, std::memory_order_relaxed); }
+
+ private:
+  std::atomic<int> next_{0};
+};
+
+// One step of Adam with the gradients that `scatter` would sum over the batches, on the rows that they touch: on those
+// (level, group) pairs that no other call with the same queue has begun.
 template <typename T>
 void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, int part, int parts);
+               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, TaskQueue& queue);
 
 template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,
@@ -52,6 +62,8 @@ void coordinate_gradient(const VertexTable& table, const T* features, const Poin
 template <typename T>
 void fourier(const T* points, std::int64_t count, double half_width_m, int first_frequency, int num_frequencies, T* out,
              std::int64_t stride, int num_threads);
+
+constexpr int kHarmonics = 16;
 
 // Real spherical harmonics of degree 0..3 of unit vectors (count, 3): out (count, 16), in the order l, m = -l..l.
 template <typename T>

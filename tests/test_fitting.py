@@ -12,7 +12,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.sampling import RaySampler, kept
+from radarsdf.sampling import Dropout, RaySampler
 from radarsdf.schedule import Schedule
 
 from .conftest import ground_and_wall
@@ -142,9 +142,10 @@ def test_the_more_often_samples_are_seen_the_more_is_hidden(monkeypatch):
 
     def record(rows, columns, dropout, generator):
         shares.append(dropout)
-        return kept(rows, columns, dropout, generator)
+        return draw(rows, columns, dropout, generator)
 
-    monkeypatch.setattr("radarsdf.training.kept", record)
+    draw = Dropout.draw
+    monkeypatch.setattr(Dropout, "draw", record)
     samples = FitConfig().near_samples * sum(map(len, scene.points))
     for passes in (1, 3, 27):
         shares.clear()

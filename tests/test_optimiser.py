@@ -13,7 +13,7 @@ import torch
 from radarsdf import kernels
 from radarsdf._core import CellSet
 from radarsdf.encodings import Octree, TriQuadtree
-from radarsdf.optimiser import Adam, RowAdam
+from radarsdf.optimiser import Adam, RowAdam, Touched
 from radarsdf.threads import Workers
 
 
@@ -64,11 +64,10 @@ def steps(cells, batches, threads, learning_rate=1e-2):
     with Workers(threads) as workers:
         for parts in batches:
             touched = []
-            gradients = []
             for points, weights in parts:
-                out = cells.interpolated(points, touched)
-                gradients.append(torch.autograd.grad((out * weights).sum(), touched[-1].interpolated)[0])
-            adam.step(touched, gradients, workers, meanwhile=lambda: None)
+                gradient = weights.expand(len(points), cells.interpolated_dim)
+                touched.append(Touched(points, kernels.locate(points, cells.table), gradient))
+            adam.step(touched, workers, meanwhile=lambda: None)
     return cells.features.detach().clone()
 
 
@@ -135,11 +134,11 @@ def test_a_step_refuses_what_does_not_fit():
     _, located = kernels.encode(cells.features, points, cells.table)
     decays = torch.ones(5, 2)
 
-    def step(gradient, features=cells.features, number=1, part=0, parts=1):
+    def step(gradient, features=cells.features, number=1):
         kernels.adam_step(
             cells.table, [(points, located, gradient)], features, memory, decays,
             step=number, learning_rate=1e-2, epsilon=1e-15,
-        )(part, parts)  # fmt: skip
+        )()  # fmt: skip
 
     good = torch.zeros(len(points), 24)
     step(good)
@@ -151,5 +150,3 @@ def test_a_step_refuses_what_does_not_fit():
     for number in (0, 5):
         with pytest.raises(ValueError, match=r"step|decays"):
             step(good, number=number)
-    with pytest.raises(ValueError, match="part"):
-        step(good, part=2, parts=2)

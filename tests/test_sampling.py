@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
-from radarsdf.sampling import RaySampler, kept
+from radarsdf.sampling import Dropout, RaySampler
 from radarsdf.scans import prepare
 
 from .conftest import pose
@@ -240,19 +240,22 @@ def test_what_is_known_of_a_ray_comes_with_its_samples(rays):
 @pytest.mark.parametrize("dropout", [0.0, 0.3, 0.85])
 def test_dropout_zeroes_its_share_and_keeps_the_mean(dropout):
     state = torch.get_rng_state()
-    factors = kept(999, 21, dropout, torch.Generator().manual_seed(0))
+    factors = Dropout.draw(999, 21, dropout, torch.Generator().manual_seed(0)).factors
     assert factors.shape == (999, 21)
     assert factors.dtype == torch.float32
     assert abs(float((factors == 0).float().mean()) - dropout) < 0.015
     assert abs(float(factors.mean()) - 1) < 0.05
     assert len(factors.unique()) == (1 if dropout == 0 else 2)
-    assert torch.equal(factors, kept(999, 21, dropout, torch.Generator().manual_seed(0)))
-    assert not torch.equal(factors, kept(999, 21, dropout, torch.Generator().manual_seed(1))) or dropout == 0
+    assert torch.equal(factors, Dropout.draw(999, 21, dropout, torch.Generator().manual_seed(0)).factors)
+    assert (
+        not torch.equal(factors, Dropout.draw(999, 21, dropout, torch.Generator().manual_seed(1)).factors)
+        or dropout == 0
+    )
     assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_dropout_hides_no_column_or_row_more_than_another():
     # The factors are cut from 64-bit words: each byte of a word has to do.
-    hidden = (kept(8000, 8, 0.5, torch.Generator().manual_seed(0)) == 0).double()
+    hidden = (Dropout.draw(8000, 8, 0.5, torch.Generator().manual_seed(0)).factors == 0).double()
     assert (hidden.mean(0) - 0.5).abs().max() < 0.03
     assert torch.corrcoef(hidden.T).fill_diagonal_(0).abs().max() < 0.06

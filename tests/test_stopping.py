@@ -281,16 +281,19 @@ def test_the_last_step_is_looked_at_too(scene, poisoned):
 @pytest.mark.parametrize("joint", [True, False])
 @pytest.mark.parametrize("name", ["sdf", "intensity"])
 def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypatch, name, joint):
-    loss, calls = getattr(radarsdf.training, f"{name}_loss"), 0
+    field_loss, calls = radarsdf._core.field_loss, 0
+    stage, of = ("sdf", 10) if joint or name == "sdf" else ("intensity", 20)
+    eighth = 8 if stage == "sdf" else 10 + 8
 
     def failing(*arguments):
         nonlocal calls
         calls += 1
-        return loss(*arguments) * (math.inf if calls == 8 else 1)
+        losses = dict(zip(("sdf", "intensity"), field_loss(*arguments), strict=True))
+        losses[name] *= math.inf if calls == eighth else 1
+        return tuple(losses.values())
 
-    monkeypatch.setattr(f"radarsdf.training.{name}_loss", failing)
+    monkeypatch.setattr("radarsdf._core.field_loss", failing)
     config = FitConfig(sdf_iterations=10, intensity_iterations=20, batch_size=512, num_threads=1, joint=joint)
-    stage, of = ("sdf", 10) if joint or name == "sdf" else ("intensity", 20)
     expected = f"the {name} loss is inf at iteration 7 of {of} of the {stage} stage"
     with pytest.raises(Diverged, match=expected) as caught:
         radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)

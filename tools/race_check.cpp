@@ -119,10 +119,11 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
     const radarsdf::AdamStep<T> adam{features.data(), moments.data(), marks.data(), decays.data(), step,
                                      T(0.01),         T(1),           T(1e-8)};
     std::vector<std::thread> workers;
-    for (int part = 0; part < threads; ++part) {
-      workers.emplace_back([&, part] {
+    radarsdf::TaskQueue queue;
+    for (int i = 0; i < threads; ++i) {
+      workers.emplace_back([&] {
         radarsdf::adam_step(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
-                            part, threads);
+                            queue);
       });
     }
     for (std::thread& worker : workers) worker.join();

@@ -42,6 +42,7 @@ std::int64_t row_stride(const Rows<T>& array, const char* name) {
 
 void bind_cell_sums(py::module_& m);
 void bind_encodings(py::module_& m);
+void bind_field_loss(py::module_& m);
 void bind_marching_cubes(py::module_& m);
 void bind_mlp(py::module_& m);
 void bind_surface_crossings(py::module_& m);

@@ -1,33 +1,11 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
-#include <pybind11/stl.h>
-
 #include <optional>
 
-#include "arrays.hpp"
-#include "mlp.hpp"
+#include "layer_arrays.hpp"
 
 namespace radarsdf {
 namespace {
-
-template <typename T>
-std::vector<Layer<T>> layers_of(const std::vector<Array<T>>& weights, const std::vector<Array<T>>& biases) {
-  if (weights.empty() || weights.size() != biases.size()) {
-    throw std::invalid_argument("there must be as many weights as biases, and at least one");
-  }
-  std::vector<Layer<T>> layers;
-  for (std::size_t i = 0; i < weights.size(); ++i) {
-    const auto inputs = i == 0 && weights[0].ndim() == 2 ? weights[0].shape(1) : i > 0 ? layers.back().outputs : 0;
-    const auto outputs = weights[i].ndim() == 2 ? weights[i].shape(0) : 0;
-    if (outputs == 0) throw std::invalid_argument("a layer must have outputs");
-    check_shape(weights[i], outputs, inputs, "weights");
-    if (biases[i].ndim() != 1 || biases[i].shape(0) != outputs) {
-      throw std::invalid_argument("biases must have as many numbers as weights have rows");
-    }
-    layers.push_back({weights[i].data(), biases[i].data(), inputs, outputs});
-  }
-  return layers;
-}
 
 template <typename T>
 std::vector<Columns<const T>> inputs_of(const std::vector<Rows<T>>& blocks, std::int64_t count,
@@ -49,8 +27,8 @@ void bind_networks(py::module_& m) {
   using namespace py::literals;
   m.def(
       "mlp",
-      [](const std::vector<Rows<T>>& blocks, const std::vector<Array<T>>& weights, const std::vector<Array<T>>& biases,
-         Array<T>& out, bool keep_hidden, int num_threads) -> py::object {
+      [](const std::vector<Rows<T>>& blocks, const Arrays<T>& weights, const Arrays<T>& biases, Array<T>& out,
+         bool keep_hidden, int num_threads) -> py::object {
         const std::vector<Layer<T>> layers = layers_of(weights, biases);
         const std::int64_t count = out.ndim() == 2 ? out.shape(0) : 0;
         check_shape(out, count, layers.back().outputs, "out");
@@ -70,27 +48,19 @@ void bind_networks(py::module_& m) {
       "Gives what `mlp_backward` needs, if it is to be kept.");
   m.def(
       "mlp_backward",
-      [](const std::vector<Rows<T>>& blocks, const std::vector<Array<T>>& weights, const std::vector<Array<T>>& biases,
-         const Array<T>& hidden, const Rows<T>& out_grad, std::optional<std::vector<Array<T>>>& weight_grads,
-         std::optional<std::vector<Array<T>>>& bias_grads, std::vector<std::optional<Rows<T>>>& input_grads,
-         int num_threads) {
+      [](const std::vector<Rows<T>>& blocks, const Arrays<T>& weights, const Arrays<T>& biases, const Array<T>& hidden,
+         const Rows<T>& out_grad, std::optional<Arrays<T>>& weight_grads, std::optional<Arrays<T>>& bias_grads,
+         std::vector<std::optional<Rows<T>>>& input_grads, int num_threads) {
         const std::vector<Layer<T>> layers = layers_of(weights, biases);
         const std::int64_t count = hidden.ndim() == 2 ? hidden.shape(0) : 0;
         check_shape(hidden, count, mlp_hidden_columns(layers), "hidden");
         check_shape(out_grad, count, layers.back().outputs, "out_grad");
         const auto inputs = inputs_of(blocks, count, layers);
-        std::vector<LayerGradients<T>> by_layers;
-        if (weight_grads.has_value() != bias_grads.has_value() ||
-            (weight_grads && (weight_grads->size() != layers.size() || bias_grads->size() != layers.size()))) {
+        if (weight_grads.has_value() != bias_grads.has_value()) {
           throw std::invalid_argument("gradients of weights and biases must be of all layers or of none");
         }
-        for (std::size_t i = 0; weight_grads && i < layers.size(); ++i) {
-          check_shape((*weight_grads)[i], layers[i].outputs, layers[i].inputs, "weight_grads");
-          if ((*bias_grads)[i].ndim() != 1 || (*bias_grads)[i].shape(0) != layers[i].outputs) {
-            throw std::invalid_argument("bias_grads must have the shapes of the biases");
-          }
-          by_layers.push_back({(*weight_grads)[i].mutable_data(), (*bias_grads)[i].mutable_data()});
-        }
+        std::vector<LayerGradients<T>> by_layers;
+        if (weight_grads) by_layers = layer_gradients_of(*weight_grads, *bias_grads, layers);
         if (input_grads.size() != inputs.size()) {
           throw std::invalid_argument("there must be one of input_grads, or None, for each of the inputs");
         }

@@ -122,7 +122,7 @@ void bind_kernels(py::class_<VertexTable>& cls) {
       "adam_step",
       [](const VertexTable& table, const std::vector<std::tuple<Array<T>, Located, Rows<T>>>& batches,
          Array<T>& features, Array<T>& moments, Located& marks, const Array<T>& decays, std::int32_t step,
-         double learning_rate, double epsilon, int part, int parts) {
+         double learning_rate, double epsilon, TaskQueue& queue) {
         const std::int64_t rows = table.num_rows();
         check_features(table, features);
         check_shape(moments, rows, 2 * kFeatureDim, "moments");
@@ -130,7 +130,6 @@ void bind_kernels(py::class_<VertexTable>& cls) {
         if (step < 1) throw std::invalid_argument("step must be at least 1");
         if (decays.ndim() != 2 || decays.shape(0) <= step || decays.shape(1) != 2)
           throw std::invalid_argument("decays must have shape (more than step, 2)");
-        if (part < 0 || part >= parts) throw std::invalid_argument("part must be one of the parts");
         std::vector<PointBatch<T>> points;
         std::vector<const T*> grads;
         std::vector<std::int64_t> strides;
@@ -150,13 +149,14 @@ void bind_kernels(py::class_<VertexTable>& cls) {
                                static_cast<T>(1 / (1 - static_cast<double>(powers[2 * step + 1]))),
                                static_cast<T>(epsilon)};
         const py::gil_scoped_release release;
-        adam_step(table, points, grads, strides, adam, part, parts);
+        adam_step(table, points, grads, strides, adam, queue);
       },
       "batches"_a, "features"_a.noconvert(), "moments"_a.noconvert(), "marks"_a.noconvert(), "decays"_a.noconvert(),
-      "step"_a, "learning_rate"_a, "epsilon"_a, "part"_a = 0, "parts"_a = 1,
+      "step"_a, "learning_rate"_a, "epsilon"_a, "queue"_a,
       "Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums "
       "their "
-      "gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step "
+      "gradients: what no other call with the same `queue` has begun. `moments` (num_rows, 16) and `marks` (num_rows, "
+      "2) int32, the step "
       "in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.");
 
   cls.def(
@@ -317,6 +317,7 @@ void bind_vertex_table(py::module_& m) {
           "the "
           "`points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of "
           "its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame.");
+  py::class_<TaskQueue>(m, "TaskQueue", "What of an `adam_step` is left for whoever calls it next.").def(py::init<>());
   bind_kernels<float>(table);
   bind_kernels<double>(table);
 }

@@ -10,6 +10,7 @@ PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   radarsdf::bind_vertex_table(m);
   radarsdf::bind_encodings(m);
   radarsdf::bind_mlp(m);
+  radarsdf::bind_field_loss(m);
   radarsdf::bind_marching_cubes(m);
   radarsdf::bind_cell_sums(m);
   radarsdf::bind_surface_crossings(m);

@@ -14,10 +14,12 @@ __all__: list[str] = [
     "CellSet",
     "Encoding",
     "SurfelMap",
+    "TaskQueue",
     "VertexTable",
     "available_instruction_sets",
     "cell_keys",
     "compiler",
+    "field_loss",
     "fourier",
     "instruction_set",
     "marching_cubes_dense",
@@ -139,11 +141,10 @@ class VertexTable:
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
-        part: typing.SupportsInt | typing.SupportsIndex = 0,
-        parts: typing.SupportsInt | typing.SupportsIndex = 1,
+        queue: TaskQueue,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: what no other call with the same `queue` has begun. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
         """
     @typing.overload
     def adam_step(
@@ -162,11 +163,10 @@ class VertexTable:
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
-        part: typing.SupportsInt | typing.SupportsIndex = 0,
-        parts: typing.SupportsInt | typing.SupportsIndex = 1,
+        queue: TaskQueue,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: part `part` of `parts` of them. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: what no other call with the same `queue` has begun. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
         """
     def average_rays(
         self,
@@ -327,6 +327,12 @@ class VertexTable:
     @property
     def num_rows(self) -> int: ...
 
+class TaskQueue:
+    """
+    What of an `adam_step` is left for whoever calls it next.
+    """
+    def __init__(self) -> None: ...
+
 class CellBlocks:
     """
     From the keys of cells to their rows, and sums over the cells round a key.
@@ -421,6 +427,84 @@ def cell_keys(
 def compiler() -> str:
     """
     Compiler that built the core.
+    """
+
+@typing.overload
+def field_loss(
+    table: VertexTable,
+    features: numpy.typing.NDArray[numpy.float32],
+    frequencies: tuple[
+        typing.SupportsFloat | typing.SupportsIndex,
+        typing.SupportsInt | typing.SupportsIndex,
+        typing.SupportsInt | typing.SupportsIndex,
+    ],
+    sdf: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]],
+    intensity: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]]
+    | None,
+    sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(3)"],
+    points: numpy.typing.NDArray[numpy.float32],
+    sdf_m: numpy.typing.NDArray[numpy.float32],
+    rays: numpy.typing.NDArray[numpy.float32],
+    num_near: typing.SupportsInt | typing.SupportsIndex,
+    intensity_count: typing.SupportsInt | typing.SupportsIndex,
+    dropout: collections.abc.Sequence[
+        tuple[
+            typing.Annotated[numpy.typing.ArrayLike, numpy.uint8], typing.SupportsInt | typing.SupportsIndex
+        ]
+    ],
+    sigma_m: typing.SupportsFloat | typing.SupportsIndex,
+    sdf_weight: typing.SupportsFloat | typing.SupportsIndex,
+    intensity_weight: typing.SupportsFloat | typing.SupportsIndex,
+    sdf_grads: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]]
+    | None,
+    intensity_grads: tuple[
+        list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]
+    ]
+    | None,
+    located: numpy.typing.NDArray[numpy.int32],
+    interpolated_grad: numpy.typing.NDArray[numpy.float32] | None,
+) -> tuple[float, float]:
+    """
+    Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.field_loss.
+    """
+
+@typing.overload
+def field_loss(
+    table: VertexTable,
+    features: numpy.typing.NDArray[numpy.float64],
+    frequencies: tuple[
+        typing.SupportsFloat | typing.SupportsIndex,
+        typing.SupportsInt | typing.SupportsIndex,
+        typing.SupportsInt | typing.SupportsIndex,
+    ],
+    sdf: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]],
+    intensity: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]]
+    | None,
+    sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(3)"],
+    points: numpy.typing.NDArray[numpy.float64],
+    sdf_m: numpy.typing.NDArray[numpy.float64],
+    rays: numpy.typing.NDArray[numpy.float64],
+    num_near: typing.SupportsInt | typing.SupportsIndex,
+    intensity_count: typing.SupportsInt | typing.SupportsIndex,
+    dropout: collections.abc.Sequence[
+        tuple[
+            typing.Annotated[numpy.typing.ArrayLike, numpy.uint8], typing.SupportsInt | typing.SupportsIndex
+        ]
+    ],
+    sigma_m: typing.SupportsFloat | typing.SupportsIndex,
+    sdf_weight: typing.SupportsFloat | typing.SupportsIndex,
+    intensity_weight: typing.SupportsFloat | typing.SupportsIndex,
+    sdf_grads: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]]
+    | None,
+    intensity_grads: tuple[
+        list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]
+    ]
+    | None,
+    located: numpy.typing.NDArray[numpy.int32],
+    interpolated_grad: numpy.typing.NDArray[numpy.float64] | None,
+) -> tuple[float, float]:
+    """
+    Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.field_loss.
     """
 
 @typing.overload

@@ -4,26 +4,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from radarsdf import kernels
 from radarsdf._core import Encoding, VertexTable
-
-
-@dataclass(frozen=True)
-class Touched:
-    """What a batch took from the features of cells, for :class:`~radarsdf.optimiser.RowAdam`."""
-
-    points: Tensor
-    """(N, 3), local frame, m."""
-    located: Tensor
-    """(N, num_levels) int32, the cells that hold them."""
-    interpolated: Tensor
-    """(N, 8 · num_levels), a leaf of the graph: the gradient by it is all that the features' step needs."""
 
 
 class VertexFeatures(nn.Module):
@@ -42,8 +28,6 @@ class VertexFeatures(nn.Module):
     """
 
     encoding: Encoding
-    num_groups: int
-    """Of rows at each level: those of different planes are never the same."""
 
     def __init__(
         self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_levels: int, num_threads: int = 0
@@ -52,17 +36,18 @@ class VertexFeatures(nn.Module):
         self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, self.encoding, num_threads)
         self.features = nn.Parameter(kernels.large_zeros(self.table.num_rows, kernels.FEATURE_DIM))
 
+    @property
+    def interpolated_dim(self) -> int:
+        """Numbers that are interpolated for a point."""
+        return kernels.FEATURE_DIM * self.table.num_levels
+
     def initialise(self, std: float) -> None:
         """Draws the features from N(0, std²)."""
         nn.init.normal_(self.features, std=std)
 
-    def interpolated(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
-        """(N, 8 · num_levels). With `touched`, no gradient reaches the features: what there is to know is put there."""
-        if touched is None:
-            return kernels.interpolate(self.features, points, self.table)
-        out, located = kernels.encode(self.features, points, self.table)
-        touched.append(Touched(points, located, out.requires_grad_()))
-        return out
+    def interpolated(self, points: Tensor) -> Tensor:
+        """(N, `interpolated_dim`)."""
+        return kernels.interpolate(self.features, points, self.table)
 
     def occupied(self, points: Tensor) -> Tensor:
         """Whether each point (N, 3), local frame, m, lies in an occupied leaf cell: (N,) bool."""
@@ -77,14 +62,12 @@ class TriQuadtree(VertexFeatures):
 
     encoding = Encoding.TRI_QUADTREE
 
-    num_groups = 3
-
     @property
     def dim(self) -> int:
-        return kernels.FEATURE_DIM * self.table.num_levels
+        return self.interpolated_dim
 
-    def forward(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
-        return self.interpolated(points, touched)
+    def forward(self, points: Tensor) -> Tensor:
+        return self.interpolated(points)
 
 
 class Octree(VertexFeatures):
@@ -94,11 +77,10 @@ class Octree(VertexFeatures):
     """
 
     encoding = Encoding.OCTREE
-    num_groups = 1
     dim = kernels.FEATURE_DIM
 
-    def forward(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
-        levels = self.interpolated(points, touched)
+    def forward(self, points: Tensor) -> Tensor:
+        levels = self.interpolated(points)
         return levels.view(-1, self.table.num_levels, kernels.FEATURE_DIM).sum(1)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from radarsdf.config import FitConfig
-from radarsdf.encodings import Fourier, Octree, Touched, TriQuadtree
+from radarsdf.encodings import Fourier, Octree, TriQuadtree
 from radarsdf.networks import IntensityNetwork, SDFNetwork
 
 
@@ -65,25 +65,23 @@ class Field(nn.Module):
         self.sdf_network = SDFNetwork(dim, config)
         self.intensity_network = IntensityNetwork(dim, config) if with_intensity else None
 
-    def encode(self, points: Tensor, touched: list[Touched] | None = None) -> tuple[Tensor, ...]:
-        """(N, 3) local, m, to (N, any) each. With `touched`, features learn by way of that: see :class:`VertexFeatures`."""
-        cells = self.cells(points, touched)
+    def encode(self, points: Tensor) -> tuple[Tensor, ...]:
+        """(N, 3) local, m, to (N, any) each."""
+        cells = self.cells(points)
         return (cells, self.fourier(points)) if self.fourier.dim else (cells,)
 
-    def logit(self, points: Tensor, touched: list[Touched] | None = None) -> Tensor:
+    def logit(self, points: Tensor) -> Tensor:
         """Signed distance / sigma (N,), positive in free space."""
-        return self.sdf_network(self.encode(points, touched))[0]  # type: ignore[no-any-return]
+        return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
 
-    def geometry(
-        self, points: Tensor, *, frozen: bool = True, touched: list[Touched] | None = None
-    ) -> Geometry:
+    def geometry(self, points: Tensor, *, frozen: bool = True) -> Geometry:
         """All that the intensity network is to know of points (N, 3). `frozen`: none of its graph is kept."""
         wants_normals = self.intensity_network is not None and self.intensity_network.normals
         # The normal is itself a gradient: where it is wanted, its own graph is needed for a moment.
         with torch.set_grad_enabled((torch.is_grad_enabled() and not frozen) or wants_normals):
             if wants_normals:
                 points = points.detach().requires_grad_()
-            encoding = self.encode(points, touched)
+            encoding = self.encode(points)
             logit, feature = self.sdf_network(encoding)
             normals = None
             if wants_normals:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from radarsdf._core import VertexTable
+from radarsdf._core import TaskQueue, VertexTable
 from radarsdf._core import fourier as _fourier
 from radarsdf._core import spherical_harmonics as _spherical_harmonics
 
@@ -58,7 +58,7 @@ def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     NumPy asks for huge pages (from 4 MB on), PyTorch does not: with small ones, a step of Adam on a map of a million rows
     takes half as long again.
     """
-    like = torch.empty(0, dtype=dtype).numpy()
+    like = torch.empty(0, dtype=dtype, device="cpu").numpy()
     numbers = np.zeros(math.prod(shape) + _CACHE_LINE, like.dtype)
     first = -numbers.ctypes.data % _CACHE_LINE // numbers.itemsize  # or rows would lie across two lines
     return torch.from_numpy(numbers[first : first + math.prod(shape)].reshape(shape))
@@ -84,9 +84,10 @@ def _interpolate(
     return out
 
 
-def _scatter(
+def scatter(
     table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
 ) -> Tensor:
+    """Gradient (num_rows, 8) by the features, of (interpolated . out_grad); along `directions`, of its derivative."""
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
     table.scatter(
         view(points),
@@ -165,7 +166,7 @@ class _InterpolateBackward(torch.autograd.Function):
             False
         )  # an unused gradient is None, not a matrix of zeros to be interpolated
         return (
-            _scatter(table, points, located, None, out_grad) if needs_features else None,
+            scatter(table, points, located, None, out_grad) if needs_features else None,
             _coordinate_gradient(table, features, points, located, None, out_grad) if needs_points else None,
         )
 
@@ -188,7 +189,7 @@ class _InterpolateBackward(torch.autograd.Function):
                 None if v is None else _interpolate(table, features, points, located, v),
             )
         if needs_features and v is not None:
-            features_grad = _scatter(table, points, located, v, g)
+            features_grad = scatter(table, points, located, v, g)
         if needs_points:
             points_grad = total(
                 None if a is None else _coordinate_gradient(table, a, points, located, None, g),
@@ -258,7 +259,7 @@ def adam_step(
     step: int,
     learning_rate: float,
     epsilon: float,
-) -> Callable[[int, int], None]:
+) -> Callable[[], None]:
     """One step of Adam on the rows that batches touch, in place; the others stay as they are.
 
     Parameters
@@ -281,7 +282,7 @@ def adam_step(
     Returns
     -------
     callable
-        That takes `part` and `parts` and moves this share of the rows. Shares are disjoint, and all of them make the step.
+        That does what of the step no other call of it has begun: threads share it by all calling it.
     """
     return functools.partial(
         table.adam_step,
@@ -293,6 +294,7 @@ def adam_step(
         step,
         learning_rate,
         epsilon,
+        TaskQueue(),
     )
 
 

@@ -4,20 +4,31 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from radarsdf import kernels
-from radarsdf.encodings import Touched, VertexFeatures
+from radarsdf.encodings import VertexFeatures
 from radarsdf.threads import Workers
 
 _BETAS = (0.9, 0.999)
 _Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class Touched:
+    """What a batch took from the features of cells, and the loss's gradient by that."""
+
+    points: Tensor
+    """(N, 3), local frame, m."""
+    located: Tensor
+    """(N, num_levels) int32, the cells that hold them."""
+    gradient: Tensor
+    """(N, 8 · num_levels), by the interpolated features."""
 
 
 class Adam:
@@ -125,11 +136,10 @@ class RowAdam:
     def step(
         self,
         touched: Sequence[Touched],
-        gradients: Sequence[Tensor],
         workers: Workers,
         meanwhile: Callable[[], _Result],
     ) -> _Result:
-        """Move the rows by the gradients of what was interpolated from them.
+        """Move the rows that batches touched.
 
         The calling thread first does `meanwhile`, whose result it returns, and then its share of what the others left.
         """
@@ -141,7 +151,7 @@ class RowAdam:
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         move = kernels.adam_step(
             self._cells.table,
-            [(t.points, t.located, g) for t, g in zip(touched, gradients, strict=True)],
+            [(t.points, t.located, t.gradient) for t in touched],
             self._cells.features,
             self._memory,
             self._decays,
@@ -149,15 +159,10 @@ class RowAdam:
             learning_rate=self.learning_rate,
             epsilon=self._epsilon,
         )
-        groups = self._cells.table.num_levels * self._cells.num_groups
-        parts = 1 if workers.num_threads == 1 else groups
-        left = deque(reversed(range(parts)))  # coarse levels first: they take longest
 
         def work(first: Callable[[], _Result] | None) -> _Result | None:
             result = None if first is None else first()
-            with contextlib.suppress(IndexError):  # from an empty deque
-                while True:
-                    move(left.popleft(), parts)
+            move()
             return result
 
         result, *_ = workers.map(work, [meanwhile] + [None] * (workers.num_threads - 1))

@@ -218,15 +218,28 @@ class _Layout:
         return cls(index, order, (start, of_range), (length, length_of_range), sums, shares[0])
 
 
-def kept(rows: int, columns: int, dropout: float, generator: torch.Generator) -> Tensor:
-    """(rows, columns) factors of mean one, for dropout: zero with this probability, else what makes up for it.
+@dataclass(frozen=True)
+class Dropout:
+    """Which numbers of a matrix stay.
 
     Not torch's own dropout, which draws from the global generator: the same seed would not give the same bits.
     """
-    # A byte for each, eight from every number drawn: drawing one for each would take a tenth of an iteration.
-    words = torch.empty(-(-rows * columns // 8), dtype=torch.int64).random_(
-        -(2**63), None, generator=generator
-    )
-    keep = round(256 * (1 - dropout))
-    bytes_ = words.view(torch.uint8)[: rows * columns].view(rows, columns)
-    return (bytes_ <= keep - 1) * (256 / keep)  # not < keep: 256 is no byte
+
+    bytes: Tensor
+    """(rows, columns) uint8, drawn for each number."""
+    keep: int
+    """What is below it stays."""
+
+    @classmethod
+    def draw(cls, rows: int, columns: int, dropout: float, generator: torch.Generator) -> Dropout:
+        """For a matrix of which each number is left out with the probability `dropout`."""
+        # Eight bytes from every number drawn: drawing one for each would take a tenth of an iteration.
+        words = torch.empty(-(-rows * columns // 8), dtype=torch.int64).random_(
+            -(2**63), None, generator=generator
+        )
+        return cls(words.view(torch.uint8)[: rows * columns].view(rows, columns), round(256 * (1 - dropout)))
+
+    @property
+    def factors(self) -> Tensor:
+        """(rows, columns) of mean one: zero, or what makes up for the zeros."""
+        return (self.bytes <= self.keep - 1) * (256 / self.keep)  # not < keep: 256 is no byte

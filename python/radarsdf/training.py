@@ -17,14 +17,13 @@ from tqdm import tqdm
 
 from radarsdf.checkpoint import Checkpoint
 from radarsdf.config import MAX_THREADS, FitConfig
-from radarsdf.encodings import Touched
-from radarsdf.field import Field, Geometry
-from radarsdf.losses import intensity_loss, sdf_loss
+from radarsdf.field import Field
 from radarsdf.map import IntensityScale
 from radarsdf.optimiser import Adam, RowAdam
-from radarsdf.sampling import RaySampler, Samples, kept
+from radarsdf.sampling import RaySampler, Samples
 from radarsdf.scans import Rays
 from radarsdf.schedule import Schedule
+from radarsdf.shards import Gradients, Shard
 from radarsdf.stopping import Diverged, deferred_interrupts
 from radarsdf.threads import Workers
 
@@ -84,71 +83,6 @@ class _Draws:
         return self._returns.spread(self._config.intensity_batch_size, self._parts)
 
 
-class _Shard:
-    """One thread's share of the work on each batch."""
-
-    def __init__(self, field: Field, config: FitConfig, schedule: Schedule, part: int) -> None:
-        self._field = field
-        self._config = config
-        self._generator = torch.Generator().manual_seed(config.seed * _GENERATORS + 1 + part)
-        dropouts = (config.feature_dropout, config.fourier_dropout)
-        self._dropouts = [schedule.dropout_scale * dropout for dropout in dropouts]
-        self.joint_parts: dict[str, Tensor] = {}
-        """The two losses of the last joint one."""
-
-    def state(self) -> dict[str, Tensor]:
-        """What its dropout depends on."""
-        return {"generator": self._generator.get_state()}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        self._generator.set_state(state["generator"])
-
-    def geometry_loss(self, samples: Samples, touched: list[Touched] | None) -> Tensor:
-        logit = self._field.logit(samples.points, touched)
-        return sdf_loss(logit, samples.sdf_m, self._config.sigma_m)
-
-    def joint_loss(self, samples: Samples, touched: list[Touched] | None) -> Tensor:
-        geometry = self._field.geometry(samples.points, frozen=False, touched=touched)
-        sdf = sdf_loss(geometry.logit, samples.sdf_m, self._config.sigma_m)
-        intensity = self._intensity_loss(samples, geometry)
-        self.joint_parts = {"sdf": sdf.detach(), "intensity": intensity.detach()}
-        return self._config.sdf_loss_weight * sdf + intensity
-
-    def reflectance_loss(self, samples: Samples, _: list[Touched] | None) -> Tensor:
-        return self._intensity_loss(samples, self._field.geometry(samples.points))
-
-    def _intensity_loss(self, samples: Samples, geometry: Geometry) -> Tensor:
-        count = len(samples.points) if self._config.intensity_in_free_space else samples.num_near
-        labels = samples.intensities[:count].clone()
-        labels[samples.num_near :] = 0  # no return is expected from free space (3QFPI)
-        predicted = self._field.reflectance(
-            geometry.first(count),
-            samples.directions[:count],
-            samples.ranges_m[:count] - samples.sdf_m[:count],
-            encoding_factors=self._encoding_factors(count),
-        )
-        return intensity_loss(predicted, labels)
-
-    def _encoding_factors(self, count: int) -> list[Tensor] | None:
-        """Dropout of the encoding for `count` samples, which the SDF network is spared."""
-        if not any(self._dropouts):
-            return None
-        dims = (self._field.cells.dim, self._field.fourier.dim)
-        parts = [part for part in zip(dims, self._dropouts, strict=True) if part[0]]
-        return [kept(count, *part, self._generator) for part in parts]
-
-
-@dataclass(frozen=True)
-class _Gradients:
-    """Of one thread's share of a batch."""
-
-    loss: Tensor
-    by_parameters: Sequence[Tensor]
-    touched: Sequence[Touched]
-    by_interpolated: Sequence[Tensor]
-    """Of `touched`, in the same order."""
-
-
 @dataclass(frozen=True)
 class _Pauses:
     """What is asked after each iteration."""
@@ -188,10 +122,9 @@ class Training:
         self.passes = schedule.passes
         parts = min(workers.num_threads, schedule.batch_size, config.intensity_batch_size)
         self._draws: _Draws | None = None  # where nothing is trained: the returns need not be put in order
-        self._shards: list[_Shard] = []
+        self._shards: list[Shard] = []
         if any(self.iterations.values()):
             self._draws = _Draws(surface, returns, scale, config, schedule, parts)
-            self._shards = [_Shard(field, config, schedule, part) for part in range(parts)]
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         geometry = list(field.sdf_network.parameters())
@@ -201,6 +134,13 @@ class Training:
             self._rows = RowAdam(field.cells, config.learning_rate, config.adam_epsilon)
         else:
             geometry = [*field.cells.parameters(), *geometry]
+        if self._draws is not None:
+            for part in range(parts):
+                generator = torch.Generator().manual_seed(config.seed * _GENERATORS + 1 + part)
+                shard = Shard(
+                    field, config, schedule.dropout_scale, generator, parts, moves_rows=self.moves_rows
+                )
+                self._shards.append(shard)
         self._adams = {"geometry": Adam(geometry, config.learning_rate, config.adam_epsilon)}
         if field.intensity_network is not None:
             self._adams["reflectance"] = Adam(
@@ -275,16 +215,16 @@ class Training:
         ):
             pauses = _Pauses(bar, interrupted, checkpoint)
             adams = [geometry, reflectance] if joint and reflectance is not None else [geometry]
-            loss_of = _Shard.joint_loss if joint else _Shard.geometry_loss
+            gradients_of = Shard.joint if joint else Shard.geometry
             bar.update(sum(self.iterations_done.values()))
             if self._draws is not None and self.iterations["sdf"]:
                 draw = self._draws.of_surface
-                self._loop("sdf", self.iterations["sdf"], adams, draw, loss_of, pauses, self._rows)
+                self._loop("sdf", self.iterations["sdf"], adams, draw, gradients_of, pauses, self._rows)
             field.cells.requires_grad_(False)
             field.sdf_network.requires_grad_(False)
             if self._draws is not None and reflectance is not None and rest:
                 draw = self._draws.of_returns
-                self._loop("intensity", rest, [reflectance], draw, _Shard.reflectance_loss, pauses)
+                self._loop("intensity", rest, [reflectance], draw, Shard.reflectance, pauses)
             if checkpoint is not None:
                 checkpoint.write(self.state())
             if interrupted():  # by now all is done, but whoever pressed it wants to stop more than this
@@ -296,7 +236,7 @@ class Training:
         iterations: int,
         adams: list[Adam],
         draw: Callable[[], list[Samples]],
-        loss_of: Callable[[_Shard, Samples, list[Touched] | None], Tensor],
+        gradients_of: Callable[[Shard, Samples], Gradients],
         pauses: _Pauses,
         rows: RowAdam | None = None,
     ) -> None:
@@ -304,11 +244,8 @@ class Training:
         changing = [*parameters, *([] if rows is None else [rows.features])]
         good = [p.detach().clone() for p in changing]
 
-        def gradients(work: tuple[_Shard, Samples]) -> _Gradients:
-            touched: list[Touched] = []
-            loss = loss_of(*work, None if rows is None else touched) / len(self._shards)
-            found = torch.autograd.grad(loss, [*parameters, *(t.interpolated for t in touched)])
-            return _Gradients(loss.detach(), found[: len(parameters)], touched, found[len(parameters) :])
+        def gradients(work: tuple[Shard, Samples]) -> Gradients:
+            return gradients_of(*work)
 
         def give_up(fault: str) -> NoReturn:
             for parameter, value in zip(changing, good, strict=True):
@@ -321,9 +258,9 @@ class Training:
             # From the full rate on in each stage, also for an Adam that has been through another.
             share = 0.5 * (1 + math.cos(math.pi * i / iterations)) if self._config.cosine_schedule else 1.0
             found = list(self._workers.map(gradients, list(zip(self._shards, ahead or draw(), strict=True))))
-            loss = float(sum(part.loss for part in found))
+            loss = sum(sum(part.losses.values()) for part in found)
             if not math.isfinite(loss):
-                give_up(f"the {self._loss_name(name)} loss is {loss}")
+                give_up(f"the {_bad_losses(found)} loss is {loss}")
             stop = pauses.interrupted()
             write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
             look = stop or write or i % _KEEP_EVERY == _KEEP_EVERY - 1 or i == iterations - 1
@@ -334,8 +271,7 @@ class Training:
             else:
                 rows.learning_rate = share * rows.full_rate
                 ahead = rows.step(
-                    [t for part in found for t in part.touched],
-                    [g for part in found for g in part.by_interpolated],
+                    [part.touched for part in found if part.touched is not None],
                     self._workers,
                     meanwhile=rest,
                 )
@@ -353,23 +289,20 @@ class Training:
             if stop:
                 raise KeyboardInterrupt
 
-    def _loss_name(self, stage: str) -> str:
-        """Which of the losses it is that is not finite."""
-        bad = {
-            name
-            for shard in self._shards
-            for name, value in shard.joint_parts.items()
-            if stage == "sdf" and not math.isfinite(float(value))
-        }
-        return " and ".join(sorted(bad)) or stage
+
+def _bad_losses(found: Sequence[Gradients]) -> str:
+    """Which of them are not finite."""
+    bad = {name for part in found for name, value in part.losses.items() if not math.isfinite(value)}
+    return " and ".join(sorted(bad))
 
 
 def _move_networks(
-    found: Sequence[_Gradients], adams: Sequence[Adam], share: float, draw: Callable[[], list[Samples]] | None
+    found: Sequence[Gradients], adams: Sequence[Adam], share: float, draw: Callable[[], list[Samples]] | None
 ) -> list[Samples] | None:
     """What of an iteration one thread does while the others move features: it draws the next samples, too."""
-    by_parameter = zip(*[part.by_parameters for part in found], strict=True)
-    total = iter([functools.reduce(Tensor.add_, parts) for parts in by_parameter])
+    for part in found[1:]:
+        torch._foreach_add_(found[0].by_parameters, part.by_parameters)
+    total = iter(found[0].by_parameters)
     for adam in adams:
         adam.learning_rate = share * adam.full_rate
         adam.step(list(itertools.islice(total, len(adam.parameters))))

@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The core's losses and gradients against what autograd makes of the field and the losses as they are defined."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from radarsdf import FitConfig, _core
+from radarsdf.field import Field
+from radarsdf.losses import sdf_loss
+from radarsdf.sampling import RaySampler
+from radarsdf.scans import prepare
+from radarsdf.shards import Shard
+from radarsdf.threads import Workers
+
+CONFIGS = {
+    "default": {},
+    "octree": {"encoding": "octree", "geometry_feature_dim": 3, "fourier_count": 0},
+    "features": {"geometry_feature_dim": 15, "num_levels": 2, "fourier_count": 4, "fourier_first": 2},
+    "free space": {"intensity_in_free_space": True, "feature_dropout": 0.0, "fourier_dropout": 0.0},
+    "one dropout": {"feature_dropout": 0.0, "sdf_loss_weight": 0.3},
+    "blind": {"sdf_input": False, "view_direction": False, "log_range": False, "intensity_hidden": (5,)},
+    "not all": {"sdf_input": False, "log_range": False, "sdf_hidden": (17, 16, 3)},
+    "intensities alone": {"sdf_loss_weight": 0.0},
+}
+STAGES = ("geometry", "joint", "reflectance")
+
+
+@pytest.fixture(scope="module")
+def rays():
+    generator = np.random.default_rng(0)
+    scan = generator.normal(size=(300, 3)) * [2, 2, 0.1] + [0, 0, -4]
+    return prepare([scan], np.eye(4)[None], [generator.uniform(size=300)])
+
+
+def shard_and_samples(rays, changes, dtype, batch_size=400):
+    config = FitConfig(**changes)
+    cells = _core.CellSet(config.leaf_size_m)
+    for chunk in rays.along(np.linspace(-0.3, 0.3, 7)):
+        cells.insert(chunk)
+    torch.manual_seed(0)
+    field = Field(cells.sorted_keys(), config, with_intensity=True)
+    field.cells.initialise(0.3)
+    generator = torch.Generator().manual_seed(1)
+    sampler = RaySampler(
+        rays, config, batch_size, generator, intensities=torch.from_numpy(rays.intensities.copy())
+    )
+    (samples,) = sampler.batch()
+    exact = {name: getattr(samples, name).to(dtype) for name in ("points", "sdf_m", "of_ray")}
+    samples = dataclasses.replace(samples, **exact)
+    field.to(dtype)
+    shard = Shard(field, config, 0.7, torch.Generator(), 2, moves_rows=False)
+    return field, config, shard, samples
+
+
+@pytest.fixture
+def default_dtype(dtype):
+    """What a dropout's factors have."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    yield
+    torch.set_default_dtype(before)
+
+
+def by_autograd(stage, field, config, shard, samples):
+    if stage != "geometry":
+        return shard._by_autograd(samples, frozen=stage == "reflectance")
+    loss = sdf_loss(field.logit(samples.points), samples.sdf_m, config.sigma_m) / 2
+    parameters = [*field.cells.parameters(), *field.sdf_network.parameters()]
+    found = torch.autograd.grad(loss, parameters)
+    return dataclasses.make_dataclass("Expected", ["losses", "by_parameters"])({"sdf": loss.item()}, found)
+
+
+@pytest.mark.usefixtures("instruction_set", "default_dtype")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("changes", CONFIGS.values(), ids=CONFIGS)
+def test_same_as_autograd(rays, changes, stage, dtype):
+    field, config, shard, samples = shard_and_samples(rays, changes, dtype)
+    results = []
+    with Workers(1):
+        for gradients in (getattr(shard, stage), lambda s: by_autograd(stage, field, config, shard, s)):
+            shard.restore({"generator": torch.Generator().manual_seed(5).get_state()})
+            results.append(gradients(samples))
+    found, expected = results
+    assert found.touched is None
+    tolerance = 3e-5 if dtype == torch.float32 else 1e-12
+    assert found.losses.keys() == expected.losses.keys()
+    for name, loss in found.losses.items():
+        assert loss == pytest.approx(expected.losses[name], rel=tolerance)
+        assert loss > 0.01 or (name, config.sdf_loss_weight) == ("sdf", 0)
+    assert len(found.by_parameters) == len(expected.by_parameters)
+    for a, b in zip(found.by_parameters, expected.by_parameters, strict=True):
+        assert b.abs().max() > 0 or (stage == "joint" and config.sdf_loss_weight == 0)
+        torch.testing.assert_close(a, b, rtol=0, atol=tolerance * max(b.abs().max().item(), 1e-3))
+
+
+def test_the_touched_features_get_the_same_gradient(rays):
+    field, config, shard, samples = shard_and_samples(rays, {}, torch.float64)
+    with Workers(1):
+        dense = shard.geometry(samples)
+        rows = Shard(field, config, 0.7, torch.Generator(), 2, moves_rows=True).geometry(samples)
+        touched = rows.touched
+        assert touched is not None
+        by_features = torch.zeros_like(field.cells.features)
+        field.cells.table.scatter(
+            touched.points.numpy(),
+            touched.located.numpy(),
+            None,
+            touched.gradient.numpy(),
+            by_features.numpy(),
+        )
+    torch.testing.assert_close(by_features, dense.by_parameters[0], rtol=0, atol=1e-15)
+    assert len(rows.by_parameters) == len(dense.by_parameters) - 1
+    assert (touched.located[: samples.num_near, 0] >= 0).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_extreme_logits_and_no_samples(rays, stage):
+    field, _, shard, samples = shard_and_samples(rays, {}, torch.float32)
+    with torch.no_grad():
+        for parameter in field.sdf_network.parameters():
+            parameter.mul_(30)
+    with Workers(1):
+        found = getattr(shard, stage)(samples)
+        assert all(np.isfinite(loss) for loss in found.losses.values())
+        assert all(p.isfinite().all() for p in found.by_parameters)
+        none = dataclasses.replace(
+            samples, points=samples.points[:0], sdf_m=samples.sdf_m[:0], of_ray=samples.of_ray[:0], num_near=0
+        )
+        found = getattr(shard, stage)(none)
+    assert set(found.losses.values()) == {0.0}
+    assert not any(p.any() for p in found.by_parameters)
+
+
+def test_not_a_number_is_passed_on(rays):
+    _, _, shard, samples = shard_and_samples(rays, {}, torch.float32)
+    samples.sdf_m[3] = float("nan")
+    with Workers(1):
+        assert np.isnan(shard.geometry(samples).losses["sdf"])
+        samples.sdf_m[3] = 0
+        samples.of_ray[2, 7] = float("nan")
+        losses = shard.joint(samples).losses
+    assert np.isnan(losses["intensity"])
+    assert np.isfinite(losses["sdf"])
+
+
+GOOD = {"frequencies": (409.6, 0, 10), "num_near": 200, "intensity_count": 200, "sees": (True, True, True)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frequencies": (409.6, 0, 9)}, "encodings of cells and positions"),
+        ({"frequencies": (409.6, 20, 10)}, "no such frequencies"),
+        ({"frequencies": (409.6, -1, 10)}, "no such frequencies"),
+        ({"num_near": 401}, "of the batch"),
+        ({"intensity_count": -1}, "of the batch"),
+        ({"intensity_count": 401}, "of the batch"),
+        ({"sees": (False, True, True)}, "see what it is said to"),
+        ({"points": np.zeros((400, 2), np.float32)}, "points must have shape"),
+        ({"sdf_m": np.zeros(399, np.float32)}, "sdf_m must have shape"),
+        ({"rays": np.zeros((400, 7), np.float32)}, "rays must have shape"),
+        ({"features": np.zeros((3, 8), np.float32)}, "features must have shape"),
+        ({"located": np.zeros((400, 2), np.int32)}, "located must have shape"),
+        ({"interpolated_grad": np.zeros((400, 16), np.float32)}, "interpolated_grad must have shape"),
+        ({"interpolated_grad": None}, "gradients of what is trained"),
+        ({"intensity_grads": None}, "gradients of what is trained"),
+        ({"dropout": [(np.zeros((200, 23), np.uint8), 3)]}, "dropout must have shape"),
+        ({"dropout": [(np.zeros((200, 24), np.uint8), 0)]}, "keep something"),
+        ({"dropout": [(np.zeros((200, 24), np.uint8), 1)] * 3}, "only the two encodings"),
+    ],
+)
+def test_the_core_refuses_what_does_not_fit(rays, changes, message):
+    field, config, shard, samples = shard_and_samples(rays, {}, torch.float32)
+    arguments = GOOD | {
+        "table": field.cells.table,
+        "features": field.cells.features.detach().numpy(),
+        "sdf": shard._sdf.values,
+        "intensity": shard._intensity.values,
+        "points": samples.points.numpy(),
+        "sdf_m": samples.sdf_m.numpy(),
+        "rays": samples.of_ray.numpy(),
+        "dropout": [],
+        "sigma_m": config.sigma_m,
+        "sdf_weight": 1.0,
+        "intensity_weight": 1.0,
+        "sdf_grads": shard._sdf.gradient_values,
+        "intensity_grads": shard._intensity.gradient_values,
+        "located": np.zeros((400, 3), np.int32),
+        "interpolated_grad": np.zeros((400, 24), np.float32),
+    }
+    assert min(_core.field_loss(**arguments)) > 0
+    with pytest.raises(ValueError, match=message):
+        _core.field_loss(**(arguments | changes))
