@@ -33,11 +33,17 @@ def test_batches_grow_where_iterations_would_be_too_many():
 
 def test_large_batches_of_a_joint_beginning_count_for_the_intensities():
     assert schedule(10**7).intensity_iterations == schedule(10**7).sdf_iterations
-    alone = schedule(10**7, joint=False)
-    assert alone.intensity_iterations == pytest.approx(6e7 / 2048, abs=1)
-    assert schedule(10**7, joint=False, intensity_passes=2.0).intensity_iterations == pytest.approx(
-        2 * 6e7 / 2048, abs=1
-    )
+    alone = schedule(10**6, joint=False)
+    assert alone.intensity_iterations == pytest.approx(6e6 / 2048, abs=1)
+    twice = schedule(10**6, joint=False, intensity_passes=2.0, max_reflectance_iterations=10**4)
+    assert twice.intensity_iterations == pytest.approx(2 * 6e6 / 2048, abs=1)
+
+
+def test_many_returns_do_not_train_the_intensities_for_ever():
+    assert schedule(10**8, joint=False).intensity_iterations == FitConfig().max_reflectance_iterations
+    dense = schedule(10**8, vertices=10**6)
+    assert dense.intensity_iterations == dense.sdf_iterations + FitConfig().max_reflectance_iterations
+    assert schedule(10**7, joint=False, max_reflectance_iterations=0).intensity_iterations == 1200
 
 
 def test_a_small_scene_trains_its_intensities_for_long_and_with_more_dropout():

@@ -55,6 +55,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "intensity_iterations": _FROM_1,
     "intensity_passes": _POSITIVE,
     "min_intensity_iterations": _FROM_1,
+    "max_reflectance_iterations": _FROM_0,
     "learning_rate": _POSITIVE,
     "intensity_learning_rate": _POSITIVE,
     "adam_epsilon": _POSITIVE,
@@ -218,11 +219,15 @@ class FitConfig:
     """Samples in an iteration of the intensity network (3QFPI: 8192; measured: more and smaller steps go further)."""
     intensity_iterations: int | None = None
     """Iterations of the intensity network, those of a joint beginning included (3QFPI: 4000). None: `intensity_passes`
-    over the data, but at least `min_intensity_iterations`."""
+    over the data, but at least `min_intensity_iterations` and, once the geometry is finished, at most
+    `max_reflectance_iterations`."""
     intensity_passes: float = 1.0
     """Times each near-surface sample is seen where `intensity_iterations` is None."""
     min_intensity_iterations: int = 1200
     """Fewer leave the reflectance of a small scene unfinished."""
+    max_reflectance_iterations: int = 4000
+    """So many on the finished geometry are enough, however many returns there are (measured: of 2 million returns of `hugin`,
+    174, 974, 2974 and 4288 give errors of 2.89, 2.83, 2.80 and 2.80 dB)."""
     joint: bool = True
     """Whether the intensity network trains from the first iteration on, its gradient reaching features and SDF network
     until these freeze (3QFPI; measured: 1 to 3 % less error for the same time), or only on the finished geometry."""

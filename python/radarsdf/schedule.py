@@ -59,7 +59,8 @@ class Schedule:
             joint = sdf_iterations if config.joint else 0
             near = batch_size * config.near_samples / (config.near_samples + config.free_samples)
             left = config.intensity_passes * samples - joint * max(near, config.intensity_batch_size)
-            wanted = joint + max(0, math.ceil(left / config.intensity_batch_size))
+            alone = max(0, math.ceil(left / config.intensity_batch_size))
+            wanted = joint + min(alone, config.max_reflectance_iterations)
             intensity_iterations = max(config.min_intensity_iterations, wanted)
         # Where each sample is seen often, there is more to learn by heart. The same dropout for all (0.7 and 0.2) would
         # be as good on sparse scenes, and cost 2 % on a dense one, whose samples are seen twice.
