@@ -97,6 +97,16 @@ def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, voxel_siz
     assert sharp_map.observed(mesh.triangles.reshape(-1, 3) + 0.01 * towards_middle).mean() > 0.999
 
 
+@pytest.mark.parametrize("voxel_size", [0.07, 0.13, 0.19])
+def test_small_voxels_have_their_centres_in_the_map(sharp_map, voxel_size):
+    local = (
+        sharp_map.mesh(voxel_size).triangles_center - sharp_map.origin
+    )  # each in the middle of one voxel's
+    centres = (np.floor(local / voxel_size) + 0.5) * voxel_size
+    occupied = sharp_map.field.cells.occupied(torch.from_numpy(centres.astype(np.float32)))
+    assert occupied.float().mean() > 0.9999
+
+
 @pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.15, 0.2, 0.3])
 def test_any_voxel_size_gives_the_same_surface(sharp_map, voxel_size):
     mesh = sharp_map.mesh(voxel_size)
@@ -302,7 +312,7 @@ def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
 
 
 # Voxels that do not divide the cells are moved otherwise at the border: there, a few vertices differ.
-@pytest.mark.parametrize("voxel_size", [0.05, 0.1])
+@pytest.mark.parametrize("voxel_size", [0.05, 0.07, 0.1, 0.13])
 def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, voxel_size, monkeypatch):
     cells = sharp_map.field.cells.table.leaf_cells()
     assert len(_crossed(sharp_map, cells)) < 0.8 * len(cells)
@@ -310,9 +320,10 @@ def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, 
     assert mesh.metadata["leaf_cells_searched"] < 0.8 * mesh.metadata["leaf_cells"] == 0.8 * len(cells)
     monkeypatch.setattr("radarsdf.meshing._crossed", lambda _, cells: cells)
     whole = sharp_map.mesh(voxel_size)
-    assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4)
+    assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4 if voxel_size in (0.05, 0.1) else 1e-3)
     distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)
-    assert np.quantile(distance_m, 0.9999) < 1e-4  # other batches, other rounding
+    even = voxel_size in (0.05, 0.1)
+    assert np.quantile(distance_m, 0.9999 if even else 0.998) < 1e-4  # other batches, other rounding
 
 
 def test_cells_are_skipped_only_where_the_encoding_is_smooth():

@@ -145,7 +145,7 @@ def extract_cells(
     ([0.5, 0.5, 0.5], (1, 3))
     """
     corners = _as_int32(corners, "corners")
-    furthest = np.abs(corners, dtype=np.float64).max(initial=0.0) + 1
+    furthest = max(-float(corners.min(initial=0)), float(corners.max(initial=0))) + 1
     return _core.marching_cubes_sparse(
         corners,
         _as_samples(values, "values"),

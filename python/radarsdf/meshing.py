@@ -102,6 +102,8 @@ def extract_mesh(
         if box is not None:
             centres = (voxels + 0.5) * voxel_size
             voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
+        if voxel_size < leaf_size_m and len(voxels) > 0:
+            voxels = _in_map(radar_map, voxels, voxel_size)
         voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
         values = _corner_distances(radar_map, voxel_size, voxels, corners, voxel_corners, progress)
     vertices, faces = extract_cells(
@@ -206,6 +208,12 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
         else:
             voxels[some] = np.floor((cells[some, None, :] + inside) * (leaf_size_m / voxel_size))
     return voxels.reshape(-1, 3)
+
+
+def _in_map(radar_map: RadarMap, voxels: NDArray[np.int32], voxel_size: float) -> NDArray[np.int32]:
+    """The voxels whose centre lies in an occupied cell: others would continue the surface beyond the map."""
+    centres = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+    return voxels[evaluate(radar_map.field.cells.occupied, torch.from_numpy(centres)).numpy()]
 
 
 def _corner_distances(
