@@ -105,7 +105,7 @@ class Batch {
   // A sample's row of an encoding, or of its gradient, after the dropout. `to` may be `from`.
   void drop(const Dropout& dropout, std::int64_t i, std::int64_t columns, const T* from, T* to) const {
     if (!dropout.bytes) {
-      std::copy_n(from, columns, to);
+      if (to != from) std::copy_n(from, columns, to);
       return;
     }
     const std::uint8_t* bytes = dropout.bytes + i * columns;

@@ -12,19 +12,18 @@ from radarsdf.kernels import FEATURE_DIM
 from radarsdf.schedule import Schedule
 
 # `python -m bench.stress durations` measures fits and prints these anew. Seconds of one thread of BENCHMARK.md's machine;
-# what they say of twenty fits, measured again, was 0.6 to 1.3 times their processor time and 0.76 to 1.92 times their wall
-# time on two. A 0 is what the others account for.
+# what they say of twenty fits is 0.58 to 1.25 times their processor time. A 0 is what the others account for.
 SECONDS = {
-    "always": 0.18,
-    "return": 2.8e-06,
+    "always": 0.0,
+    "return": 3.1e-06,
     "ghost": 0.0,
     "averaged return": 0.0,
-    "cell": 6.7e-07,
+    "cell": 4.1e-07,
     "row": 0.0,
-    "moved row": 5.6e-09,
-    "iteration": 3.3e-3,
-    "encoded number": 2.1e-9,
-    "multiplication": 3.2e-11,
+    "moved row": 4.3e-09,
+    "iteration": 5.5e-4,
+    "encoded number": 3.2e-9,
+    "multiplication": 2.7e-11,
 }
 
 
