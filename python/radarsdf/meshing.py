@@ -213,7 +213,8 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
 def _in_map(radar_map: RadarMap, voxels: NDArray[np.int32], voxel_size: float) -> NDArray[np.int32]:
     """The voxels whose centre lies in an occupied cell: others would continue the surface beyond the map."""
     centres = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-    return voxels[evaluate(radar_map.field.cells.occupied, torch.from_numpy(centres)).numpy()]
+    inside: NDArray[np.bool_] = evaluate(radar_map.field.cells.occupied, torch.from_numpy(centres)).numpy()
+    return voxels[inside]
 
 
 def _corner_distances(
