@@ -4,8 +4,8 @@
 
 A group for each of the schedule's stages: geometry alone, joint with the reflectance, and reflectance on frozen
 geometry. A round is `STEPS` steps in all cases of a group, so that their ratios can be read off. The whole is
-`Training` itself; the parts are rebuilt here from what it calls, so where they do not add up to it, it has found a
-shorter way or wastes time between them.
+`Training` itself, which has the losses and gradients from the core in one call; the parts are rebuilt here as the field
+and the losses define them, one after the other through autograd.
 """
 
 from __future__ import annotations

@@ -285,10 +285,10 @@ def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypat
     stage, of = ("sdf", 10) if joint or name == "sdf" else ("intensity", 20)
     eighth = 8 if stage == "sdf" else 10 + 8
 
-    def failing(*arguments):
+    def failing(**arguments):
         nonlocal calls
         calls += 1
-        losses = dict(zip(("sdf", "intensity"), field_loss(*arguments), strict=True))
+        losses = dict(zip(("sdf", "intensity"), field_loss(**arguments), strict=True))
         losses[name] *= math.inf if calls == eighth else 1
         return tuple(losses.values())
 
