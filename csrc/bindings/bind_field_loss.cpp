@@ -92,7 +92,7 @@ void bind_loss(py::module_& m) {
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_near"_a, "intensity_count"_a,
       "dropout"_a, "sigma_m"_a, "sdf_weight"_a, "intensity_weight"_a, "sdf_grads"_a.noconvert(),
       "intensity_grads"_a.noconvert(), "located"_a.noconvert(), "interpolated_grad"_a.noconvert(),
-      "Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.field_loss.");
+      "Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.shards.");
 }
 
 }  // namespace

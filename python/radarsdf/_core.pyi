@@ -465,7 +465,7 @@ def field_loss(
     interpolated_grad: numpy.typing.NDArray[numpy.float32] | None,
 ) -> tuple[float, float]:
     """
-    Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.field_loss.
+    Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.shards.
     """
 
 @typing.overload
@@ -504,7 +504,7 @@ def field_loss(
     interpolated_grad: numpy.typing.NDArray[numpy.float64] | None,
 ) -> tuple[float, float]:
     """
-    Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.field_loss.
+    Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.shards.
     """
 
 @typing.overload

@@ -102,7 +102,7 @@ def extract_mesh(
         if box is not None:
             centres = (voxels + 0.5) * voxel_size
             voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
-        if voxel_size < leaf_size_m and len(voxels) > 0:
+        if voxel_size < leaf_size_m and not _per_cell(voxel_size, leaf_size_m)[1]:
             voxels = _in_map(radar_map, voxels, voxel_size)
         voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
         values = _corner_distances(radar_map, voxel_size, voxels, corners, voxel_corners, progress)
@@ -187,14 +187,25 @@ def _crossed(radar_map: RadarMap, cells: NDArray[np.int32]) -> NDArray[np.int32]
     return crossed
 
 
+def _per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
+    """Voxels along the edge of a leaf cell, and whether they divide it: each then lies in one cell."""
+    parts = max(1, math.ceil(min(leaf_size_m / voxel_size, _MAX_VOXELS) - 1e-9))
+    return parts, math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
+
+
+def _occupied(radar_map: RadarMap, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Whether each of the points (N, 3), local frame, m, lies in an occupied leaf cell."""
+    inside: NDArray[np.bool_] = evaluate(radar_map.field.cells.occupied, torch.from_numpy(points)).numpy()
+    return inside
+
+
 def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -> NDArray[np.int32]:
     """Lattice coordinates (M, 3) of the voxels that overlap leaf cells; some more than once."""
     leaf_size_m = config.leaf_size_m
-    parts = max(1, math.ceil(min(leaf_size_m / voxel_size, _MAX_VOXELS) - 1e-9))
+    parts, even = _per_cell(voxel_size, leaf_size_m)
     if max(len(cells) * (parts + 1) ** 3, int(np.abs(cells).max(initial=0)) * parts) > _MAX_VOXELS:
         msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
         raise ValueError(msg)
-    even = math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
     check_mesh(len(cells) * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
     # Where they are not even: points of the cell no further apart than a voxel, from one end to the other, fall into each
     # voxel that overlaps it.
@@ -213,8 +224,7 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
 def _in_map(radar_map: RadarMap, voxels: NDArray[np.int32], voxel_size: float) -> NDArray[np.int32]:
     """The voxels whose centre lies in an occupied cell: others would continue the surface beyond the map."""
     centres = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-    inside: NDArray[np.bool_] = evaluate(radar_map.field.cells.occupied, torch.from_numpy(centres)).numpy()
-    return voxels[inside]
+    return voxels[_occupied(radar_map, centres)]
 
 
 def _corner_distances(
@@ -231,9 +241,8 @@ def _corner_distances(
     jump. It is evaluated a hair inside one of its own voxels instead. A corner further out, as voxels have that do not
     divide the cells, is moved until it is inside, and the way is added to its distance.
     """
-    occupied = radar_map.field.cells.occupied
     points = corners.astype(np.float32) * np.float32(voxel_size)
-    outside = ~evaluate(occupied, torch.from_numpy(points)).numpy()
+    outside = ~_occupied(radar_map, points)
     # The voxel that a corner is moved into: of several the last. NumPy lets the last of equal indices count.
     owners = np.zeros(len(corners), np.int32)
     for part in _parts(len(voxels)):
@@ -248,7 +257,7 @@ def _corner_distances(
         place, left = corner.copy(), np.arange(len(corner))
         for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
             place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
-            left = left[~evaluate(occupied, torch.from_numpy(place[left])).numpy()]
+            left = left[~_occupied(radar_map, place[left])]
         points[moved[part]] = place
         way_m[part] = np.linalg.norm(place - corner, axis=1)
     values: NDArray[np.float32] = evaluate(
