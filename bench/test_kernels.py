@@ -14,8 +14,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from radarsdf import kernels
 from radarsdf._core import CellSet, VertexTable
+from radarsdf.field import kernels
 
 from .conftest import FEATURE_DIM, LEAF_M, NUM_LEVELS, PLANES, surface_points
 

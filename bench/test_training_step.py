@@ -17,14 +17,14 @@ import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
-from radarsdf.field import Field
-from radarsdf.losses import intensity_loss, sdf_loss
-from radarsdf.map import IntensityScale
-from radarsdf.optimiser import Adam
-from radarsdf.sampling import Dropout, RaySampler
-from radarsdf.scans import prepare
+from radarsdf.field.field import Field
+from radarsdf.field.losses import intensity_loss, sdf_loss
+from radarsdf.fitting.optimiser import Adam
+from radarsdf.fitting.sampling import Dropout, RaySampler
+from radarsdf.fitting.training import Training
+from radarsdf.map.radar_map import IntensityScale
+from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
-from radarsdf.training import Training
 
 from .conftest import Surface, surface_points
 

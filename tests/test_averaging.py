@@ -10,9 +10,9 @@ import radarsdf
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import cell_keys
-from radarsdf.averaging import CellRays
-from radarsdf.networks import SDFNetwork
-from radarsdf.scans import prepare
+from radarsdf.field.networks import SDFNetwork
+from radarsdf.fitting.averaging import CellRays
+from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 
 from .conftest import ground_and_wall

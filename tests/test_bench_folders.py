@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
+from radarsdf.io.folders import read_posed_folder, read_snail_radar
+from radarsdf.io.pcd import read_pcd
 
-from bench.paper.folders import read_posed_folder, read_snail_radar
-from bench.paper.pcd import read_pcd
 from bench.paper.scenes import load_scene
 
 START_S = 1706001766.0

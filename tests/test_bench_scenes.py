@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from radarsdf.readers import Scans, read_scans, write_scans
+from radarsdf.io.scans import Scans, read_scans, write_scans
 from radarsdf.simulate import SCENES
 from scipy.spatial import cKDTree
 

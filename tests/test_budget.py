@@ -11,10 +11,11 @@ import sys
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf import FitConfig, budget
+from radarsdf import FitConfig
+from radarsdf.budget import estimate as budget
 from radarsdf.cli import main
-from radarsdf.readers import Scans, write_scans
-from radarsdf.scans import prepare
+from radarsdf.io.scans import Scans, write_scans
+from radarsdf.returns.rays import prepare
 
 from bench.growth.street import street
 from bench.stress.memory import peak_of_a_fit
@@ -60,7 +61,7 @@ def test_a_sample_tells_about_as_much(monkeypatch):
 
 def test_a_fit_beyond_the_budget_is_refused_before_anything_is_allocated(scene, monkeypatch):
     config = dataclasses.replace(QUICK, max_memory_bytes=60_000_000)
-    monkeypatch.setattr("radarsdf.fitting.Surfels.of", lambda *_: pytest.fail("began"))
+    monkeypatch.setattr("radarsdf.fitting.fit.Surfels.of", lambda *_: pytest.fail("began"))
     with pytest.raises(
         MemoryError, match=r"about 0\.\d\d GB for \d+ leaf cells and 9000 returns, of 0\.06: use larger"
     ):

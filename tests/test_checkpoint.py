@@ -14,7 +14,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig, Interrupted
-from radarsdf.training import Training
+from radarsdf.fitting.training import Training
 from safetensors import safe_open
 from safetensors.torch import save_file
 
@@ -45,7 +45,7 @@ def interrupted_after(iterations, monkeypatch, *arguments, **keywords):
             return self.left == 0
 
     with monkeypatch.context() as patch:
-        patch.setattr("radarsdf.training.deferred_interrupts", Deferred)
+        patch.setattr("radarsdf.fitting.training.deferred_interrupts", Deferred)
         with pytest.raises(Interrupted) as caught:
             fitted(*arguments, **keywords)
     return caught.value.radar_map.report["iterations_done"]
@@ -81,12 +81,13 @@ def test_without_intensities(scene, tmp_path, monkeypatch):
 
 def test_it_is_written_on_the_way_without_changing_the_result(scene, tmp_path, monkeypatch):
     whole = fitted(scene)
-    monkeypatch.setattr("radarsdf.checkpoint._EVERY_S", 0.0)
-    monkeypatch.setattr("radarsdf.checkpoint._SHARE", 1e9)
+    monkeypatch.setattr("radarsdf.fitting.checkpoint._EVERY_S", 0.0)
+    monkeypatch.setattr("radarsdf.fitting.checkpoint._SHARE", 1e9)
     written = []
-    write = radarsdf.checkpoint.Checkpoint.write
+    write = radarsdf.fitting.checkpoint.Checkpoint.write
     monkeypatch.setattr(
-        "radarsdf.checkpoint.Checkpoint.write", lambda self, state: (written.append(1), write(self, state))
+        "radarsdf.fitting.checkpoint.Checkpoint.write",
+        lambda self, state: (written.append(1), write(self, state)),
     )
     assert_same_bits(whole, fitted(scene, tmp_path / "state"))
     assert len(written) == 61  # each iteration, and the end
@@ -101,19 +102,19 @@ def test_a_killed_fit_goes_on_from_what_was_written_last(scene, tmp_path):
     path = tmp_path / "state"
     code = f"""
 import os, signal
-import radarsdf.checkpoint
+import radarsdf.fitting.checkpoint
 from tests.conftest import ground_and_wall
 from tests.test_checkpoint import fitted
-radarsdf.checkpoint._EVERY_S = 0.0
-radarsdf.checkpoint._SHARE = 1e9
-write, count = radarsdf.checkpoint.Checkpoint.write, 0
+radarsdf.fitting.checkpoint._EVERY_S = 0.0
+radarsdf.fitting.checkpoint._SHARE = 1e9
+write, count = radarsdf.fitting.checkpoint.Checkpoint.write, 0
 def counted(self, state):
     global count
     count += 1
     write(self, state)
     if count == 37:
         os.kill(os.getpid(), signal.SIGKILL)
-radarsdf.checkpoint.Checkpoint.write = counted
+radarsdf.fitting.checkpoint.Checkpoint.write = counted
 fitted(ground_and_wall(), {str(path)!r})
 """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
@@ -124,7 +125,7 @@ fitted(ground_and_wall(), {str(path)!r})
 
 def test_when_the_fit_is_done_the_file_gives_its_map_at_once(scene, tmp_path, monkeypatch):
     whole = fitted(scene, tmp_path / "state")
-    monkeypatch.setattr("radarsdf.optimiser.Adam.step", lambda *_: pytest.fail("a step"))
+    monkeypatch.setattr("radarsdf.fitting.optimiser.Adam.step", lambda *_: pytest.fail("a step"))
     assert_same_bits(whole, fitted(scene, tmp_path / "state"))
 
 
@@ -221,7 +222,7 @@ class TestOtherFiles:
 
 
 def test_a_folder_that_does_not_exist_is_said_before_any_work(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("radarsdf.fitting.Surfels.of", lambda *_: pytest.fail("began"))
+    monkeypatch.setattr("radarsdf.fitting.fit.Surfels.of", lambda *_: pytest.fail("began"))
     with pytest.raises(FileNotFoundError, match="no folder"):
         fitted(scene, tmp_path / "nowhere" / "state")
 
@@ -230,7 +231,7 @@ def test_a_full_disk_is_a_warning_and_the_fit_goes_on(scene, tmp_path, monkeypat
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("radarsdf.checkpoint.write_whole", full)
+    monkeypatch.setattr("radarsdf.fitting.checkpoint.write_whole", full)
     with pytest.warns(RuntimeWarning, match="no checkpoint: .*No space"):
         radar_map = fitted(scene, tmp_path / "state")
     assert np.isfinite(radar_map.sdf(np.zeros((1, 3)))).all()

@@ -15,7 +15,7 @@ import radarsdf
 import trimesh
 from radarsdf import FitConfig
 from radarsdf.cli import main
-from radarsdf.readers import Scans, write_scans
+from radarsdf.io.scans import Scans, write_scans
 
 FAST = [
     "--set",

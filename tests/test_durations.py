@@ -9,8 +9,9 @@ import dataclasses
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf import FitConfig, durations
-from radarsdf.schedule import Schedule
+from radarsdf import FitConfig
+from radarsdf.budget import durations
+from radarsdf.budget.schedule import Schedule
 from torch import nn
 
 BOTH = FitConfig(sdf_iterations=100, intensity_iterations=300, batch_size=1000, intensity_batch_size=500)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from radarsdf._core import CellSet
-from radarsdf.encodings import Fourier, Octree, SphericalHarmonics, TriQuadtree
+from radarsdf.field.encodings import Fourier, Octree, SphericalHarmonics, TriQuadtree
 
 LEAF_M = 0.2
 

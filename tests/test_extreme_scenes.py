@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.scans import prepare
+from radarsdf.returns.rays import prepare
 
 from .conftest import SEED, pose
 from .conftest import ground_and_wall as any_ground_and_wall

@@ -9,9 +9,9 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
-from radarsdf.gaps import _MAX_SUPPORT, bridged
-from radarsdf.scans import prepare
-from radarsdf.surfels import support_of
+from radarsdf.returns.gaps import _MAX_SUPPORT, bridged
+from radarsdf.returns.rays import prepare
+from radarsdf.returns.surfels import support_of
 
 from .conftest import ground_and_wall
 

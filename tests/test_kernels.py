@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from radarsdf import _core, kernels
+from radarsdf import _core
+from radarsdf.field import kernels
 from scipy.special import sph_harm_y
 
 LEAF_M = 0.2

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
-from radarsdf.field import Field
-from radarsdf.map import IntensityScale, RadarMap, evaluate
+from radarsdf.field.field import Field
+from radarsdf.map.radar_map import IntensityScale, RadarMap, evaluate
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 

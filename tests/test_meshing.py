@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
-from radarsdf.isosurface import mesh_components
-from radarsdf.map import RadarMap
-from radarsdf.meshing import _corner_distances, _crossed, _smooth_in_cells, _voxels_of
-from radarsdf.picture import intensity_colors
+from radarsdf.map.isosurface import mesh_components
+from radarsdf.map.meshing import _corner_distances, _crossed, _smooth_in_cells, _voxels_of
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.render.picture import intensity_colors
 from scipy.spatial import KDTree
 
 from .conftest import ground_and_wall
@@ -167,7 +167,7 @@ def test_two_meshes_of_one_map_are_the_same_bits(sharp_map):
 @pytest.mark.parametrize("voxel_size", [0.1, 0.15])
 def test_small_parts_give_the_same_bits(sharp_map, voxel_size, monkeypatch):
     whole = sharp_map.mesh(voxel_size)
-    monkeypatch.setattr("radarsdf.meshing._PART", 1 << 12)  # of a large map, as many parts
+    monkeypatch.setattr("radarsdf.map.meshing._PART", 1 << 12)  # of a large map, as many parts
     parts = sharp_map.mesh(voxel_size)
     np.testing.assert_array_equal(parts.vertices, whole.vertices)
     np.testing.assert_array_equal(parts.faces, whole.faces)
@@ -293,7 +293,7 @@ def test_a_viewpoint_needs_intensities(scene):
 
 def lattice(radar_map, voxel_size):
     voxels = occupied_voxels(radar_map, voxel_size)
-    return radarsdf.isosurface.sparse_lattice(voxels)
+    return radarsdf.map.isosurface.sparse_lattice(voxels)
 
 
 @pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
@@ -318,7 +318,7 @@ def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, 
     assert len(_crossed(sharp_map, cells)) < 0.8 * len(cells)
     mesh = sharp_map.mesh(voxel_size)
     assert mesh.metadata["leaf_cells_searched"] < 0.8 * mesh.metadata["leaf_cells"] == 0.8 * len(cells)
-    monkeypatch.setattr("radarsdf.meshing._crossed", lambda _, cells: cells)
+    monkeypatch.setattr("radarsdf.map.meshing._crossed", lambda _, cells: cells)
     whole = sharp_map.mesh(voxel_size)
     assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4 if voxel_size in (0.05, 0.1) else 1e-3)
     distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)

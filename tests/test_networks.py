@@ -11,9 +11,9 @@ import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
-from radarsdf.field import Field
-from radarsdf.losses import intensity_loss, sdf_loss
-from radarsdf.networks import IntensityNetwork, SDFNetwork
+from radarsdf.field.field import Field
+from radarsdf.field.losses import intensity_loss, sdf_loss
+from radarsdf.field.networks import IntensityNetwork, SDFNetwork
 
 BARE = FitConfig(sdf_input=False, view_direction=False, log_range=False)
 

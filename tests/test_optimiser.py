@@ -10,10 +10,10 @@ import sys
 import numpy as np
 import pytest
 import torch
-from radarsdf import kernels
 from radarsdf._core import CellSet
-from radarsdf.encodings import Octree, TriQuadtree
-from radarsdf.optimiser import Adam, RowAdam, Touched
+from radarsdf.field import kernels
+from radarsdf.field.encodings import Octree, TriQuadtree
+from radarsdf.fitting.optimiser import Adam, RowAdam, Touched
 from radarsdf.threads import Workers
 
 

@@ -7,7 +7,7 @@ import builtins
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.picture import intensity_colors, render, save_picture
+from radarsdf.render.picture import intensity_colors, render, save_picture
 
 WHITE = np.array([255, 255, 255])
 

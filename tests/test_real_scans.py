@@ -14,8 +14,8 @@ import radarsdf
 import trimesh
 from radarsdf import FitConfig
 from radarsdf.evaluation import KNNIntensity, holdout, intensity_metrics, surface_metrics
-from radarsdf.readers import read_scans
-from radarsdf.scans import prepare
+from radarsdf.io.scans import read_scans
+from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 
 DATA = os.environ.get("RADARSDF_DATA")

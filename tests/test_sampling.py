@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
-from radarsdf.sampling import Dropout, RaySampler
-from radarsdf.scans import prepare
+from radarsdf.fitting.sampling import Dropout, RaySampler
+from radarsdf.returns.rays import prepare
 
 from .conftest import pose
 

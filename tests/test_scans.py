@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.scans import check_poses, prepare
+from radarsdf.returns.rays import check_poses, prepare
 
 from .conftest import pose
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 from radarsdf import FitConfig
-from radarsdf.schedule import Schedule
+from radarsdf.budget.schedule import Schedule
 
 
 def schedule(returns, vertices=10**9, *, with_intensity=True, **changes):

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig, _core
-from radarsdf.field import Field
-from radarsdf.losses import sdf_loss
-from radarsdf.sampling import RaySampler
-from radarsdf.scans import prepare
-from radarsdf.shards import Shard
+from radarsdf.field.field import Field
+from radarsdf.field.losses import sdf_loss
+from radarsdf.fitting.gradients import Shard
+from radarsdf.fitting.sampling import RaySampler
+from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
 
 CONFIGS = {

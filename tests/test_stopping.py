@@ -19,9 +19,9 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import Diverged, FitConfig, Interrupted, _core
-from radarsdf.optimiser import Adam
-from radarsdf.readers import Scans, write_scans
-from radarsdf.stopping import deferred_interrupts
+from radarsdf.fitting.optimiser import Adam
+from radarsdf.fitting.stopping import deferred_interrupts
+from radarsdf.io.scans import Scans, write_scans
 
 from .conftest import ground_and_wall
 
@@ -53,7 +53,7 @@ def interrupted_python(code, after="ready", delay_s=0.3):
 
 # Says when the training begins.
 ANNOUNCED = """
-from radarsdf.training import Training
+from radarsdf.fitting.training import Training
 run = Training.run
 def announced(*arguments):
     print("ready", flush=True)
@@ -98,12 +98,12 @@ import radarsdf
 rng = np.random.default_rng(0)
 points = rng.normal(size=(3_000_000, 3))
 points *= 300 / np.linalg.norm(points, axis=1, keepdims=True)
-prepare = radarsdf.fitting.prepare
+prepare = radarsdf.fitting.fit.prepare
 def announced(*arguments, **keywords):
     rays = prepare(*arguments, **keywords)
     print("ready", flush=True)
     return rays
-radarsdf.fitting.prepare = announced
+radarsdf.fitting.fit.prepare = announced
 try:
     radarsdf.fit([points], np.eye(4)[None], progress=False)
 except radarsdf.Interrupted as error:
@@ -173,12 +173,12 @@ import radarsdf
 assert "trimesh" not in sys.modules and "{part}" not in sys.modules
 sys.meta_path.insert(0, Press())
 try:
-    import radarsdf.meshing
+    import radarsdf.map.meshing
     print("lost")
 except KeyboardInterrupt:
     print("stopped")
 assert presses
-import radarsdf.meshing  # and now it is whole
+import radarsdf.map.meshing  # and now it is whole
 assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 """
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
@@ -314,12 +314,12 @@ def test_an_interrupted_fit_is_a_keyboard_interrupt_even_where_nobody_defers(sce
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("radarsdf.training.Training.run", interrupt)
+    monkeypatch.setattr("radarsdf.fitting.training.Training.run", interrupt)
     config = dataclasses.replace(FitConfig(), sdf_iterations=1)
     with pytest.raises(Interrupted, match="while training") as caught:
         radarsdf.fit(scene.points, scene.poses, config=config)
     assert caught.value.radar_map.report["iterations_done"] == {"sdf": 0, "intensity": 0}
-    monkeypatch.setattr("radarsdf.fitting.prepare", interrupt)
+    monkeypatch.setattr("radarsdf.fitting.fit.prepare", interrupt)
     with pytest.raises(Interrupted, match="before the training") as caught:
         radarsdf.fit(scene.points, scene.poses, config=config)
     assert caught.value.radar_map is None

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
-from radarsdf import FitConfig, storage
+from radarsdf import FitConfig
+from radarsdf.map import storage
 from safetensors import safe_open
 from safetensors.torch import save_file
 

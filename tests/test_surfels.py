@@ -11,9 +11,9 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
-from radarsdf.averaging import CellRays
-from radarsdf.scans import prepare
-from radarsdf.surfels import Surfels, support_of
+from radarsdf.fitting.averaging import CellRays
+from radarsdf.returns.rays import prepare
+from radarsdf.returns.surfels import Surfels, support_of
 
 from .conftest import ground_and_wall
 

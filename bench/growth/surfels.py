@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from radarsdf import FitConfig
-from radarsdf.fitting import occupied_leaf_keys
-from radarsdf.scans import prepare
-from radarsdf.surfels import Surfels, support_of
+from radarsdf.fitting.fit import occupied_leaf_keys
+from radarsdf.returns.rays import prepare
+from radarsdf.returns.surfels import Surfels, support_of
 
 from bench.memory import memory_bytes
 

@@ -14,7 +14,7 @@ import radarsdf
 import trimesh
 from radarsdf import FitConfig, RadarMap
 from radarsdf.evaluation import intensity_metrics, surface_metrics
-from radarsdf.picture import save_picture
+from radarsdf.render.picture import save_picture
 
 from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
 
@@ -128,7 +128,7 @@ def fit(scene: Scene, config: FitConfig) -> RadarMap:
 
 def world_returns(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """World points (N, 3), sensor positions (N, 3) and intensities (N,) of the returns that the scene's ranges keep."""
-    rays = radarsdf.scans.prepare(
+    rays = radarsdf.returns.rays.prepare(
         scene.points,
         scene.poses,
         scene.intensities,

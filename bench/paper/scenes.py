@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from radarsdf.evaluation import holdout
-from radarsdf.readers import Scans, read_scans
-from radarsdf.scans import prepare
+from radarsdf.io.folders import is_posed_folder, is_snail_radar, read_posed_folder, read_snail_radar
+from radarsdf.io.scans import Scans, read_scans
+from radarsdf.returns.rays import prepare
 from radarsdf.simulate import SCENES, Simulation
 from scipy.spatial import cKDTree
-
-from .folders import is_posed_folder, is_snail_radar, read_posed_folder, read_snail_radar
 
 SEEN_BY_RADAR_M = 1.0
 """Lidar sees all round: a lidar point further than this from every return says nothing about a radar map."""
@@ -120,7 +119,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
         One of
 
         - the name of a simulated scene, of `radarsdf.simulate.SCENES`;
-        - an ``.npz`` file as :func:`radarsdf.readers.read_scans` reads it: only static returns are used, and of the
+        - an ``.npz`` file as :func:`radarsdf.io.scans.read_scans` reads it: only static returns are used, and of the
           lidar points those within 1 m of a return that is 2.5 to 60 m from its sensor;
         - a folder as :func:`.folders.read_posed_folder` reads it: recordings of Viking Hill, exported from ROS bags;
         - a sequence of SNAIL-Radar as :func:`.folders.read_snail_radar` reads it.

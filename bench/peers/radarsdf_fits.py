@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-import radarsdf.meshing  # with trimesh: imported by the first mesh otherwise, and counted
+import radarsdf.map.meshing  # with trimesh: imported by the first mesh otherwise, and counted
 
 from .child import Made, ScanArrays
 

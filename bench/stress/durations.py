@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-from radarsdf import FitConfig, durations
-from radarsdf.schedule import Schedule
+from radarsdf import FitConfig
+from radarsdf.budget import durations
+from radarsdf.budget.schedule import Schedule
 from scipy.optimize import nnls
 
 from bench.growth.street import street

@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-from radarsdf.checkpoint import Checkpoint
 from radarsdf.cli import _read_mesh, _read_points
-from radarsdf.readers import read_scans
+from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.io.folders import read_posed_folder
+from radarsdf.io.pcd import read_pcd
+from radarsdf.io.scans import read_scans
+from radarsdf.io.trajectory import read_trajectory
 from tqdm import tqdm
 
-from bench.paper.folders import read_posed_folder
-from bench.paper.pcd import read_pcd
 from bench.paper.report import markdown
-from bench.paper.trajectory import read_trajectory
 
 from . import samples
 from .mutations import boundaries, mutate

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from radarsdf import _core, kernels
+from radarsdf import _core
+from radarsdf.field import kernels
 
 from bench.paper.report import markdown
 

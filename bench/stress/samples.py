@@ -16,14 +16,14 @@ import numpy as np
 import radarsdf
 import trimesh
 from radarsdf import FitConfig
-from radarsdf.checkpoint import Checkpoint
-from radarsdf.field import Field
-from radarsdf.fitting import occupied_leaf_keys
-from radarsdf.map import IntensityScale
-from radarsdf.readers import Scans, write_scans
-from radarsdf.scans import Rays, prepare
+from radarsdf.field.field import Field
+from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.fit import occupied_leaf_keys
+from radarsdf.fitting.training import Training
+from radarsdf.io.scans import Scans, write_scans
+from radarsdf.map.radar_map import IntensityScale
+from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import Workers
-from radarsdf.training import Training
 
 _CONFIG = FitConfig(
     sdf_iterations=2, intensity_iterations=2, batch_size=64, intensity_batch_size=64, sdf_hidden=(4,),

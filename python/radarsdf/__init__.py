@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import torch  # noqa: F401 - before the compiled core, which then shares PyTorch's OpenMP runtime
 
-from radarsdf.budget import Estimate, estimate
+from radarsdf.budget.estimate import Estimate, estimate
 from radarsdf.config import FitConfig
-from radarsdf.fitting import fit
-from radarsdf.isosurface import marching_cubes
-from radarsdf.map import RadarMap
-from radarsdf.stopping import Diverged, Interrupted
-from radarsdf.storage import load
+from radarsdf.fitting.fit import fit
+from radarsdf.fitting.stopping import Diverged, Interrupted
+from radarsdf.map.isosurface import marching_cubes
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.storage import load
 
 if TYPE_CHECKING:
     from radarsdf import evaluation, simulate

@@ -19,9 +19,9 @@ import torch
 import radarsdf
 from radarsdf import FitConfig, Interrupted, RadarMap, _core
 from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
-from radarsdf.picture import save_picture
-from radarsdf.readers import Scans, read_scans, write_scans
-from radarsdf.stopping import whole_import
+from radarsdf.fitting.stopping import whole_import
+from radarsdf.io.scans import Scans, read_scans, write_scans
+from radarsdf.render.picture import save_picture
 
 with whole_import():
     import trimesh
@@ -298,7 +298,7 @@ def _whole(path: Path, read: Callable[[], Any]) -> Any:
 
 def _world(scans: Scans, config: FitConfig) -> tuple[Any, Any, Any]:
     """World points, sensor positions and intensities of the returns within the ranges that the map was fitted to."""
-    rays = radarsdf.scans.prepare(
+    rays = radarsdf.returns.rays.prepare(
         scans.points,
         scans.poses,
         scans.intensities,

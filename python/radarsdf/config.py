@@ -359,7 +359,7 @@ class FitConfig:
 
     @property
     def preparation(self) -> dict[str, Any]:
-        """What :func:`radarsdf.scans.prepare` is told for a fit."""
+        """What :func:`radarsdf.returns.rays.prepare` is told for a fit."""
         names = ("min_range_m", "max_range_m", "accumulate_frames")
         return {name: getattr(self, name) for name in names}
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf._checks import MAX_POSITION_M, positive, real_array, whole_number
+from radarsdf.checks import MAX_POSITION_M, positive, real_array, whole_number
 
 INTENSITY_PROTOCOL = "radarsdf-intensity-1"
 """Name and version of the definitions in `intensity_metrics`; a change of any number's meaning changes it."""

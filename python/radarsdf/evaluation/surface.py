@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf._checks import positions, positive, real_array, whole_number
 from radarsdf._core import cell_keys
+from radarsdf.checks import positions, positive, real_array, whole_number
 
 if TYPE_CHECKING:
     import trimesh

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from radarsdf._checks import number, whole_number
+from radarsdf.checks import number, whole_number
 
 from .scene import Hits, Scene
 

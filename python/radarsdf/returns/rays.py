@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._checks import MAX_POSITION_M, number, real_array, whole_number
-from radarsdf._checks import positions as check_positions
+from radarsdf.checks import MAX_POSITION_M, number, real_array, whole_number
+from radarsdf.checks import positions as check_positions
 
 _MAX_ROTATION_ERROR = 1e-3  # of R R^T - 1: float32 poses pass, a scaled or sheared one does not
 

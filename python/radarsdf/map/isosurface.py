@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf import _core
-from radarsdf._checks import real_array
+from radarsdf.checks import real_array
 
 Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from radarsdf.config import FitConfig
-from radarsdf.encodings import SphericalHarmonics
-from radarsdf.mlp import mlp
+from radarsdf.field.encodings import SphericalHarmonics
+from radarsdf.field.mlp import mlp
 
 
 def _layers(widths: Sequence[int]) -> nn.Sequential:

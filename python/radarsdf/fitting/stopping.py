@@ -12,7 +12,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from radarsdf.map import RadarMap
+    from radarsdf.map.radar_map import RadarMap
 
 
 class Interrupted(KeyboardInterrupt):

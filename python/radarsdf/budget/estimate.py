@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.budget.durations import SECONDS, shared, work_of
+from radarsdf.budget.schedule import Schedule
 from radarsdf.config import FitConfig
-from radarsdf.durations import SECONDS, shared, work_of
-from radarsdf.kernels import FEATURE_DIM
-from radarsdf.scans import Rays, prepare
-from radarsdf.schedule import Schedule
+from radarsdf.field.kernels import FEATURE_DIM
+from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import resolve_num_threads
 
 # Measured: peaks of fits of 1e4 to 3e6 returns of a street, over what the process had before; `bench.stress memory`

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from radarsdf._core import cell_keys
 from radarsdf.config import FitConfig
-from radarsdf.scans import Rays
+from radarsdf.returns.rays import Rays
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from radarsdf import kernels
 from radarsdf._core import Encoding, VertexTable
+from radarsdf.field import kernels
 
 
 class VertexFeatures(nn.Module):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, CellSet, SurfelMap, cell_keys, principal_axes, sum_moments
-from radarsdf.scans import Rays
+from radarsdf.returns.rays import Rays
 
 # Measured on simulated and real scans; see "What the levers of the surface are worth" in BENCHMARK.md.
 SURFEL_LEAVES = 2  # leaf cells along an edge of a surfel's: 0.4 m

@@ -7,9 +7,9 @@ from __future__ import annotations
 import itertools
 import os
 
+from radarsdf.budget.schedule import Schedule
 from radarsdf.config import FitConfig
-from radarsdf.kernels import FEATURE_DIM
-from radarsdf.schedule import Schedule
+from radarsdf.field.kernels import FEATURE_DIM
 
 # `python -m bench.stress durations` measures fits and prints these anew. Seconds of one thread of BENCHMARK.md's machine;
 # what they say of twenty fits is 0.58 to 1.25 times their processor time. A 0 is what the others account for.

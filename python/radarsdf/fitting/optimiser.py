@@ -11,8 +11,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from radarsdf import kernels
-from radarsdf.encodings import VertexFeatures
+from radarsdf.field import kernels
+from radarsdf.field.encodings import VertexFeatures
 from radarsdf.threads import Workers
 
 _BETAS = (0.9, 0.999)

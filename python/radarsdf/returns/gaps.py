@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, cell_keys
-from radarsdf.scans import Rays
-from radarsdf.surfels import support_of
+from radarsdf.returns.rays import Rays
+from radarsdf.returns.surfels import support_of
 
 # Measured on simulated and real scans; see "What the levers of the surface are worth" in BENCHMARK.md.
 _MIN_SUPPORT = 0.5  # of the median: returns of less are too often false to say where a surface goes on

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from radarsdf._checks import real_array
 from radarsdf._core import CellBlocks
+from radarsdf.checks import real_array
 from radarsdf.config import FitConfig
-from radarsdf.field import Field
+from radarsdf.field.field import Field
 from radarsdf.threads import Workers, resolve_num_threads
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class RadarMap:
     def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
         from safetensors.torch import save as to_bytes  # noqa: PLC0415
 
-        from radarsdf.storage import from_pickle, parts_of  # noqa: PLC0415 - storage is built on the map
+        from radarsdf.map.storage import from_pickle, parts_of  # noqa: PLC0415 - storage is built on the map
 
         tensors, description = parts_of(self)
         return from_pickle, (to_bytes(tensors), description)
@@ -269,8 +269,8 @@ class RadarMap:
         min_confidence: float = 0.0,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
-        """The surface as triangles; see :func:`radarsdf.meshing.extract_mesh`."""
-        from radarsdf.meshing import extract_mesh  # noqa: PLC0415 - meshing is built on the map
+        """The surface as triangles; see :func:`radarsdf.map.meshing.extract_mesh`."""
+        from radarsdf.map.meshing import extract_mesh  # noqa: PLC0415 - meshing is built on the map
 
         return extract_mesh(
             self,
@@ -283,7 +283,7 @@ class RadarMap:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes the whole map to one safetensors file; :func:`radarsdf.load` reads it back to the same answers."""
-        from radarsdf.storage import save_map  # noqa: PLC0415 - storage is built on the map
+        from radarsdf.map.storage import save_map  # noqa: PLC0415 - storage is built on the map
 
         save_map(self, path)
 

@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from radarsdf import _core, kernels
+from radarsdf import _core
 from radarsdf.config import FitConfig
-from radarsdf.field import Field
-from radarsdf.losses import intensity_loss, sdf_loss
-from radarsdf.networks import IntensityNetwork
-from radarsdf.optimiser import Touched
-from radarsdf.sampling import Dropout, Samples
+from radarsdf.field import kernels
+from radarsdf.field.field import Field
+from radarsdf.field.losses import intensity_loss, sdf_loss
+from radarsdf.field.networks import IntensityNetwork
+from radarsdf.fitting.optimiser import Touched
+from radarsdf.fitting.sampling import Dropout, Samples
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Gradients:
 
 
 class Shard:
-    """Losses and gradients as :class:`~radarsdf.field.Field` and :mod:`~radarsdf.losses` define them.
+    """Losses and gradients as :class:`~radarsdf.field.field.Field` and :mod:`~radarsdf.field.losses` define them.
 
     The core has them in one call. Only where the intensity network sees normals, which are themselves gradients, does
     PyTorch's autograd go through all of it.

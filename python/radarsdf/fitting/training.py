@@ -15,16 +15,16 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from radarsdf.checkpoint import Checkpoint
+from radarsdf.budget.schedule import Schedule
 from radarsdf.config import MAX_THREADS, FitConfig
-from radarsdf.field import Field
-from radarsdf.map import IntensityScale
-from radarsdf.optimiser import Adam, RowAdam
-from radarsdf.sampling import RaySampler, Samples
-from radarsdf.scans import Rays
-from radarsdf.schedule import Schedule
-from radarsdf.shards import Gradients, Shard
-from radarsdf.stopping import Diverged, deferred_interrupts
+from radarsdf.field.field import Field
+from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.gradients import Gradients, Shard
+from radarsdf.fitting.optimiser import Adam, RowAdam
+from radarsdf.fitting.sampling import RaySampler, Samples
+from radarsdf.fitting.stopping import Diverged, deferred_interrupts
+from radarsdf.map.radar_map import IntensityScale
+from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
 _GENERATORS = MAX_THREADS + 1  # of random numbers in a fit: one for the draws, one for each thread's dropout

@@ -15,18 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf import threads
 from radarsdf._core import CellSet
-from radarsdf.averaging import CellRays, start_from_average
-from radarsdf.budget import check_fit
-from radarsdf.checkpoint import Checkpoint
+from radarsdf.budget.estimate import check_fit
 from radarsdf.config import FitConfig
-from radarsdf.field import Field
-from radarsdf.gaps import bridged
-from radarsdf.map import MAX_CELLS_FROM_ORIGIN, IntensityScale, RadarMap
-from radarsdf.scans import Rays, prepare
-from radarsdf.stopping import Diverged, Interrupted
-from radarsdf.surfels import Surfels, support_of, support_of_cells
+from radarsdf.field.field import Field
+from radarsdf.fitting.averaging import CellRays, start_from_average
+from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.stopping import Diverged, Interrupted
+from radarsdf.fitting.training import Training
+from radarsdf.map.radar_map import MAX_CELLS_FROM_ORIGIN, IntensityScale, RadarMap
+from radarsdf.returns.gaps import bridged
+from radarsdf.returns.rays import Rays, prepare
+from radarsdf.returns.surfels import Surfels, support_of, support_of_cells
 from radarsdf.threads import Workers
-from radarsdf.training import Training
 
 
 def fit(
@@ -67,7 +67,7 @@ def fit(
     Raises
     ------
     ValueError
-        For scans or poses that cannot be what they should be, see :func:`radarsdf.scans.prepare`, and for a
+        For scans or poses that cannot be what they should be, see :func:`radarsdf.returns.rays.prepare`, and for a
         `checkpoint` that is damaged or belongs to another fit.
     MemoryError
         If the estimate of :func:`radarsdf.estimate` exceeds ``config.max_memory_bytes``, or what the system has.

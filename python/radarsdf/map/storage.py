@@ -20,9 +20,9 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from radarsdf.config import FitConfig
-from radarsdf.field import Field
-from radarsdf.map import IntensityScale, RadarMap
-from radarsdf.readers import check_regular_file
+from radarsdf.field.field import Field
+from radarsdf.io.scans import check_regular_file
+from radarsdf.map.radar_map import IntensityScale, RadarMap
 
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 2  # 1: without support

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from radarsdf.config import FitConfig
-from radarsdf.encodings import Fourier, Octree, TriQuadtree
-from radarsdf.networks import IntensityNetwork, SDFNetwork
+from radarsdf.field.encodings import Fourier, Octree, TriQuadtree
+from radarsdf.field.networks import IntensityNetwork, SDFNetwork
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Field(nn.Module):
     ) -> Tensor:
         """Scaled intensity (N,) where the geometry is that of the same points.
 
-        Directions and ranges are those of :class:`~radarsdf.networks.IntensityNetwork`. What that sees of the encoding is
+        Directions and ranges are those of :class:`~radarsdf.field.networks.IntensityNetwork`. What that sees of the encoding is
         multiplied by `encoding_factors`, (N, any) each: dropout.
         """
         assert self.intensity_network is not None

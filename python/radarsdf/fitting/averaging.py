@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CellSet
 from radarsdf.config import FitConfig
-from radarsdf.field import Field
-from radarsdf.scans import Rays
-from radarsdf.surfels import Surfels, cells_of
+from radarsdf.field.field import Field
+from radarsdf.returns.rays import Rays
+from radarsdf.returns.surfels import Surfels, cells_of
 
 
 @dataclass(frozen=True)

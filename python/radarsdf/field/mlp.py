@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from radarsdf import _core
-from radarsdf.kernels import rows_view, threads, view
+from radarsdf.field.kernels import rows_view, threads, view
 
 
 def mlp(inputs: Sequence[Tensor], layers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:

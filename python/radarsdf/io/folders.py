@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from radarsdf._core import cell_keys
-from radarsdf.readers import Scans
-from radarsdf.scans import check_poses
 
-from .pcd import read_pcd
-from .trajectory import Trajectory, read_table, read_trajectory
+from radarsdf._core import cell_keys
+from radarsdf.io.pcd import read_pcd
+from radarsdf.io.scans import Scans
+from radarsdf.io.trajectory import Trajectory, read_table, read_trajectory
+from radarsdf.returns.rays import check_poses
 
 MAX_GAP_S = 0.5
 """Over a longer time without a pose, no pose is made up."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ._raster import PIXELS_AT_ONCE, barycentric, contours, corner_normals, project, rasterise
+from radarsdf.render.raster import PIXELS_AT_ONCE, barycentric, contours, corner_normals, project, rasterise
 
 if TYPE_CHECKING:
     import trimesh

@@ -18,12 +18,12 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.config import FitConfig
-from radarsdf.readers import check_regular_file
-from radarsdf.scans import Rays
-from radarsdf.storage import write_whole
+from radarsdf.io.scans import check_regular_file
+from radarsdf.map.storage import write_whole
+from radarsdf.returns.rays import Rays
 
 if TYPE_CHECKING:
-    from radarsdf.training import Training
+    from radarsdf.fitting.training import Training
 
 FORMAT = "radarsdf.checkpoint"
 _EVERY_S = 30.0

@@ -1,0 +1,3 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""How long a fit trains, and what memory and time it takes: known before it begins."""

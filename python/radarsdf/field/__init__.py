@@ -1,0 +1,3 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The learnt field: encodings, networks, losses, and the autograd face of the compiled core."""

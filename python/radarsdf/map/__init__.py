@@ -1,0 +1,3 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The fitted map: queries, mesh extraction, and its file."""
