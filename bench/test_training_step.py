@@ -18,11 +18,11 @@ import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
 from radarsdf.field.field import Field
+from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.field.losses import intensity_loss, sdf_loss
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.fitting.sampling import Dropout, RaySampler
 from radarsdf.fitting.training import Training
-from radarsdf.map.radar_map import IntensityScale
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
 

@@ -311,7 +311,7 @@ def test_paper_configuration_is_the_published_one():
 def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     is_ghost = np.concatenate(scene.points)[:, 2] > -0.5  # of the sensor frame: the wall, for once
     assert 0.1 < is_ghost.mean() < 0.9
-    monkeypatch.setattr("radarsdf.fitting.fit.Surfels.ghosts", lambda *_: is_ghost)
+    monkeypatch.setattr("radarsdf.fitting.fit.find_ghosts", lambda *_: is_ghost)
     drawn_from = []
     spread = RaySampler.spread
     monkeypatch.setattr(

@@ -11,7 +11,7 @@ from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
 from radarsdf.returns.gaps import _MAX_SUPPORT, bridged
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import support_of
+from radarsdf.returns.support import support_of_points
 
 from .conftest import ground_and_wall
 
@@ -76,7 +76,7 @@ def test_as_a_search_of_all_pairs_says(max_cells):
     leaf_keys = leaf_keys_of(rays)
     cells = np.unique(np.floor(rays.points / np.float32(LEAF_M)).astype(int), axis=0)
     keys = cell_keys(((cells + 0.5) * LEAF_M), LEAF_M)
-    support = support_of(rays.points, leaf_keys, LEAF_M)[np.searchsorted(leaf_keys, keys)]
+    support = support_of_points(rays.points, leaf_keys, LEAF_M)[np.searchsorted(leaf_keys, keys)]
     least = 0.5 * np.median(support)
     expected = set()
     for i, a in enumerate(cells):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 
 import numpy as np
@@ -11,7 +12,9 @@ import pytest
 import radarsdf
 import torch
 from radarsdf.field.field import Field
-from radarsdf.map.radar_map import IntensityScale, RadarMap, evaluate
+from radarsdf.field.intensity_scale import IntensityScale
+from radarsdf.map.queries import evaluate
+from radarsdf.map.radar_map import RadarMap
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 
@@ -59,13 +62,7 @@ def test_lists_are_double_precision(query):
 
 
 def test_precision_of_the_answer_does_not_decide_that_of_the_query(sharp_map):
-    far = RadarMap(
-        field=sharp_map.field,
-        origin=sharp_map.origin + [5e5, 5.4e6, 0],
-        intensity_scale=sharp_map.intensity_scale,
-        config=sharp_map.config,
-        report={},
-    )
+    far = RadarMap(dataclasses.replace(sharp_map._contents, origin=sharp_map.origin + [5e5, 5.4e6, 0]))
     x = near_surface(300)
     for near_query, far_query in ((sharp_map.sdf, far.sdf), (sharp_map.gradient, far.gradient)):
         difference = np.abs(far_query(x + [5e5, 5.4e6, 0]) - near_query(x))

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
+from radarsdf.map.colors import intensity_colors
+from radarsdf.map.contents import MapContents
 from radarsdf.map.isosurface import mesh_components
-from radarsdf.map.meshing import _corner_distances, _crossed, _smooth_in_cells, _voxels_of
+from radarsdf.map.queries import confidence_of_median
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.render.picture import intensity_colors
+from radarsdf.map.voxels import _corner_distances, _crossed, _smooth_in_cells, _voxels_of
 from scipy.spatial import KDTree
 
 from .conftest import ground_and_wall
@@ -31,12 +33,14 @@ def occupied_voxels(radar_map, voxel_size):
 
 def with_changes(radar_map, *, origin=(0, 0, 0), **settings):
     return RadarMap(
-        field=radar_map.field,
-        origin=radar_map.origin + np.asarray(origin),
-        intensity_scale=radar_map.intensity_scale,
-        config=dataclasses.replace(radar_map.config, **settings),
-        report={},
-        support=radar_map.support,
+        MapContents(
+            field=radar_map.field,
+            origin=radar_map.origin + np.asarray(origin),
+            intensity_scale=radar_map.intensity_scale,
+            config=dataclasses.replace(radar_map.config, **settings),
+            support=radar_map.support,
+            report={},
+        )
     )
 
 
@@ -167,7 +171,7 @@ def test_two_meshes_of_one_map_are_the_same_bits(sharp_map):
 @pytest.mark.parametrize("voxel_size", [0.1, 0.15])
 def test_small_parts_give_the_same_bits(sharp_map, voxel_size, monkeypatch):
     whole = sharp_map.mesh(voxel_size)
-    monkeypatch.setattr("radarsdf.map.meshing._PART", 1 << 12)  # of a large map, as many parts
+    monkeypatch.setattr("radarsdf.map.voxels._PART", 1 << 12)  # of a large map, as many parts
     parts = sharp_map.mesh(voxel_size)
     np.testing.assert_array_equal(parts.vertices, whole.vertices)
     np.testing.assert_array_equal(parts.faces, whole.faces)
@@ -299,7 +303,7 @@ def lattice(radar_map, voxel_size):
 @pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
 def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
     voxels, corners, voxel_corners = lattice(sharp_map, voxel_size)
-    values = _corner_distances(sharp_map, voxel_size, voxels, corners, voxel_corners, False)
+    values = _corner_distances(sharp_map._contents, voxel_size, voxels, corners, voxel_corners, False)
     centres = (voxels + 0.5) * voxel_size
     inner = corners[voxel_corners] * voxel_size
     inner = inner + 0.01 * (centres[:, None] - inner)
@@ -315,10 +319,10 @@ def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
 @pytest.mark.parametrize("voxel_size", [0.05, 0.07, 0.1, 0.13])
 def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, voxel_size, monkeypatch):
     cells = sharp_map.field.cells.table.leaf_cells()
-    assert len(_crossed(sharp_map, cells)) < 0.8 * len(cells)
+    assert len(_crossed(sharp_map._contents, cells)) < 0.8 * len(cells)
     mesh = sharp_map.mesh(voxel_size)
     assert mesh.metadata["leaf_cells_searched"] < 0.8 * mesh.metadata["leaf_cells"] == 0.8 * len(cells)
-    monkeypatch.setattr("radarsdf.map.meshing._crossed", lambda _, cells: cells)
+    monkeypatch.setattr("radarsdf.map.voxels._crossed", lambda _, cells: cells)
     whole = sharp_map.mesh(voxel_size)
     assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4 if voxel_size in (0.05, 0.1) else 1e-3)
     distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)
@@ -371,7 +375,7 @@ def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path)
     confidence = mesh.vertex_attributes["confidence"]
     assert confidence.dtype == np.float32
     np.testing.assert_allclose(confidence, sharp_map.confidence(np.asarray(mesh.vertices)), atol=1e-6)
-    assert confidence.min() >= sharp_map.least_confidence > 0
+    assert confidence.min() >= confidence_of_median(sharp_map._contents, sharp_map.config.min_support) > 0
     mesh.export(tmp_path / "mesh.ply")
     assert b"property float confidence" in (tmp_path / "mesh.ply").read_bytes()[:1000]
 
@@ -389,11 +393,3 @@ def test_less_confident_triangles_are_cut(sharp_map):
     for wrong in (-0.1, 1.1, float("nan")):
         with pytest.raises(ValueError, match="min_confidence"):
             whole.mesh(min_confidence=wrong)
-
-
-def test_a_map_without_support_has_a_mesh_without_confidence(sharp_map):
-    old = with_changes(sharp_map)
-    old.support = None
-    assert "confidence" not in old.mesh().vertex_attributes
-    with pytest.raises(ValueError, match="without confidence"):
-        old.mesh(min_confidence=0.5)

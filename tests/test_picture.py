@@ -7,7 +7,8 @@ import builtins
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.render.picture import intensity_colors, render, save_picture
+from radarsdf.map.colors import intensity_colors
+from radarsdf.render.picture import render, save_picture
 
 WHITE = np.array([255, 255, 255])
 

@@ -20,7 +20,7 @@ import radarsdf
 import torch
 from radarsdf import Diverged, FitConfig, Interrupted, _core
 from radarsdf.fitting.optimiser import Adam
-from radarsdf.fitting.stopping import deferred_interrupts
+from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.scans import Scans, write_scans
 
 from .conftest import ground_and_wall

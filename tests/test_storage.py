@@ -105,7 +105,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "2"
+    assert metadata["format_version"] == "3"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -150,30 +150,12 @@ def test_files_of_other_programs(tmp_path):
             radarsdf.load(tmp_path / "other.safetensors")
 
 
-@pytest.mark.parametrize("version", ["3", "10", "", "1.5", "-1", "one"])
+@pytest.mark.parametrize("version", ["2", "4", "10", "", "1.5", "-1", "one"])
 def test_other_versions(saved, tmp_path, version):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "new.safetensors", tensors, metadata | {"format_version": version})
     with pytest.raises(ValueError, match="format version"):
         radarsdf.load(path)
-
-
-def test_a_file_of_the_first_version_is_a_map_without_confidence(saved, tmp_path):
-    radar_map, _, tensors, metadata = saved
-    old = {name: tensor for name, tensor in tensors.items() if name != "support"}
-    settings = json.loads(metadata["description"])["config"]
-    first = with_description(
-        metadata | {"format_version": "1"},
-        lambda d: d.update(
-            config={k: v for k, v in settings.items() if k not in ("drop_ghosts", "min_support")}
-        ),
-    )
-    loaded = radarsdf.load(write(tmp_path / "old.safetensors", old, first))
-    assert loaded.support is None
-    x = np.array([[12.0, 0, 0]])
-    np.testing.assert_array_equal(loaded.sdf(x), radar_map.sdf(x))
-    with pytest.raises(ValueError, match="earlier version"):
-        loaded.confidence(x)
 
 
 def test_confidence_survives_the_file(saved):

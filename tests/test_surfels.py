@@ -11,14 +11,21 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
-from radarsdf.fitting.averaging import CellRays
+from radarsdf.returns.ghosts import find_ghosts
+from radarsdf.returns.mean_rays import MeanRays
+from radarsdf.returns.noise import beam_noise
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import Surfels, support_of
+from radarsdf.returns.support import support_of_points
+from radarsdf.returns.surfels import Surfels
 
 from .conftest import ground_and_wall
 
 CELL_M = 0.4
 LEAF_M = 0.2
+
+
+def noise_of(surfels, rays):
+    return beam_noise(surfels, rays, surfels.cells.cell_of_ray)
 
 
 def a_wall(noise_range_m=0.05, noise_angle_rad=0.01, scans=8, returns=1500, ghosts=0):
@@ -47,7 +54,7 @@ def a_wall(noise_range_m=0.05, noise_angle_rad=0.01, scans=8, returns=1500, ghos
 def test_the_noise_is_found_in_the_data(range_m, angle_rad):
     points, poses, _ = a_wall(range_m, angle_rad)
     rays = prepare(points, poses)
-    noise = Surfels.of(rays, LEAF_M).noise(rays)
+    noise = noise_of(Surfels.of(rays, LEAF_M), rays)
     assert noise.range_m == pytest.approx(range_m, rel=0.35)
     assert noise.angle_rad == pytest.approx(angle_rad, rel=0.35)
 
@@ -56,33 +63,39 @@ def test_ghosts_are_found_and_the_surface_is_kept():
     points, poses, is_ghost = a_wall(ghosts=40)
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
-    dropped = surfels.ghosts(rays)
+    dropped = find_ghosts(surfels, rays)
     assert dropped[is_ghost].mean() > 0.9
     assert dropped[~is_ghost].mean() < 0.005
-    np.testing.assert_array_equal(dropped, surfels.ghosts(rays, num_threads=1))
-    np.testing.assert_array_equal(dropped, surfels.ghosts(rays, num_threads=3))
+    np.testing.assert_array_equal(dropped, find_ghosts(surfels, rays, num_threads=1))
+    np.testing.assert_array_equal(dropped, find_ghosts(surfels, rays, num_threads=3))
 
 
 def test_one_ray_of_a_cell_finds_them_too():
     points, poses, is_ghost = a_wall(ghosts=40)
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
-    averaged = CellRays.of(rays, 0.2)
+    averaged = MeanRays.of(rays, 0.2)
     assert len(averaged.first) < 0.7 * len(rays)
-    dropped = surfels.ghosts(rays, tried=averaged.first, counts=averaged.counts)
+    dropped = find_ghosts(surfels, rays, averaged)
     assert dropped[is_ghost].mean() > 0.9
     assert dropped[~is_ghost].mean() < 0.005
-    everyone = surfels.ghosts(rays, tried=np.arange(len(rays)), counts=np.ones(len(rays), np.float32))
-    assert (everyone != surfels.ghosts(rays)).mean() < 0.001  # but for the noise of fewer of them
+    everyone = find_ghosts(
+        surfels,
+        rays,
+        dataclasses.replace(averaged, first=np.arange(len(rays)), counts=np.ones(len(rays), np.float32)),
+    )
+    assert (everyone != find_ghosts(surfels, rays)).mean() < 0.001  # but for the noise of fewer of them
 
 
 def test_planes_of_cells():
     points, poses, _ = a_wall()
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
-    plane = surfels.flat_plane_of(surfels.cell_of_ray)
+    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray)
     assert (plane >= 0).mean() > 0.9
-    np.testing.assert_array_equal(surfels.cell_of_plane[plane[plane >= 0]], surfels.cell_of_ray[plane >= 0])
+    np.testing.assert_array_equal(
+        surfels.cell_of_plane[plane[plane >= 0]], surfels.cells.cell_of_ray[plane >= 0]
+    )
     on_ground = (np.abs(rays.in_world()[0][:, 2]) < 0.05) & (rays.in_world()[0][:, 0] < 14) & (plane >= 0)
     assert np.median(surfels.normals[plane[on_ground], 2]) > 0.98
 
@@ -109,15 +122,15 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     passed = [np.concatenate([p[-750:] * rng.uniform(1.3, 1.9, (750, 1)) for _ in range(5)]) for p in points]
     rays = prepare([np.concatenate(pair) for pair in zip(points, passed, strict=True)], poses)
     behind = np.concatenate([np.arange(1500 + 3750) >= 1500] * len(points))
-    assert Surfels.of(rays, LEAF_M).ghosts(rays)[behind].mean() < 0.05
+    assert find_ghosts(Surfels.of(rays, LEAF_M), rays)[behind].mean() < 0.05
 
 
 def test_few_returns_make_no_plane():
     few = ground_and_wall(scans=2, returns_per_scan=20)
     rays = prepare(few.points, few.poses)
     surfels = Surfels.of(rays, LEAF_M)
-    assert not surfels.ghosts(rays).any()
-    assert np.isfinite([surfels.noise(rays).range_m, surfels.noise(rays).angle_rad]).all()
+    assert not find_ghosts(surfels, rays).any()
+    assert np.isfinite([noise_of(surfels, rays).range_m, noise_of(surfels, rays).angle_rad]).all()
 
 
 def one_surfel(normal=(-1.0, 0, 0), thickness_m=0.0):
@@ -211,11 +224,11 @@ def test_support_counts_the_returns_in_27_cells():
     cells = np.floor(points / np.float32(0.2)).astype(int)
     leaf_keys, first = np.unique(cell_keys(points, 0.2), return_index=True)
     expected = [(np.abs(cells - cell).max(axis=1) <= 1).sum() for cell in cells[first]]
-    support = support_of(points, leaf_keys, 0.2)
+    support = support_of_points(points, leaf_keys, 0.2)
     assert support.dtype == np.uint16
     np.testing.assert_array_equal(support, expected)
     crowd = np.full((70_000, 3), 0.1, np.float32)
-    assert support_of(crowd, np.unique(cell_keys(crowd, 0.2)), 0.2).tolist() == [65535]
+    assert support_of_points(crowd, np.unique(cell_keys(crowd, 0.2)), 0.2).tolist() == [65535]
 
 
 def test_returns_come_onto_the_planes_that_they_make():
@@ -246,8 +259,8 @@ def test_returns_that_make_no_plane_stay_where_they_are():
     rays = prepare([points], np.eye(4)[None])
     surfels = Surfels.of(rays, LEAF_M)
     moved = surfels.onto_planes(rays)
-    assert (surfels.flat_plane_of(surfels.cell_of_ray) < 0).mean() > 0.5
-    still = surfels.flat_plane_of(surfels.cell_of_ray) < 0
+    assert (surfels.flat_plane_of(surfels.cells.cell_of_ray) < 0).mean() > 0.5
+    still = surfels.flat_plane_of(surfels.cells.cell_of_ray) < 0
     for name in ("points", "directions", "ranges_m"):
         np.testing.assert_array_equal(getattr(moved, name)[still], getattr(rays, name)[still])
     lone = prepare([[[5.0, 0, 0]]], np.eye(4)[None])

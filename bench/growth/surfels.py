@@ -11,8 +11,10 @@ from typing import Any, TypeVar
 
 from radarsdf import FitConfig
 from radarsdf.fitting.fit import occupied_leaf_keys
+from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import Surfels, support_of
+from radarsdf.returns.support import support_of_points
+from radarsdf.returns.surfels import Surfels
 
 from bench.memory import memory_bytes
 
@@ -45,12 +47,13 @@ def row(returns: int, threads: int) -> dict[str, Any]:
     del scans
     config = FitConfig()
     is_ghost, ghosts = _measured(
-        "ghosts", lambda: Surfels.of(rays, config.leaf_size_m, threads).ghosts(rays, threads)
+        "ghosts",
+        lambda: find_ghosts(Surfels.of(rays, config.leaf_size_m, threads), rays, num_threads=threads),
     )
     kept = rays.select(~is_ghost)
     leaf_keys = occupied_leaf_keys(kept, config, threads)
     counts, support = _measured(
-        "support", lambda: support_of(kept.points, leaf_keys, config.leaf_size_m, threads)
+        "support", lambda: support_of_points(kept.points, leaf_keys, config.leaf_size_m, threads)
     )
     # A tenth of those that hit something within 70 m are ghosts, and every cell lies within 0.3 m of a return.
     if not 0.02 * returns < is_ghost.sum() < 0.15 * returns or not (counts > 0).mean() > 0.5:

@@ -17,11 +17,11 @@ import radarsdf
 import trimesh
 from radarsdf import FitConfig
 from radarsdf.field.field import Field
+from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.fit import occupied_leaf_keys
 from radarsdf.fitting.training import Training
 from radarsdf.io.scans import Scans, write_scans
-from radarsdf.map.radar_map import IntensityScale
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import Workers
 

@@ -13,8 +13,7 @@ from radarsdf.config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.fitting.stopping import Diverged, Interrupted
 from radarsdf.map.isosurface import marching_cubes
-from radarsdf.map.radar_map import RadarMap
-from radarsdf.map.storage import load
+from radarsdf.map.radar_map import RadarMap, load
 
 if TYPE_CHECKING:
     from radarsdf import evaluation, simulate

@@ -19,7 +19,7 @@ import torch
 import radarsdf
 from radarsdf import FitConfig, Interrupted, RadarMap, _core
 from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
-from radarsdf.fitting.stopping import whole_import
+from radarsdf.interrupts import whole_import
 from radarsdf.io.scans import Scans, read_scans, write_scans
 from radarsdf.render.picture import save_picture
 

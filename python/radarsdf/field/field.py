@@ -74,6 +74,10 @@ class Field(nn.Module):
         """Signed distance / sigma (N,), positive in free space."""
         return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
 
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """(N,) m, positive in free space."""
+        return self.logit(points) * self.sigma_m
+
     def geometry(self, points: Tensor, *, frozen: bool = True) -> Geometry:
         """All that the intensity network is to know of points (N, 3). `frozen`: none of its graph is kept."""
         wants_normals = self.intensity_network is not None and self.intensity_network.normals

@@ -18,14 +18,20 @@ from radarsdf._core import CellSet
 from radarsdf.budget.estimate import check_fit
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.fitting.averaging import CellRays, start_from_average
+from radarsdf.field.intensity_scale import IntensityScale
+from radarsdf.fitting.averaging import start_from_average
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.stopping import Diverged, Interrupted
 from radarsdf.fitting.training import Training
-from radarsdf.map.radar_map import MAX_CELLS_FROM_ORIGIN, IntensityScale, RadarMap
+from radarsdf.map.contents import MapContents
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.gaps import bridged
+from radarsdf.returns.ghosts import find_ghosts
+from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import Rays, prepare
-from radarsdf.returns.surfels import Surfels, support_of, support_of_cells
+from radarsdf.returns.support import support_of_cells, support_of_points
+from radarsdf.returns.surfels import Surfels
 from radarsdf.threads import Workers
 
 
@@ -97,7 +103,7 @@ def fit(
         with Workers(config.num_threads) as workers:
             surface, surfels = rays, None
             averaged = (
-                CellRays.of(rays, config.leaf_size_m, workers.num_threads)
+                MeanRays.of(rays, config.leaf_size_m, workers.num_threads)
                 if config.start == "average"
                 else None
             )
@@ -113,7 +119,9 @@ def fit(
                 clock.lap("average_s")
                 support = support_of_cells(averaged.keys, averaged.counts, leaf_keys, workers.num_threads)
             else:
-                support = support_of(surface.points, leaf_keys, config.leaf_size_m, workers.num_threads)
+                support = support_of_points(
+                    surface.points, leaf_keys, config.leaf_size_m, workers.num_threads
+                )
             clock.lap("support_s")
             scale = IntensityScale.of(rays.intensities)
             training = Training(field, surface, rays, scale, config, workers)
@@ -132,12 +140,14 @@ def fit(
             }
             # Whole from here on, and better with every iteration: what there is when the training ends too early.
             radar_map = RadarMap(
-                field=field,
-                origin=rays.origin,
-                intensity_scale=scale,
-                config=config,
-                report=report,
-                support=support,
+                MapContents(
+                    field=field,
+                    origin=rays.origin,
+                    intensity_scale=scale,
+                    config=config,
+                    support=support,
+                    report=report,
+                )
             )
             training.run(progress, saved)
     except KeyboardInterrupt as interruption:
@@ -171,15 +181,13 @@ def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None
 
 
 def _surface(
-    rays: Rays, averaged: CellRays | None, surfels: Surfels, config: FitConfig, num_threads: int
-) -> tuple[Rays, CellRays | None]:
+    rays: Rays, averaged: MeanRays | None, surfels: Surfels, config: FitConfig, num_threads: int
+) -> tuple[Rays, MeanRays | None]:
     """What the SDF is to learn from: rays without ghosts, and to the planes that their returns make."""
     kept = None
     if config.drop_ghosts:
-        if averaged is None:
-            kept = ~surfels.ghosts(rays, num_threads)
-        else:
-            kept = ~surfels.ghosts(rays, num_threads, tried=averaged.first, counts=averaged.counts)
+        kept = ~find_ghosts(surfels, rays, averaged, num_threads)
+        if averaged is not None:
             averaged = averaged.select(kept[averaged.first])
     if config.onto_planes and config.sdf_iterations != 0:  # the average has distances to planes in any case
         rays = surfels.onto_planes(rays)
@@ -214,11 +222,11 @@ def _check_extent(rays: Rays, config: FitConfig) -> None:
         raise ValueError(msg)
 
 
-def _new_field(rays: Rays, averaged: CellRays | None, config: FitConfig, num_threads: int) -> Field:
+def _new_field(rays: Rays, averaged: MeanRays | None, config: FitConfig, num_threads: int) -> Field:
     leaf_keys = bridged(
         occupied_leaf_keys(rays, config, num_threads)
         if averaged is None
-        else averaged.leaf_keys(config, num_threads),
+        else averaged.leaf_keys(config.leaf_size_m, config.near_band_m, num_threads),
         rays,
         config.leaf_size_m,
         config.bridge_cells,

@@ -18,12 +18,13 @@ from tqdm import tqdm
 from radarsdf.budget.schedule import Schedule
 from radarsdf.config import MAX_THREADS, FitConfig
 from radarsdf.field.field import Field
+from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.gradients import Gradients, Shard
 from radarsdf.fitting.optimiser import Adam, RowAdam
 from radarsdf.fitting.sampling import RaySampler, Samples
-from radarsdf.fitting.stopping import Diverged, deferred_interrupts
-from radarsdf.map.radar_map import IntensityScale
+from radarsdf.fitting.stopping import Diverged
+from radarsdf.interrupts import deferred_interrupts
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 

@@ -21,20 +21,21 @@ from torch import Tensor
 
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
+from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.scans import check_regular_file
-from radarsdf.map.radar_map import IntensityScale, RadarMap
+from radarsdf.map.contents import MapContents
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 2  # 1: without support
+FORMAT_VERSION = 3
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 
 
-def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
-    """Writes a map; the old file at `path`, if any, is replaced only once the new one is whole.
+def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
+    """Writes a map to one file. An old file at `path` is replaced only once the new one is whole.
 
     A process that is killed meanwhile may leave a hidden file beside it, ``.NAME.`` and 16 hexadecimal digits.
     """
-    tensors, description = parts_of(radar_map)
+    tensors, description = parts_of(contents)
     metadata = {
         "format": FORMAT,
         "format_version": str(FORMAT_VERSION),
@@ -44,28 +45,33 @@ def save_map(radar_map: RadarMap, path: str | PathLike[str]) -> None:
     write_whole(path, to_bytes(tensors, metadata))
 
 
-def parts_of(radar_map: RadarMap) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def to_pickle(contents: MapContents) -> tuple[bytes, dict[str, Any]]:
+    """What a pickle of a map holds. Bytes, so that no module of PyTorch's is in it."""
+    tensors, description = parts_of(contents)
+    return to_bytes(tensors), description
+
+
+def from_pickle(data: bytes, description: dict[str, Any]) -> MapContents:
+    """The inverse of :func:`to_pickle`."""
+    return _build(from_bytes(data), description)
+
+
+def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """All numbers of a map, and a description of JSON's types."""
     tensors: dict[str, Tensor] = {
-        f"field.{name}": value for name, value in radar_map.field.state_dict().items()
+        f"field.{name}": value for name, value in contents.field.state_dict().items()
     }
-    tensors["origin"] = torch.from_numpy(radar_map.origin)
+    tensors["origin"] = torch.from_numpy(contents.origin)
     # Morton keys use 63 bits, so the cast to the signed integers that every reader knows is lossless.
-    tensors["leaf_keys"] = torch.from_numpy(radar_map.field.cells.table.leaf_keys().astype(np.int64))
-    if radar_map.support is not None:
-        tensors["support"] = torch.from_numpy(radar_map.support)
-    scale = radar_map.intensity_scale
+    tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
+    tensors["support"] = torch.from_numpy(contents.support)
+    scale = contents.intensity_scale
     description = {
-        "config": radar_map.config.to_dict(),
+        "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
-        "report": radar_map.report,
+        "report": contents.report,
     }
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
-
-
-def from_pickle(data: bytes, description: dict[str, Any]) -> RadarMap:
-    """What pickles of maps call: no module of PyTorch's is in them."""
-    return _build(from_bytes(data), description)
 
 
 def write_whole(path: str | PathLike[str], data: bytes) -> None:
@@ -84,18 +90,8 @@ def write_whole(path: str | PathLike[str], data: bytes) -> None:
         raise
 
 
-def load(path: str | PathLike[str]) -> RadarMap:
-    """Reads a map that :meth:`RadarMap.save` wrote. Nothing in the file is executed.
-
-    Parameters
-    ----------
-    path : path-like
-        A file written by this version or an earlier one.
-
-    Returns
-    -------
-    RadarMap
-        Gives the same bits as the map that was saved.
+def load_contents(path: str | PathLike[str]) -> MapContents:
+    """Reads a map's file. Nothing in the file is executed.
 
     Raises
     ------
@@ -128,12 +124,12 @@ def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
         msg = f"{path} is not a radarsdf map"
         raise _OtherFileError(msg)
     version = metadata.get("format_version", "")
-    if not version.isdecimal() or len(version) > 9 or int(version) > FORMAT_VERSION:
-        msg = f"{path} has format version {version!r}; this radarsdf reads up to {FORMAT_VERSION}"
+    if not version.isdecimal() or len(version) > 9 or int(version) != FORMAT_VERSION:
+        msg = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}"
         raise _OtherFileError(msg)
 
 
-def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
+def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
     config = FitConfig.from_dict(description["config"])
     origin = tensors.pop("origin")
     if origin.shape != (3,) or origin.dtype != torch.float64 or not origin.isfinite().all():
@@ -143,8 +139,8 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
     if leaf_keys.ndim != 1 or leaf_keys.dtype != torch.int64:
         msg = "leaf_keys is not a list of cells"
         raise ValueError(msg)
-    support = tensors.pop("support", None)  # maps of the first format lack it
-    if support is not None and (support.shape != leaf_keys.shape or support.dtype != torch.uint16):
+    support = tensors.pop("support")
+    if support.shape != leaf_keys.shape or support.dtype != torch.uint16:
         msg = "support is not a number of returns for each cell"
         raise ValueError(msg)
     scale = None
@@ -168,11 +164,11 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> RadarMap:
             raise ValueError(msg)
     field.load_state_dict(state, assign=True)  # a RuntimeError for wrong names or shapes
     field.requires_grad_(False)
-    return RadarMap(
+    return MapContents(
         field=field,
         origin=origin.numpy(),
         intensity_scale=scale,
         config=config,
         report=dict(description["report"]),
-        support=None if support is None else support.numpy().copy(),
+        support=support.numpy().copy(),
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.render.raster import PIXELS_AT_ONCE, barycentric, contours, corner_normals, project, rasterise
 
 if TYPE_CHECKING:
@@ -17,49 +18,7 @@ if TYPE_CHECKING:
 
 _Floats = NDArray[np.float64]
 
-# Indigo to yellow through magenta and orange: lightness 0.32 to 0.93 in OKLab, in steps that look equally large.
-_ANCHORS = np.array(
-    [
-        [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
-        [245, 113, 79], [253, 156, 70], [254, 197, 84], [249, 237, 82],
-    ]
-)  # fmt: skip
-_NEUTRAL = (190, 196, 204)  # surfaces without a value
 _SUPERSAMPLING = 2  # subpixels per pixel and axis, averaged: edges without stairs
-
-
-def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
-    """Colours of a perceptually uniform map, dark indigo at `low` to bright yellow at `high`.
-
-    Parameters
-    ----------
-    values
-        (N,) scalars. Those outside the limits take the colour of the nearer one; NaN, such as the intensity of
-        an unobserved vertex, is grey.
-    low, high
-        Limits, low ≤ high; where they are equal, everything takes the middle colour.
-
-    Returns
-    -------
-    (N, 4) uint8
-        Red, green, blue and an alpha of 255.
-
-    Raises
-    ------
-    ValueError
-        If low > high or one of them is not finite.
-    """
-    if not (np.isfinite([low, high]).all() and low <= high):
-        msg = f"limits must be finite and ascending, not {low} and {high}"
-        raise ValueError(msg)
-    v = np.asarray(values, dtype=np.float64)
-    where = np.clip((v - low) / (high - low), 0.0, 1.0) if high > low else np.where(np.isnan(v), np.nan, 0.5)
-    known = ~np.isnan(where)
-    positions = np.linspace(0.0, 1.0, len(_ANCHORS))
-    colors = np.full((*v.shape, 4), (*_NEUTRAL, 255), dtype=np.uint8)
-    for channel in range(3):
-        colors[known, channel] = np.rint(np.interp(where[known], positions, _ANCHORS[:, channel]))
-    return colors
 
 
 def render(
@@ -99,7 +58,7 @@ def render(
     if len(faces) == 0:
         msg = "there is nothing to draw: the mesh has no triangles"
         raise ValueError(msg)
-    rgb = np.array(_NEUTRAL)[None].repeat(len(vertices), axis=0) if colors is None else np.asarray(colors)
+    rgb = np.array(NEUTRAL)[None].repeat(len(vertices), axis=0) if colors is None else np.asarray(colors)
     if rgb.shape not in {(len(vertices), 3), (len(vertices), 4)}:
         msg = f"colors must be ({len(vertices)}, 3) or (…, 4), not {rgb.shape}"
         raise ValueError(msg)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, cell_keys
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.surfels import support_of
+from radarsdf.returns.support import support_of_points
 
 # Measured on simulated and real scans; see "What the levers of the surface are worth" in BENCHMARK.md.
 _MIN_SUPPORT = 0.5  # of the median: returns of less are too often false to say where a surface goes on
@@ -41,7 +41,7 @@ def bridged(
     if max_cells == 0:
         return leaf_keys
     points = np.ascontiguousarray(rays.points)
-    support = support_of(points, leaf_keys, leaf_size_m, num_threads)
+    support = support_of_points(points, leaf_keys, leaf_size_m, num_threads)
     median = float(np.median(support[support > 0])) if support.any() else 0.0
     keys, first = np.unique(cell_keys(points, leaf_size_m, num_threads), return_index=True)
     rows = np.minimum(np.searchsorted(leaf_keys, keys), len(leaf_keys) - 1)

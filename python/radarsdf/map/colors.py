@@ -1,0 +1,51 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Colours of intensities."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# Indigo to yellow through magenta and orange: lightness 0.32 to 0.93 in OKLab, in steps that look equally large.
+_ANCHORS = np.array(
+    [
+        [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
+        [245, 113, 79], [253, 156, 70], [254, 197, 84], [249, 237, 82],
+    ]
+)  # fmt: skip
+NEUTRAL = (190, 196, 204)  # surfaces without a value
+
+
+def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
+    """Colours of a perceptually uniform map, dark indigo at `low` to bright yellow at `high`.
+
+    Parameters
+    ----------
+    values
+        (N,) scalars. Those outside the limits take the colour of the nearer one; NaN, such as the intensity of
+        an unobserved vertex, is grey.
+    low, high
+        Limits, low ≤ high; where they are equal, everything takes the middle colour.
+
+    Returns
+    -------
+    (N, 4) uint8
+        Red, green, blue and an alpha of 255.
+
+    Raises
+    ------
+    ValueError
+        If low > high or one of them is not finite.
+    """
+    if not (np.isfinite([low, high]).all() and low <= high):
+        msg = f"limits must be finite and ascending, not {low} and {high}"
+        raise ValueError(msg)
+    v = np.asarray(values, dtype=np.float64)
+    where = np.clip((v - low) / (high - low), 0.0, 1.0) if high > low else np.where(np.isnan(v), np.nan, 0.5)
+    known = ~np.isnan(where)
+    positions = np.linspace(0.0, 1.0, len(_ANCHORS))
+    colors = np.full((*v.shape, 4), (*NEUTRAL, 255), dtype=np.uint8)
+    for channel in range(3):
+        colors[known, channel] = np.rint(np.interp(where[known], positions, _ANCHORS[:, channel]))
+    return colors

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a map answers at points of its local frame, (N, 3) float32 tensors, m."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from radarsdf._core import CellBlocks
+from radarsdf.map.contents import MapContents
+from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
+from radarsdf.threads import Workers, resolve_num_threads
+
+_HALF_SUPPORT = 10.0  # so many returns round a point give a confidence of one half
+_CHUNK = 1 << 13  # points evaluated at a time: hidden layers stay in the second-level cache
+_MIN_RANGE_M = 1e-6  # a point at the sensor itself has no direction
+
+
+def to_local(contents: MapContents, world: Tensor) -> Tensor:
+    """World positions (N, 3), m, in the local frame, float32. The origin is subtracted in float64."""
+    return (world.double() - torch.from_numpy(contents.origin)).float()
+
+
+def signed_distance(
+    contents: MapContents, points: Tensor, *, description: str = "", progress: bool | None = False
+) -> Tensor:
+    """(N,) m, positive in free space."""
+    return evaluate(contents.field.signed_distance, points, description=description, progress=progress)
+
+
+def gradient(contents: MapContents, points: Tensor) -> Tensor:
+    """(N, 3) gradient of the signed distance, towards free space."""
+    field = contents.field
+
+    def of_chunk(chunk: Tensor) -> Tensor:
+        with torch.enable_grad():
+            chunk = chunk.detach().requires_grad_()
+            return torch.autograd.grad(field.signed_distance(chunk).sum(), chunk)[0]
+
+    return evaluate(of_chunk, points)
+
+
+def occupied(contents: MapContents, points: Tensor) -> Tensor:
+    """(N,) bool, whether each point lies in an occupied leaf cell."""
+    return evaluate(contents.field.cells.occupied, points)
+
+
+def confidence(contents: MapContents, points: Tensor) -> Tensor:
+    """(N,) n / (n + 10) for n returns in the 27 leaf cells round each point."""
+    # Trilinear between the centres of cells: a vertex on the face of two cells belongs to both.
+    table = contents.field.cells.table
+    # A point too far away for a key is in no cell.
+    limit_m = MAX_CELLS_FROM_ORIGIN * table.leaf_size_m
+    near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
+    cells = CellBlocks(table.leaf_keys())
+    returns = cells.interpolate(
+        table.leaf_size_m, contents.support.astype(np.float32), near.numpy(), resolve_num_threads(0)
+    )
+    return _confidence_of(torch.from_numpy(returns))
+
+
+def confidence_of_median(contents: MapContents, share: float) -> float:
+    """The confidence of `share` of the median support."""
+    observed = contents.support[contents.support > 0]
+    if len(observed) == 0:
+        return 0.0
+    returns = share * float(np.median(observed))
+    return returns / (returns + _HALF_SUPPORT)
+
+
+def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
+    """(N,) intensity, sensor units, of the returns from points to sensors at positions (N, 3), local, m."""
+    scale, field = contents.intensity_scale, contents.field
+    assert scale is not None
+
+    def of_chunk(chunk: Tensor) -> Tensor:
+        positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
+        ranges_m = rays.norm(dim=1)
+        directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
+        return scale.to_sensor(field.reflectance(field.geometry(positions), directions, ranges_m))
+
+    return evaluate(of_chunk, torch.cat([points, sensors], 1))
+
+
+def evaluate(
+    function: Callable[[Tensor], Tensor],
+    points: Tensor,
+    *,
+    description: str = "",
+    progress: bool | None = False,
+) -> Tensor:
+    """function(points) without gradients, in chunks on all threads, with a progress bar where asked for."""
+
+    def without_gradients(chunk: Tensor) -> Tensor:
+        with torch.no_grad():
+            return function(chunk)
+
+    chunks = torch.split(points, _CHUNK) if len(points) > _CHUNK else (points,)
+    if len(chunks) == 1:
+        return without_gradients(points)
+    with Workers() as workers:
+        results = workers.map(without_gradients, chunks)
+        disable = None if progress is None else not progress
+        return torch.cat(list(tqdm(results, description, len(chunks), unit="chunk", disable=disable)))
+
+
+def _confidence_of(returns: Tensor) -> Tensor:
+    return returns / (returns + _HALF_SUPPORT)

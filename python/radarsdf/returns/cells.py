@@ -1,0 +1,44 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Which lattice cells hold returns, and sums over the returns of each cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf._core import CellBlocks, CellSet, cell_keys, sum_moments
+from radarsdf.returns.rays import Rays
+
+MAX_CELLS_FROM_ORIGIN = 1_000_000
+"""Along each axis. A cell's key has 21 bits for each axis."""
+
+
+@dataclass(frozen=True)
+class ReturnCells:
+    """The cells that hold returns."""
+
+    keys: NDArray[np.uint64]
+    """(C,) Morton keys of the cells, ascending."""
+    blocks: CellBlocks
+    """Finds a cell's row from its key."""
+    cell_of_ray: NDArray[np.int32]
+    """(N,) row of each return's cell."""
+    moments: NDArray[np.float64]
+    """(C, 13) sums over the returns of each cell: 1, x, y, z, xx, xy, xz, yy, yz, zz, and the ray's direction."""
+
+    @classmethod
+    def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> ReturnCells:
+        """Cells of this size, m, that hold returns of `rays`."""
+        points = np.ascontiguousarray(rays.points)
+        occupied = CellSet(cell_size_m)
+        occupied.insert(points, num_threads)
+        keys = occupied.sorted_keys(num_threads)
+        del occupied  # it may be as large as all that follows
+        blocks = CellBlocks(keys)
+        rows = blocks.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
+        directions = np.ascontiguousarray(rays.directions)
+        moments = sum_moments(points, directions, rows, len(keys), num_threads)
+        return cls(keys, blocks, rows, moments)

@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""One ray for each cell that holds returns: their mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf._core import CellSet
+from radarsdf.returns.cells import ReturnCells
+from radarsdf.returns.rays import Rays
+
+_MIN_LENGTH = 1e-3  # of the sum of directions: shorter ones cancel each other
+
+
+@dataclass(frozen=True)
+class MeanRays:
+    """The mean ray of each cell. Measured: an average over them is as good as one over all rays, 2 to 3 times as many."""
+
+    keys: NDArray[np.uint64]
+    """(M,) Morton keys of the cells, ascending."""
+    first: NDArray[np.int64]
+    """(M,) row of the first return in each cell."""
+    points: NDArray[np.float32]
+    """(M, 3) mean of the returns in each cell, local, m."""
+    directions: NDArray[np.float32]
+    """(M, 3) mean direction of their rays, unit."""
+    counts: NDArray[np.float32]
+    """(M,) number of returns in each cell."""
+
+    @classmethod
+    def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> MeanRays:
+        """The mean rays of cells of this size, m."""
+        cells = ReturnCells.of(rays, cell_size_m, num_threads)
+        rows, moments = cells.cell_of_ray, cells.moments
+        first = np.zeros(len(cells.keys), np.int64)
+        first[rows[::-1]] = np.arange(
+            len(rows) - 1, -1, -1
+        )  # of several rows, NumPy keeps the one written last
+        lengths = np.linalg.norm(moments[:, 10:], axis=1)[:, None]
+        directions = np.where(
+            lengths > _MIN_LENGTH,
+            moments[:, 10:] / np.maximum(lengths, _MIN_LENGTH),
+            rays.directions[first],  # of rays that cancel each other, the first
+        )
+        return cls(
+            keys=cells.keys,
+            first=first,
+            points=(moments[:, 1:4] / moments[:, :1]).astype(np.float32),
+            directions=directions.astype(np.float32),
+            counts=moments[:, 0].astype(np.float32),
+        )
+
+    def select(self, part: NDArray[np.bool_]) -> MeanRays:
+        """The mean rays of some of the cells."""
+        return MeanRays(
+            self.keys[part], self.first[part], self.points[part], self.directions[part], self.counts[part]
+        )
+
+    def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
+        """Leaf cells that the rays go through within `reach_m` of their ends: Morton keys, ascending."""
+        cells = CellSet(leaf_size_m)
+        cells.insert_rays(self.points, self.directions, reach_m, num_threads)
+        return cells.sorted_keys(num_threads)
