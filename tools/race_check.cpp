@@ -15,18 +15,18 @@
 #include <thread>
 #include <vector>
 
-#include "cell_blocks.hpp"
-#include "cell_set.hpp"
-#include "cell_sums.hpp"
-#include "encodings.hpp"
-#include "instruction_set.hpp"
-#include "marching_cubes.hpp"
-#include "mlp.hpp"
-#include "parallel.hpp"
-#include "ray_average.hpp"
-#include "sparse_lattice.hpp"
-#include "surface_crossings.hpp"
-#include "vertex_table.hpp"
+#include "field/encodings.hpp"
+#include "field/mlp.hpp"
+#include "lattice/cell_blocks.hpp"
+#include "lattice/cell_set.hpp"
+#include "lattice/vertex_table.hpp"
+#include "returns/cell_sums.hpp"
+#include "returns/ray_average.hpp"
+#include "returns/surface_crossings.hpp"
+#include "surface/marching_cubes.hpp"
+#include "surface/sparse_lattice.hpp"
+#include "util/instruction_set.hpp"
+#include "util/parallel.hpp"
 
 namespace {
 

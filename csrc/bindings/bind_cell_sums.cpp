@@ -3,10 +3,10 @@
 #include <algorithm>
 #include <memory>
 
-#include "arrays.hpp"
-#include "cell_blocks.hpp"
-#include "cell_sums.hpp"
-#include "principal_axes.hpp"
+#include "bindings/arrays.hpp"
+#include "lattice/cell_blocks.hpp"
+#include "returns/cell_sums.hpp"
+#include "returns/principal_axes.hpp"
 
 namespace radarsdf {
 namespace {

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
-#include "arrays.hpp"
-#include "encodings.hpp"
-#include "fourier_kernels.hpp"
+#include "bindings/arrays.hpp"
+#include "field/encodings.hpp"
+#include "kernels/fourier_kernels.hpp"
 
 namespace radarsdf {
 namespace {

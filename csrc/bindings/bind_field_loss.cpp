@@ -6,9 +6,9 @@
 #include <utility>
 #include <vector>
 
-#include "field_loss.hpp"
-#include "fourier_kernels.hpp"
-#include "layer_arrays.hpp"
+#include "bindings/layer_arrays.hpp"
+#include "field/field_loss.hpp"
+#include "kernels/fourier_kernels.hpp"
 
 namespace radarsdf {
 namespace {

@@ -11,9 +11,9 @@
 #include <utility>
 #include <vector>
 
-#include "marching_cubes.hpp"
-#include "mesh_components.hpp"
-#include "sparse_lattice.hpp"
+#include "surface/marching_cubes.hpp"
+#include "surface/mesh_components.hpp"
+#include "surface/sparse_lattice.hpp"
 
 namespace py = pybind11;
 

@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: MIT
 #include <optional>
 
-#include "layer_arrays.hpp"
+#include "bindings/layer_arrays.hpp"
 
 namespace radarsdf {
 namespace {

@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: MIT
 #include <memory>
 
-#include "arrays.hpp"
-#include "surface_crossings.hpp"
+#include "bindings/arrays.hpp"
+#include "returns/surface_crossings.hpp"
 
 namespace radarsdf {
 namespace {

@@ -2,9 +2,9 @@
 // SPDX-License-Identifier: MIT
 #include <pybind11/stl.h>
 
-#include "arrays.hpp"
-#include "instruction_set.hpp"
-#include "parallel.hpp"
+#include "bindings/arrays.hpp"
+#include "util/instruction_set.hpp"
+#include "util/parallel.hpp"
 
 namespace radarsdf {
 

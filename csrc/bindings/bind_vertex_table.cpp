@@ -7,11 +7,11 @@
 #include <tuple>
 #include <vector>
 
-#include "arrays.hpp"
-#include "cell_set.hpp"
-#include "encodings.hpp"
-#include "ray_average.hpp"
-#include "vertex_table.hpp"
+#include "bindings/arrays.hpp"
+#include "field/encodings.hpp"
+#include "lattice/cell_set.hpp"
+#include "lattice/vertex_table.hpp"
+#include "returns/ray_average.hpp"
 
 namespace radarsdf {
 namespace {

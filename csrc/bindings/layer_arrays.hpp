@@ -8,8 +8,8 @@
 
 #include <vector>
 
-#include "arrays.hpp"
-#include "mlp.hpp"
+#include "bindings/arrays.hpp"
+#include "field/mlp.hpp"
 
 namespace radarsdf {
 

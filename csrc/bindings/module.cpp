@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: MIT
 //
 // Table of contents of the compiled core. Each subject has its own file; the core itself knows no Python.
-#include "arrays.hpp"
+#include "bindings/arrays.hpp"
 
 PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   m.doc() = "Compiled core of radarsdf: private, use the functions of the package.";

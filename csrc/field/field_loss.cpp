@@ -1,0 +1,235 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "field/field_loss.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "util/large_array.hpp"
+
+namespace radarsdf {
+namespace {
+
+constexpr std::int64_t kDirection = 3, kRange = 6, kIntensity = 7;  // columns of a ray
+
+template <typename T>
+using Matrix = std::unique_ptr<T[]>;
+
+template <typename T>
+Matrix<T> matrix(std::int64_t rows, std::int64_t columns) {
+  return large_array<T>(rows * columns);
+}
+
+// What a sum over a batch is to be multiplied by: a thread's share of a small one may be empty.
+double mean(std::int64_t count) { return 1 / static_cast<double>(std::max<std::int64_t>(count, 1)); }
+
+template <typename T>
+class Batch {
+ public:
+  Batch(const FieldLayers<T>& field, const LossBatch<T>& batch, const LossWeights& weights,
+        const FieldGradients<T>& gradients)
+      : field_(field),
+        batch_(batch),
+        weights_(weights),
+        gradients_(gradients),
+        levels_(field.levels()),
+        cells_(field.cells()),
+        waves_(field.waves()),
+        feature_(field.feature()) {}
+
+  FieldLosses run() {
+    encode();
+    const bool trains = !gradients_.sdf.empty();
+    const std::int64_t outputs = 1 + feature_;
+    out_ = matrix<T>(batch_.count, outputs);
+    const Matrix<T> hidden = trains ? matrix<T>(batch_.count, mlp_hidden_columns(field_.sdf)) : nullptr;
+    std::vector<Columns<const T>> inputs = {{encoding_.get(), dim(), cells_}};
+    if (waves_ > 0) inputs.push_back({encoding_.get() + cells_, dim(), waves_});
+    mlp(field_.sdf, inputs, batch_.count, hidden.get(), out_.get(), 1);
+
+    FieldLosses losses{0, 0};
+    if (!field_.intensity.empty()) losses.intensity = intensity_loss(trains);
+    if (!trains) return losses;
+    out_grad_ = matrix<T>(batch_.count, outputs);
+    std::fill_n(out_grad_.get(), batch_.count * outputs, T(0));
+    losses.sdf = sdf_loss();
+    add_links();
+    const Matrix<T> own = sums_levels() ? matrix<T>(batch_.count, cells_) : nullptr;
+    T* cells_grad = own ? own.get() : gradients_.interpolated;
+    std::vector<Columns<T>> input_grads = {{cells_grad, cells_, cells_}};
+    if (waves_ > 0) input_grads.push_back({nullptr, 0, waves_});
+    mlp_backward(field_.sdf, inputs, batch_.count, hidden.get(), {out_grad_.get(), outputs, outputs}, gradients_.sdf,
+                 input_grads, 1);
+    add_cells(cells_grad);
+    if (own) spread(own.get());
+    return losses;
+  }
+
+ private:
+  bool sums_levels() const { return field_.table->encoding() == Encoding::kOctree; }
+  std::int64_t dim() const { return cells_ + waves_; }
+
+  void encode() {
+    encoding_ = matrix<T>(batch_.count, dim());
+    const Matrix<T> own = sums_levels() ? matrix<T>(batch_.count, levels_) : nullptr;
+    radarsdf::encode(*field_.table, field_.features, batch_.points, batch_.count, gradients_.located,
+                     own ? own.get() : encoding_.get(), own ? levels_ : dim(), 1);
+    for (std::int64_t i = 0; own && i < batch_.count; ++i) {
+      for (std::int64_t d = 0; d < cells_; ++d) {
+        T sum = 0;
+        for (std::int64_t at = d; at < levels_; at += cells_) sum += own[i * levels_ + at];
+        encoding_[i * dim() + d] = sum;
+      }
+    }
+    if (waves_ > 0) {
+      fourier(batch_.points, batch_.count, field_.half_width_m, field_.first_frequency, field_.num_frequencies,
+              encoding_.get() + cells_, dim(), 1);
+    }
+  }
+
+  // Binary cross-entropy of sigmoid(logit) and sigmoid(sdf / sigma), as python/radarsdf/losses.py has it.
+  double sdf_loss() {
+    const std::int64_t outputs = 1 + feature_;
+    const T inverse_sigma = static_cast<T>(1 / weights_.sigma_m);
+    const T share = static_cast<T>(weights_.sdf * mean(batch_.count));
+    double sum = 0;
+    for (std::int64_t i = 0; i < batch_.count; ++i) {
+      const T logit = out_[i * outputs], label = 1 / (1 + std::exp(-batch_.sdf_m[i] * inverse_sigma));
+      const T tail = std::exp(-std::abs(logit));
+      sum += static_cast<double>(std::max(logit, T(0)) - logit * label + std::log1p(tail));
+      out_grad_[i * outputs] = share * ((logit < 0 ? tail : T(1)) / (1 + tail) - label);
+    }
+    return sum * mean(batch_.count);
+  }
+
+  // A sample's row of an encoding, or of its gradient, after the dropout. `to` may be `from`.
+  void drop(const Dropout& dropout, std::int64_t i, std::int64_t columns, const T* from, T* to) const {
+    if (!dropout.bytes) {
+      if (to != from) std::copy_n(from, columns, to);
+      return;
+    }
+    const std::uint8_t* bytes = dropout.bytes + i * columns;
+    const T scale = T(256) / static_cast<T>(dropout.keep);
+    for (std::int64_t d = 0; d < columns; ++d) to[d] = from[d] * (bytes[d] < dropout.keep ? scale : T(0));
+  }
+
+  // Mean absolute error, and the gradients by the layers and, where `trains`, by what the SDF network hands on.
+  double intensity_loss(bool trains) {
+    const std::int64_t count = batch_.intensity_count, width = field_.intensity[0].inputs;
+    const std::int64_t links = feature_ + field_.sdf_input;
+    const std::int64_t rest = dim() + links;  // where the columns begin that nothing learnt is behind
+    const Matrix<T> x = matrix<T>(count, width);
+    for (std::int64_t i = 0; i < count; ++i) fill(i, x.get() + i * width);
+    if (field_.view_direction) {
+      const Matrix<T> directions = matrix<T>(count, 3);
+      for (std::int64_t i = 0; i < count; ++i) {
+        std::copy_n(batch_.rays + i * batch_.ray_columns + kDirection, 3, directions.get() + 3 * i);
+      }
+      spherical_harmonics(directions.get(), count, x.get() + rest, width, 1);
+    }
+
+    std::vector<Columns<const T>> inputs;
+    std::vector<Columns<T>> input_grads;
+    if (trains) {
+      cells_grad_ = matrix<T>(count, cells_);
+      links_grad_ = matrix<T>(count, links);
+    }
+    std::int64_t first = 0;
+    const auto add = [&](std::int64_t columns, T* gradient) {
+      if (columns == 0) return;
+      inputs.push_back({x.get() + first, width, columns});
+      input_grads.push_back({gradient, columns, columns});
+      first += columns;
+    };
+    add(cells_, cells_grad_.get());
+    add(waves_, nullptr);
+    add(links, links_grad_.get());
+    add(width - rest, nullptr);
+
+    const Matrix<T> predicted = matrix<T>(count, 1);
+    const Matrix<T> hidden = matrix<T>(count, mlp_hidden_columns(field_.intensity));
+    mlp(field_.intensity, inputs, count, hidden.get(), predicted.get(), 1);
+    const T share = static_cast<T>(weights_.intensity * mean(count));
+    double sum = 0;
+    for (std::int64_t i = 0; i < count; ++i) {
+      // No return is expected from free space (3QFPI).
+      const T label = i < batch_.num_near ? batch_.rays[i * batch_.ray_columns + kIntensity] : T(0);
+      const T error = predicted[i] - label;
+      sum += static_cast<double>(std::abs(error));
+      predicted[i] = error > 0 ? share : error < 0 ? -share : T(0);
+    }
+    mlp_backward(field_.intensity, inputs, count, hidden.get(), {predicted.get(), 1, 1}, gradients_.intensity,
+                 input_grads, 1);
+    return sum * mean(count);
+  }
+
+  // What the intensity network sees of a sample, but for the harmonics.
+  void fill(std::int64_t i, T* x) const {
+    const T* encoding = encoding_.get() + i * dim();
+    drop(batch_.dropout[0], i, cells_, encoding, x);
+    drop(batch_.dropout[1], i, waves_, encoding + cells_, x + cells_);
+    x += dim();
+    const T* out = out_.get() + i * (1 + feature_);
+    x = std::copy_n(out + 1, feature_, x);
+    if (field_.sdf_input) *x++ = out[0];
+    if (field_.view_direction) x += kHarmonics;
+    if (field_.log_range) {
+      const T range_m = batch_.rays[i * batch_.ray_columns + kRange] - batch_.sdf_m[i];
+      *x = std::log10(std::max(range_m, T(1e-3)) / 10);
+    }
+  }
+
+  // Gradients of the intensity by the outputs of the SDF network.
+  void add_links() {
+    if (!links_grad_) return;
+    const std::int64_t links = feature_ + field_.sdf_input;
+    for (std::int64_t i = 0; i < batch_.intensity_count; ++i) {
+      const T* from = links_grad_.get() + i * links;
+      T* to = out_grad_.get() + i * (1 + feature_);
+      for (std::int64_t g = 0; g < feature_; ++g) to[1 + g] += from[g];
+      if (field_.sdf_input) to[0] += from[feature_];
+    }
+  }
+
+  // Gradients of the intensity by the cells' encoding.
+  void add_cells(T* cells_grad) {
+    if (!cells_grad_) return;
+    for (std::int64_t i = 0; i < batch_.intensity_count; ++i) {
+      T* own = cells_grad_.get() + i * cells_;
+      drop(batch_.dropout[0], i, cells_, own, own);
+      for (std::int64_t d = 0; d < cells_; ++d) cells_grad[i * cells_ + d] += own[d];
+    }
+  }
+
+  // Each level's gradient is that of their sum.
+  void spread(const T* cells_grad) const {
+    for (std::int64_t i = 0; i < batch_.count; ++i) {
+      for (std::int64_t first = 0; first < levels_; first += cells_) {
+        std::copy_n(cells_grad + i * cells_, cells_, gradients_.interpolated + i * levels_ + first);
+      }
+    }
+  }
+
+  const FieldLayers<T>& field_;
+  const LossBatch<T>& batch_;
+  const LossWeights& weights_;
+  const FieldGradients<T>& gradients_;
+  std::int64_t levels_, cells_, waves_, feature_;  // numbers of columns
+  Matrix<T> encoding_, out_, out_grad_;
+  Matrix<T> cells_grad_, links_grad_;  // of the intensity's loss alone
+};
+
+}  // namespace
+
+template <typename T>
+FieldLosses field_loss(const FieldLayers<T>& field, const LossBatch<T>& batch, const LossWeights& weights,
+                       const FieldGradients<T>& gradients) {
+  return Batch<T>(field, batch, weights, gradients).run();
+}
+
+template FieldLosses field_loss(const FieldLayers<float>&, const LossBatch<float>&, const LossWeights&,
+                                const FieldGradients<float>&);
+template FieldLosses field_loss(const FieldLayers<double>&, const LossBatch<double>&, const LossWeights&,
+                                const FieldGradients<double>&);
+
+}  // namespace radarsdf

@@ -1,0 +1,67 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Serial interpolation kernels on a range of points, compiled once for each instruction set from one source
+// (interpolation_kernels.cpp). Only plain data here: an inline library function compiled for a newer processor could
+// be the copy that the linker keeps for all.
+#pragma once
+
+#include <cstdint>
+
+#include "kernels/adam_kernels.hpp"
+
+namespace radarsdf {
+
+// With F the features of the corners of the point's cell and w(x) the corner weights, a level's output is
+//   y = sum_k W_k F_k,   W = w(x), or with `directions` v: W = dw/dx . v   (metres).
+// The first and second derivatives that autograd needs are these same sums with other arrays in the places of F and v.
+template <typename T>
+struct Interpolation {
+  const Cell* cells;            // of the table
+  const std::int32_t* located;  // (n, num_levels) cell of each point, -1: none (VertexTable::locate)
+  const T* points;              // (n, 3) local frame, m
+  const T* directions;          // (n, 3), or null
+  int num_levels;
+  T inverse_leaf_size;  // 1/m
+};
+
+// Sums of the rows that a batch touches, and which these are, in the order in which they first were. Side by side, they
+// stay in the cache, which sums at the rows' own places would leave on a large map.
+template <typename T>
+struct RowSums {
+  RowMark* marks;      // of every row
+  std::int32_t* rows;  // those touched; room for one more
+  T* sums;             // (count, 8), beyond that zero
+  std::int64_t count;
+};
+
+template <typename T>
+struct InterpolationKernels {
+  // out (n, num_levels * 8), rows `stride` apart. Zero where a point has no cell.
+  void (*interpolate)(const Interpolation<T>&, const T* features, T* out, std::int64_t stride, std::int64_t begin,
+                      std::int64_t end);
+  // features_grad (rows, 8) += W^T out_grad, for one level and one group of corners (a plane, or all of space):
+  // different (level, group) touch different rows.
+  void (*scatter)(const Interpolation<T>&, const T* out_grad, std::int64_t stride, T* features_grad, int level,
+                  int group, std::int64_t begin, std::int64_t end);
+  // The same into the sums of the rows that are touched.
+  void (*scatter_rows)(const Interpolation<T>&, const T* out_grad, std::int64_t stride, RowSums<T>& touched, int level,
+                       int group, std::int64_t begin, std::int64_t end);
+  // points_grad (n, 3) = d(out . out_grad)/dx, 1/m.
+  void (*coordinate_gradient)(const Interpolation<T>&, const T* features, const T* out_grad, std::int64_t stride,
+                              T* points_grad, std::int64_t begin, std::int64_t end);
+};
+
+inline int num_vertex_groups(Encoding encoding) { return encoding == Encoding::kTriQuadtree ? 3 : 1; }
+
+#define RADARSDF_DECLARE_KERNELS(isa)                                      \
+  namespace isa {                                                          \
+  template <typename T>                                                    \
+  const InterpolationKernels<T>& interpolation_kernels(Encoding encoding); \
+  }
+RADARSDF_DECLARE_KERNELS(baseline)
+RADARSDF_DECLARE_KERNELS(avx2)
+RADARSDF_DECLARE_KERNELS(avx512)
+#undef RADARSDF_DECLARE_KERNELS
+
+}  // namespace radarsdf

@@ -1,0 +1,61 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Cells in blocks of 4 x 4 x 4, and these in regions of 4 x 4 x 4 blocks: a bit for each. A block's cells are
+// consecutive in Morton order, so the row of a cell is that of the block's first cell and the number of bits below its
+// own; so are a region's blocks. Only regions are looked up in a hash table, which thus stays small and tells at once
+// where there is nothing: rays skip what is empty, sums over neighbours rarely leave a region.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "lattice/flat_map.hpp"
+#include "util/bits.hpp"
+
+namespace radarsdf {
+
+constexpr int kBlockBits = 2;                // an axis
+constexpr int kRegionBits = 2 * kBlockBits;  // an axis
+
+// What is there of a cube of 4 x 4 x 4.
+struct Occupancy {
+  std::uint64_t mask;  // bit i: part i (of Morton order) is there
+  std::int32_t first;  // row of the first part that is there; the others follow
+
+  std::int32_t row(std::uint64_t key) const {  // of one of the 64 parts; -1 where it is not there
+    const std::uint64_t bit = std::uint64_t{1} << (key & 63);
+    return (mask & bit) != 0 ? first + count_bits(mask & (bit - 1)) : -1;
+  }
+};
+
+class CellBlocks {
+ public:
+  // keys: Morton keys, ascending, each once; a key's position is its row. Throws std::invalid_argument.
+  CellBlocks(const std::uint64_t* keys, std::int64_t count);
+
+  std::int64_t size() const { return size_; }
+
+  static std::uint64_t block_key(std::uint64_t key) { return key >> (3 * kBlockBits); }
+  static std::uint64_t region_key(std::uint64_t key) { return key >> (3 * kRegionBits); }
+
+  // The blocks of a region, the cells of one of its blocks; nullptr where there are none.
+  const Occupancy* region(std::uint64_t region_key) const { return at(regions_, numbers_.find(region_key)); }
+  const Occupancy* block(const Occupancy& region, std::uint64_t block_key) const {
+    return at(blocks_, region.row(block_key));
+  }
+
+  // The row of each key, -1 where it has none.
+  void rows(const std::uint64_t* keys, std::int64_t count, std::int32_t* rows, int num_threads) const;
+
+ private:
+  static const Occupancy* at(const std::vector<Occupancy>& cubes, std::int32_t i) {
+    return i >= 0 ? &cubes[static_cast<std::size_t>(i)] : nullptr;
+  }
+
+  std::int64_t size_;
+  FlatMap numbers_;  // of regions
+  std::vector<Occupancy> regions_, blocks_;
+};
+
+}  // namespace radarsdf

@@ -1,0 +1,86 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Flat open-addressing map from 64-bit keys to 32-bit values: power-of-two capacity, linear probing, at most half
+// full, no deletion. Exact: keys are compared whole, so two keys never share a value.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "util/large_array.hpp"
+
+namespace radarsdf {
+
+constexpr std::uint64_t kEmptyKey = ~std::uint64_t{0};  // no lattice key uses the top bit
+
+// Multiplicative (Fibonacci) hashing: the high bits of key * 2^64/phi depend on every bit of the key.
+inline std::uint64_t hash_key(std::uint64_t key) { return key * 0x9e3779b97f4a7c15; }
+
+struct Slot {
+  std::uint64_t key = kEmptyKey;
+  std::int32_t value = -1;
+};
+
+// Look-up without the container, so that kernels compiled for other instruction sets share no library code.
+struct FlatMapView {
+  const Slot* slots;
+  std::uint64_t mask;  // capacity - 1
+  int shift;           // 64 - log2(capacity)
+
+  std::uint64_t home(std::uint64_t key) const { return hash_key(key) >> shift; }
+
+  std::int32_t find(std::uint64_t key) const {
+    for (std::uint64_t i = home(key);; i = (i + 1) & mask) {
+      if (slots[i].key == key) return slots[i].value;
+      if (slots[i].key == kEmptyKey) return -1;
+    }
+  }
+};
+
+class FlatMap {
+ public:
+  explicit FlatMap(std::size_t expected_size = 0) { reset(expected_size); }
+
+  std::size_t size() const { return size_; }
+  FlatMapView view() const { return {slots_.data(), slots_.size() - 1, shift_}; }
+  std::int32_t find(std::uint64_t key) const { return view().find(key); }
+  const LargeVector<Slot>& slots() const { return slots_; }
+
+  // Returns false, and leaves the old value, where the key is present.
+  bool insert(std::uint64_t key, std::int32_t value) {
+    if (2 * (size_ + 1) > slots_.size()) grow();
+    const FlatMapView table = view();
+    for (std::uint64_t i = table.home(key);; i = (i + 1) & table.mask) {
+      if (slots_[i].key == key) return false;
+      if (slots_[i].key == kEmptyKey) {
+        slots_[i] = {key, value};
+        ++size_;
+        return true;
+      }
+    }
+  }
+
+ private:
+  void reset(std::size_t expected_size) {
+    int log2_capacity = 4;
+    while ((std::size_t{1} << log2_capacity) < 2 * expected_size) ++log2_capacity;
+    slots_.assign(std::size_t{1} << log2_capacity, Slot{});
+    shift_ = 64 - log2_capacity;
+    size_ = 0;
+  }
+
+  void grow() {
+    const LargeVector<Slot> old = slots_;  // copied first: if memory runs out the map is as it was
+    reset(slots_.size());
+    for (const Slot& slot : old) {
+      if (slot.key != kEmptyKey) insert(slot.key, slot.value);
+    }
+  }
+
+  LargeVector<Slot> slots_;
+  int shift_ = 60;
+  std::size_t size_ = 0;
+};
+
+}  // namespace radarsdf

@@ -1,0 +1,204 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "returns/cell_sums.hpp"
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <stdexcept>
+#include <vector>
+
+#include "lattice/cell.hpp"
+#include "lattice/morton.hpp"
+#include "util/bits.hpp"
+#include "util/parallel.hpp"
+
+namespace radarsdf {
+namespace {
+
+constexpr std::int32_t kEdge = 1 << kBlockBits;
+
+// The 27 blocks round one, the last coordinate fastest.
+class BlocksRound {
+ public:
+  explicit BlocksRound(const CellBlocks& cells) : cells_(&cells) {}
+
+  void move_to(std::uint64_t block_key) {
+    if (block_key == block_key_) return;
+    block_key_ = block_key;
+    std::uint64_t parts[3][3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const std::uint32_t coordinate = morton_coordinate(block_key, axis);
+      for (std::uint32_t i = 0; i < 3; ++i) parts[axis][i] = spread_bits(coordinate + i - 1) << axis;
+    }
+    for (int i = 0; i < 27; ++i) {
+      const std::uint64_t key = parts[0][i / 9] | parts[1][i / 3 % 3] | parts[2][i % 3];
+      const std::uint64_t region_key = key >> (3 * (kRegionBits - kBlockBits));
+      if (region_key != region_key_) {  // often it is the same
+        region_key_ = region_key;
+        region_ = cells_->region(region_key);
+      }
+      blocks_[i] = region_ != nullptr ? cells_->block(*region_, key) : nullptr;
+    }
+  }
+
+  // The middle block, where there is one.
+  const Occupancy* middle() const { return blocks_[13]; }
+
+  // How many cells the middle block has.
+  int num_cells() const { return blocks_[13] != nullptr ? count_bits(blocks_[13]->mask) : 0; }
+
+  // The row of the cell at these coordinates, counted from the middle block's first cell; -1 where there is none.
+  std::int32_t row(std::int32_t x, std::int32_t y, std::int32_t z) const {
+    const auto block = [](std::int32_t v) { return (v + kEdge) >> kBlockBits; };
+    const Occupancy* found = blocks_[9 * block(x) + 3 * block(y) + block(z)];
+    if (found == nullptr) return -1;
+    return found->row(child_[x & 3] | child_[y & 3] << 1 | child_[z & 3] << 2);
+  }
+
+ private:
+  static constexpr std::uint64_t child_[kEdge] = {0, 1, 8, 9};  // spread_bits of 0 to 3
+
+  const CellBlocks* cells_;
+  std::uint64_t block_key_ = kEmptyKey, region_key_ = kEmptyKey;
+  const Occupancy* region_ = nullptr;
+  const Occupancy* blocks_[27] = {};
+};
+
+// From how many cells of a block on it is less work to add up round all 64, axis after axis.
+constexpr int kManyCells = 8;
+
+// sums: (64, columns), in Morton order, of the values in the 27 cells round each of a block's.
+void sum_round_block(const BlocksRound& round, const double* values, int columns, double* sums) {
+  constexpr std::int32_t kWide = kEdge + 2;
+  for (int k = 0; k < columns; ++k) {
+    double along_z[kWide][kWide][kEdge], along_y[kWide][kEdge][kEdge];
+    for (std::int32_t x = 0; x < kWide; ++x) {
+      for (std::int32_t y = 0; y < kWide; ++y) {
+        double line[kWide];
+        for (std::int32_t z = 0; z < kWide; ++z) {
+          const std::int32_t row = round.row(x - 1, y - 1, z - 1);
+          line[z] = row >= 0 ? values[columns * std::int64_t{row} + k] : 0;
+        }
+        for (std::int32_t z = 0; z < kEdge; ++z) along_z[x][y][z] = line[z] + line[z + 1] + line[z + 2];
+      }
+      for (std::int32_t y = 0; y < kEdge; ++y) {
+        for (std::int32_t z = 0; z < kEdge; ++z) {
+          along_y[x][y][z] = along_z[x][y][z] + along_z[x][y + 1][z] + along_z[x][y + 2][z];
+        }
+      }
+    }
+    for (std::uint32_t i = 0; i < 64; ++i) {
+      const std::uint32_t x = morton_coordinate(i, 0), y = morton_coordinate(i, 1), z = morton_coordinate(i, 2);
+      sums[columns * std::int64_t{i} + k] = along_y[x][y][z] + along_y[x + 1][y][z] + along_y[x + 2][y][z];
+    }
+  }
+}
+
+}  // namespace
+
+void sum_moments(const float* points, const float* directions, const std::int32_t* cells, std::int64_t count,
+                 std::int64_t num_cells, double* moments, int num_threads) {
+  std::fill(moments, moments + kMoments * num_cells, 0.0);
+  // Every thread reads all returns and adds those of its own cells: the order of a sum is that of the returns, whatever
+  // the number of threads. Its cells are scattered, since returns are denser in some places than in others.
+  const std::int64_t threads = count > (1 << 14) ? resolve_num_threads(num_threads) : 1;
+  parallel_tasks(threads, num_threads, [&](std::int64_t task) {
+    for (std::int64_t i = 0; i < count; ++i) {
+      if ((cells[i] >> 6) % threads != task) continue;
+      const double x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
+      const float* d = directions + 3 * i;
+      const double terms[kMoments] = {1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, d[0], d[1], d[2]};
+      double* sums = moments + kMoments * std::int64_t{cells[i]};
+      for (int k = 0; k < kMoments; ++k) sums[k] += terms[k];
+    }
+  });
+}
+
+void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t count, const double* values,
+               int columns, double weight, double* sums, int num_threads) {
+  const double weights[4] = {1, weight, std::pow(weight, 2), std::pow(weight, 3)};
+  std::fill(sums, sums + columns * count, 0.0);
+  parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    BlocksRound round(cells);
+    std::uint64_t block_key = kEmptyKey;
+    bool add_up_block = false;
+    std::vector<double> block_sums(static_cast<std::size_t>(64 * columns));
+    for (std::int64_t i = begin; i < end; ++i) {
+      if (CellBlocks::block_key(keys[i]) != block_key) {
+        block_key = CellBlocks::block_key(keys[i]);
+        round.move_to(block_key);
+        add_up_block = weight == 1 && round.num_cells() >= kManyCells;
+        if (add_up_block) sum_round_block(round, values, columns, block_sums.data());
+      }
+      if (add_up_block) {
+        const double* own = block_sums.data() + columns * static_cast<std::int64_t>(keys[i] & 63);
+        std::copy(own, own + columns, sums + columns * i);
+        continue;
+      }
+      std::int32_t cell[3];
+      for (int axis = 0; axis < 3; ++axis) {
+        cell[axis] = static_cast<std::int32_t>(morton_coordinate(keys[i], axis)) & (kEdge - 1);
+      }
+      for (int x = -1; x <= 1; ++x) {
+        for (int y = -1; y <= 1; ++y) {
+          for (int z = -1; z <= 1; ++z) {
+            const std::int32_t row = round.row(cell[0] + x, cell[1] + y, cell[2] + z);
+            if (row < 0) continue;
+            const double w = weights[x * x + y * y + z * z];
+            for (int k = 0; k < columns; ++k) sums[columns * i + k] += w * values[columns * std::int64_t{row} + k];
+          }
+        }
+      }
+    }
+  });
+}
+
+void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, const float* points,
+                       std::int64_t count, float* interpolated, int num_threads) {
+  const auto size_m = static_cast<float>(cell_size_m);
+  std::atomic<bool> inside{true};
+  parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    std::uint64_t block_key = kEmptyKey;  // neighbours are often of the same block
+    const Occupancy* block = nullptr;
+    for (std::int64_t i = begin; i < end; ++i) {
+      float share[3];
+      std::int32_t lower[3];
+      std::uint64_t parts[3][2];  // of keys
+      for (int axis = 0; axis < 3; ++axis) {
+        const float u = points[3 * i + axis] / size_m - 0.5F;
+        if (!(std::abs(u) < static_cast<float>(kAxisBias - (1 << kMaxLevels)))) {
+          inside = false;
+          return;
+        }
+        const float whole = std::floor(u);
+        share[axis] = u - whole;
+        lower[axis] = static_cast<std::int32_t>(whole) + kAxisBias;
+        for (std::uint32_t step = 0; step < 2; ++step) {
+          parts[axis][step] = spread_bits(static_cast<std::uint32_t>(lower[axis]) + step) << axis;
+        }
+      }
+      float sum = 0;
+      for (int corner = 0; corner < 8; ++corner) {
+        float weight = 1;
+        std::uint64_t key = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+          const int step = corner >> (2 - axis) & 1;
+          weight *= step != 0 ? share[axis] : 1 - share[axis];
+          key |= parts[axis][step];
+        }
+        if (CellBlocks::block_key(key) != block_key) {
+          block_key = CellBlocks::block_key(key);
+          const Occupancy* region = cells.region(CellBlocks::region_key(key));
+          block = region != nullptr ? cells.block(*region, block_key) : nullptr;
+        }
+        const std::int32_t row = block != nullptr ? block->row(key) : -1;
+        if (row >= 0) sum += weight * values[row];
+      }
+      interpolated[i] = sum;
+    }
+  });
+  if (!inside) throw std::invalid_argument("points must be finite and within a million cells of the origin");
+}
+
+}  // namespace radarsdf

@@ -1,0 +1,164 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Marching cubes on a list of cells. An edge is named by its lower corner and its axis, so a plain array with three
+// entries per corner takes the place of a map from edges to vertices. Passes run over blocks of fixed size, whose
+// places in the output follow from their counts: the result does not depend on the number of threads.
+#include <atomic>
+#include <vector>
+
+#include "surface/marching_cubes.hpp"
+#include "surface/marching_cubes_common.hpp"
+#include "surface/marching_cubes_table.hpp"
+#include "util/bits.hpp"
+#include "util/parallel.hpp"
+
+namespace radarsdf {
+namespace {
+
+using std::int32_t;
+using std::int64_t;
+using std::size_t;
+
+constexpr int64_t block_size = 1 << 14;
+constexpr int32_t no_vertex = -1;
+
+// Calls task(block, begin, end) for each block of [0, size).
+template <typename Task>
+void for_each_block(int64_t size, int num_threads, const Task& task) {
+  parallel_tasks((size + block_size - 1) / block_size, num_threads, [&](int64_t block) {
+    task(static_cast<size_t>(block), block * block_size, std::min(size, (block + 1) * block_size));
+  });
+}
+
+// Counts per block, at index block + 1; sum_up() turns them into the first place of each block, and the total.
+std::vector<int64_t> block_counts(int64_t size) {
+  return std::vector<int64_t>(static_cast<size_t>((size + block_size - 1) / block_size) + 1);
+}
+
+void sum_up(std::vector<int64_t>& counts) {
+  for (size_t i = 1; i < counts.size(); ++i) counts[i] += counts[i - 1];
+}
+
+// The corners' signs, or 0 (a pattern without triangles) where a value is NaN.
+template <typename T>
+std::uint8_t sign_pattern(const T* values, const int32_t* cell, double level) {
+  unsigned pattern = 0;
+  bool has_nan = false;
+  for (int corner = 0; corner < 8; ++corner) {
+    const T value = values[cell[corner]];
+    has_nan |= value != value;
+    pattern |= static_cast<unsigned>(static_cast<double>(value) > level) << corner;
+  }
+  return has_nan ? std::uint8_t{0} : static_cast<std::uint8_t>(pattern);
+}
+
+void check_corner_numbers(const int32_t* cell, int64_t num_corners) {
+  for (int corner = 0; corner < 8; ++corner) {
+    if (cell[corner] < 0 || cell[corner] >= num_corners) {
+      throw std::invalid_argument("a cell refers to a corner that does not exist");
+    }
+  }
+}
+
+void check_corner_positions(const int32_t* corners, const int32_t* cell) {
+  const int32_t* lowest = corners + 3 * int64_t{cell[0]};
+  for (int corner = 1; corner < 8; ++corner) {
+    const int32_t* position = corners + 3 * int64_t{cell[corner]};
+    for (int axis = 0; axis < 3; ++axis) {
+      const int step = corner & axis_bit(axis) ? 1 : 0;
+      if (int64_t{position[axis]} != int64_t{lowest[axis]} + step) {
+        throw std::invalid_argument("the corners of a cell are not in C order of a 2x2x2 block");
+      }
+    }
+  }
+}
+
+}  // namespace
+
+template <typename T>
+Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_corners, const int32_t* cells,
+                           int64_t num_cells, const Lattice& lattice, double level, int num_threads) {
+  check_lattice(lattice, level);
+  if (num_corners > std::numeric_limits<int32_t>::max()) {
+    throw std::invalid_argument("there are more corners than int32 cells can refer to");
+  }
+  const auto& table = marching_cubes_table();
+
+  // For each edge that is cut: first its upper corner, then its vertex. Cells that share an edge write the same
+  // number, so which one comes last does not matter; atomics only make that well defined, at no cost.
+  const int64_t num_edges = 3 * num_corners;
+  const auto edges = large_array<std::atomic<int32_t>>(num_edges);
+  for_each_block(num_edges, num_threads, [&](size_t, int64_t begin, int64_t end) {
+    for (int64_t e = begin; e < end; ++e) edges[static_cast<size_t>(e)].store(no_vertex, std::memory_order_relaxed);
+  });
+  const auto edge_of = [&](const int32_t* cell, int edge) -> std::atomic<int32_t>& {
+    const auto [corner, axis] = cell_edge(edge);
+    return edges[static_cast<size_t>(3 * int64_t{cell[corner]} + axis)];
+  };
+
+  const auto patterns = large_array<std::uint8_t>(num_cells);
+  std::vector<int64_t> first_face = block_counts(num_cells);
+  for_each_block(num_cells, num_threads, [&](size_t block, int64_t begin, int64_t end) {
+    for (int64_t m = begin; m < end; ++m) {
+      const int32_t* cell = cells + 8 * m;
+      check_corner_numbers(cell, num_corners);
+      const std::uint8_t pattern = patterns[static_cast<size_t>(m)] = sign_pattern(values, cell, level);
+      if (pattern == 0 || pattern == 255) continue;
+      check_corner_positions(corners, cell);
+      first_face[block + 1] += table[pattern].num_triangles;
+      for (std::uint32_t bits = table[pattern].cut_edges; bits != 0; bits &= bits - 1) {
+        const int edge = lowest_bit(bits);
+        const auto [lower, axis] = cell_edge(edge);
+        const int upper = lower | axis_bit(axis);
+        edge_of(cell, edge).store(cell[upper], std::memory_order_relaxed);
+      }
+    }
+  });
+  sum_up(first_face);
+
+  std::vector<int64_t> first_vertex = block_counts(num_corners);
+  for_each_block(num_corners, num_threads, [&](size_t block, int64_t begin, int64_t end) {
+    for (int64_t e = 3 * begin; e < 3 * end; ++e) {
+      first_vertex[block + 1] += edges[static_cast<size_t>(e)].load(std::memory_order_relaxed) != no_vertex;
+    }
+  });
+  sum_up(first_vertex);
+
+  Mesh mesh = allocate_mesh(first_vertex.back(), first_face.back());
+  for_each_block(num_corners, num_threads, [&](size_t block, int64_t begin, int64_t end) {
+    auto vertex = static_cast<int32_t>(first_vertex[block]);
+    for (int64_t c = begin; c < end; ++c) {
+      const int32_t* position = corners + 3 * c;
+      for (size_t axis = 0; axis < 3; ++axis) {
+        auto& edge = edges[static_cast<size_t>(3 * c) + axis];
+        const int32_t upper = edge.load(std::memory_order_relaxed);
+        if (upper == no_vertex) continue;
+        const double fraction =
+            edge_fraction(static_cast<double>(values[c]), static_cast<double>(values[upper]), level);
+        write_vertex(
+            lattice,
+            {static_cast<double>(position[0]), static_cast<double>(position[1]), static_cast<double>(position[2])},
+            axis, fraction, mesh.vertices.get() + 3 * int64_t{vertex});
+        edge.store(vertex++, std::memory_order_relaxed);
+      }
+    }
+  });
+  for_each_block(num_cells, num_threads, [&](size_t block, int64_t begin, int64_t end) {
+    int32_t* faces = mesh.faces.get() + 3 * first_face[block];
+    for (int64_t m = begin; m < end; ++m) {
+      const CellTriangles& cell = table[patterns[static_cast<size_t>(m)]];
+      for (size_t n = 0; n < 3u * cell.num_triangles; ++n) {
+        *faces++ = edge_of(cells + 8 * m, cell.edges[n]).load(std::memory_order_relaxed);
+      }
+    }
+  });
+  return mesh;
+}
+
+template Mesh marching_cubes_sparse(const int32_t*, const float*, int64_t, const int32_t*, int64_t, const Lattice&,
+                                    double, int);
+template Mesh marching_cubes_sparse(const int32_t*, const double*, int64_t, const int32_t*, int64_t, const Lattice&,
+                                    double, int);
+
+}  // namespace radarsdf

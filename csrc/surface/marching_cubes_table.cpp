@@ -1,0 +1,154 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Two properties make the meshes closed and manifold, and the code below is nothing but these two:
+//  1. Where the surface crosses a cell's face depends on the four signs of that face alone, so the two cells that
+//     share it draw the same segments. The segments chain into loops; each cut edge lies on exactly one of them.
+//  2. No diagonal of a loop's triangulation joins two edges of one face. Two cells share nothing beyond a face, so
+//     each diagonal belongs to one cell, and each mesh edge to two triangles.
+#include "surface/marching_cubes_table.hpp"
+
+#include <cmath>
+#include <limits>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+namespace radarsdf {
+namespace {
+
+constexpr int num_edges = 12;
+using Loop = std::vector<int>;  // edges, in order
+using Point = std::array<double, 3>;
+
+std::array<int, 3> corner_position(int corner) { return {corner >> 2, (corner >> 1) & 1, corner & 1}; }
+
+int edge_between(int corner_a, int corner_b) {
+  for (int edge = 0; edge < num_edges; ++edge) {
+    const auto [corner, axis] = cell_edge(edge);
+    if (corner == (corner_a & corner_b) && (corner | axis_bit(axis)) == (corner_a | corner_b)) return edge;
+  }
+  throw std::logic_error("two corners of a cell that no edge joins");
+}
+
+// The corners of a face, counter-clockwise seen from outside the cell.
+std::array<int, 4> face_corners(int axis, bool upper) {
+  const int u = axis_bit((axis + 1) % 3);
+  const int v = axis_bit((axis + 2) % 3);
+  const int side = upper ? axis_bit(axis) : 0;
+  if (upper) return {side, side | u, side | u | v, side | v};
+  return {side, side | v, side | u | v, side | u};
+}
+
+// Adds the segments on one face to `next`, which maps each cut edge to the one that follows it in its loop.
+// Going round the face, a segment starts where the walk leaves the positive corners and ends where it had entered
+// them, so its cell's triangles face the positive side. On a face with two positive corners across the diagonal this
+// cuts off each positive corner by itself, the rule of property 1.
+void trace_face(int pattern, const std::array<int, 4>& corners, std::array<int, num_edges>& next) {
+  const auto corner = [&](int i) { return corners[static_cast<std::size_t>((i + 4) % 4)]; };
+  const auto positive = [&](int i) { return ((pattern >> corner(i)) & 1) != 0; };
+  for (int i = 0; i < 4; ++i) {
+    if (!positive(i) || positive(i + 1)) continue;
+    int first = i;
+    while (positive(first - 1)) --first;
+    next[static_cast<std::size_t>(edge_between(corner(i), corner(i + 1)))] =
+        edge_between(corner(first - 1), corner(first));
+  }
+}
+
+std::vector<Loop> trace_loops(int pattern) {
+  std::array<int, num_edges> next{};
+  next.fill(-1);
+  for (int axis = 0; axis < 3; ++axis) {
+    for (const bool upper : {false, true}) trace_face(pattern, face_corners(axis, upper), next);
+  }
+  std::vector<Loop> loops;
+  for (int start = 0; start < num_edges; ++start) {
+    Loop loop;
+    for (int edge = start; next[static_cast<std::size_t>(edge)] >= 0;) {
+      loop.push_back(edge);
+      edge = std::exchange(next[static_cast<std::size_t>(edge)], -1);
+    }
+    if (!loop.empty()) loops.push_back(loop);
+  }
+  return loops;
+}
+
+bool share_face(int edge_a, int edge_b) {
+  const CellEdge a = cell_edge(edge_a);
+  const CellEdge b = cell_edge(edge_b);
+  for (int axis = 0; axis < 3; ++axis) {
+    const int bit = axis_bit(axis);
+    if (a.axis != axis && b.axis != axis && (a.corner & bit) == (b.corner & bit)) return true;
+  }
+  return false;
+}
+
+Point edge_middle(int edge) {
+  const auto [corner, axis] = cell_edge(edge);
+  const auto position = corner_position(corner);
+  Point middle{static_cast<double>(position[0]), static_cast<double>(position[1]), static_cast<double>(position[2])};
+  middle[static_cast<std::size_t>(axis)] += 0.5;
+  return middle;
+}
+
+// How far a triangle is from equilateral: its squared sides over its area, infinite where it is a line.
+double shape_cost(int edge_a, int edge_b, int edge_c) {
+  const Point a = edge_middle(edge_a), b = edge_middle(edge_b), c = edge_middle(edge_c);
+  const Point ab{b[0] - a[0], b[1] - a[1], b[2] - a[2]}, ac{c[0] - a[0], c[1] - a[1], c[2] - a[2]};
+  const auto dot = [](const Point& p, const Point& q) { return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]; };
+  const double double_area = std::sqrt(dot(ab, ab) * dot(ac, ac) - dot(ab, ac) * dot(ab, ac));
+  return (dot(ab, ab) + dot(ac, ac) - dot(ab, ac)) / double_area;  // |ab|²+|ac|²+|bc|² is twice the numerator
+}
+
+// The best triangulation of the part of a loop from `first` to `last`, closed by the line between these two: every
+// choice of the third corner on that line is tried. An infinite cost says that property 2 allows none.
+struct Triangulation {
+  double cost = 0;
+  std::vector<int> edges;
+};
+
+Triangulation triangulate(const Loop& loop, std::size_t first, std::size_t last) {
+  if (last == first + 1) return {};
+  Triangulation best{std::numeric_limits<double>::infinity(), {}};
+  const bool is_diagonal = first != 0 || last + 1 != loop.size();
+  if (is_diagonal && share_face(loop[first], loop[last])) return best;
+  for (std::size_t third = first + 1; third < last; ++third) {
+    Triangulation left = triangulate(loop, first, third);
+    const Triangulation right = triangulate(loop, third, last);
+    left.cost += right.cost + shape_cost(loop[first], loop[third], loop[last]);
+    if (!(left.cost < best.cost)) continue;
+    left.edges.insert(left.edges.end(), right.edges.begin(), right.edges.end());
+    left.edges.insert(left.edges.end(), {loop[first], loop[third], loop[last]});
+    best = std::move(left);
+  }
+  return best;
+}
+
+CellTriangles build_case(int pattern) {
+  CellTriangles result;
+  std::size_t used = 0;
+  for (const Loop& loop : trace_loops(pattern)) {
+    const Triangulation triangulation = triangulate(loop, 0, loop.size() - 1);
+    if (std::isinf(triangulation.cost)) throw std::logic_error("a loop of marching cubes without triangulation");
+    for (const int edge : loop) result.cut_edges = static_cast<std::uint16_t>(result.cut_edges | 1 << edge);
+    for (const int edge : triangulation.edges) result.edges.at(used++) = static_cast<std::uint8_t>(edge);
+  }
+  result.num_triangles = static_cast<std::uint8_t>(used / 3);
+  return result;
+}
+
+}  // namespace
+
+const MarchingCubesTable& marching_cubes_table() {
+  static const MarchingCubesTable table = [] {
+    MarchingCubesTable result;
+    for (std::size_t pattern = 0; pattern < result.size(); ++pattern) {
+      result[pattern] = build_case(static_cast<int>(pattern));
+    }
+    return result;
+  }();
+  return table;
+}
+
+}  // namespace radarsdf

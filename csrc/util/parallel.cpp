@@ -1,0 +1,54 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "util/parallel.hpp"
+
+#include <atomic>
+#include <chrono>
+
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+#if defined(__unix__) || defined(__APPLE__)
+#include <pthread.h>
+#define RADARSDF_FORKS
+#endif
+
+namespace radarsdf {
+namespace {
+
+std::atomic<bool> forked{false};
+std::atomic<void (*)()> interrupt_check{nullptr};
+
+#ifdef RADARSDF_FORKS
+[[maybe_unused]] const int at_fork = pthread_atfork(nullptr, nullptr, [] { forked = true; });
+#endif
+
+}  // namespace
+
+int resolve_num_threads(int num_threads) {
+#ifdef _OPENMP
+  // Where the system refuses a thread, OpenMP ends the whole program.
+  constexpr int kMaxThreads = 1024;
+  if (forked) return 1;
+  return num_threads > 0 ? std::min(num_threads, kMaxThreads) : omp_get_max_threads();
+#else
+  (void)num_threads;
+  return 1;
+#endif
+}
+
+void set_interrupt_check(void (*check)()) { interrupt_check = check; }
+
+void check_interrupt() {
+  using Clock = std::chrono::steady_clock;
+  thread_local Clock::time_point next;
+#ifdef _OPENMP
+  if (omp_get_thread_num() != 0) return;
+#endif
+  void (*const check)() = interrupt_check;
+  if (check == nullptr || Clock::now() < next) return;
+  next = Clock::now() + std::chrono::milliseconds(100);
+  check();
+}
+
+}  // namespace radarsdf
