@@ -17,6 +17,7 @@
 
 #include "field/encodings.hpp"
 #include "field/mlp.hpp"
+#include "field/optimiser.hpp"
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
 #include "lattice/vertex_table.hpp"
@@ -27,6 +28,7 @@
 #include "surface/sparse_lattice.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
+#include "util/parallel_sort.hpp"
 
 namespace {
 

@@ -9,8 +9,11 @@
 #include <pybind11/pybind11.h>
 
 #include <cstdint>
+#include <memory>
 #include <stdexcept>
 #include <string>
+#include <utility>
+#include <vector>
 
 namespace radarsdf {
 
@@ -40,13 +43,21 @@ std::int64_t row_stride(const Rows<T>& array, const char* name) {
   return array.shape(0) > 1 ? array.strides(0) / item : array.shape(1);
 }
 
-void bind_cell_sums(py::module_& m);
-void bind_encodings(py::module_& m);
-void bind_field_loss(py::module_& m);
-void bind_marching_cubes(py::module_& m);
-void bind_mlp(py::module_& m);
-void bind_surface_crossings(py::module_& m);
-void bind_system(py::module_& m);
-void bind_vertex_table(py::module_& m);
+// Number of points (N, 3).
+inline std::int64_t check_points(const py::array& points) {
+  if (points.ndim() != 2 || points.shape(1) != 3) throw std::invalid_argument("points must have shape (N, 3)");
+  return points.shape(0);
+}
+
+// Hands a vector's memory to NumPy without a copy.
+template <typename T>
+Array<T> to_array(std::vector<T> values) {
+  auto owner = std::make_unique<std::vector<T>>(std::move(values));
+  T* data = owner->data();
+  const auto size = static_cast<py::ssize_t>(owner->size());
+  const py::capsule free(owner.get(), [](void* p) { delete static_cast<std::vector<T>*>(p); });
+  owner.release();  // only once the capsule exists
+  return Array<T>({size}, {static_cast<py::ssize_t>(sizeof(T))}, data, free);
+}
 
 }  // namespace radarsdf

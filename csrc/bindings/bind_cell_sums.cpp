@@ -4,6 +4,7 @@
 #include <memory>
 
 #include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
 #include "lattice/cell_blocks.hpp"
 #include "returns/cell_sums.hpp"
 #include "returns/principal_axes.hpp"

@@ -1,6 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 #include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
 #include "field/encodings.hpp"
 #include "kernels/fourier_kernels.hpp"
 

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "bindings/layer_arrays.hpp"
+#include "bindings/subjects.hpp"
 #include "field/field_loss.hpp"
 #include "kernels/fourier_kernels.hpp"
 

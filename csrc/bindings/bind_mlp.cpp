@@ -3,6 +3,7 @@
 #include <optional>
 
 #include "bindings/layer_arrays.hpp"
+#include "bindings/subjects.hpp"
 
 namespace radarsdf {
 namespace {

@@ -3,6 +3,7 @@
 #include <memory>
 
 #include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
 #include "returns/surface_crossings.hpp"
 
 namespace radarsdf {

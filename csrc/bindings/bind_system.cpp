@@ -3,6 +3,7 @@
 #include <pybind11/stl.h>
 
 #include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
 

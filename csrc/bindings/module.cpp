@@ -2,16 +2,20 @@
 // SPDX-License-Identifier: MIT
 //
 // Table of contents of the compiled core. Each subject has its own file; the core itself knows no Python.
-#include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
 
 PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   m.doc() = "Compiled core of radarsdf: private, use the functions of the package.";
   radarsdf::bind_system(m);
-  radarsdf::bind_vertex_table(m);
+  radarsdf::bind_cell_set(m);
+  radarsdf::VertexTableClass table = radarsdf::bind_vertex_table(m);
+  radarsdf::bind_interpolation(table);
+  radarsdf::bind_optimiser(m, table);
+  radarsdf::bind_ray_average(table);
   radarsdf::bind_encodings(m);
   radarsdf::bind_mlp(m);
   radarsdf::bind_field_loss(m);
-  radarsdf::bind_marching_cubes(m);
+  radarsdf::bind_surfaces(m);
   radarsdf::bind_cell_sums(m);
   radarsdf::bind_surface_crossings(m);
 }

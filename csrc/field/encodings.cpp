@@ -5,7 +5,6 @@
 #include <algorithm>
 
 #include "kernels/fourier_kernels.hpp"
-#include "kernels/interpolation_kernels.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
 
@@ -14,17 +13,6 @@ namespace {
 
 // A thread is woken for about 50 us of work: waking one costs a few.
 constexpr std::int64_t kMinPoints = 512;
-
-template <typename T>
-const InterpolationKernels<T>& kernels_for(const VertexTable& table) {
-  return RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
-}
-
-template <typename T>
-Interpolation<T> interpolation(const VertexTable& table, const PointBatch<T>& batch) {
-  return {table.cells().data(), batch.located,      batch.points,
-          batch.directions,     table.num_levels(), static_cast<T>(1.0 / table.leaf_size_m())};
-}
 
 }  // namespace
 
@@ -38,7 +26,7 @@ void locate(const VertexTable& table, const T* points, std::int64_t count, std::
 template <typename T>
 void encode(const VertexTable& table, const T* features, const T* points, std::int64_t count, std::int32_t* located,
             T* out, std::int64_t stride, int num_threads) {
-  const InterpolationKernels<T>& kernels = kernels_for<T>(table);
+  const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
   const Interpolation<T> in = interpolation<T>(table, {points, nullptr, located, count});
   parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
     constexpr std::int64_t kBlock = 256;  // the cells found are still in the first-level cache when they are used
@@ -53,7 +41,7 @@ void encode(const VertexTable& table, const T* features, const T* points, std::i
 template <typename T>
 void interpolate(const VertexTable& table, const T* features, const PointBatch<T>& batch, T* out, std::int64_t stride,
                  int num_threads) {
-  const InterpolationKernels<T>& kernels = kernels_for<T>(table);
+  const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
   const Interpolation<T> in = interpolation(table, batch);
   parallel_blocks(batch.count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
     kernels.interpolate(in, features, out, stride, begin, end);
@@ -63,7 +51,7 @@ void interpolate(const VertexTable& table, const T* features, const PointBatch<T
 template <typename T>
 void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
              T* features_grad, int num_threads) {
-  const InterpolationKernels<T>& kernels = kernels_for<T>(table);
+  const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
   const Interpolation<T> in = interpolation(table, batch);
   // Threads take whole (level, group) pairs, whose rows are disjoint: no atomics, no private copies of the gradient,
   // and each row's sum in the order of the points. Coarse levels first: they are hit most.
@@ -76,35 +64,9 @@ void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_
 }
 
 template <typename T>
-void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, TaskQueue& queue) {
-  const InterpolationKernels<T>& kernels = kernels_for<T>(table);
-  const AdamKernel<T> adam_kernel = RADARSDF_KERNEL(adam_kernel<T>)();
-  const int groups = num_vertex_groups(table.encoding());
-  const std::int64_t corners = table.encoding() == Encoding::kTriQuadtree ? 4 : 8;
-  std::int64_t points = 0;
-  for (const PointBatch<T>& batch : batches) points += batch.count;
-  // Kept from call to call: fresh pages would cost as much as the sums.
-  thread_local std::vector<std::int32_t> rows;
-  thread_local std::vector<T> sums;  // zero between calls
-  const auto most = static_cast<std::size_t>(std::min(points * corners, table.num_rows())) + 1;
-  if (rows.size() < most) rows.resize(most);
-  if (sums.size() < most * kFeatureDim) sums.resize(most * kFeatureDim);
-  for (int task = queue.take(); task < table.num_levels() * groups; task = queue.take()) {
-    const int level = table.num_levels() - 1 - task / groups;  // coarse ones first: they take longest
-    RowSums<T> touched{adam.marks, rows.data(), sums.data(), 0};
-    for (std::size_t b = 0; b < batches.size(); ++b) {
-      kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, level, task % groups, 0,
-                           batches[b].count);
-    }
-    adam_kernel.move(adam, touched.rows, touched.sums, touched.count);
-  }
-}
-
-template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,
                          std::int64_t stride, T* points_grad, int num_threads) {
-  const InterpolationKernels<T>& kernels = kernels_for<T>(table);
+  const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
   const Interpolation<T> in = interpolation(table, batch);
   parallel_blocks(batch.count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
     kernels.coordinate_gradient(in, features, out_grad, stride, points_grad, begin, end);
@@ -154,8 +116,6 @@ void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::i
   template void encode(const VertexTable&, const T*, const T*, std::int64_t, std::int32_t*, T*, std::int64_t, int); \
   template void interpolate(const VertexTable&, const T*, const PointBatch<T>&, T*, std::int64_t, int);             \
   template void scatter(const VertexTable&, const PointBatch<T>&, const T*, std::int64_t, T*, int);                 \
-  template void adam_step(const VertexTable&, const std::vector<PointBatch<T>>&, const std::vector<const T*>&,      \
-                          const std::vector<std::int64_t>&, const AdamStep<T>&, TaskQueue&);                        \
   template void coordinate_gradient(const VertexTable&, const T*, const PointBatch<T>&, const T*, std::int64_t, T*, \
                                     int);                                                                           \
   template void fourier(const T*, std::int64_t, double, int, int, T*, std::int64_t, int);                           \

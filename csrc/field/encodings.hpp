@@ -5,23 +5,12 @@
 // `stride` is the distance between rows, so that encodings can be written side by side into one matrix.
 #pragma once
 
-#include <atomic>
 #include <cstdint>
-#include <vector>
 
-#include "kernels/adam_kernels.hpp"
+#include "field/point_batch.hpp"
 #include "lattice/vertex_table.hpp"
 
 namespace radarsdf {
-
-// Points (count, 3) and the cells that hold them; `directions` as in interpolation_kernels.hpp.
-template <typename T>
-struct PointBatch {
-  const T* points;
-  const T* directions;  // or null
-  const std::int32_t* located;
-  std::int64_t count;
-};
 
 template <typename T>
 void locate(const VertexTable& table, const T* points, std::int64_t count, std::int32_t* located, int num_threads);
@@ -39,21 +28,6 @@ void interpolate(const VertexTable& table, const T* features, const PointBatch<T
 template <typename T>
 void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
              T* features_grad, int num_threads);
-
-// Numbers from 0 on for whoever comes first, so that threads of the caller's own share work.
-class TaskQueue {
- public:
-  int take() { return next_.fetch_add(1, std::memory_order_relaxed); }
-
- private:
-  std::atomic<int> next_{0};
-};
-
-// One step of Adam with the gradients that `scatter` would sum over the batches, on the rows that they touch: on those
-// (level, group) pairs that no other call with the same queue has begun.
-template <typename T>
-void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, TaskQueue& queue);
 
 template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,

@@ -13,6 +13,7 @@
 #include "lattice/morton.hpp"
 #include "util/bits.hpp"
 #include "util/parallel.hpp"
+#include "util/parallel_sort.hpp"
 
 namespace radarsdf {
 
@@ -130,21 +131,6 @@ std::vector<std::uint64_t> CellSet::sorted_keys(int num_threads) const {
     }
   }
   return keys;
-}
-
-void parallel_sort(std::vector<std::uint64_t>& keys, int num_threads) {
-  const auto size = static_cast<std::int64_t>(keys.size());
-  std::int64_t blocks = 1;
-  const std::int64_t threads = resolve_num_threads(num_threads);
-  // Several for a thread where one would keep whoever wants to interrupt the call waiting.
-  while (size / blocks > (blocks * 2 <= threads ? 1 << 15 : 1 << 22)) blocks *= 2;
-  const auto at = [&](std::int64_t i) { return keys.begin() + size * i / blocks; };
-  parallel_tasks(blocks, num_threads, [&](std::int64_t i) { std::sort(at(i), at(i + 1)); });
-  for (std::int64_t width = 1; width < blocks; width *= 2) {
-    parallel_tasks(blocks / (2 * width), num_threads, [&](std::int64_t i) {
-      std::inplace_merge(at(2 * i * width), at((2 * i + 1) * width), at((2 * i + 2) * width));
-    });
-  }
 }
 
 template void cell_keys(const float*, std::int64_t, double, std::uint64_t*, int);

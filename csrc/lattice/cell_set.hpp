@@ -51,7 +51,4 @@ class CellSet {
   std::array<Partition, kPartitions> partitions_;
 };
 
-// Sorts in place: blocks on threads, then merged pairwise.
-void parallel_sort(std::vector<std::uint64_t>& keys, int num_threads);
-
 }  // namespace radarsdf

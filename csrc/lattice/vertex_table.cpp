@@ -10,10 +10,10 @@
 #include <utility>
 
 #include "lattice/cell_blocks.hpp"
-#include "lattice/cell_set.hpp"
 #include "lattice/morton.hpp"
 #include "util/bits.hpp"
 #include "util/parallel.hpp"
+#include "util/parallel_sort.hpp"
 #include "util/prefetch.hpp"
 
 namespace radarsdf {

@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include "bindings/subjects.hpp"
 #include "surface/marching_cubes.hpp"
 #include "surface/mesh_components.hpp"
 #include "surface/sparse_lattice.hpp"
@@ -122,7 +123,7 @@ void bind_for_type(py::module_& m) {
 
 }  // namespace
 
-void bind_marching_cubes(py::module_& m) {
+void bind_surfaces(py::module_& m) {
   bind_for_type<float>(m);
   bind_for_type<double>(m);
   m.def("sparse_lattice", &lattice, py::arg("cells").noconvert(), py::arg("num_threads") = 0);

@@ -1,0 +1,72 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
+#include "lattice/cell_set.hpp"
+
+namespace radarsdf {
+namespace {
+
+template <typename T>
+void bind_cells(py::module_& m, py::class_<CellSet>& cls) {
+  using namespace py::literals;
+  m.def(
+      "cell_keys",
+      [](const Array<T>& points, double leaf_size_m, int num_threads) {
+        std::vector<std::uint64_t> keys(static_cast<std::size_t>(check_points(points)));
+        const T* p = points.data();
+        {
+          const py::gil_scoped_release release;
+          cell_keys(p, static_cast<std::int64_t>(keys.size()), leaf_size_m, keys.data(), num_threads);
+        }
+        return to_array(std::move(keys));
+      },
+      "points"_a.noconvert(), "leaf_size_m"_a, "num_threads"_a = 0,
+      "Morton key (N,) uint64 of the leaf cell of each point (N, 3), local frame, m.");
+  cls.def(
+      "insert",
+      [](CellSet& cells, const Array<T>& points, int num_threads) {
+        const std::int64_t count = check_points(points);
+        const T* p = points.data();
+        const py::gil_scoped_release release;
+        cells.insert(p, count, num_threads);
+      },
+      "points"_a.noconvert(), "num_threads"_a = 0, "Marks the leaf cells that hold the points (N, 3), local frame, m.");
+}
+
+}  // namespace
+
+void bind_cell_set(py::module_& m) {
+  using namespace py::literals;
+  py::class_<CellSet> cell_set(m, "CellSet", "Set of occupied leaf cells, filled from points in chunks.");
+  cell_set.def(py::init<double>(), "leaf_size_m"_a)
+      .def("__len__", &CellSet::size)
+      .def(
+          "insert_rays",
+          [](CellSet& cells, const Array<float>& points, const Array<float>& directions, double reach_m,
+             int num_threads) {
+            const std::int64_t count = check_points(points);
+            check_shape(directions, count, 3, "directions");
+            const float *p = points.data(), *d = directions.data();
+            const py::gil_scoped_release release;
+            cells.insert_rays(p, d, count, reach_m, num_threads);
+          },
+          "points"_a.noconvert(), "directions"_a.noconvert(), "reach_m"_a, "num_threads"_a = 0,
+          "Marks the leaf cells that rays go through within `reach_m` before and behind their points (N, 3) float32, "
+          "local frame, m; `directions` are unit vectors (N, 3) float32.")
+      .def(
+          "sorted_keys",
+          [](const CellSet& cells, int num_threads) {
+            std::vector<std::uint64_t> keys;
+            {
+              const py::gil_scoped_release release;
+              keys = cells.sorted_keys(num_threads);
+            }
+            return to_array(std::move(keys));
+          },
+          "num_threads"_a = 0, "Morton keys of the cells (C,) uint64, ascending.");
+  bind_cells<float>(m, cell_set);
+  bind_cells<double>(m, cell_set);
+}
+
+}  // namespace radarsdf

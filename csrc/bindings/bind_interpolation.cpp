@@ -1,0 +1,109 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include <optional>
+
+#include "bindings/subjects.hpp"
+#include "bindings/table_arrays.hpp"
+#include "field/encodings.hpp"
+
+namespace radarsdf {
+namespace {
+
+template <typename T>
+void bind_kernels(py::class_<VertexTable>& cls) {
+  using Located = Array<std::int32_t>;
+  using Directions = std::optional<Array<T>>;
+  using namespace py::literals;
+
+  cls.def(
+      "locate",
+      [](const VertexTable& table, const Array<T>& points, Located& located, int num_threads) {
+        const std::int64_t count = check_points(points);
+        check_shape(located, count, table.num_levels(), "located");
+        const T* p = points.data();
+        std::int32_t* found = located.mutable_data();
+        const py::gil_scoped_release release;
+        locate(table, p, count, found, num_threads);
+      },
+      "points"_a.noconvert(), "located"_a.noconvert(), "num_threads"_a = 0,
+      "Writes the cell of each point (N, 3), local frame, m, at each level, or -1, to `located` (N, L) int32.");
+
+  cls.def(
+      "encode",
+      [](const VertexTable& table, const Array<T>& features, const Array<T>& points, Located& located, Rows<T>& out,
+         int num_threads) {
+        const std::int64_t count = check_points(points);
+        check_features(table, features);
+        check_shape(located, count, table.num_levels(), "located");
+        check_shape(out, count, table.num_levels() * kFeatureDim, "out");
+        const std::int64_t stride = row_stride(out, "out");
+        const T *f = features.data(), *p = points.data();
+        std::int32_t* found = located.mutable_data();
+        T* result = out.mutable_data();
+        const py::gil_scoped_release release;
+        encode(table, f, p, count, found, result, stride, num_threads);
+      },
+      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "out"_a.noconvert(),
+      "num_threads"_a = 0, "Locates the points and writes their interpolated features to `out` (N, 8 L).");
+
+  cls.def(
+      "interpolate",
+      [](const VertexTable& table, const Array<T>& features, const Array<T>& points, const Located& located,
+         const Directions& directions, Rows<T>& out, int num_threads) {
+        const PointBatch<T> batch = point_batch(table, points, located, directions);
+        check_features(table, features);
+        check_shape(out, batch.count, table.num_levels() * kFeatureDim, "out");
+        const std::int64_t stride = row_stride(out, "out");
+        const T* f = features.data();
+        T* result = out.mutable_data();
+        const py::gil_scoped_release release;
+        interpolate(table, f, batch, result, stride, num_threads);
+      },
+      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true),
+      "out"_a.noconvert(), "num_threads"_a = 0,
+      "Like `encode` for located points; with `directions` (N, 3), the directional derivative of the features.");
+
+  cls.def(
+      "scatter",
+      [](const VertexTable& table, const Array<T>& points, const Located& located, const Directions& directions,
+         const Rows<T>& out_grad, Array<T>& features_grad, int num_threads) {
+        const PointBatch<T> batch = point_batch(table, points, located, directions);
+        check_features(table, features_grad);
+        check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
+        const std::int64_t stride = row_stride(out_grad, "out_grad");
+        const T* grad = out_grad.data();
+        T* result = features_grad.mutable_data();
+        const py::gil_scoped_release release;
+        scatter(table, batch, grad, stride, result, num_threads);
+      },
+      "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true), "out_grad"_a.noconvert(),
+      "features_grad"_a.noconvert(), "num_threads"_a = 0,
+      "Adds the transpose of `interpolate`, applied to `out_grad` (N, 8 L), to `features_grad` (num_rows, 8).");
+
+  cls.def(
+      "coordinate_gradient",
+      [](const VertexTable& table, const Array<T>& features, const Array<T>& points, const Located& located,
+         const Directions& directions, const Rows<T>& out_grad, Array<T>& points_grad, int num_threads) {
+        const PointBatch<T> batch = point_batch(table, points, located, directions);
+        check_features(table, features);
+        check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
+        check_shape(points_grad, batch.count, 3, "points_grad");
+        const std::int64_t stride = row_stride(out_grad, "out_grad");
+        const T *f = features.data(), *grad = out_grad.data();
+        T* result = points_grad.mutable_data();
+        const py::gil_scoped_release release;
+        coordinate_gradient(table, f, batch, grad, stride, result, num_threads);
+      },
+      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true),
+      "out_grad"_a.noconvert(), "points_grad"_a.noconvert(), "num_threads"_a = 0,
+      "Writes the gradient of (interpolate . out_grad) by the points to `points_grad` (N, 3), 1/m.");
+}
+
+}  // namespace
+
+void bind_interpolation(VertexTableClass& table) {
+  bind_kernels<float>(table);
+  bind_kernels<double>(table);
+}
+
+}  // namespace radarsdf

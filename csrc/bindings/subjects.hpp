@@ -1,0 +1,28 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// One function for each subject, called by module.cpp. Kernels that work on a table are methods of its class.
+#pragma once
+
+#include <pybind11/pybind11.h>
+
+#include "lattice/vertex_table.hpp"
+
+namespace radarsdf {
+
+using VertexTableClass = pybind11::class_<VertexTable>;
+
+void bind_system(pybind11::module_& m);
+void bind_cell_set(pybind11::module_& m);
+VertexTableClass bind_vertex_table(pybind11::module_& m);
+void bind_interpolation(VertexTableClass& table);
+void bind_optimiser(pybind11::module_& m, VertexTableClass& table);
+void bind_ray_average(VertexTableClass& table);
+void bind_encodings(pybind11::module_& m);
+void bind_mlp(pybind11::module_& m);
+void bind_field_loss(pybind11::module_& m);
+void bind_surfaces(pybind11::module_& m);
+void bind_cell_sums(pybind11::module_& m);
+void bind_surface_crossings(pybind11::module_& m);
+
+}  // namespace radarsdf

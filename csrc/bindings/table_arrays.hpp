@@ -1,0 +1,31 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Arrays that belong to a table, checked.
+#pragma once
+
+#include <pybind11/stl.h>
+
+#include <optional>
+
+#include "bindings/arrays.hpp"
+#include "field/encodings.hpp"
+
+namespace radarsdf {
+
+template <typename T>
+void check_features(const VertexTable& table, const Array<T>& features) {
+  check_shape(features, table.num_rows(), kFeatureDim, "features");
+}
+
+// Checked arguments of the kernels that work on located points.
+template <typename T>
+PointBatch<T> point_batch(const VertexTable& table, const Array<T>& points, const Array<std::int32_t>& located,
+                          const std::optional<Array<T>>& directions) {
+  const std::int64_t count = check_points(points);
+  check_shape(located, count, table.num_levels(), "located");
+  if (directions) check_shape(*directions, count, 3, "directions");
+  return {points.data(), directions ? directions->data() : nullptr, located.data(), count};
+}
+
+}  // namespace radarsdf

@@ -1,0 +1,29 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Points and the cells that hold them, as the interpolation kernels take them.
+#pragma once
+
+#include <cstdint>
+
+#include "kernels/interpolation_kernels.hpp"
+#include "lattice/vertex_table.hpp"
+
+namespace radarsdf {
+
+// Points (count, 3) and the cells that hold them; `directions` as in interpolation_kernels.hpp.
+template <typename T>
+struct PointBatch {
+  const T* points;
+  const T* directions;  // or null
+  const std::int32_t* located;
+  std::int64_t count;
+};
+
+template <typename T>
+Interpolation<T> interpolation(const VertexTable& table, const PointBatch<T>& batch) {
+  return {table.cells().data(), batch.located,      batch.points,
+          batch.directions,     table.num_levels(), static_cast<T>(1.0 / table.leaf_size_m())};
+}
+
+}  // namespace radarsdf
