@@ -27,7 +27,7 @@ std::int64_t check_batch(const VertexTable& table, const Array<T>& features, con
   const std::int64_t count = points.ndim() == 2 ? points.shape(0) : 0;
   check_shape(points, count, 3, "points");
   if (sdf_m.ndim() != 1 || sdf_m.shape(0) != count) throw std::invalid_argument("sdf_m must have shape (N,)");
-  check_shape(rays, count, with_intensity ? 8 : rays.ndim() == 2 ? rays.shape(1) : 0, "rays");
+  check_shape(rays, count, with_intensity ? kRayColumns : rays.ndim() == 2 ? rays.shape(1) : 0, "rays");
   if (num_near < 0 || num_near > count || intensity_count < 0 || intensity_count > count)
     throw std::invalid_argument("num_near and intensity_count must be of the batch");
   return count;

@@ -4,11 +4,13 @@
 
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
+#include "field/field_loss.hpp"
+#include "kernels/fourier_kernels.hpp"
+#include "lattice/cell.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
-
 namespace {
 
 // Python runs its handlers of signals, Ctrl-C's among them, only when a call returns, unless it is asked to.
@@ -17,12 +19,27 @@ void check_signals() {
   if (PyErr_CheckSignals() != 0) throw py::error_already_set();
 }
 
+// What Python must know of the core's arrays. It is defined in the core's headers and nowhere else.
+void bind_numbers(py::module_& m) {
+  m.attr("FEATURE_DIM") = kFeatureDim;
+  m.attr("MAX_LEVELS") = kMaxLevels;
+  m.attr("MAX_FREQUENCIES") = kMaxFrequencies;
+  m.attr("NUM_SPHERICAL_HARMONICS") = kHarmonics;
+  // The first column of each part of a ray's row, and how many columns there are.
+  m.attr("RAY_POINT") = kRayPoint;
+  m.attr("RAY_DIRECTION") = kRayDirection;
+  m.attr("RAY_RANGE") = kRayRange;
+  m.attr("RAY_INTENSITY") = kRayIntensity;
+  m.attr("RAY_COLUMNS") = kRayColumns;
+}
+
 }  // namespace
 
 void bind_system(py::module_& m) {
   set_interrupt_check(&check_signals);
   using namespace py::literals;
   m.attr("__version__") = RADARSDF_VERSION;
+  bind_numbers(m);
   m.def(
       "compiler",
       [] {

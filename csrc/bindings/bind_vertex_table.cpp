@@ -12,7 +12,10 @@ VertexTableClass bind_vertex_table(py::module_& m) {
   using namespace py::literals;
   py::enum_<Encoding>(m, "Encoding", "Which vertices of a cell carry features.")
       .value("TRI_QUADTREE", Encoding::kTriQuadtree)
-      .value("OCTREE", Encoding::kOctree);
+      .value("OCTREE", Encoding::kOctree)
+      .def_property_readonly("num_vertex_groups", &num_vertex_groups,
+                             "Groups of a cell's corners: three planes, or all of space.")
+      .def_property_readonly("corners_per_group", &corners_per_group, "Corners of a cell in each group.");
 
   VertexTableClass table(m, "VertexTable", "From points to rows of the feature matrix (num_rows, 8).");
   table

@@ -37,7 +37,7 @@ template <typename T>
 void fourier(const T* points, std::int64_t count, double half_width_m, int first_frequency, int num_frequencies, T* out,
              std::int64_t stride, int num_threads);
 
-constexpr int kHarmonics = 16;
+constexpr int kHarmonics = 16;  // of degree 0 to 3
 
 // Real spherical harmonics of degree 0..3 of unit vectors (count, 3): out (count, 16), in the order l, m = -l..l.
 template <typename T>

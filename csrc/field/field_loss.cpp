@@ -10,8 +10,6 @@
 namespace radarsdf {
 namespace {
 
-constexpr std::int64_t kDirection = 3, kRange = 6, kIntensity = 7;  // columns of a ray
-
 template <typename T>
 using Matrix = std::unique_ptr<T[]>;
 
@@ -123,7 +121,7 @@ class Batch {
     if (field_.view_direction) {
       const Matrix<T> directions = matrix<T>(count, 3);
       for (std::int64_t i = 0; i < count; ++i) {
-        std::copy_n(batch_.rays + i * batch_.ray_columns + kDirection, 3, directions.get() + 3 * i);
+        std::copy_n(batch_.rays + i * batch_.ray_columns + kRayDirection, 3, directions.get() + 3 * i);
       }
       spherical_harmonics(directions.get(), count, x.get() + rest, width, 1);
     }
@@ -153,7 +151,7 @@ class Batch {
     double sum = 0;
     for (std::int64_t i = 0; i < count; ++i) {
       // No return is expected from free space (3QFPI).
-      const T label = i < batch_.num_near ? batch_.rays[i * batch_.ray_columns + kIntensity] : T(0);
+      const T label = i < batch_.num_near ? batch_.rays[i * batch_.ray_columns + kRayIntensity] : T(0);
       const T error = predicted[i] - label;
       sum += static_cast<double>(std::abs(error));
       predicted[i] = error > 0 ? share : error < 0 ? -share : T(0);
@@ -174,7 +172,7 @@ class Batch {
     if (field_.sdf_input) *x++ = out[0];
     if (field_.view_direction) x += kHarmonics;
     if (field_.log_range) {
-      const T range_m = batch_.rays[i * batch_.ray_columns + kRange] - batch_.sdf_m[i];
+      const T range_m = batch_.rays[i * batch_.ray_columns + kRayRange] - batch_.sdf_m[i];
       *x = std::log10(std::max(range_m, T(1e-3)) / 10);
     }
   }

@@ -14,6 +14,10 @@
 
 namespace radarsdf {
 
+// A ray is a row: return (3), direction (3), range and, where intensities are learnt, the label of its intensity. These
+// are the first columns of the parts, and the number of columns.
+constexpr std::int64_t kRayPoint = 0, kRayDirection = 3, kRayRange = 6, kRayIntensity = 7, kRayColumns = 8;
+
 // What is learnt, as python/radarsdf/field.py puts it together.
 template <typename T>
 struct FieldLayers {

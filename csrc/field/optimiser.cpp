@@ -15,7 +15,7 @@ void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batch
   const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
   const AdamKernel<T> adam_kernel = RADARSDF_KERNEL(adam_kernel<T>)();
   const int groups = num_vertex_groups(table.encoding());
-  const std::int64_t corners = table.encoding() == Encoding::kTriQuadtree ? 4 : 8;
+  const std::int64_t corners = corners_per_group(table.encoding());
   std::int64_t points = 0;
   for (const PointBatch<T>& batch : batches) points += batch.count;
   // Kept from call to call: fresh pages would cost as much as the sums.

@@ -52,8 +52,6 @@ struct InterpolationKernels {
                               T* points_grad, std::int64_t begin, std::int64_t end);
 };
 
-inline int num_vertex_groups(Encoding encoding) { return encoding == Encoding::kTriQuadtree ? 3 : 1; }
-
 #define RADARSDF_DECLARE_KERNELS(isa)                                      \
   namespace isa {                                                          \
   template <typename T>                                                    \

@@ -17,6 +17,10 @@
 
 namespace radarsdf {
 
+// The corners of a cell that carry features, in groups: one for each plane of a tri-quadtree, or one for all of space.
+constexpr int num_vertex_groups(Encoding encoding) { return encoding == Encoding::kTriQuadtree ? 3 : 1; }
+constexpr int corners_per_group(Encoding encoding) { return encoding == Encoding::kTriQuadtree ? 4 : 8; }
+
 class VertexTable {
  public:
   // leaf_keys: Morton keys of the occupied leaf cells, ascending and unique (CellSet::sorted_keys). Rows are numbered

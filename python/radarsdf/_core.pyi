@@ -13,6 +13,15 @@ __all__: list[str] = [
     "CellBlocks",
     "CellSet",
     "Encoding",
+    "FEATURE_DIM",
+    "MAX_FREQUENCIES",
+    "MAX_LEVELS",
+    "NUM_SPHERICAL_HARMONICS",
+    "RAY_COLUMNS",
+    "RAY_DIRECTION",
+    "RAY_INTENSITY",
+    "RAY_POINT",
+    "RAY_RANGE",
     "SurfelMap",
     "TaskQueue",
     "VertexTable",
@@ -108,7 +117,17 @@ class Encoding:
     def __setstate__(self, state: typing.SupportsInt | typing.SupportsIndex) -> None: ...
     def __str__(self) -> str: ...
     @property
+    def corners_per_group(self) -> int:
+        """
+        Corners of a cell in each group.
+        """
+    @property
     def name(self) -> str: ...
+    @property
+    def num_vertex_groups(self) -> int:
+        """
+        Groups of a cell's corners: three planes, or all of space.
+        """
     @property
     def value(self) -> int: ...
 
@@ -711,4 +730,13 @@ def sum_moments(
     Sums over the returns of each cell, (num_cells, 13): 1, x, y, z, xx, xy, xz, yy, yz, zz, direction. `points` and `directions` (N, 3) float32; `cells` (N,) int32, the row of each return's cell.
     """
 
+FEATURE_DIM: int = 8
+MAX_FREQUENCIES: int = 24
+MAX_LEVELS: int = 12
+NUM_SPHERICAL_HARMONICS: int = 16
+RAY_COLUMNS: int = 8
+RAY_DIRECTION: int = 3
+RAY_INTENSITY: int = 7
+RAY_POINT: int = 0
+RAY_RANGE: int = 6
 __version__: str
