@@ -15,7 +15,7 @@ from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 
-from .conftest import ground_and_wall
+from ..conftest import ground_and_wall
 
 
 def rays_down(heights, half_m=3.0, spacing_m=0.05):

@@ -15,7 +15,7 @@ from radarsdf import FitConfig
 from radarsdf.budget.schedule import Schedule
 from radarsdf.fitting.sampling import Dropout, RaySampler
 
-from .conftest import ground_and_wall
+from ..conftest import ground_and_wall
 
 QUICK = FitConfig(sdf_iterations=20, intensity_iterations=20, batch_size=1024)
 

@@ -18,7 +18,7 @@ from radarsdf.returns.rays import prepare
 from radarsdf.returns.support import support_of_points
 from radarsdf.returns.surfels import Surfels
 
-from .conftest import ground_and_wall
+from ..conftest import ground_and_wall
 
 CELL_M = 0.4
 LEAF_M = 0.2

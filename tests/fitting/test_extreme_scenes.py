@@ -12,8 +12,8 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.returns.rays import prepare
 
-from .conftest import SEED, pose
-from .conftest import ground_and_wall as any_ground_and_wall
+from ..conftest import SEED, pose
+from ..conftest import ground_and_wall as any_ground_and_wall
 
 QUICK = FitConfig(
     sdf_iterations=60, intensity_iterations=80, batch_size=512, intensity_batch_size=512, min_range_m=0.0, num_threads=1,

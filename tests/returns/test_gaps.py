@@ -13,7 +13,7 @@ from radarsdf.returns.gaps import _MAX_SUPPORT, bridged
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.support import support_of_points
 
-from .conftest import ground_and_wall
+from ..conftest import ground_and_wall
 
 LEAF_M = 0.2
 

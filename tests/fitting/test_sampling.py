@@ -13,7 +13,7 @@ from radarsdf import FitConfig
 from radarsdf.fitting.sampling import Dropout, RaySampler
 from radarsdf.returns.rays import prepare
 
-from .conftest import pose
+from ..conftest import pose
 
 NUM_RAYS = 1000
 

@@ -9,7 +9,7 @@ import pytest
 from radarsdf import _core
 from radarsdf.map.isosurface import extract_cells, marching_cubes, sparse_lattice
 
-from .mesh_checks import (
+from ..mesh_checks import (
     area,
     cells_in_use,
     euler_characteristic,
@@ -25,7 +25,7 @@ from .mesh_checks import (
     sphere,
     torus,
 )
-from .reference_marching_cubes import reference_marching_cubes
+from ..reference_marching_cubes import reference_marching_cubes
 
 
 @pytest.mark.parametrize(

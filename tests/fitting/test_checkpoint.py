@@ -104,7 +104,7 @@ def test_a_killed_fit_goes_on_from_what_was_written_last(scene, tmp_path):
 import os, signal
 import radarsdf.fitting.checkpoint
 from tests.conftest import ground_and_wall
-from tests.test_checkpoint import fitted
+from tests.fitting.test_checkpoint import fitted
 radarsdf.fitting.checkpoint._EVERY_S = 0.0
 radarsdf.fitting.checkpoint._SHARE = 1e9
 write, count = radarsdf.fitting.checkpoint.Checkpoint.write, 0

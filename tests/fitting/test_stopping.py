@@ -23,7 +23,7 @@ from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.scans import Scans, write_scans
 
-from .conftest import ground_and_wall
+from ..conftest import ground_and_wall
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 LONG = {"sdf_iterations": 1_000_000, "batch_size": 512}

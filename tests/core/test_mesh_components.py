@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from radarsdf.map.isosurface import marching_cubes, mesh_components
 
-from .mesh_checks import directed_edges, grid, noise
+from ..mesh_checks import directed_edges, grid, noise
 
 
 def test_components_are_labelled_in_order():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from radarsdf.map.isosurface import extract_cells, marching_cubes, sparse_lattice
 
-from .mesh_checks import (
+from ..mesh_checks import (
     cells_in_use,
     euler_characteristic,
     has_single_cycle_links,
@@ -25,7 +25,7 @@ from .mesh_checks import (
     sphere,
     torus,
 )
-from .reference_marching_cubes import reference_marching_cubes
+from ..reference_marching_cubes import reference_marching_cubes
 
 EXAMPLES = int(os.environ.get("RADARSDF_EXAMPLES", "0"))
 LIMITS = settings(max_examples=EXAMPLES or 40, derandomize=not EXAMPLES, deadline=None, database=None)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Batches and iterations follow the size of the data. How many passes a small scene gets is in test_fitting."""
+"""Batches and iterations follow the size of the data. How many passes a small scene gets is in fitting/test_fit.py."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.voxels import _corner_distances, _crossed, _smooth_in_cells, _voxels_of
 from scipy.spatial import KDTree
 
-from .conftest import ground_and_wall
-from .mesh_checks import has_single_cycle_links, single_edges
+from ..conftest import ground_and_wall
+from ..mesh_checks import has_single_cycle_links, single_edges
 
 UTM = np.array([5e5, 5.4e6, 300.0])
 SENSOR = np.array([3.0, 0.0, 1.5])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from radarsdf.io.scans import Scans, read_scans, write_scans
 
-from .conftest import pose
+from ..conftest import pose
 
 
 def arrays():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from radarsdf.returns.rays import check_poses, prepare
 
-from .conftest import pose
+from ..conftest import pose
 
 
 def tilted_pose(seed, position):
