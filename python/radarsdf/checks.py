@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 MAX_POSITION_M = 1e12
 """Further out than the planets, yet squares and products of three such lengths are far from overflow."""
 
+_MAX_ROTATION_ERROR = 1e-3  # of R R^T - 1: float32 poses pass, a scaled or sheared one does not
+
 
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
     """`values` as an array of floats, of any shape, not copied where it is one already.
@@ -50,6 +52,29 @@ def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
         msg = f"{name} must be finite, and within {MAX_POSITION_M:g} m"
         raise ValueError(msg)
     return points
+
+
+def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
+    """`poses` as (F, 4, 4) float64, or a ValueError that names the first that is not a rigid transform."""
+    T_world_sensor = real_array(poses, "poses")
+    if T_world_sensor.shape != (num_scans, 4, 4):
+        msg = f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
+        raise ValueError(msg)
+    rotation = T_world_sensor[:, :3, :3]
+    with np.errstate(all="ignore"):  # of what is refused
+        rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        rigid = (
+            (np.abs(T_world_sensor) <= MAX_POSITION_M).all(axis=(1, 2))
+            & (rotation_error < _MAX_ROTATION_ERROR)
+            & (np.linalg.det(rotation) > 0)
+            & (T_world_sensor[:, 3] == [0, 0, 0, 1]).all(axis=1)
+        )
+    if not rigid.all():
+        msg = (
+            f"pose {int(np.argmin(rigid))} is not a rigid transform (rotation, translation, last row 0 0 0 1)"
+        )
+        raise ValueError(msg)
+    return T_world_sensor
 
 
 def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:

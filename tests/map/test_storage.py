@@ -15,7 +15,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.map import storage
+from radarsdf.io import files
 from safetensors import safe_open
 from safetensors.torch import save_file
 
@@ -280,7 +280,7 @@ def test_a_failing_save_leaves_the_old_file_and_nothing_else(saved, tmp_path, mo
     if failing == "fsync":
         monkeypatch.setattr(os, "fsync", fail)
     else:
-        monkeypatch.setattr(storage.Path, "replace", fail)
+        monkeypatch.setattr(files.Path, "replace", fail)
     with pytest.raises(OSError, match="no space left"):
         radar_map.save(path)
     assert [p.name for p in tmp_path.iterdir()] == ["map.safetensors"]

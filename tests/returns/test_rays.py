@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.returns.rays import check_poses, prepare
+from radarsdf.checks import check_poses
+from radarsdf.returns.rays import prepare
 
 from ..conftest import pose
 

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.config import FitConfig
-from radarsdf.io.scans import check_regular_file
-from radarsdf.map.storage import write_whole
+from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.returns.rays import Rays
 
 if TYPE_CHECKING:

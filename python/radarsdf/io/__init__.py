@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files in and out: formats, folders, atomic writes."""
+"""Reads and writes files of scans, poses and point clouds. Imports only `checks` and `_core` of this package."""

@@ -17,10 +17,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
+from radarsdf.checks import check_poses
 from radarsdf.io.pcd import read_pcd
 from radarsdf.io.scans import Scans
 from radarsdf.io.trajectory import Trajectory, read_table, read_trajectory
-from radarsdf.returns.rays import check_poses
 
 MAX_GAP_S = 0.5
 """Over a longer time without a pose, no pose is made up."""

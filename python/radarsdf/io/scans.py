@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-import stat
+import io
 import zipfile
 from dataclasses import dataclass
 from os import PathLike
@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from radarsdf.io.files import check_regular_file, write_whole
 
 _ARRAYS = ("points", "frame", "poses", "intensity", "static", "lidar_points")
 # A few megabytes of zeros can unpack to gigabytes. Measurements, which are mostly noise, compress by two to five.
@@ -121,18 +123,21 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         return arrays
 
 
-def check_regular_file(path: str | PathLike[str]) -> None:
-    """An OSError that names the path where it cannot be read, a ValueError where it is a pipe or a device, which could
-    keep a reader waiting, or feed it, for ever."""
-    if not Path(path).is_dir() and not stat.S_ISREG(Path(path).stat().st_mode):
-        msg = f"{path} is not a regular file"
-        raise ValueError(msg)
-    with open(path, "rb"):  # noqa: PTH123 - of a directory too, whose error it is
-        pass
-
-
 def write_scans(path: str | PathLike[str], scans: Scans) -> None:
-    """Writes scans as the ``.npz`` file that :func:`read_scans` reads."""
+    """Writes scans as the ``.npz`` file that :func:`read_scans` reads, whole or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        Where the file goes. ``.npz`` is appended where it is missing.
+    scans : Scans
+        At least one scan. Where `intensities` or `ground_truth` is None, the file lacks its array.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
     arrays: dict[str, NDArray[Any]] = {
         "points": np.concatenate(scans.points),
         "frame": np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points]),
@@ -142,4 +147,9 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
         arrays["intensity"] = np.concatenate(scans.intensities)
     if scans.ground_truth is not None:
         arrays["lidar_points"] = scans.ground_truth
-    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    target = Path(path)
+    write_whole(
+        target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz"), file.getvalue()
+    )

@@ -6,10 +6,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import secrets
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +19,7 @@ from torch import Tensor
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
-from radarsdf.io.scans import check_regular_file
+from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.map.contents import MapContents
 
 FORMAT = "radarsdf.map"
@@ -72,22 +69,6 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "report": contents.report,
     }
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
-
-
-def write_whole(path: str | PathLike[str], data: bytes) -> None:
-    """Writes a file; the old one, if any, is replaced only once the new one is on the disk."""
-    target = Path(path)
-    # Not tempfile, whose files only their owner may read, and a map would stay so.
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
-    try:
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def load_contents(path: str | PathLike[str]) -> MapContents:

@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
+import io
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.render.raster import PIXELS_AT_ONCE, barycentric, contours, corner_normals, project, rasterise
 
@@ -164,7 +166,9 @@ def save_picture(
         bar.ax.tick_params(labelsize=12)
         bar.outline.set_visible(False)
     figure.figimage(image, 0, 0)
-    figure.savefig(path, format="png", dpi=dpi)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=dpi)
+    write_whole(path, file.getvalue())
 
 
 def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tuple[_Floats, _Floats]:

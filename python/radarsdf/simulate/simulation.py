@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.returns.rays import check_poses
+from radarsdf.checks import check_poses
 
 from .radar import Origin, RadarSensor, generator, unit_vectors
 from .scene import Scene
