@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How good is a map: its surface against lidar, its intensity against held-out radar frames.
+"""Errors of a map: its surface against lidar points, its intensity against held-out radar scans.
 
-Nothing here knows how a map was made, so that meshes and predictions of other programs can be measured alike.
+The functions take meshes and arrays, not maps, so they measure the results of other programs in the same way.
 """
 
 from ._report import format_metrics

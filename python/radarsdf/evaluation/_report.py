@@ -19,17 +19,18 @@ def _percent(ratio: float) -> str:
 
 
 def format_metrics(metrics: SurfaceMetrics | IntensityMetrics) -> str:
-    """Write metrics as a few aligned lines for people.
+    """Write metrics as a few aligned lines of text.
 
     Parameters
     ----------
-    metrics
-        What `surface_metrics` or `intensity_metrics` returned.
+    metrics : SurfaceMetrics or IntensityMetrics
+        Result of `surface_metrics` or `intensity_metrics`.
 
     Returns
     -------
     str
-        Lines without a trailing newline; errors in centimetres and ratios in percent, as in the paper's tables.
+        Lines without a trailing newline. Surface errors are in centimetres and ratios in percent, as in the paper's
+        tables; intensity errors are in sensor units.
 
     Examples
     --------

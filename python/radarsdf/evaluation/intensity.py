@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Intensity against held-out frames, and the nearest-neighbour baseline to be beaten."""
+"""Errors of intensities on held-out scans, and the nearest-neighbour baseline of the paper."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.checks import MAX_POSITION_M, positive, real_array, whole_number
+from radarsdf.threads import resolve_num_threads
 
 INTENSITY_PROTOCOL = "radarsdf-intensity-1"
-"""Name and version of the definitions in `intensity_metrics`; a change of any number's meaning changes it."""
+"""Name and version of the definitions in `intensity_metrics`. It changes when the meaning of a number changes."""
 
-_MAX_FRAMES = 10**8  # 58 days at 20 Hz; a larger number is a mistake, and would fill the memory
-_MAX_INTENSITY = 1e100  # the sum of as many as memory holds is finite
-_CHUNK = 1 << 17  # queries at a time: 20 candidates of each take about 150 MB
+_MAX_FRAMES = 10**8  # 58 days at 20 Hz; a larger number is a mistake and would fill the memory
+_MAX_INTENSITY = 1e100  # a sum of as many intensities as fit in memory stays finite
+_CHUNK = 1 << 17  # queries at a time; 20 candidates for each take about 150 MB
 
 
 class IntensityMetrics(TypedDict):
@@ -35,8 +36,8 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
 
     Parameters
     ----------
-    predicted, measured
-        (N,) intensities in the sensor's own units.
+    predicted, measured : (N,) array_like
+        Intensities, sensor units.
 
     Returns
     -------
@@ -46,8 +47,10 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
     Raises
     ------
     ValueError
-        If the shapes differ, there is no return, or a value is not finite: a return without a prediction
-        has to be given one, since leaving it out would flatter the method.
+        If the shapes differ, there is no return, or a value is not finite. Every return needs a prediction: a method
+        that leaves out difficult returns would look better than it is.
+    TypeError
+        If the values are not real numbers.
     """
     p, m = real_array(predicted, "predicted"), real_array(measured, "measured")
     if p.ndim != 1 or p.shape != m.shape:
@@ -69,28 +72,28 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
 
 
 def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Split frames into those to train on and those held out.
+    """Split scans into training scans and held-out scans.
 
-    The first frame is held out and then every `every`-th: 0, 10, 20, … of the frames in ascending order. The
-    paper holds out every tenth point cloud and leaves open with which one it begins.
+    In ascending order, scans 0, `every`, 2 · `every`, … are held out. The paper holds out every tenth scan and does
+    not say which is the first.
 
     Parameters
     ----------
-    frames
-        Number of frames F, standing for frames 0 … F-1; or frame numbers, one per frame or one per return,
-        in any order and with repetitions.
-    every
-        Distance between held-out frames, at least 2.
+    frames : int or iterable of int
+        Number of scans F, for the scans 0 … F-1; or the scan numbers, one for each scan or one for each return, in any
+        order and with repetitions.
+    every : int
+        Distance between held-out scans, at least 2.
 
     Returns
     -------
     train, test : (A,), (B,) int64
-        Frame numbers, ascending. Select returns with ``numpy.isin(frame, test)``.
+        Scan numbers, ascending. Select returns with ``numpy.isin(frame, test)``.
 
     Raises
     ------
     ValueError
-        If `every` is below 2 or there are fewer than two frames, which would leave nothing to train on.
+        If `every` is below 2, or there are fewer than two scans: no scan would be left to train on.
 
     Examples
     --------
@@ -104,13 +107,13 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
     else:
         numbers = np.unique(np.asarray(frames))
     if numbers.ndim != 1 or not (numbers.size == 0 or np.issubdtype(numbers.dtype, np.integer)):
-        msg = "frames must be a number of frames or integer frame numbers"
+        msg = "frames must be a number of scans or integer frame numbers"
         raise ValueError(msg)
     if numbers.size and numbers[-1] > np.iinfo(np.int64).max:
         msg = "frame numbers must fit int64"
         raise ValueError(msg)
     if every < 2 or numbers.size < 2:
-        msg = f"cannot hold out every {every}th of {numbers.size} frames: something must remain to train on"
+        msg = f"cannot hold out every {every}th of {numbers.size} scans: at least one must remain to train on"
         raise ValueError(msg)
     held_out = np.arange(numbers.size) % every == 0
     return numbers[~held_out].astype(np.int64), numbers[held_out].astype(np.int64)
@@ -119,32 +122,37 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
 class KNNIntensity:
     """Intensity from the nearest returns seen from a similar direction: the paper's baseline.
 
-    Of the `candidates` returns nearest in space, the `k` whose viewing direction differs least are averaged with
-    weights 1 / ((distance + distance_scale_m) · (angle + angle_scale_rad)).
+    The search takes the `candidates` returns that are nearest in space, and of these the `k` with the most similar
+    viewing direction. Their intensities are averaged with the weights
+    1 / ((distance + distance_scale_m) · (angle + angle_scale_rad)).
 
     Parameters
     ----------
-    points_world
-        (N, 3) returns of the training frames, world frame, metres.
-    sensor_positions
-        (N, 3) or (3,) sensor origin of each return, world frame, metres.
-    intensities
-        (N,) in the sensor's own units.
-    candidates, k
+    points_world : (N, 3) array_like
+        Returns of the training scans, world frame, m.
+    sensor_positions : (N, 3) or (3,) array_like
+        Position of the sensor for each return, world frame, m.
+    intensities : (N,) array_like
+        Sensor units.
+    candidates, k : int
         Sizes of the two selections, 1 ≤ k ≤ candidates.
-    distance_scale_m, angle_scale_rad
-        Below these a smaller distance or angle is no evidence of more likeness (noise of the returns), and no
-        single neighbour takes all the weight.
-    num_threads
-        Threads of the spatial search; below 1 means all.
+    distance_scale_m, angle_scale_rad : float
+        Noise of the returns: differences far below these values do not change a weight, so no single return takes all
+        the weight.
+    num_threads : int
+        Threads of the search; 0 means as many as PyTorch uses.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If a shape is wrong, a value is not finite or out of its range, or a return lies at the sensor itself.
 
     Notes
     -----
-    The paper names neither numbers nor weights. The defaults were chosen on the held-out frames of four scenes
-    of an automotive radar, so that the baseline is as strong as it can fairly be. There an average over many
-    counts more than likeness of view, as intensity fluctuates from frame to frame: 4 of 128 candidates were a
-    tenth worse, 16 of 16 one percent better (the angle then only weighs). Where the view decides, as with a
-    corner reflector, more candidates help.
+    The paper gives neither the numbers nor the weights. The defaults were chosen on the held-out scans of four scenes
+    of an automotive radar, to make the baseline as strong as possible. There the intensity fluctuates from scan to
+    scan, so an average over many returns counts more than a similar view: k = 4 of 128 candidates had 10 % more error,
+    k = 16 of 16 had 1 % less. Where the view decides, as at a corner reflector, more candidates help.
     """
 
     def __init__(
@@ -157,12 +165,12 @@ class KNNIntensity:
         k: int = 16,
         distance_scale_m: float = 0.1,
         angle_scale_rad: float = 0.1,
-        num_threads: int = -1,
+        num_threads: int = 0,
     ) -> None:
         points, directions = _rays(points_world, sensor_positions)
         values = real_array(intensities, "intensities")
         if len(points) == 0:
-            msg = "a baseline needs at least one return"
+            msg = "the baseline needs at least one return"
             raise ValueError(msg)
         if values.shape != (len(points),) or not (np.abs(values) <= _MAX_INTENSITY).all():
             msg = f"intensities must be ({len(points)},) and finite, but have shape {values.shape}"
@@ -180,23 +188,27 @@ class KNNIntensity:
         self._candidates = min(candidates, len(points))
         self._k = min(k, len(points))
         self._scales = distance_scale_m, angle_scale_rad
-        self._workers = num_threads if num_threads > 0 else -1
+        self._num_threads = whole_number(num_threads, "num_threads", 0)
 
     def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> NDArray[np.float64]:
         """Predict the intensity of returns.
 
         Parameters
         ----------
-        x
-            (M, 3) points, world frame, metres.
-        sensor_positions
-            (M, 3) or (3,) where each is seen from, world frame, metres.
+        x : (M, 3) array_like
+            Points, world frame, m.
+        sensor_positions : (M, 3) or (3,) array_like
+            Position of the sensor for each point, world frame, m.
 
         Returns
         -------
         (M,) float64
-            Intensity in the sensor's own units. Defined everywhere: far from all returns it is that of the
-            nearest ones.
+            Intensities, sensor units. They are defined everywhere: far from all returns, the nearest returns decide.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If a shape is wrong, a value is not finite, or a point lies at the sensor itself.
         """
         points, directions = _rays(x, sensor_positions)
         predicted = np.zeros(len(points))
@@ -206,8 +218,9 @@ class KNNIntensity:
         return predicted
 
     def _predict(self, points: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        ranks = np.arange(1, self._candidates + 1)  # a list, so that one candidate still gives two dimensions
-        distance, index = self._tree.query(points, k=ranks, workers=self._workers)
+        ranks = np.arange(1, self._candidates + 1)  # with k=1 as a number, the result would lose a dimension
+        workers = resolve_num_threads(self._num_threads)
+        distance, index = self._tree.query(points, k=ranks, workers=workers)
         chord = np.linalg.norm(self._directions[index] - directions[:, None], axis=2)
         angle = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))  # accurate at small angles, unlike arccos
         if self._k < self._candidates:
@@ -221,7 +234,7 @@ class KNNIntensity:
 
 
 def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Check points and sensor positions; return the points and unit vectors from the sensor to them."""
+    """Points (N, 3) and the unit vectors (N, 3) from the sensor to each, after checks of both arguments."""
     x, s = real_array(points, "points"), real_array(sensors, "sensor positions")
     if x.ndim != 2 or x.shape[1] != 3 or s.shape not in {x.shape, (3,)}:
         msg = f"points must be (N, 3) and sensor positions (N, 3) or (3,), not {x.shape} and {s.shape}"
@@ -232,6 +245,6 @@ def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[NDArray[np.float64], N
     ray = x - s
     length = np.linalg.norm(ray, axis=1, keepdims=True)
     if (length == 0).any():
-        msg = "points and sensor positions must differ: each point needs a viewing direction"
+        msg = "a point lies at its sensor position: it has no viewing direction"
         raise ValueError(msg)
     return x, ray / length

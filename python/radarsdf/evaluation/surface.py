@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A mesh against lidar points: accuracy, completion, F-score and smoothness."""
+"""Errors of a mesh against lidar points: accuracy, completion, F-score and smoothness."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from scipy.spatial import cKDTree
 
 from radarsdf._core import cell_keys
 from radarsdf.checks import positions, positive, real_array, whole_number
+from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
     import trimesh
 
 PROTOCOL = "radarsdf-surface-1"
-"""Name and version of the definitions in `surface_metrics`; a change of any number's meaning changes it."""
+"""Name and version of the definitions in `surface_metrics`. It changes when the meaning of a number changes."""
 
-_CHUNK = 500_000  # samples at a time: bounds the memory, and part of the protocol's random sequence
-_ANGLE_NOISE_RAD = 1e-7  # what float64 leaves of equal angles: 1e-9 m of a UTM northing over an edge of 1 cm
+_CHUNK = 500_000  # samples at a time. Bounds the memory; the protocol's random numbers depend on it
+_ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in float64 over an edge of 1 cm
 _Points = NDArray[np.float64]
 
 
@@ -63,62 +64,64 @@ def surface_metrics(
     threshold_m: float = 0.2,
     outlier_m: float = 0.4,
     truncation_m: float = 2.0,
-    num_threads: int = -1,
+    num_threads: int = 0,
 ) -> SurfaceMetrics:
     """Measure a mesh against ground-truth points by the paper's definitions.
 
     Parameters
     ----------
-    mesh
-        The surface, world frame, metres. Orientation does not matter; vertices must be shared between
-        neighbouring triangles for the angles (a soup of triangles has none).
-    ground_truth
-        (M, 3) lidar points, world frame, metres. The same points serve accuracy and completion.
-    box
-        (2, 3) lower and upper corner, world frame; only what lies in it counts, bounds included, of mesh samples
-        and ground truth alike. None takes everything, which is rarely fair: radar and lidar see differently far.
-    samples
-        Points drawn uniformly by area on the triangles whose bounds touch the box; those outside the box are
-        then dropped (`num_mesh_samples` remain).
-    seed
-        Of the random samples. The same arguments give the same numbers, whatever `num_threads` is.
-    threshold_m
-        Distance below which a point counts as right.
-    outlier_m
-        Mesh samples farther than this from the ground truth are left out of the accuracy.
-    truncation_m
-        A ground-truth point farther than this from the mesh counts as this far.
-    num_threads
-        Threads of the nearest-neighbour search; below 1 means all.
+    mesh : trimesh.Trimesh
+        The surface, world frame, m. Its orientation does not matter. For the angles, neighbouring triangles must share
+        vertices.
+    ground_truth : (M, 3) array_like
+        Lidar points, world frame, m. Accuracy and completion use the same points.
+    box : (2, 3) array_like, optional
+        Lower and upper corner, world frame, m. Mesh samples and ground truth outside it do not count. None takes
+        everything, which is rarely fair: radar and lidar have different ranges.
+    samples : int
+        Points drawn uniformly by area on the triangles whose bounds touch the box. Those outside the box are then
+        dropped; `num_mesh_samples` remain.
+    seed : int
+        Seed of the samples. The same arguments give the same numbers, with any `num_threads`.
+    threshold_m : float
+        A point nearer than this counts as correct.
+    outlier_m : float
+        The accuracy leaves out mesh samples farther than this from the ground truth.
+    truncation_m : float
+        A ground-truth point farther than this from the mesh counts with this distance.
+    num_threads : int
+        Threads of the nearest-neighbour search; 0 means as many as PyTorch uses.
 
     Returns
     -------
     SurfaceMetrics
-        - `accuracy_error_m`: mean distance mesh sample → ground truth of those within `outlier_m`, None if there
-          are none; `accuracy_ratio`: share *of these* below `threshold_m`, 0 if there are none;
-          `outlier_ratio`: share of the samples that was left out.
-        - `completion_error_m`: mean distance ground truth → nearest mesh sample, truncated;
+        - `accuracy_error_m`: mean distance from a mesh sample to the ground truth, over the samples within `outlier_m`.
+          None if there are none. `accuracy_ratio`: share *of these* below `threshold_m`, 0 if there are none.
+          `outlier_ratio`: share of the samples that were left out.
+        - `completion_error_m`: mean truncated distance from a ground-truth point to the nearest mesh sample.
           `completion_ratio`: share below `threshold_m`.
-        - `f_score`: harmonic mean of `accuracy_ratio` and `completion_ratio`. It is blind to a mesh that fills
-          the void, hence `precision`, the share of *all* samples below `threshold_m`, and `f_score_all`,
-          the harmonic mean of `precision` and `completion_ratio`.
-        - `gamma_shape`, `gamma_mean`, `gamma_variance`: see `gamma_from_moments`, over the `num_angles` edges
-          with two triangles and their midpoint in the box.
-        - `protocol`, the arguments, the counts, and a hash of the ground truth used (in the box, as float64).
+        - `f_score`: harmonic mean of `accuracy_ratio` and `completion_ratio`, as in the paper. It does not punish
+          surface in free space, whose samples are left out as outliers.
+        - `precision`: share of *all* samples below `threshold_m`. `f_score_all`: harmonic mean of `precision` and
+          `completion_ratio`, which does punish it.
+        - `gamma_shape`, `gamma_mean`, `gamma_variance`: see `gamma_from_moments`, over the `num_angles` edges that
+          have two triangles and their midpoint in the box.
+        - `protocol`, the arguments, the counts, and a hash of the ground truth in the box as float64.
 
     Raises
     ------
     ValueError
-        If the mesh has no area in the box or the ground truth no point in it, or an argument has a wrong
-        shape, is not finite or not positive.
+        If the mesh has no area or the ground truth no point in the box, or an argument has a wrong shape, is not finite
+        or not positive.
 
     Notes
     -----
-    Memory is bounded: beside mesh and ground truth, a block of samples and its search tree at a time (200 MB in
-    all for 400,000 triangles and 300,000 points).
-    A ground-truth point's distance is the exact one to the nearest of all samples, not to the triangles: even a
-    perfect mesh has a completion error of half the samples' spacing, 0.5 · sqrt(area / samples), 5 mm for 1e7 on
-    1000 m². Compare at equal `samples`.
+    Memory is bounded: besides mesh and ground truth, there is one block of samples and its search tree at a time,
+    200 MB in all for 400,000 triangles and 300,000 points.
+
+    The completion measures distances to samples, not to triangles. Even a perfect mesh has a completion error of half
+    the spacing of the samples, 0.5 · sqrt(area / samples): 5 mm for 1e7 samples on 1000 m². Compare meshes at equal
+    `samples`.
     """
     whole_number(samples, "samples", 1)
     positive(threshold_m, "threshold_m")
@@ -130,7 +133,7 @@ def surface_metrics(
         msg = "there are no ground-truth points" + ("" if corners is None else " in the box")
         raise ValueError(msg)
     digest = hashlib.sha256(points.tobytes()).hexdigest()
-    # Near the origin from here on, where differences of coordinates lose nothing.
+    # From here on relative to the mean: differences of large coordinates would lose digits.
     origin = points.mean(axis=0)
     points = points - origin
     vertices = positions(mesh.vertices, "mesh.vertices") - origin
@@ -138,14 +141,14 @@ def surface_metrics(
     if corners is not None:
         corners = corners - origin
 
-    workers = num_threads if num_threads > 0 else -1
+    workers = resolve_num_threads(whole_number(num_threads, "num_threads", 0))
     reach = max(outlier_m, threshold_m)
     tree = cKDTree(points)
     completion = np.full(len(points), float(truncation_m))
     total = kept = right_kept = right = 0
     kept_sum = 0.0
     for block in _sample_blocks(vertices, faces, corners, samples, np.random.default_rng(seed)):
-        # The search looks strictly below its bound; a sample at outlier_m still counts.
+        # The search finds distances strictly below its bound, and a sample at outlier_m exactly is an inlier.
         distance, _ = tree.query(block, distance_upper_bound=np.nextafter(reach, np.inf), workers=workers)
         inliers = distance[distance <= outlier_m]
         total += len(block)
@@ -190,20 +193,20 @@ def surface_metrics(
 
 
 def adjacent_angles(mesh: trimesh.Trimesh, *, box: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Angles between the triangles on both sides of an edge: the histogram that the paper shows.
+    """Angles between the triangles on both sides of each edge, of which the paper shows the histogram.
 
     Parameters
     ----------
-    mesh
-        As of `surface_metrics`.
-    box
-        (2, 3) lower and upper corner, world frame; only edges with their midpoint in it count. None takes all.
+    mesh : trimesh.Trimesh
+        As in `surface_metrics`.
+    box : (2, 3) array_like, optional
+        Lower and upper corner, world frame, m. Only edges with their midpoint in it count. None takes all.
 
     Returns
     -------
     (E,) float64
-        Radians: 0 where two triangles continue each other, π where they fold. Edges of one or more than two triangles
-        have no angle.
+        Radians: 0 where two triangles lie in one plane, π where one is folded onto the other. Edges with one triangle,
+        or with more than two, have no angle.
 
     Raises
     ------
@@ -222,21 +225,21 @@ def gamma_from_moments(angles_rad: ArrayLike) -> tuple[float | None, float | Non
 
     Parameters
     ----------
-    angles_rad
-        (N,) angles between adjacent triangles, radians: 0 where they continue each other, π where they fold.
+    angles_rad : (N,) array_like
+        Angles between adjacent triangles, as of `adjacent_angles`.
 
     Returns
     -------
     shape, mean, variance : float or None
-        Mean and variance are those of the angles, shape = mean² / variance. All None without an angle; shape is
-        None if the variance is zero, as on a plane, where no Gamma distribution fits.
+        Mean and variance of the angles, in rad and rad², and shape = mean² / variance. All are None without an angle.
+        The shape is None where the variance is zero, as on a plane: no Gamma distribution fits.
 
     Notes
     -----
-    The paper does not name its estimator. In all twelve rows of its table shape = mean² / variance within
-    rounding, so the distribution begins at zero (no free location), which any estimator with that would obey.
-    Maximum likelihood needs the mean logarithm of the angles: one angle of exactly zero makes it undefined, and
-    on flat walls its shape would be decided by rounding errors of 1e-8 rad. Moments exist always.
+    The paper does not name its estimator. In all twelve rows of its table shape = mean² / variance within rounding, so
+    its distribution begins at zero.
+    Maximum likelihood is not used: it needs the mean logarithm of the angles, which one angle of zero makes undefined,
+    and on flat walls rounding errors of 1e-8 rad would decide the shape.
     """
     angles = np.asarray(angles_rad, dtype=np.float64)
     if angles.size == 0:
@@ -282,7 +285,7 @@ def _sample_blocks(
     samples: int,
     rng: np.random.Generator,
 ) -> Iterator[_Points]:
-    """Draw samples uniformly by area, in blocks of neighbouring triangles, so that searches stay in cache."""
+    """Samples drawn uniformly by area, in blocks of neighbouring triangles, so that searches stay in cache."""
     if corners is not None and len(faces):
         x = vertices[faces]
         faces = faces[((x.max(axis=1) >= corners[0]) & (x.min(axis=1) <= corners[1])).all(axis=1)]
@@ -293,7 +296,7 @@ def _sample_blocks(
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if area.sum() == 0:
         return
-    # How many of independent uniform samples fall on each triangle: the same set as drawing one by one.
+    # The number of samples on each triangle, distributed as if the samples were drawn one by one.
     last = np.cumsum(rng.multinomial(samples, area / area.sum()))
     for start in range(0, samples, _CHUNK):
         index = np.searchsorted(last, np.arange(start, min(start + _CHUNK, samples)), side="right")
@@ -306,13 +309,13 @@ def _sample_blocks(
 
 
 def _morton_order(points: _Points) -> NDArray[np.intp]:
-    """Order points along a curve that keeps neighbours together (ten bits an axis, interleaved)."""
+    """Order (N,) of the points along a Morton curve, which keeps neighbours together; ten bits for each axis."""
     low, extent = points.min(axis=0), np.ptp(points, axis=0).max()
     return np.argsort(cell_keys(points - low, max(float(extent), 1e-9) / 1023), kind="stable")
 
 
 def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -> None:
-    """Lower `shortest`, each point's distance to all samples so far, where `block` has a nearer one."""
+    """Update `shortest` (M,), the distance of each point to all samples so far, with the samples of `block`."""
     low, high = block.min(axis=0), block.max(axis=0)
     gap = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
     candidates = np.flatnonzero(gap < shortest)
@@ -326,7 +329,7 @@ def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -
 
 
 def _angles(vertices: _Points, faces: NDArray[np.int64], corners: _Points | None) -> _Points:
-    """See `adjacent_angles`; vertices near the origin."""
+    """See `adjacent_angles`. The vertices must be near the origin."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     has_area = np.linalg.norm(normals, axis=1) > 0  # without it, a triangle has no direction
@@ -342,7 +345,8 @@ def _angles(vertices: _Points, faces: NDArray[np.int64], corners: _Points | None
         middle = vertices[edges[i]].mean(axis=1)
         inside = ((middle >= corners[0]) & (middle <= corners[1])).all(axis=1)
         i, j = i[inside], j[inside]
-    # Consistently wound neighbours run along their edge in opposite directions; turn those that do not.
+    # Two triangles of the same orientation run along their common edge in opposite directions. Otherwise one normal is
+    # turned round.
     turn = np.where(forward[i] == forward[j], -1.0, 1.0)[:, None]
     m, n = normals[i // 3], turn * normals[j // 3]
     sine, cosine = np.linalg.norm(np.cross(m, n), axis=1), np.einsum("ij,ij->i", m, n)

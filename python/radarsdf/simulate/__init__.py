@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Radar scans of made-up worlds whose true surface is known.
+"""Simulated radar scans of worlds whose true surface is known.
 
-`SCENES` has the ready-made ones by name; `simulate` scans a `Scene` of your own with a `RadarSensor`.
+`SCENES` holds the ready-made simulations by name. `simulate` scans your own `Scene` with a `RadarSensor`.
 
 Examples
 --------

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a surface does to a radar wave: how much comes back, from which angles, and how much it flickers."""
+"""Radar properties of surfaces: strength of the echo, its dependence on the angle, and its fading."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
-# A texture is three plane waves (rad/m), none of them along an axis, so that every face of a box shows it.
+# A texture is three plane waves (rad/m). None of them is along an axis, so that every face of a box shows it.
 _TEXTURE_WAVES = np.array([[1.7, 0.9, 1.3], [-0.8, 2.1, -1.1], [0.5, -1.2, 2.6]])
 
 
@@ -32,25 +32,25 @@ _TEXTURE_WAVES = np.array([[1.7, 0.9, 1.3], [-0.8, 2.1, -1.1], [0.5, -1.2, 2.6]]
 class Material:
     """Radar properties of a surface.
 
-    The echo of a surface at incidence angle θ is ``reflectivity_db`` plus, in dB, a diffuse lobe cos²θ and a
-    specular lobe exp(-θ²/2w²), weighted by ``specular``; both together are 1 at normal incidence.
+    The echo of a surface at the incidence angle θ is ``reflectivity_db`` + 10·log10(lobe), where lobe is the sum of a
+    diffuse lobe cos²θ and a specular lobe exp(-θ²/2w²), weighted by ``specular``. It is 1 at normal incidence.
 
     Raises
     ------
     ValueError
-        If a value is outside the range its comment gives.
+        If a value is outside the range in its comment.
     """
 
     name: str
     reflectivity_db: float  # echo at normal incidence, relative to the other materials [dB]
     specular: float = 0.5  # share of the specular lobe at normal incidence, 0..1
-    lobe_width_rad: float = 0.25  # standard deviation of the specular lobe [rad], > 0
-    looks: float = 3.0  # independent scatterers averaged in one return, > 0: few flicker much
-    texture_db: float = 0.0  # amplitude of the reflectivity's slow change over the surface [dB], >= 0
-    mirror_loss_db: float = np.inf  # loss of a wave mirrored by the surface [dB], >= 0; inf: rough, no ghosts
+    lobe_width_rad: float = 0.25  # w, standard deviation of the specular lobe [rad], > 0
+    looks: float = 3.0  # independent scatterers averaged in one return, > 0: few mean strong fading
+    texture_db: float = 0.0  # amplitude of the slow change of reflectivity over the surface [dB], >= 0
+    mirror_loss_db: float = np.inf  # loss of a wave mirrored by the surface [dB], >= 0; inf: no ghosts
 
     def __post_init__(self) -> None:
-        """Refuse values no surface can have."""
+        """Check the ranges."""
         if not 0 <= self.specular <= 1:
             msg = f"specular must be in [0, 1], not {self.specular}"
             raise ValueError(msg)
@@ -80,12 +80,12 @@ class Material:
         return lobe
 
     def echo_db(self, points: FloatArray, cos_incidence: FloatArray) -> FloatArray:
-        """Echo of the surface without the radar equation's range: reflectivity, texture and lobe.
+        """Echo of the surface without the loss by range: reflectivity, texture and lobe.
 
         Parameters
         ----------
         points : (N, 3) float64
-            Where the surface is hit, world frame, metres.
+            Hits on the surface, world frame, m.
         cos_incidence : (N,) float64
             As in `lobe_db`.
 
@@ -105,7 +105,8 @@ CONCRETE = Material("concrete", 3.0, specular=0.8, lobe_width_rad=0.3, texture_d
 BRICK = Material("brick", 1.0, specular=0.6, lobe_width_rad=0.4, texture_db=3.0, mirror_loss_db=18.0)
 GLASS = Material("glass", 0.0, specular=0.97, lobe_width_rad=0.12, looks=4.0, mirror_loss_db=5.0)
 METAL = Material("metal", 9.0, specular=0.9, lobe_width_rad=0.25, looks=2.0, mirror_loss_db=6.0)
-# Plates of a corner reflector: what they mirror into each other is the reflector's own lobe, not a ghost.
+# Plates of a corner reflector. They have no mirror loss: `CornerReflector.retro_db` stands for what they mirror into
+# each other.
 REFLECTOR = Material("reflector plate", -6.0, specular=0.5, looks=8.0)
 STEEL_POLE = Material("steel pole", 6.0, specular=0.6, lobe_width_rad=0.5)
 TREE = Material("tree", -2.0, specular=0.2, lobe_width_rad=0.6, looks=2.0, texture_db=2.0)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Solids that a ray can hit exactly: boxes, vertical cylinders and trihedral corner reflectors.
+"""Solids with exact ray intersections: boxes, vertical cylinders and trihedral corner reflectors.
 
-World frame: z up, metres. Signed distances are positive in free space, negative inside a solid.
+World frame: z up, m. Signed distances are positive in free space and negative inside a solid.
 """
 
 from __future__ import annotations
@@ -21,35 +21,38 @@ FloatArray = NDArray[np.float64]
 
 
 class Primitive(Protocol):
-    """What a scene asks of its parts. All arrays are float64, in the world frame and in metres."""
+    """Interface of a solid in a scene. All arrays are float64, in the world frame, in m."""
 
     @property
     def material(self) -> Material:
-        """The surface's radar properties."""
+        """Radar properties of the surface."""
 
     def bounding_sphere(self) -> tuple[FloatArray, float]:
-        """Centre (3,) and radius of a sphere round the primitive."""
+        """Centre (3,) and radius of a sphere that contains the solid."""
 
     def intersect(
         self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """First hits of (N, 3) rays: range (N,), inf where none is within (N,) `max_range_m`, and normals (N, 3)."""
+        """First hits of (N, 3) rays: ranges (N,) and unit normals (N, 3).
+
+        The range is inf where there is no hit within `max_range_m` (N,). Its normal then has no meaning.
+        """
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
-        """Distance (N,) of (N, 3) points to the surface, negative inside."""
+        """Distances (N,) of points (N, 3) to the surface, negative inside."""
 
     def echo_db(self, points: FloatArray, directions: FloatArray, normals: FloatArray) -> FloatArray:
-        """Echo (N,) in dB of (N, 3) hits seen along (N, 3) unit directions, without the loss by range."""
+        """Echo (N,), dB, of hits (N, 3) seen along unit directions (N, 3), without the loss by range."""
 
 
 def cos_incidence(directions: FloatArray, normals: FloatArray) -> FloatArray:
-    """Cosine (N,) between (N, 3) normals and the way back to the sensor."""
+    """Cosine (N,) between the normals (N, 3) and the directions back to the sensor."""
     cos: FloatArray = -np.einsum("ni,ni->n", directions, normals)
     return cos
 
 
 def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Divide, with a tiny denominator instead of zero: a parallel ray meets the plane very far away."""
+    """Quotient with a tiny denominator instead of zero, so that a ray parallel to a plane hits it very far away."""
     tiny = np.abs(denominator) < 1e-12
     result: FloatArray = numerator / np.where(tiny, np.where(denominator < 0, -1e-12, 1e-12), denominator)
     return result
@@ -57,10 +60,10 @@ def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A solid box, turned round the vertical axis only."""
+    """A solid box, turned about the vertical axis only."""
 
-    center: FloatArray  # (3,) world, metres
-    half_extents: FloatArray  # (3,) along its own axes, metres
+    center: FloatArray  # (3,) world, m
+    half_extents: FloatArray  # (3,) along its own axes, m
     yaw_rad: float
     material: Material
 
@@ -103,7 +106,7 @@ class Box:
 class Pole:
     """A solid vertical cylinder."""
 
-    base: FloatArray  # (3,) middle of the lower end, world, metres
+    base: FloatArray  # (3,) centre of the lower end, world, m
     radius_m: float
     height_m: float
     material: Material
@@ -152,21 +155,21 @@ class Pole:
 
 @dataclass(frozen=True, eq=False)
 class CornerReflector:
-    """A trihedral of three right-angled triangular plates, open towards `axis`.
+    """A trihedral corner reflector of three right-angled triangular plates, open towards `axis`.
 
-    The plates are infinitely thin, so its distance is never negative. Seen from within its lobe, every plate
-    sends the wave back the way it came: the echo depends on the angle to the axis, not on the plate's normal.
+    The plates are infinitely thin, so distances are never negative. The echo is the sum of that of the plates and of a
+    lobe that depends only on the angle to the axis: the three plates together send a wave back where it came from.
     """
 
-    apex: FloatArray  # (3,) world, metres
+    apex: FloatArray  # (3,) world, m
     axis: FloatArray  # (3,) unit vector out of the opening, world
     edge_m: float  # length of the three edges that meet in the apex
-    material: Material  # of the plates, as seen from outside the lobe
+    material: Material  # of the plates
     retro_db: float = 25.0  # echo on the axis, above `material.reflectivity_db` [dB]
     retro_width_rad: float = 0.28  # standard deviation of the lobe; 0.28 is the usual 3 dB cone of 38 degrees
 
     def edges(self) -> FloatArray:
-        """(3, 3) unit vectors from the apex along the edges, one per row, at equal angles to the axis."""
+        """Unit vectors (3, 3) from the apex along the edges, one per row, at equal angles to the axis."""
         up = np.array([0.0, 0.0, 1.0]) if abs(self.axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
         side = np.cross(up, self.axis)
         side /= np.linalg.norm(side)
@@ -203,7 +206,7 @@ class CornerReflector:
         for i in range(3):
             u, v = p[:, (i + 1) % 3], p[:, (i + 2) % 3]
             x, y = np.maximum(u, 0), np.maximum(v, 0)
-            # Nearest point of the triangle x, y >= 0, x + y <= edge: where it is beyond the sloping side, project on that side.
+            # Nearest point of the triangle x, y >= 0, x + y <= edge. Points beyond the sloping side are moved onto it.
             along = np.clip((u - v + self.edge_m) / 2, 0, self.edge_m)
             beyond = x + y > self.edge_m
             x, y = np.where(beyond, along, x), np.where(beyond, self.edge_m - along, y)

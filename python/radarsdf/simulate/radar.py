@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A radar that obeys the radar equation: noisy in angle, blind below its threshold, fooled by mirrors."""
+"""A radar sensor: radar equation, speckle, noise in range and angle, detection threshold, clutter and ghosts."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ __all__ = ["Origin", "RadarSensor", "Scan", "generator"]
 
 FloatArray = NDArray[np.float64]
 
-_OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, so as not to hit it again
-_MAX_BEAMS = 10**7  # in a scan; their rays fill some gigabytes
-_LARGEST = 1e9  # of any number of a sensor: sums and products of such are far from overflow
-_MIN_LEG_M = 0.01  # shorter ways from a mirror to the next surface are no reflection
-# Streams of random numbers within a scan: more clutter, say, must not change the noise of the surface returns.
+_OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, not to hit it again
+_MAX_BEAMS = 10**7  # in a scan; their rays take some gigabytes
+_LARGEST = 1e9  # limit of all settings: sums and products of such numbers do not overflow
+_MIN_LEG_M = 0.01  # shorter paths from a mirror to the next surface are no reflection
+# Separate streams of random numbers within a scan: more clutter, for example, must not change the noise of the surface
+# returns.
 _BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER = range(6)
 
 
 class Origin(IntEnum):
-    """Where a return comes from: the codes of `Simulation.origin_kind`."""
+    """Cause of a return: the codes of `Simulation.origin_kind`."""
 
     SURFACE = 0
     CLUTTER = 1
@@ -38,71 +39,70 @@ class Origin(IntEnum):
 
 
 class Scan(NamedTuple):
-    """N returns of one frame."""
+    """The N returns of one scan."""
 
-    points: NDArray[np.float32]  # (N, 3) sensor frame, metres
-    intensities: NDArray[np.float32]  # (N,) sensor units, dB
-    noiseless_intensities: NDArray[np.float32]  # (N,) without speckle, noise and steps; NaN for false returns
+    points: NDArray[np.float32]  # (N, 3) sensor frame, m
+    intensities: NDArray[np.float32]  # (N,) dB
+    noiseless_intensities: NDArray[np.float32]  # (N,) dB, no speckle, noise and steps; NaN: false return
     origin_kind: NDArray[np.int8]  # (N,) codes of `Origin`
 
 
 class _Rays(NamedTuple):
-    """The beams of a scan and what they hit first."""
+    """The N beams of a scan and their first hits."""
 
-    origin: FloatArray  # (3,) world, metres
+    origin: FloatArray  # (3,) world, m
     directions: FloatArray  # (N, 3) world, unit
     angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
     hits: Hits
 
 
 class _Echoes(NamedTuple):
-    """Candidate returns before detection."""
+    """Candidates of returns, before detection."""
 
     range_m: FloatArray  # (N,)
     angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
     power_db: FloatArray  # (N,) with speckle
-    noiseless_db: FloatArray  # (N,) NaN for false returns
+    noiseless_db: FloatArray  # (N,) without speckle; NaN for false returns
 
 
 def generator(seed: int, *key: int) -> np.random.Generator:
-    """Random numbers of the part `key` of a simulation: other keys give independent streams."""
+    """Random number generator of the part `key` of a simulation. Different keys give independent streams."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
 @dataclass(frozen=True)
 class RadarSensor:
-    """A scanning 3D radar: x forward, y left, z up.
+    """A scanning 3D radar. Sensor frame: x forward, y left, z up.
 
-    The power of a return is ``gain_db`` + echo of the surface − 40·log10(range) + speckle + noise, in dB. Speckle is
-    the fading of ``Material.looks`` independent scatterers (a Gamma distribution), with its median at 0 dB.
+    By the radar equation, the power of a return in dB is ``gain_db`` + echo of the surface − 40·log10(range in m) +
+    speckle + noise. Speckle is the fading of ``Material.looks`` independent scatterers: a Gamma distribution, with its
+    median at 0 dB.
 
     Raises
     ------
     ValueError
-        If a value is outside the range its comment gives.
+        If a value is outside the range in its comment.
     """
 
     azimuth_fov_rad: float = 1.92  # full width, centred on x [rad], 0..2π
     elevation_fov_rad: float = 0.52  # full height, centred on the xy plane [rad], 0..π
-    beams: int = 3000  # candidate directions in a scan, a jittered grid over the field of view; 1..10^7
-    min_range_m: float = 0.5  # nothing nearer is returned [m], > 0
-    max_range_m: float = 60.0  # nothing further is returned [m], > min_range_m
+    beams: int = 3000  # directions in a scan, a jittered grid over the field of view; 1..10^7
+    min_range_m: float = 0.5  # there are no nearer returns [m], > 0
+    max_range_m: float = 60.0  # there are no farther returns [m], > min_range_m
     sigma_range_m: float = 0.04  # standard deviation along the beam [m]
     sigma_azimuth_rad: float = 0.004  # standard deviation of the azimuth [rad]
     sigma_elevation_rad: float = 0.006  # standard deviation of the elevation [rad]
-    sigma_power_db: float = 1.0  # standard deviation of the receiver's noise on top of speckle [dB]
+    sigma_power_db: float = 1.0  # standard deviation of the receiver's noise, besides speckle [dB]
     gain_db: float = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
     threshold_db: float = 64.0  # weaker returns are not detected [dB]
-    floor_db: float = (
-        -np.inf
-    )  # intensities are clipped to this from below [dB]; above the threshold, they pile up
-    saturation_db: float = 118.0  # intensities are clipped to this from above [dB]
+    floor_db: float = -np.inf  # lower limit of the intensities, to which weaker ones are clipped [dB]
+    saturation_db: float = 118.0  # upper limit of the intensities, to which stronger ones are clipped [dB]
     step_db: float = 0.1  # intensities are multiples of this [dB], >= 0; 0: continuous
     clutter_per_scan: float = 0.0  # expected number of false returns in free space, >= 0
-    ghost_share: float = 0.0  # share of the beams on a mirroring surface that are followed on, 0..1
+    ghost_share: float = 0.0  # share of the beams on mirroring surfaces that can give a ghost, 0..1
 
     def __post_init__(self) -> None:
-        """Refuse what no sensor can be."""
+        """Check the ranges."""
         whole_number(self.beams, "beams", 1, _MAX_BEAMS)
         for field in dataclasses.fields(self):
             value = number(getattr(self, field.name), field.name)
@@ -130,21 +130,21 @@ class RadarSensor:
             raise ValueError(msg)
 
     def scan(self, scene: Scene, T_world_sensor: FloatArray, seed: int = 0, frame: int = 0) -> Scan:
-        """One scan of a scene.
+        """Scan a scene once.
 
         Parameters
         ----------
         scene : Scene
-            What is there to see.
+            The world.
         T_world_sensor : (4, 4) float64
-            Pose of the sensor.
+            Pose of the sensor, m.
         seed, frame : int
-            Together they fix every random number of the scan: same numbers, same bits.
+            Seed and number of the scan. Together they determine all its random numbers.
 
         Returns
         -------
         Scan
-            Detected returns in random order.
+            Detected returns, in random order.
         """
         angles = self._beam_angles(generator(seed, frame, _BEAMS))
         R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
@@ -175,11 +175,11 @@ class RadarSensor:
         Parameters
         ----------
         scene : Scene
-            Where the rays were cast.
+            The world.
         origins, directions : (3,) or (N, 3), and (N, 3) float64
-            Of the rays, world frame.
+            Origins and unit directions of the rays, world frame, m.
         hits : Hits
-            Of the rays.
+            Hits of these rays in the scene.
 
         Returns
         -------
@@ -193,7 +193,7 @@ class RadarSensor:
         return power
 
     def _beam_angles(self, rng: np.random.Generator) -> FloatArray:
-        """Azimuth and elevation (beams, 2) of a jittered grid, uniform in azimuth and in the sine of elevation."""
+        """Azimuth and elevation (beams, 2), rad: a jittered grid, uniform in azimuth and in the sine of elevation."""
         aspect = self.azimuth_fov_rad / self.elevation_fov_rad
         columns = max(1, round(min(self.beams, np.sqrt(self.beams * aspect))))
         rows = -(-self.beams // columns)
@@ -215,7 +215,7 @@ class RadarSensor:
         return _Echoes(hits.range_m[rows], rays.angles[rows], power[rows], noiseless[rows])
 
     def _ghosts(self, scene: Scene, rays: _Rays, rng: np.random.Generator) -> _Echoes:
-        """Returns over a mirror: sensor, mirror, target and back, placed straight on at the total path length."""
+        """Echoes from sensor to mirror to target and back. They appear behind the mirror, at the whole path length."""
         origin, directions, angles, hits = rays
         loss = scene.material_values(hits, "mirror_loss_db", np.inf)
         rows = np.flatnonzero((rng.random(len(directions)) < self.ghost_share) & np.isfinite(loss))
@@ -225,17 +225,17 @@ class RadarSensor:
         mirror = origin + first[:, None] * directions[rows] + _OFF_SURFACE_M * normals
         second = scene.raycast(mirror, mirrored, self.max_range_m)
         path = first + second.range_m
-        # A mirror's foot in the ground gives a second leg of no length, and no ghost.
+        # Where a mirror stands on the ground, the path to the next surface has no length: this is no ghost.
         seen = (path <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
         rows, path, second = rows[seen], path[seen], second.select(seen)
         mirrored, target = mirrored[seen], mirror[seen] + second.range_m[:, None] * mirrored[seen]
-        # The radar equation sees the whole path, and both passes pay the mirror.
+        # The range in the radar equation is the whole path, and the wave loses power at the mirror twice.
         power = self.gain_db + scene.echo_db(target, mirrored, second) - 40 * np.log10(path) - 2 * loss[rows]
         looks = scene.material_values(second, "looks", 1.0)
         return _Echoes(path, angles[rows], power + _speckle_db(looks, rng), np.full(len(rows), np.nan))
 
     def _clutter(self, angles: FloatArray, range_m: FloatArray, rng: np.random.Generator) -> _Echoes:
-        """Weak false returns in free space: half anywhere along a beam, half piled up near the sensor."""
+        """Weak false returns in free space: half of them anywhere along a beam, half of them near the sensor."""
         beam = rng.integers(len(angles), size=rng.poisson(self.clutter_per_scan))
         free = np.minimum(range_m[beam], self.max_range_m)
         anywhere = free * rng.uniform(0.05, 0.95, size=len(beam))
@@ -265,14 +265,17 @@ class RadarSensor:
 
 
 def unit_vectors(angles: FloatArray) -> FloatArray:
-    """Unit vectors (N, 3) of (N, 2) azimuths and elevations [rad], sensor frame."""
+    """Unit vectors (N, 3), sensor frame, of azimuths and elevations (N, 2), rad."""
     azimuth, elevation = angles[:, 0], angles[:, 1]
     cos = np.cos(elevation)
     return np.stack([cos * np.cos(azimuth), cos * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
 def _speckle_db(looks: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Fading (N,) in dB of (N,) numbers of scatterers, with median 0: what an L1 fit would find is the rest."""
+    """Fading (N,), dB, for numbers of scatterers (N,).
+
+    Its median is 0, so that a fit with the L1 loss, which estimates medians, finds the noiseless intensity.
+    """
     power = rng.standard_gamma(looks)
     values, index = np.unique(looks, return_inverse=True)
     fading: FloatArray = 10 * np.log10(np.maximum(power, 1e-12) / gammaincinv(values, 0.5)[index])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A world of ground and solids: exact ray hits, exact distances, and the echo of every hit."""
+"""A world of ground and solids: exact ray hits, distances, and the echo of every hit."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .materials import Material
 from .primitives import Primitive
 from .terrain import Terrain
 
 __all__ = ["Hits", "Scene"]
 
 FloatArray = NDArray[np.float64]
-_CHUNK = 32768  # rays or points at a time: some tens of MB of working memory
+_CHUNK = 32768  # rays or points at a time; they take some tens of MB
 
 
 class Hits(NamedTuple):
     """First hits of N rays."""
 
     range_m: FloatArray  # (N,) inf where the ray hits nothing
-    normals: FloatArray  # (N, 3) world, unit, towards the ray's origin; zero where it hits nothing
+    normals: (
+        FloatArray  # (N, 3) unit vectors, world, towards the origin of the ray; zero where it hits nothing
+    )
     primitive: NDArray[np.int64]  # (N,) index into `Scene.parts`, -1 where it hits nothing
 
     def select(self, rows: NDArray[np.bool_]) -> Hits:
-        """Hits of some of the rays only, given by an (N,) mask."""
+        """Hits of the rays in an (N,) mask."""
         return Hits(self.range_m[rows], self.normals[rows], self.primitive[rows])
 
 
@@ -40,9 +41,9 @@ class Scene:
     Parameters
     ----------
     solids : sequence of Primitive
-        Boxes, poles, reflectors; they may overlap and reach below the ground.
+        Boxes, poles and reflectors. They may overlap and reach below the ground.
     terrain : Terrain, optional
-        The ground; without it solids float in empty space.
+        The ground. None: there is no ground.
     """
 
     solids: Sequence[Primitive]
@@ -50,7 +51,7 @@ class Scene:
 
     @property
     def parts(self) -> list[Primitive | Terrain]:
-        """All primitives in the order of `Hits.primitive`: the solids, then the ground."""
+        """All parts in the order of `Hits.primitive`: the solids, then the ground."""
         return [*self.solids, *([self.terrain] if self.terrain is not None else [])]
 
     def raycast(self, origins: ArrayLike, directions: ArrayLike, max_range_m: float) -> Hits:
@@ -59,16 +60,16 @@ class Scene:
         Parameters
         ----------
         origins : (N, 3) or (3,) array_like
-            World frame, metres.
+            World frame, m.
         directions : (N, 3) array_like
             Unit vectors, world frame.
         max_range_m : float
-            Hits further away do not count.
+            Farther hits do not count.
 
         Returns
         -------
         Hits
-            float64, exact to about 1e-9 m.
+            The first hit of each ray, exact to about 1e-9 m.
         """
         d = np.asarray(directions, dtype=np.float64)
         o = np.broadcast_to(np.asarray(origins, dtype=np.float64), d.shape)
@@ -106,13 +107,13 @@ class Scene:
         Parameters
         ----------
         points : (N, 3) array_like
-            World frame, metres.
+            World frame, m.
 
         Returns
         -------
         (N,) float64
-            Metres, positive in free space. Exact there (see `Terrain.signed_distance` for points metres off the
-            ground); inside, where parts overlap, the depth may come out too small.
+            Distances, m, positive in free space. There they are exact, but see `Terrain.signed_distance` for points
+            metres above the ground. Inside, where parts overlap, the absolute value may be too small.
         """
         p = np.asarray(points, dtype=np.float64)
         best = np.full(len(p), np.inf)
@@ -123,23 +124,23 @@ class Scene:
         return best
 
     def distance(self, points: ArrayLike) -> FloatArray:
-        """Distance (N,) in metres of (N, 3) world points to the nearest surface, from either side."""
+        """Absolute distance (N,), m, of world points (N, 3) to the nearest surface."""
         return np.abs(self.signed_distance(points))
 
     def echo_db(self, points: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
-        """Strength of each hit's echo without the loss by range.
+        """Strength of the echo of each hit, without the loss by range.
 
         Parameters
         ----------
         points, directions : (N, 3) float64
-            Where the rays hit, and their unit directions; world frame, metres.
+            Points where the rays hit, and their unit directions, world frame, m.
         hits : Hits
-            Of those rays.
+            Hits of these rays.
 
         Returns
         -------
         (N,) float64
-            dB; -inf where there is no hit.
+            dB, -inf where there is no hit.
         """
         echo = np.full(len(points), -np.inf)
         for index in np.unique(hits.primitive[hits.primitive >= 0]):
@@ -147,12 +148,7 @@ class Scene:
             echo[rows] = self.parts[index].echo_db(points[rows], directions[rows], hits.normals[rows])
         return echo
 
-    def materials(self, hits: Hits) -> list[Material | None]:
-        """Material of each of the N hits, None where there is none."""
-        parts = [part.material for part in self.parts]
-        return [parts[i] if i >= 0 else None for i in hits.primitive]
-
     def material_values(self, hits: Hits, field: str, missing: float) -> FloatArray:
-        """One numeric field of each hit's material, (N,) float64; `missing` where there is no hit."""
+        """A numeric field of the material at each hit, (N,) float64; `missing` where there is no hit."""
         table = np.array([*(getattr(part.material, field) for part in self.parts), missing], dtype=np.float64)
         return table[hits.primitive]

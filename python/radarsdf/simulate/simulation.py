@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Drive a radar through a scene, and a lidar after it for the truth."""
+"""Radar scans of a scene from given poses, and lidar points of the same scene as ground truth."""
 
 from __future__ import annotations
 
@@ -19,41 +19,39 @@ __all__ = ["Simulation", "lidar_points", "simulate"]
 FloatArray = NDArray[np.float64]
 
 _LIDAR_SIGMA_M = 0.01
-_LIDAR_VOXEL_M = (
-    0.05  # one lidar point per cell: otherwise most of them would lie on the ground near the sensor
-)
-_LIDAR_STREAM = 2**31  # no frame has this number
+_LIDAR_CELL_M = 0.05  # one lidar point per cell: otherwise most would lie on the ground near the sensor
+_LIDAR_STREAM = 2**31  # no scan has this number
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Radar scans with poses, and everything a real data set does not tell.
+    """Simulated radar scans with poses, and the truth about them.
 
-    F frames, N_i returns in frame i.
+    There are F scans, with N_i returns in scan i.
     """
 
-    points: list[NDArray[np.float32]]  # F arrays (N_i, 3), sensor frame, metres
-    poses: FloatArray  # (F, 4, 4) T_world_sensor
-    intensities: list[NDArray[np.float32]]  # F arrays (N_i,), sensor units, dB
-    noiseless_intensities: list[NDArray[np.float32]]  # F arrays (N_i,), no noise, no steps; NaN: false return
+    points: list[NDArray[np.float32]]  # F arrays (N_i, 3), sensor frame, m
+    poses: FloatArray  # (F, 4, 4) T_world_sensor, m
+    intensities: list[NDArray[np.float32]]  # F arrays (N_i,), dB
+    noiseless_intensities: list[NDArray[np.float32]]  # F arrays (N_i,), dB, as in `Scan`
     origin_kind: list[NDArray[np.int8]]  # F arrays (N_i,), codes of `Origin`
-    ground_truth: FloatArray  # (M, 3) lidar points of what the radar could see, world frame, metres
+    ground_truth: FloatArray  # (M, 3) lidar points of the surfaces that the radar can detect, world frame, m
     scene: Scene
     sensor: RadarSensor
     name: str
     seed: int
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Number of scans."""
         return len(self.points)
 
     @property
     def num_returns(self) -> int:
-        """Number of returns in all frames, false ones included."""
+        """Number of returns in all scans, false ones included."""
         return sum(len(points) for points in self.points)
 
     def world_points(self) -> FloatArray:
-        """All returns, (num_returns, 3) float64, world frame, metres, in the order of the frames."""
+        """All returns, (num_returns, 3) float64, world frame, m, in the order of the scans."""
         moved = [
             p.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
             for p, T in zip(self.points, self.poses, strict=True)
@@ -61,15 +59,16 @@ class Simulation:
         return np.concatenate(moved)
 
     def is_surface(self) -> NDArray[np.bool_]:
-        """Which of `world_points` are true returns, (num_returns,) bool."""
+        """Mask of the returns from a surface, (num_returns,) bool, in the order of `world_points`."""
         surface: NDArray[np.bool_] = np.concatenate(self.origin_kind) == Origin.SURFACE
         return surface
 
     def intensity_noise_floor(self) -> float:
-        """Mean absolute error, in dB, of the noiseless intensities over the surface returns.
+        """Mean absolute difference of measured and noiseless intensities over the surface returns, dB.
 
-        The error of one who knows scene and sensor but not speckle and noise. Near the detection threshold only lucky
-        returns survive, so a fit to them, which sees their bias, may come out slightly lower.
+        It is the error of a perfect model of scene and sensor: speckle and noise cannot be predicted. The error of a
+        fit can be slightly lower. Near the detection threshold, only returns with positive noise are detected, and a
+        fit learns this bias.
         """
         error = np.abs(np.concatenate(self.intensities) - np.concatenate(self.noiseless_intensities))
         surface = self.is_surface()
@@ -90,22 +89,27 @@ def simulate(
     Parameters
     ----------
     scene : Scene
-        What is there.
+        The world.
     sensor : RadarSensor
-        What looks at it.
+        The radar.
     poses : (F, 4, 4) float64
-        T_world_sensor.
+        T_world_sensor, m.
     name : str
-        Kept in the result.
+        Name of the simulation.
     seed : int
-        Fixes every random number: same arguments, same bits.
+        Seed of all random numbers. The same arguments give the same result, bit by bit.
     lidar_rays : int
-        Rays cast from a pose for the ground truth; of more than 80 poses only every n-th is used, 40 to 79.
+        Rays cast from each pose for the ground truth. Of 80 poses or more, only every n-th is used, 40 to 60 in all.
 
     Returns
     -------
     Simulation
-        With one entry per pose.
+        One scan for each pose.
+
+    Raises
+    ------
+    ValueError
+        If a pose is not a rigid transform.
     """
     poses = check_poses(poses, len(poses))
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
@@ -124,22 +128,22 @@ def simulate(
 
 
 def lidar_points(scene: Scene, sensor: RadarSensor, poses: FloatArray, seed: int, rays: int) -> FloatArray:
-    """Dense points of the surfaces the radar could see: in its field of view and range, with an echo it detects.
+    """Dense points of the surfaces that the radar can detect: in its field of view and range, above its threshold.
 
     Parameters
     ----------
     scene, sensor, poses, seed
         As in `simulate`.
     rays : int
-        Rays from a pose.
+        Rays from each pose.
 
     Returns
     -------
     (M, 3) float64
-        World frame, metres, 1 cm of noise along the ray, at most one point in a cell of 5 cm.
+        World frame, m, with a noise of 1 cm along the ray and at most one point in each cell of 5 cm.
     """
     rng = generator(seed, _LIDAR_STREAM)
-    poses = poses[:: max(1, len(poses) // 40)]  # neighbouring poses see the same
+    poses = poses[:: max(1, len(poses) // 40)]  # neighbouring poses see the same surfaces
     found = [np.zeros((0, 3))]
     for T_world_sensor in poses:
         u = rng.uniform(-1, 1, size=(rays, 2))
@@ -152,6 +156,6 @@ def lidar_points(scene: Scene, sensor: RadarSensor, poses: FloatArray, seed: int
         range_m = hits.range_m[visible] + _LIDAR_SIGMA_M * rng.standard_normal(int(visible.sum()))
         found.append(origin + range_m[:, None] * directions[visible])
     points = np.concatenate(found)
-    cells = np.floor(points / _LIDAR_VOXEL_M).astype(np.int64)
+    cells = np.floor(points / _LIDAR_CELL_M).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     return points[np.sort(first)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Building site: puts houses, walls, cars and poles on the ground where there is still room."""
+"""Random placement of buildings, walls, cars and poles on the ground, without overlap."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ __all__ = ["Site", "vary"]
 
 FloatArray = NDArray[np.float64]
 
-_BURIED_M = 1.0  # solids reach this far into the ground, so that no slope uncovers their lower end
+_BURIED_M = 1.0  # solids reach this far into the ground, so that they have no gap to the ground on a slope
 
 
 def vary(rng: np.random.Generator, material: Material) -> Material:
-    """Return a material as found on one object: no two walls reflect the same."""
+    """The material with a random change of its reflectivity, since no two objects are the same."""
     return replace(material, reflectivity_db=material.reflectivity_db + rng.normal(0, 1.5))
 
 
 class Site:
-    """Puts solids on the ground, where there is still room."""
+    """Solids on the ground. A new one must not overlap the earlier ones, nor the circles `taken`: x, y, radius [m]."""
 
     def __init__(
         self, rng: np.random.Generator, terrain: Terrain, taken: list[tuple[float, float, float]]
@@ -46,7 +46,7 @@ class Site:
         return True
 
     def _block(self, xy: FloatArray, yaw: float, size: FloatArray, material: Material) -> bool:
-        """Put a box of length, width and height on the ground, unless something else stands there."""
+        """Put a box of length, width and height on the ground, unless it would overlap."""
         along = np.array([np.cos(yaw), np.sin(yaw)])
         spots = np.linspace(-0.5, 0.5, max(1, round(size[0] / size[1]))) * max(0.0, size[0] - size[1])
         if not self._free([(*(xy + s * along), 0.75 * size[1]) for s in spots]):
@@ -66,23 +66,23 @@ class Site:
         put: Callable[[FloatArray, float], bool],
         where: Callable[[], tuple[FloatArray, float]],
     ) -> None:
-        """Put `count` objects at random places, trying ten places for each."""
+        """Put `count` objects at random places. Each has ten tries, and is left out if all fail."""
         for _ in range(count):
             any(put(*where()) for _ in range(10))
 
     def building(self, xy: FloatArray, yaw: float) -> bool:
-        """Rather a house than a hut, of concrete or brick."""
+        """A building of concrete or brick, 9 to 16 m long."""
         material = vary(self._rng, materials.CONCRETE if self._rng.random() < 0.5 else materials.BRICK)
         size = self._rng.uniform([9, 6, 5], [16, 9, 9])
         return self._block(xy, yaw + self._rng.normal(0, 0.15), size, material)
 
     def wall(self, xy: FloatArray, yaw: float) -> bool:
-        """Free-standing, about as high as a man."""
+        """A free-standing wall, 1.4 to 2.6 m high."""
         size = self._rng.uniform([5, 0.25, 1.4], [12, 0.4, 2.6])
         return self._block(xy, yaw + self._rng.normal(0, 0.15), size, vary(self._rng, materials.CONCRETE))
 
     def car(self, xy: FloatArray, yaw: float) -> bool:
-        """Two boxes: body, and cabin on top."""
+        """A car of two boxes: the body, and the cabin on top."""
         metal = vary(self._rng, materials.METAL)
         yaw, size = yaw + self._rng.normal(0, 0.05), self._rng.uniform([3.9, 1.7, 0.8], [4.8, 1.9, 1.0])
         if not self._block(xy, yaw, size, metal):
@@ -104,7 +104,7 @@ class Site:
         return True
 
     def basket(self, xy: FloatArray, facing: float) -> None:
-        """Post and backboard, the board 0.6 m in front of the post in the direction of x times `facing`."""
+        """A basketball hoop: a post, and a board 0.6 m from it towards x · `facing`, where `facing` is 1 or -1."""
         base = float(self._terrain.height(xy[None])[0])
         if self._free([(*xy, 0.3)]):
             self.solids.append(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Ground as a smooth height field made of a few plane waves: rays, normals and distances come from one formula."""
+"""The ground: a smooth height field, a sum of plane waves."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Height field z(x, y) = level + Σ amplitude · sin(wave · (x, y) + phase), solid below.
+    """Height field z(x, y) = level + Σ amplitude · sin(wave · (x, y) + phase), solid below and without an edge.
 
-    World frame, metres, z up. It has no edge.
+    World frame, m, z up.
     """
 
     waves: FloatArray  # (K, 2) wave vectors [rad/m]
@@ -32,21 +32,21 @@ class Terrain:
 
     @classmethod
     def random(cls, rng: np.random.Generator, roughness_m: float, material: Material) -> Terrain:
-        """Rolling ground of five octaves, two waves each, 40 m down to 2.5 m.
+        """Rolling ground of five octaves with two waves each, of about 40 m down to 2.5 m.
 
         Parameters
         ----------
         rng : Generator
-            Chooses directions, phases and exact wavelengths.
+            Draws directions, phases and wavelengths.
         roughness_m : float
-            Amplitude of the longest waves; every halving of the wavelength divides it by 2.5.
+            Amplitude of the longest waves, m. Each halving of the wavelength divides the amplitude by 2.5.
         material : Material
-            Of the ground.
+            Material of the ground.
 
         Returns
         -------
         Terrain
-            With mean height 0.
+            Ground with mean height 0.
         """
         octave = np.repeat(np.arange(5), 2)
         length = 40.0 / 2.0**octave * rng.uniform(0.8, 1.25, size=10)
@@ -56,17 +56,17 @@ class Terrain:
         return cls(waves, amplitudes, rng.uniform(0, 2 * np.pi, size=10), 0.0, material)
 
     def height(self, xy: FloatArray) -> FloatArray:
-        """Height (N,) of the ground at (N, 2) positions."""
+        """Height (N,), m, of the ground at the positions (N, 2), world, m."""
         height: FloatArray = self.level_m + np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes
         return height
 
     def slope(self, xy: FloatArray) -> FloatArray:
-        """Gradient (N, 2) of the height at (N, 2) positions."""
+        """Gradient (N, 2) of the height at the positions (N, 2), world, m."""
         slope: FloatArray = (np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves
         return slope
 
     def normals(self, xy: FloatArray) -> FloatArray:
-        """Upward unit normals (N, 3) at (N, 2) positions."""
+        """Upward unit normals (N, 3) at the positions (N, 2), world, m."""
         normals = np.concatenate([-self.slope(xy), np.ones((len(xy), 1))], axis=1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return normals
@@ -76,15 +76,15 @@ class Terrain:
     ) -> tuple[FloatArray, FloatArray]:
         """First hits of (N, 3) rays from above the ground; see `Primitive.intersect`.
 
-        March by steps the steepest possible slope makes safe, but at least 10 cm + 1 % of the range (a crest of
-        millimetres, which the ray leaves again within such a step, is missed); then close in by Newton's method
-        inside the last step.
+        Each ray advances until it is below the ground. The steepest possible slope bounds the length of a safe step,
+        but a step is at least 10 cm + 1 % of the range, so a crest of millimetres can be missed. Newton's method then
+        finds the crossing within the last step.
         """
         steepest = float(np.abs(self.amplitudes) @ np.linalg.norm(self.waves, axis=1))
         top = self.level_m + float(np.abs(self.amplitudes).sum())
         dz = directions[:, 2]
         closing = np.linalg.norm(directions[:, :2], axis=1) * steepest - dz
-        # Rays from above the highest crest start where they come down to it.
+        # Rays from above the highest crest start at its height.
         above = origins[:, 2] > top
         start = np.where(above, (origins[:, 2] - top) / np.maximum(-dz, 1e-9), 0.0)
         t, before = start, start.copy()
@@ -117,10 +117,10 @@ class Terrain:
         return result, normals
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
-        """Distance (N,) of (N, 3) points to the ground, negative below.
+        """Distances (N,) of points (N, 3) to the ground, negative below.
 
-        Exact near the ground (nearer than the ground's radius of curvature, some metres); further away it is the
-        distance to some point of the ground and may be too long, never too short.
+        Exact for points that are nearer to the ground than its radius of curvature, some metres. Farther away the
+        result is the distance to some point of the ground: it may be too large, never too small.
         """
         foot = points[:, :2].copy()
         vertical = points[:, 2] - self.height(foot)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Smooth poses along a path: a vehicle that pitches, rolls and bounces a little."""
+"""Smooth poses along a path, with a little heave, pitch and roll as of a vehicle."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ def along_path(
     Parameters
     ----------
     terrain : Terrain
-        The ground below.
+        The ground.
     path : callable
-        From (N,) values in 0..1 to (N, 2) world positions, metres.
+        Maps values (N,) in 0..1 to positions (N, 2), world frame, m.
     frames : int
         Number of poses, at least 1.
     height_m : float
-        Mean height of the sensor above ground.
+        Mean height of the sensor above the ground.
     rng : Generator
-        Chooses the sway: at most 3 cm of height, 1.2 degrees of pitch and roll.
+        Draws heave, pitch and roll: at most 3 cm, and 1.2 degrees each.
     look_at : (2,) float64, optional
-        Look there; by default look ahead.
+        Position in the world frame, m, that the sensor looks at. Default: it looks ahead.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def along_path(
     xy = path(u)
     ahead = look_at - xy if look_at is not None else path(u + 1e-4) - path(u - 1e-4)
     yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
-    # Two swings of different length per degree of freedom, never quite in phase.
+    # Two sines of different frequency for each of heave, pitch and roll, so that the motion does not repeat.
     cycles, phase = rng.uniform([3, 7], [6, 12], size=(3, 2)), rng.uniform(0, 2 * np.pi, size=(3, 2))
     swing = np.sin(2 * np.pi * u[:, None, None] * cycles + phase).mean(axis=2) * [0.03, 0.02, 0.02]
     poses = np.tile(np.eye(4), (frames, 1, 1))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Three worlds, each a function of a seed: a lane among buildings, a sports court, a reflector on a wall."""
+"""Three ready-made simulations: a lane among buildings, a sports court, and a corner reflector on a wall."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ __all__ = ["SCENES", "hugin", "oculii", "wall"]
 
 FloatArray = NDArray[np.float64]
 
-_LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams apart from those of the frames
+_LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams of random numbers that no scan has
 
-# Only the intensity scales are the paper's (Table II). The rest is assumed, not measured: fields of view as usual for
-# such sensors, and noise and gain such that the kNN baseline's errors come out near those of the paper's data sets.
+# The ranges of intensities are those of the paper (Table II). Everything else is assumed, not measured: the fields of
+# view are usual ones, and noise and gain are chosen so that the kNN baseline has errors as on the paper's data sets.
 HUGIN_A3 = RadarSensor(
     azimuth_fov_rad=np.deg2rad(110), elevation_fov_rad=np.deg2rad(30), beams=2950, max_range_m=50.0,
     sigma_range_m=0.06, sigma_azimuth_rad=np.deg2rad(0.4), sigma_elevation_rad=np.deg2rad(0.6), sigma_power_db=1.0,
@@ -45,19 +45,19 @@ OCULII_EAGLE = RadarSensor(
 
 
 def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
-    """Dense and accurate: a drive of 60 m past walls, buildings, cars and poles on rolling ground.
+    """A dense and accurate radar on a drive of 60 m past walls, buildings, cars and poles on rolling ground.
 
     Parameters
     ----------
     seed : int
-        Layout, path and noise.
+        Seed of layout, path and noise.
     frames : int, optional
-        Scans along the same path; 120 by default, which is about 190,000 returns (170,000 to 220,000 by seed).
+        Number of scans, always along the whole path. Default: 120, with 170,000 to 220,000 returns.
 
     Returns
     -------
     Simulation
-        Intensities 64 to 118 dB, as of a Hugin A3.
+        Intensities are 64 to 118 dB, as of a Hugin A3.
     """
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.45, materials.GRASS)
@@ -86,19 +86,19 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
 
 
 def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
-    """Sparse and noisy: a lap inside a sports court with baskets, fence posts, cars and buildings behind them.
+    """A sparse and noisy radar on a lap in a sports court with hoops and fence posts, cars and buildings behind them.
 
     Parameters
     ----------
     seed : int
-        Layout, path and noise.
+        Seed of layout, path and noise.
     frames : int, optional
-        Scans along the same lap; 120 by default, which is 80,000 to 100,000 returns.
+        Number of scans, always along the whole lap. Default: 120, with 80,000 to 100,000 returns.
 
     Returns
     -------
     Simulation
-        Intensities 0 to 36 dB, clipped, as of an Oculii Eagle; with clutter and ghosts.
+        Intensities are clipped to 0 to 36 dB, as of an Oculii Eagle. There are clutter and ghosts.
     """
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.08, materials.ASPHALT)
@@ -129,20 +129,20 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
 
 
 def wall(seed: int = 0, frames: int | None = None) -> Simulation:
-    """View dependence: a semicircle of 10 m round a corner reflector mounted on a wall, some seeds with windows.
+    """A scene for view dependence: an arc of 10 m radius round a corner reflector on a wall. Some walls have windows.
 
     Parameters
     ----------
     seed : int
-        Layout, path and noise.
+        Seed of layout, path and noise.
     frames : int, optional
-        Scans between -80 and 80 degrees from the wall's normal; 90 by default.
+        Number of scans, between -80 and 80 degrees from the normal of the wall. Default: 90.
 
     Returns
     -------
     Simulation
-        Intensities 80 to 133 dB, as of a Hugin A4. The wall's front is the plane x = 0, the reflector at y = 0
-        is the last solid of the scene.
+        Intensities are 80 to 133 dB, as of a Hugin A4. The front of the wall is the plane x = 0. The reflector is at
+        y = 0 and is the last of `scene.solids`.
     """
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.05, materials.GRASS)
