@@ -1,22 +1,22 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From 3D radar scans with known poses to a surface and a reflectance map, on a CPU."""
+"""From 3D radar scans with known poses to a surface and a reflectance map, on a CPU.
 
-import importlib
-from types import ModuleType
+Each public name is imported from its module when it is first used, so ``import radarsdf`` alone is fast: it imports
+neither PyTorch nor NumPy.
+"""
+
+from importlib import import_module
 from typing import TYPE_CHECKING
 
-import torch  # noqa: F401 - before the compiled core, which then shares PyTorch's OpenMP runtime
-
-from radarsdf.budget.estimate import Estimate, estimate
-from radarsdf.config import FitConfig
-from radarsdf.fitting.fit import fit
-from radarsdf.fitting.stopping import Diverged, Interrupted
-from radarsdf.map.isosurface import marching_cubes
-from radarsdf.map.radar_map import RadarMap, load
-
 if TYPE_CHECKING:
-    from radarsdf import evaluation, simulate
+    from radarsdf import evaluation, io, simulate
+    from radarsdf.budget.estimate import Estimate, estimate
+    from radarsdf.config import FitConfig
+    from radarsdf.fitting.fit import fit
+    from radarsdf.fitting.stopping import Diverged, Interrupted
+    from radarsdf.map.isosurface import marching_cubes
+    from radarsdf.map.radar_map import RadarMap, load
 
 __all__ = [
     "Diverged",
@@ -27,16 +27,38 @@ __all__ = [
     "estimate",
     "evaluation",
     "fit",
+    "io",
     "load",
     "marching_cubes",
     "simulate",
 ]
 
+_PACKAGES = ("budget", "evaluation", "field", "fitting", "io", "map", "render", "returns", "simulate")
+_MODULES = {
+    "Diverged": "radarsdf.fitting.stopping",
+    "Estimate": "radarsdf.budget.estimate",
+    "FitConfig": "radarsdf.config",
+    "Interrupted": "radarsdf.fitting.stopping",
+    "RadarMap": "radarsdf.map.radar_map",
+    "estimate": "radarsdf.budget.estimate",
+    "fit": "radarsdf.fitting.fit",
+    "load": "radarsdf.map.radar_map",
+    "marching_cubes": "radarsdf.map.isosurface",
+} | {name: f"radarsdf.{name}" for name in _PACKAGES}
+"""The module of each name that is imported when it is first used."""
 
-def __getattr__(name: str) -> ModuleType:
-    # Parts that a fit does not need, and SciPy with them, are imported when first asked for: they would be most of
-    # what `import radarsdf` costs beyond importing torch.
-    if name in ("evaluation", "simulate"):
-        return importlib.import_module(f"radarsdf.{name}")
-    msg = f"module 'radarsdf' has no attribute {name!r}"
-    raise AttributeError(msg)
+if not TYPE_CHECKING:  # type checkers use the imports above, and report every other name
+
+    def __getattr__(name: str) -> object:
+        """Import a name when it is first used."""
+        if name not in _MODULES:
+            msg = f"module {__name__!r} has no attribute {name!r}"
+            raise AttributeError(msg)
+        import_module("torch")  # before the compiled core, so that both share one OpenMP runtime
+        module = import_module(_MODULES[name])
+        value = module if name in _PACKAGES else getattr(module, name)
+        globals()[name] = value  # the next use does not come here
+        return value
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *_MODULES})

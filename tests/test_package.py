@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The names of the package: complete, and imported only when they are used."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+from types import ModuleType
+
+import pytest
+import radarsdf
+
+
+def run(code):
+    """Run code in a Python of its own, where nothing of the package is imported yet."""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_importing_the_package_imports_nothing_else():
+    run(
+        "import sys; before = set(sys.modules); import radarsdf; dir(radarsdf);"
+        "new = {name.partition('.')[0] for name in set(sys.modules) - before};"
+        "assert new - sys.stdlib_module_names == {'radarsdf'}, new"
+    )
+
+
+@pytest.mark.parametrize("name", sorted(radarsdf._MODULES))
+def test_a_name_is_what_its_module_has(name):
+    value = getattr(radarsdf, name)
+    module = sys.modules[radarsdf._MODULES[name]]
+    assert value is (module if isinstance(value, ModuleType) else getattr(module, name))
+    assert radarsdf.__dict__[name] is value
+
+
+def test_functions_are_not_hidden_by_packages_of_similar_names():
+    assert inspect.isfunction(radarsdf.fit)
+    assert inspect.isfunction(radarsdf.estimate)
+    for name in ("fitting", "map", "simulate"):
+        assert inspect.ismodule(getattr(radarsdf, name))
+
+
+def test_all_names_are_listed():
+    assert set(radarsdf.__all__) <= set(radarsdf._MODULES) <= set(dir(radarsdf))
+    # Every name that has a module is public, but for the packages that only the package itself needs.
+    private = set(radarsdf._MODULES) - set(radarsdf.__all__)
+    assert private == set(radarsdf._PACKAGES) - {"evaluation", "io", "simulate"}
+
+
+def test_star_import():
+    run("from radarsdf import *; import radarsdf; assert set(radarsdf.__all__) <= set(globals())")
+
+
+def test_an_unknown_name():
+    with pytest.raises(AttributeError, match="module 'radarsdf' has no attribute 'fitt'"):
+        radarsdf.fitt  # noqa: B018
+    assert not hasattr(radarsdf, "_shards")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_core_shares_the_openmp_runtime_of_pytorch():
+    # This module imports the core, but not PyTorch.
+    run(
+        "import radarsdf; radarsdf.marching_cubes;"
+        "lines = open('/proc/self/maps').read().splitlines();"
+        "libraries = {line.split()[-1] for line in lines if any(x in line for x in ('gomp', 'iomp', 'libomp'))};"
+        "assert len(libraries) == 1, libraries"
+    )
