@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``radarsdf demo``: every step of the package on simulated scans."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from radarsdf.cli.options import add_fit_options, config_of, progress_of
+
+SCENES = ("hugin", "oculii", "wall")
+"""The names in `radarsdf.simulate.SCENES`, which is not imported for a help text."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument("--scene", choices=SCENES, default="hugin", help="default: hugin")
+    parser.add_argument("--frames", type=int, help="number of scans; default: depends on the scene")
+    parser.add_argument(
+        "--out", type=Path, default=Path("radarsdf_demo"), help="output folder; default: radarsdf_demo"
+    )
+    add_fit_options(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Simulate, fit, mesh, evaluate, write."""
+    if options.frames is not None and options.frames < 2:
+        msg = f"--frames must be at least 2, one of them to be held out, not {options.frames}"
+        raise ValueError(msg)
+    config = config_of(options)
+
+    import radarsdf
+    from radarsdf.cli.held_out import print_intensity_errors
+    from radarsdf.evaluation import format_metrics, holdout, surface_metrics
+    from radarsdf.io.scans import Scans, write_scans
+    from radarsdf.render.picture import save_picture
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    simulation = radarsdf.simulate.SCENES[options.scene](frames=options.frames)
+    scans = Scans(simulation.points, simulation.poses, simulation.intensities, simulation.ground_truth)
+    train, test = holdout(len(scans.points))
+    print(f"simulated {options.scene}: {sum(map(len, scans.points))} returns in {len(scans.points)} scans")
+
+    started_s = time.perf_counter()
+    kept = scans.select(train)
+    radar_map = radarsdf.fit(
+        kept.points, kept.poses, kept.intensities, config=config, progress=progress_of(options)
+    )
+    fitted_s = time.perf_counter()
+    viewpoint = scans.poses[len(scans.poses) // 2, :3, 3]
+    mesh = radar_map.mesh(viewpoint=viewpoint, progress=progress_of(options))
+    print(f"fit {fitted_s - started_s:.1f} s, mesh {time.perf_counter() - fitted_s:.1f} s: {radar_map}")
+
+    if scans.ground_truth is not None:
+        print(format_metrics(surface_metrics(mesh, scans.ground_truth, samples=1_000_000)))
+    print_intensity_errors(radar_map, scans.select(test), kept)
+
+    write_scans(options.out / "scans.npz", scans)
+    radar_map.save(options.out / "map.safetensors")
+    mesh.export(options.out / "mesh.ply")
+    files = ["scans.npz", "map.safetensors", "mesh.ply"]
+    try:
+        save_picture(options.out / "picture.png", mesh, scalar=mesh.vertex_attributes["intensity"])
+        files.append("picture.png")
+    except ImportError as error:  # Matplotlib is optional
+        print(f"no picture: {error}")
+    print("wrote " + ", ".join(str(options.out / name) for name in files))

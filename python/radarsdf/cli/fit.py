@@ -1,0 +1,75 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``radarsdf fit``: from scans to a map."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from radarsdf.cli.options import add_fit_options, config_of, progress_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument(
+        "scans",
+        type=Path,
+        help="the scans, .npz, with the arrays points, frame and poses, and optionally intensity, static and lidar_points",
+    )
+    out = parser.add_mutually_exclusive_group(required=True)
+    out.add_argument("-o", "--out", type=Path, help="the map to write, .safetensors")
+    out.add_argument("--dry-run", action="store_true", help="only estimate memory and time")
+    parser.add_argument(
+        "--holdout",
+        type=int,
+        metavar="N",
+        help="leave out the first scan and then every N-th scan, for radarsdf eval --holdout N",
+    )
+    parser.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
+    parser.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="PATH",
+        help="save the state of the fit in this file from time to time; if the file exists, continue from it; "
+        "it is removed when the map is written",
+    )
+    add_fit_options(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fit a map, or estimate what the fit takes."""
+    config = config_of(options)
+
+    import radarsdf
+    from radarsdf.io.scans import read_scans
+
+    scans = read_scans(options.scans)
+    if options.holdout:
+        from radarsdf.evaluation import holdout
+
+        scans = scans.select(holdout(len(scans.points), options.holdout)[0])
+    intensities = None if options.geometry_only else scans.intensities
+    if options.dry_run:
+        print(radarsdf.estimate(scans.points, scans.poses, intensities, config=config))
+        return
+    started_s = time.perf_counter()
+    try:
+        radar_map = radarsdf.fit(
+            scans.points,
+            scans.poses,
+            intensities,
+            config=config,
+            progress=progress_of(options),
+            checkpoint=options.checkpoint,
+        )
+    except radarsdf.Interrupted as stop:
+        if stop.radar_map is not None:
+            stop.radar_map.save(options.out)
+            stop.args = (f"{stop}; the map so far is in {options.out}",)
+        raise
+    radar_map.save(options.out)
+    if options.checkpoint is not None:
+        options.checkpoint.unlink(missing_ok=True)
+    print(f"fit {time.perf_counter() - started_s:.1f} s: {radar_map}, written to {options.out}")

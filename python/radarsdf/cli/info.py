@@ -1,0 +1,31 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``radarsdf info``: what a bug report needs."""
+
+from __future__ import annotations
+
+import argparse
+import platform
+
+
+def add_arguments(_: argparse.ArgumentParser) -> None:
+    """The command has no arguments."""
+
+
+def run(_: argparse.Namespace) -> None:
+    """Print one line for each part."""
+    import torch
+
+    from radarsdf import _core
+
+    openmp = _core.openmp_version()
+    rows = {
+        "radarsdf": _core.__version__,
+        "python": f"{platform.python_version()} on {platform.platform()}",
+        "torch": f"{torch.__version__}, {torch.get_num_threads()} threads",
+        "compiler": _core.compiler(),
+        "openmp": f"{openmp}, {_core.num_threads()} threads" if openmp else "none: the core is serial",
+        "instruction set": f"{_core.instruction_set()} of {', '.join(_core.available_instruction_sets())}",
+    }
+    for name, value in rows.items():
+        print(f"{name:<16}{value}")

@@ -1,0 +1,61 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``radarsdf mesh``: from a map to a triangle mesh."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from radarsdf.cli.options import add_box, add_quiet, box_of, progress_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument("map", type=Path, help="the map that radarsdf fit wrote, .safetensors")
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, help="the mesh to write: .ply, .obj, .stl, .glb"
+    )
+    parser.add_argument(
+        "--voxel", type=float, default=0.1, metavar="M", help="edge length of a voxel, m; default: 0.1"
+    )
+    add_box(parser)
+    parser.add_argument(
+        "--viewpoint",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="colour the mesh by the intensity seen from here: world frame, m",
+    )
+    parser.add_argument(
+        "--min-confidence",
+        type=float,
+        default=0.0,
+        metavar="C",
+        help="leave out the surface whose confidence is below C, 0 to 1; default: 0",
+    )
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the mesh as a picture")
+    add_quiet(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Extract the mesh, write it, draw it."""
+    import radarsdf
+    from radarsdf.render.picture import save_picture
+
+    radar_map = radarsdf.load(options.map)
+    mesh = radar_map.mesh(
+        options.voxel,
+        box=box_of(options),
+        viewpoint=options.viewpoint,
+        min_confidence=options.min_confidence,
+        progress=progress_of(options),
+    )
+    if len(mesh.faces) == 0:
+        msg = f"{options.map} has no surface here: nothing written"
+        raise ValueError(msg)
+    mesh.export(options.out)
+    print(f"{len(mesh.vertices)} vertices and {len(mesh.faces)} triangles written to {options.out}")
+    if options.picture:
+        save_picture(options.picture, mesh, scalar=mesh.vertex_attributes.get("intensity"))
+        print(f"picture written to {options.picture}")
