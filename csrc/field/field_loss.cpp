@@ -4,7 +4,11 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
+#include <stdexcept>
+#include <string>
 
+#include "kernels/fourier_kernels.hpp"
 #include "util/large_array.hpp"
 
 namespace radarsdf {
@@ -21,15 +25,25 @@ Matrix<T> matrix(std::int64_t rows, std::int64_t columns) {
 // What a sum over a batch is to be multiplied by: a thread's share of a small one may be empty.
 double mean(std::int64_t count) { return 1 / static_cast<double>(std::max<std::int64_t>(count, 1)); }
 
+// What is asked for of a batch.
 template <typename T>
-class Batch {
+struct Request {
+  FieldLosses weights;
+  const std::vector<LayerGradients<T>>* sdf;        // null: the geometry is frozen and has no loss
+  const std::vector<LayerGradients<T>>* intensity;  // null: there is no loss of intensities
+  FeatureGradients<T> by_features;                  // `interpolated` is null where the geometry is frozen
+};
+
+template <typename T>
+class Pass {
  public:
-  Batch(const FieldLayers<T>& field, const LossBatch<T>& batch, const LossWeights& weights,
-        const FieldGradients<T>& gradients)
+  Pass(const FieldParameters<T>& field, const LossOptions& options, const LossBatch<T>& batch,
+       const Request<T>& request, std::int64_t num_seen)
       : field_(field),
+        options_(options),
         batch_(batch),
-        weights_(weights),
-        gradients_(gradients),
+        request_(request),
+        num_seen_(num_seen),
         levels_(field.levels()),
         cells_(field.cells()),
         waves_(field.waves()),
@@ -37,7 +51,7 @@ class Batch {
 
   FieldLosses run() {
     encode();
-    const bool trains = !gradients_.sdf.empty();
+    const bool trains = request_.sdf != nullptr;
     const std::int64_t outputs = 1 + feature_;
     out_ = matrix<T>(batch_.count, outputs);
     const Matrix<T> hidden = trains ? matrix<T>(batch_.count, mlp_hidden_columns(field_.sdf)) : nullptr;
@@ -46,17 +60,17 @@ class Batch {
     mlp(field_.sdf, inputs, batch_.count, hidden.get(), out_.get(), 1);
 
     FieldLosses losses{0, 0};
-    if (!field_.intensity.empty()) losses.intensity = intensity_loss(trains);
+    if (request_.intensity != nullptr) losses.intensity = intensity_loss(trains);
     if (!trains) return losses;
     out_grad_ = matrix<T>(batch_.count, outputs);
     std::fill_n(out_grad_.get(), batch_.count * outputs, T(0));
     losses.sdf = sdf_loss();
     add_links();
     const Matrix<T> own = sums_levels() ? matrix<T>(batch_.count, cells_) : nullptr;
-    T* cells_grad = own ? own.get() : gradients_.interpolated;
+    T* cells_grad = own ? own.get() : request_.by_features.interpolated;
     std::vector<Columns<T>> input_grads = {{cells_grad, cells_, cells_}};
     if (waves_ > 0) input_grads.push_back({nullptr, 0, waves_});
-    mlp_backward(field_.sdf, inputs, batch_.count, hidden.get(), {out_grad_.get(), outputs, outputs}, gradients_.sdf,
+    mlp_backward(field_.sdf, inputs, batch_.count, hidden.get(), {out_grad_.get(), outputs, outputs}, *request_.sdf,
                  input_grads, 1);
     add_cells(cells_grad);
     if (own) spread(own.get());
@@ -70,7 +84,7 @@ class Batch {
   void encode() {
     encoding_ = matrix<T>(batch_.count, dim());
     const Matrix<T> own = sums_levels() ? matrix<T>(batch_.count, levels_) : nullptr;
-    radarsdf::encode(*field_.table, field_.features, batch_.points, batch_.count, gradients_.located,
+    radarsdf::encode(*field_.table, field_.features, batch_.points, batch_.count, request_.by_features.located,
                      own ? own.get() : encoding_.get(), own ? levels_ : dim(), 1);
     for (std::int64_t i = 0; own && i < batch_.count; ++i) {
       for (std::int64_t d = 0; d < cells_; ++d) {
@@ -80,16 +94,16 @@ class Batch {
       }
     }
     if (waves_ > 0) {
-      fourier(batch_.points, batch_.count, field_.half_width_m, field_.first_frequency, field_.num_frequencies,
-              encoding_.get() + cells_, dim(), 1);
+      fourier(batch_.points, batch_.count, field_.frequencies.half_width_m, field_.frequencies.first,
+              field_.frequencies.count, encoding_.get() + cells_, dim(), 1);
     }
   }
 
-  // Binary cross-entropy of sigmoid(logit) and sigmoid(sdf / sigma), as python/radarsdf/losses.py has it.
+  // Binary cross-entropy of sigmoid(logit) and sigmoid(sdf / sigma), as `sdf_loss` of the Python package has it.
   double sdf_loss() {
     const std::int64_t outputs = 1 + feature_;
-    const T inverse_sigma = static_cast<T>(1 / weights_.sigma_m);
-    const T share = static_cast<T>(weights_.sdf * mean(batch_.count));
+    const T inverse_sigma = static_cast<T>(1 / options_.sigma_m);
+    const T share = static_cast<T>(request_.weights.sdf * mean(batch_.count));
     double sum = 0;
     for (std::int64_t i = 0; i < batch_.count; ++i) {
       const T logit = out_[i * outputs], label = 1 / (1 + std::exp(-batch_.sdf_m[i] * inverse_sigma));
@@ -100,7 +114,7 @@ class Batch {
     return sum * mean(batch_.count);
   }
 
-  // A sample's row of an encoding, or of its gradient, after the dropout. `to` may be `from`.
+  // Applies the dropout to a sample's row of an encoding, or of its gradient. `to` may be `from`.
   void drop(const Dropout& dropout, std::int64_t i, std::int64_t columns, const T* from, T* to) const {
     if (!dropout.bytes) {
       if (to != from) std::copy_n(from, columns, to);
@@ -113,15 +127,15 @@ class Batch {
 
   // Mean absolute error, and the gradients by the layers and, where `trains`, by what the SDF network hands on.
   double intensity_loss(bool trains) {
-    const std::int64_t count = batch_.intensity_count, width = field_.intensity[0].inputs;
-    const std::int64_t links = feature_ + field_.sdf_input;
-    const std::int64_t rest = dim() + links;  // where the columns begin that nothing learnt is behind
+    const std::int64_t count = num_seen_, width = field_.intensity[0].inputs;
+    const std::int64_t links = feature_ + field_.sees.sdf;  // columns that the SDF network gives
+    const std::int64_t rest = dim() + links;                // the columns from here on are data and need no gradient
     const Matrix<T> x = matrix<T>(count, width);
     for (std::int64_t i = 0; i < count; ++i) fill(i, x.get() + i * width);
-    if (field_.view_direction) {
+    if (field_.sees.view_direction) {
       const Matrix<T> directions = matrix<T>(count, 3);
       for (std::int64_t i = 0; i < count; ++i) {
-        std::copy_n(batch_.rays + i * batch_.ray_columns + kRayDirection, 3, directions.get() + 3 * i);
+        std::copy_n(batch_.rays + i * batch_.ray_stride + kRayDirection, 3, directions.get() + 3 * i);
       }
       spherical_harmonics(directions.get(), count, x.get() + rest, width, 1);
     }
@@ -147,16 +161,16 @@ class Batch {
     const Matrix<T> predicted = matrix<T>(count, 1);
     const Matrix<T> hidden = matrix<T>(count, mlp_hidden_columns(field_.intensity));
     mlp(field_.intensity, inputs, count, hidden.get(), predicted.get(), 1);
-    const T share = static_cast<T>(weights_.intensity * mean(count));
+    const T share = static_cast<T>(request_.weights.intensity * mean(count));
     double sum = 0;
     for (std::int64_t i = 0; i < count; ++i) {
       // No return is expected from free space (3QFPI).
-      const T label = i < batch_.num_near ? batch_.rays[i * batch_.ray_columns + kRayIntensity] : T(0);
+      const T label = i < batch_.num_near ? batch_.rays[i * batch_.ray_stride + kRayIntensity] : T(0);
       const T error = predicted[i] - label;
       sum += static_cast<double>(std::abs(error));
       predicted[i] = error > 0 ? share : error < 0 ? -share : T(0);
     }
-    mlp_backward(field_.intensity, inputs, count, hidden.get(), {predicted.get(), 1, 1}, gradients_.intensity,
+    mlp_backward(field_.intensity, inputs, count, hidden.get(), {predicted.get(), 1, 1}, *request_.intensity,
                  input_grads, 1);
     return sum * mean(count);
   }
@@ -169,10 +183,10 @@ class Batch {
     x += dim();
     const T* out = out_.get() + i * (1 + feature_);
     x = std::copy_n(out + 1, feature_, x);
-    if (field_.sdf_input) *x++ = out[0];
-    if (field_.view_direction) x += kHarmonics;
-    if (field_.log_range) {
-      const T range_m = batch_.rays[i * batch_.ray_columns + kRayRange] - batch_.sdf_m[i];
+    if (field_.sees.sdf) *x++ = out[0];
+    if (field_.sees.view_direction) x += kHarmonics;
+    if (field_.sees.log_range) {
+      const T range_m = batch_.rays[i * batch_.ray_stride + kRayRange] - batch_.sdf_m[i];
       *x = std::log10(std::max(range_m, T(1e-3)) / 10);
     }
   }
@@ -180,54 +194,107 @@ class Batch {
   // Gradients of the intensity by the outputs of the SDF network.
   void add_links() {
     if (!links_grad_) return;
-    const std::int64_t links = feature_ + field_.sdf_input;
-    for (std::int64_t i = 0; i < batch_.intensity_count; ++i) {
+    const std::int64_t links = feature_ + field_.sees.sdf;
+    for (std::int64_t i = 0; i < num_seen_; ++i) {
       const T* from = links_grad_.get() + i * links;
       T* to = out_grad_.get() + i * (1 + feature_);
       for (std::int64_t g = 0; g < feature_; ++g) to[1 + g] += from[g];
-      if (field_.sdf_input) to[0] += from[feature_];
+      if (field_.sees.sdf) to[0] += from[feature_];
     }
   }
 
   // Gradients of the intensity by the cells' encoding.
   void add_cells(T* cells_grad) {
     if (!cells_grad_) return;
-    for (std::int64_t i = 0; i < batch_.intensity_count; ++i) {
+    for (std::int64_t i = 0; i < num_seen_; ++i) {
       T* own = cells_grad_.get() + i * cells_;
       drop(batch_.dropout[0], i, cells_, own, own);
       for (std::int64_t d = 0; d < cells_; ++d) cells_grad[i * cells_ + d] += own[d];
     }
   }
 
-  // Each level's gradient is that of their sum.
+  // The encoding is the sum of the levels, so each level's gradient is that of the sum.
   void spread(const T* cells_grad) const {
     for (std::int64_t i = 0; i < batch_.count; ++i) {
       for (std::int64_t first = 0; first < levels_; first += cells_) {
-        std::copy_n(cells_grad + i * cells_, cells_, gradients_.interpolated + i * levels_ + first);
+        std::copy_n(cells_grad + i * cells_, cells_, request_.by_features.interpolated + i * levels_ + first);
       }
     }
   }
 
-  const FieldLayers<T>& field_;
+  const FieldParameters<T>& field_;
+  const LossOptions& options_;
   const LossBatch<T>& batch_;
-  const LossWeights& weights_;
-  const FieldGradients<T>& gradients_;
+  const Request<T>& request_;
+  std::int64_t num_seen_;
   std::int64_t levels_, cells_, waves_, feature_;  // numbers of columns
   Matrix<T> encoding_, out_, out_grad_;
   Matrix<T> cells_grad_, links_grad_;  // of the intensity's loss alone
 };
 
+template <typename T>
+void check_layers(const std::vector<Layer<T>>& layers, std::int64_t num_gradients, std::int64_t inputs,
+                  const char* message) {
+  if (static_cast<std::int64_t>(layers.size()) != num_gradients) {
+    throw std::invalid_argument("there must be gradients of all layers");
+  }
+  for (const Layer<T>& layer : layers) {
+    if (layer.inputs != inputs || layer.outputs < 1) throw std::invalid_argument(message);
+    inputs = layer.outputs;
+  }
+}
+
 }  // namespace
 
 template <typename T>
-FieldLosses field_loss(const FieldLayers<T>& field, const LossBatch<T>& batch, const LossWeights& weights,
-                       const FieldGradients<T>& gradients) {
-  return Batch<T>(field, batch, weights, gradients).run();
+FieldLoss<T>::FieldLoss(const FieldParameters<T>& parameters, const LossOptions& options,
+                        const NetworkGradients<T>& gradients)
+    : parameters_(parameters), options_(options), gradients_(gradients) {
+  const Frequencies& f = parameters.frequencies;
+  if (f.first < 0 || f.count < 0 || f.first > kMaxFrequencies || f.count > kMaxFrequencies - f.first) {
+    throw std::invalid_argument("frequencies must lie in [0, " + std::to_string(kMaxFrequencies) + ")");
+  }
+  if (!(f.half_width_m > 0)) throw std::invalid_argument("half_width_m must be positive");
+  if (!(options.sigma_m > 0)) throw std::invalid_argument("sigma_m must be positive");
+  if (parameters.sdf.empty()) throw std::invalid_argument("there must be an SDF network");
+  check_layers(parameters.sdf, static_cast<std::int64_t>(gradients.sdf.size()), parameters.cells() + parameters.waves(),
+               "the SDF network must see the encodings of cells and positions");
+  if (parameters.intensity.empty() && gradients.intensity.empty()) return;
+  check_layers(parameters.intensity, static_cast<std::int64_t>(gradients.intensity.size()),
+               parameters.intensity_inputs(), "the intensity network must see what it is said to");
+  if (parameters.intensity.back().outputs != 1) {
+    throw std::invalid_argument("the intensity network must have one output");
+  }
 }
 
-template FieldLosses field_loss(const FieldLayers<float>&, const LossBatch<float>&, const LossWeights&,
-                                const FieldGradients<float>&);
-template FieldLosses field_loss(const FieldLayers<double>&, const LossBatch<double>&, const LossWeights&,
-                                const FieldGradients<double>&);
+template <typename T>
+void FieldLoss<T>::check_intensity() const {
+  if (parameters_.intensity.empty()) throw std::invalid_argument("there is no intensity network");
+}
+
+template <typename T>
+double FieldLoss<T>::geometry(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features) const {
+  const Request<T> request{{weight, 0}, &gradients_.sdf, nullptr, by_features};
+  return Pass<T>(parameters_, options_, batch, request, 0).run().sdf;
+}
+
+template <typename T>
+FieldLosses FieldLoss<T>::joint(const LossBatch<T>& batch, FieldLosses weights,
+                                const FeatureGradients<T>& by_features) const {
+  check_intensity();
+  const Request<T> request{weights, &gradients_.sdf, &gradients_.intensity, by_features};
+  return Pass<T>(parameters_, options_, batch, request, num_seen(batch.count, batch.num_near)).run();
+}
+
+template <typename T>
+double FieldLoss<T>::reflectance(const LossBatch<T>& batch, double weight) const {
+  check_intensity();
+  const auto located = large_array<std::int32_t>(batch.count * parameters_.table->num_levels());
+  const Request<T> request{{0, weight}, nullptr, &gradients_.intensity, {located.get(), nullptr}};
+  return Pass<T>(parameters_, options_, batch, request, num_seen(batch.count, batch.num_near)).run().intensity;
+}
+
+template class FieldLoss<float>;
+template class FieldLoss<double>;
 
 }  // namespace radarsdf

@@ -18,67 +18,107 @@ namespace radarsdf {
 // are the first columns of the parts, and the number of columns.
 constexpr std::int64_t kRayPoint = 0, kRayDirection = 3, kRayRange = 6, kRayIntensity = 7, kRayColumns = 8;
 
-// What is learnt, as python/radarsdf/field.py puts it together.
-template <typename T>
-struct FieldLayers {
-  const VertexTable* table;
-  const T* features;
-  double half_width_m;  // of the Fourier encoding, as are
-  int first_frequency, num_frequencies;
-  std::vector<Layer<T>> sdf;  // gives the logit and then the geometry feature
-  std::vector<Layer<T>>
-      intensity;  // sees encoding, geometry feature and, where asked for, the next three; may be empty
-  bool sdf_input, view_direction, log_range;
+// Of the Fourier encoding: 2^first to 2^(first + count - 1), in units of pi / half_width_m.
+struct Frequencies {
+  double half_width_m;
+  int first, count;
+};
 
-  // Numbers of columns: of the cells' encoding, of what it is interpolated from, of the Fourier encoding, of the
-  // feature.
-  std::int64_t cells() const { return table->encoding() == Encoding::kOctree ? kFeatureDim : levels(); }
+// What the intensity network sees after the encodings and the geometry feature, in this order.
+struct IntensityInputs {
+  bool sdf, view_direction, log_range;
+};
+
+// What is learnt, as the Field of the Python package puts it together. The numbers stay the caller's: they may change
+// between two calls, but not move.
+template <typename T>
+struct FieldParameters {
+  const VertexTable* table;
+  const T* features;  // (num_rows, 8)
+  Frequencies frequencies;
+  std::vector<Layer<T>> sdf;        // gives the logit of the signed distance, then the geometry feature
+  std::vector<Layer<T>> intensity;  // empty: no intensities are learnt
+  IntensityInputs sees;
+
+  // Numbers of columns: of the interpolated features of all levels, of the cells' encoding made of them, of the Fourier
+  // encoding, of the geometry feature.
   std::int64_t levels() const { return kFeatureDim * table->num_levels(); }
-  std::int64_t waves() const { return 6 * num_frequencies; }
+  std::int64_t cells() const { return table->encoding() == Encoding::kOctree ? kFeatureDim : levels(); }
+  std::int64_t waves() const { return 6 * std::int64_t{frequencies.count}; }
   std::int64_t feature() const { return sdf.back().outputs - 1; }
   std::int64_t intensity_inputs() const {
-    return cells() + waves() + feature() + sdf_input + kHarmonics * view_direction + log_range;
+    return cells() + waves() + feature() + sees.sdf + kHarmonics * sees.view_direction + sees.log_range;
   }
 };
 
-// The bytes of a dropout: what is below `keep` stays, times 256 / keep.
+struct LossOptions {
+  double sigma_m;                // width of the sigmoid that turns a signed distance into a label
+  bool intensity_in_free_space;  // or only near the returns
+};
+
+// By weights and biases, of as many layers as the networks have.
+template <typename T>
+struct NetworkGradients {
+  std::vector<LayerGradients<T>> sdf, intensity;
+};
+
+// The bytes of a dropout: a number whose byte is below `keep` stays, times 256 / keep; the others become 0.
 struct Dropout {
   const std::uint8_t* bytes = nullptr;  // null: all stays
   int keep = 256;
 };
 
+// Samples on rays. The geometry needs points and labels only.
 template <typename T>
 struct LossBatch {
   const T* points;  // (count, 3) local frame, m
   const T* sdf_m;   // (count) labels, positive in front of the return
-  const T* rays;    // (count, ray_columns): return (3), direction (3), range and, for the intensity, its label
-  std::int64_t ray_columns;
   std::int64_t count;
-  std::int64_t num_near;         // the first are near a surface: behind them, no return is expected
-  std::int64_t intensity_count;  // the intensity network sees the first so many
-  Dropout dropout[2];            // of the cells' (intensity_count, dim) and of the Fourier encoding
+  const T* rays = nullptr;  // (count, kRayColumns), rows ray_stride apart
+  std::int64_t ray_stride = 0;
+  std::int64_t num_near = 0;  // the first are near a return, the others in free space
+  Dropout dropout[2] = {};    // of the cells' encoding and of the Fourier encoding: (num_seen, columns)
 };
 
-struct LossWeights {
-  double sigma_m;
-  double sdf, intensity;  // what the mean losses are multiplied by in the gradients
-};
-
-// All overwritten. An empty `sdf` stands for frozen geometry: it has no loss.
+// By the features, which only few points touch: what `scatter` and `adam_step` take.
 template <typename T>
-struct FieldGradients {
-  std::vector<LayerGradients<T>> sdf, intensity;
+struct FeatureGradients {
   std::int32_t* located;  // (count, num_levels), see VertexTable::locate
-  T* interpolated;        // (count, 8 num_levels), by what is interpolated of the features; null where `sdf` is empty
+  T* interpolated;        // (count, 8 num_levels), by what is interpolated of the features
 };
 
-// Means over the batch.
+// Means over the batch, or what these are multiplied by in the gradients.
 struct FieldLosses {
   double sdf, intensity;
 };
 
+// All gradients are overwritten. The calls run on the calling thread; two calls of one object must not overlap, since
+// both would write the gradients of the networks.
 template <typename T>
-FieldLosses field_loss(const FieldLayers<T>& field, const LossBatch<T>& batch, const LossWeights& weights,
-                       const FieldGradients<T>& gradients);
+class FieldLoss {
+ public:
+  // Throws std::invalid_argument where the parts do not fit together.
+  FieldLoss(const FieldParameters<T>& parameters, const LossOptions& options, const NetworkGradients<T>& gradients);
+
+  const FieldParameters<T>& parameters() const { return parameters_; }
+  // The intensity network sees the first so many samples of a batch.
+  std::int64_t num_seen(std::int64_t count, std::int64_t num_near) const {
+    return options_.intensity_in_free_space ? count : num_near;
+  }
+
+  // The loss of the signed distances alone.
+  double geometry(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features) const;
+  // Both losses.
+  FieldLosses joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features) const;
+  // The loss of the intensities, by the intensity network alone: the geometry is frozen.
+  double reflectance(const LossBatch<T>& batch, double weight) const;
+
+ private:
+  void check_intensity() const;
+
+  FieldParameters<T> parameters_;
+  LossOptions options_;
+  NetworkGradients<T> gradients_;
+};
 
 }  // namespace radarsdf

@@ -14,6 +14,7 @@ __all__: list[str] = [
     "CellSet",
     "Encoding",
     "FEATURE_DIM",
+    "FieldLoss",
     "MAX_FREQUENCIES",
     "MAX_LEVELS",
     "NUM_SPHERICAL_HARMONICS",
@@ -28,7 +29,6 @@ __all__: list[str] = [
     "available_instruction_sets",
     "cell_keys",
     "compiler",
-    "field_loss",
     "fourier",
     "instruction_set",
     "marching_cubes_dense",
@@ -352,6 +352,169 @@ class TaskQueue:
     """
     def __init__(self) -> None: ...
 
+class FieldLoss:
+    """
+    The losses of batches and their gradients, as the package's Field and its losses define them. One thread at a time may use an object.
+    """
+    @typing.overload
+    def __init__(
+        self,
+        table: VertexTable,
+        features: numpy.typing.NDArray[numpy.float32],
+        frequencies: tuple[
+            typing.SupportsFloat | typing.SupportsIndex,
+            typing.SupportsInt | typing.SupportsIndex,
+            typing.SupportsInt | typing.SupportsIndex,
+        ],
+        sdf: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]],
+        intensity: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]]
+        | None,
+        sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(3)"],
+        sigma_m: typing.SupportsFloat | typing.SupportsIndex,
+        intensity_in_free_space: bool,
+    ) -> None:
+        """
+        `features` (num_rows, 8); `frequencies`: half width (m), the first exponent and how many; `sdf` and `intensity`: weights and biases of their layers, `intensity` may be None; `sees`: whether the intensity network sees SDF, viewing direction and range. The arrays are read anew by each call, where they are.
+        """
+    @typing.overload
+    def __init__(
+        self,
+        table: VertexTable,
+        features: numpy.typing.NDArray[numpy.float64],
+        frequencies: tuple[
+            typing.SupportsFloat | typing.SupportsIndex,
+            typing.SupportsInt | typing.SupportsIndex,
+            typing.SupportsInt | typing.SupportsIndex,
+        ],
+        sdf: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]],
+        intensity: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]]
+        | None,
+        sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(3)"],
+        sigma_m: typing.SupportsFloat | typing.SupportsIndex,
+        intensity_in_free_space: bool,
+    ) -> None:
+        """
+        `features` (num_rows, 8); `frequencies`: half width (m), the first exponent and how many; `sdf` and `intensity`: weights and biases of their layers, `intensity` may be None; `sees`: whether the intensity network sees SDF, viewing direction and range. The arrays are read anew by each call, where they are.
+        """
+    @typing.overload
+    def geometry(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        sdf_m: numpy.typing.NDArray[numpy.float32],
+        weight: typing.SupportsFloat | typing.SupportsIndex,
+        located: numpy.typing.NDArray[numpy.int32],
+        interpolated_grad: numpy.typing.NDArray[numpy.float32],
+    ) -> float:
+        """
+        The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of `weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        """
+    @typing.overload
+    def geometry(
+        self,
+        points: numpy.typing.NDArray[numpy.float64],
+        sdf_m: numpy.typing.NDArray[numpy.float64],
+        weight: typing.SupportsFloat | typing.SupportsIndex,
+        located: numpy.typing.NDArray[numpy.int32],
+        interpolated_grad: numpy.typing.NDArray[numpy.float64],
+    ) -> float:
+        """
+        The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of `weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        """
+    @typing.overload
+    def joint(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        sdf_m: numpy.typing.NDArray[numpy.float32],
+        rays: numpy.typing.NDArray[numpy.float32],
+        num_near: typing.SupportsInt | typing.SupportsIndex,
+        dropout: collections.abc.Sequence[
+            tuple[
+                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
+                typing.SupportsInt | typing.SupportsIndex,
+            ]
+        ],
+        weights: tuple[
+            typing.SupportsFloat | typing.SupportsIndex, typing.SupportsFloat | typing.SupportsIndex
+        ],
+        located: numpy.typing.NDArray[numpy.int32],
+        interpolated_grad: numpy.typing.NDArray[numpy.float32],
+    ) -> tuple[float, float]:
+        """
+        Like `geometry`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
+        """
+    @typing.overload
+    def joint(
+        self,
+        points: numpy.typing.NDArray[numpy.float64],
+        sdf_m: numpy.typing.NDArray[numpy.float64],
+        rays: numpy.typing.NDArray[numpy.float64],
+        num_near: typing.SupportsInt | typing.SupportsIndex,
+        dropout: collections.abc.Sequence[
+            tuple[
+                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
+                typing.SupportsInt | typing.SupportsIndex,
+            ]
+        ],
+        weights: tuple[
+            typing.SupportsFloat | typing.SupportsIndex, typing.SupportsFloat | typing.SupportsIndex
+        ],
+        located: numpy.typing.NDArray[numpy.int32],
+        interpolated_grad: numpy.typing.NDArray[numpy.float64],
+    ) -> tuple[float, float]:
+        """
+        Like `geometry`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
+        """
+    @typing.overload
+    def reflectance(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        sdf_m: numpy.typing.NDArray[numpy.float32],
+        rays: numpy.typing.NDArray[numpy.float32],
+        num_near: typing.SupportsInt | typing.SupportsIndex,
+        dropout: collections.abc.Sequence[
+            tuple[
+                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
+                typing.SupportsInt | typing.SupportsIndex,
+            ]
+        ],
+        weight: typing.SupportsFloat | typing.SupportsIndex,
+    ) -> float:
+        """
+        Like `joint`, of the intensities alone while the geometry is frozen: writes to `intensity_gradients` only.
+        """
+    @typing.overload
+    def reflectance(
+        self,
+        points: numpy.typing.NDArray[numpy.float64],
+        sdf_m: numpy.typing.NDArray[numpy.float64],
+        rays: numpy.typing.NDArray[numpy.float64],
+        num_near: typing.SupportsInt | typing.SupportsIndex,
+        dropout: collections.abc.Sequence[
+            tuple[
+                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
+                typing.SupportsInt | typing.SupportsIndex,
+            ]
+        ],
+        weight: typing.SupportsFloat | typing.SupportsIndex,
+    ) -> float:
+        """
+        Like `joint`, of the intensities alone while the geometry is frozen: writes to `intensity_gradients` only.
+        """
+    @property
+    def intensity_gradients(
+        self,
+    ) -> list[numpy.typing.NDArray[numpy.float32]] | list[numpy.typing.NDArray[numpy.float64]]:
+        """
+        The same of the intensity network.
+        """
+    @property
+    def sdf_gradients(
+        self,
+    ) -> list[numpy.typing.NDArray[numpy.float32]] | list[numpy.typing.NDArray[numpy.float64]]:
+        """
+        By weights and biases of each layer of the SDF network in turn, as the last call that trained it wrote them.
+        """
+
 class CellBlocks:
     """
     From the keys of cells to their rows, and sums over the cells round a key.
@@ -446,84 +609,6 @@ def cell_keys(
 def compiler() -> str:
     """
     Compiler that built the core.
-    """
-
-@typing.overload
-def field_loss(
-    table: VertexTable,
-    features: numpy.typing.NDArray[numpy.float32],
-    frequencies: tuple[
-        typing.SupportsFloat | typing.SupportsIndex,
-        typing.SupportsInt | typing.SupportsIndex,
-        typing.SupportsInt | typing.SupportsIndex,
-    ],
-    sdf: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]],
-    intensity: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]]
-    | None,
-    sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(3)"],
-    points: numpy.typing.NDArray[numpy.float32],
-    sdf_m: numpy.typing.NDArray[numpy.float32],
-    rays: numpy.typing.NDArray[numpy.float32],
-    num_near: typing.SupportsInt | typing.SupportsIndex,
-    intensity_count: typing.SupportsInt | typing.SupportsIndex,
-    dropout: collections.abc.Sequence[
-        tuple[
-            typing.Annotated[numpy.typing.ArrayLike, numpy.uint8], typing.SupportsInt | typing.SupportsIndex
-        ]
-    ],
-    sigma_m: typing.SupportsFloat | typing.SupportsIndex,
-    sdf_weight: typing.SupportsFloat | typing.SupportsIndex,
-    intensity_weight: typing.SupportsFloat | typing.SupportsIndex,
-    sdf_grads: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]]
-    | None,
-    intensity_grads: tuple[
-        list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]
-    ]
-    | None,
-    located: numpy.typing.NDArray[numpy.int32],
-    interpolated_grad: numpy.typing.NDArray[numpy.float32] | None,
-) -> tuple[float, float]:
-    """
-    Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.shards.
-    """
-
-@typing.overload
-def field_loss(
-    table: VertexTable,
-    features: numpy.typing.NDArray[numpy.float64],
-    frequencies: tuple[
-        typing.SupportsFloat | typing.SupportsIndex,
-        typing.SupportsInt | typing.SupportsIndex,
-        typing.SupportsInt | typing.SupportsIndex,
-    ],
-    sdf: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]],
-    intensity: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]]
-    | None,
-    sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(3)"],
-    points: numpy.typing.NDArray[numpy.float64],
-    sdf_m: numpy.typing.NDArray[numpy.float64],
-    rays: numpy.typing.NDArray[numpy.float64],
-    num_near: typing.SupportsInt | typing.SupportsIndex,
-    intensity_count: typing.SupportsInt | typing.SupportsIndex,
-    dropout: collections.abc.Sequence[
-        tuple[
-            typing.Annotated[numpy.typing.ArrayLike, numpy.uint8], typing.SupportsInt | typing.SupportsIndex
-        ]
-    ],
-    sigma_m: typing.SupportsFloat | typing.SupportsIndex,
-    sdf_weight: typing.SupportsFloat | typing.SupportsIndex,
-    intensity_weight: typing.SupportsFloat | typing.SupportsIndex,
-    sdf_grads: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]]
-    | None,
-    intensity_grads: tuple[
-        list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]
-    ]
-    | None,
-    located: numpy.typing.NDArray[numpy.int32],
-    interpolated_grad: numpy.typing.NDArray[numpy.float64] | None,
-) -> tuple[float, float]:
-    """
-    Gives the mean losses of SDF and intensity and writes their weighted gradients: see radarsdf.shards.
     """
 
 @typing.overload

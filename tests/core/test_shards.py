@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import gc
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.field import Field
 from radarsdf.field.losses import sdf_loss
-from radarsdf.fitting.gradients import Shard
+from radarsdf.fitting.gradients import Shard, _layers
 from radarsdf.fitting.sampling import RaySampler
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
@@ -149,51 +151,124 @@ def test_not_a_number_is_passed_on(rays):
     assert np.isfinite(losses["sdf"])
 
 
-GOOD = {"frequencies": (409.6, 0, 10), "num_near": 200, "intensity_count": 200, "sees": (True, True, True)}
+def core_arguments(field, config):
+    return {
+        "table": field.cells.table,
+        "features": field.cells.features.detach().numpy(),
+        "frequencies": (409.6, 0, 10),
+        "sdf": _layers(field.sdf_network),
+        "intensity": _layers(field.intensity_network),
+        "sees": (True, True, True),
+        "sigma_m": config.sigma_m,
+        "intensity_in_free_space": False,
+    }
+
+
+def one_more_output(layers):
+    weights, biases = layers
+    return [*weights[:-1], np.repeat(weights[-1], 2, 0)], [*biases[:-1], np.repeat(biases[-1], 2)]
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"frequencies": (409.6, 0, 9)}, "encodings of cells and positions"),
-        ({"frequencies": (409.6, 20, 10)}, "no such frequencies"),
-        ({"frequencies": (409.6, -1, 10)}, "no such frequencies"),
-        ({"num_near": 401}, "of the batch"),
-        ({"intensity_count": -1}, "of the batch"),
-        ({"intensity_count": 401}, "of the batch"),
+        ({"frequencies": (409.6, 20, 10)}, "frequencies must lie in"),
+        ({"frequencies": (409.6, -1, 10)}, "frequencies must lie in"),
+        ({"frequencies": (0.0, 0, 10)}, "half_width_m must be positive"),
+        ({"sigma_m": 0.0}, "sigma_m must be positive"),
+        ({"sigma_m": float("nan")}, "sigma_m must be positive"),
         ({"sees": (False, True, True)}, "see what it is said to"),
+        ({"features": np.zeros((3, 8), np.float32)}, "features must have shape"),
+        ({"sdf": ([], [])}, "at least one"),
+        ({"intensity": one_more_output}, "one output"),
+    ],
+)
+def test_the_core_refuses_networks_that_do_not_fit(rays, changes, message):
+    field, config, _, _ = shard_and_samples(rays, {}, torch.float32)
+    arguments = core_arguments(field, config)
+    _core.FieldLoss(**arguments)
+    changes = {k: change(arguments[k]) if callable(change) else change for k, change in changes.items()}
+    with pytest.raises(ValueError, match=message):
+        _core.FieldLoss(**(arguments | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_near": 401}, "of the batch"),
+        ({"num_near": -1}, "of the batch"),
         ({"points": np.zeros((400, 2), np.float32)}, "points must have shape"),
         ({"sdf_m": np.zeros(399, np.float32)}, "sdf_m must have shape"),
+        ({"sdf_m": np.zeros((400, 1), np.float32)}, "sdf_m must have shape"),
         ({"rays": np.zeros((400, 7), np.float32)}, "rays must have shape"),
-        ({"features": np.zeros((3, 8), np.float32)}, "features must have shape"),
+        ({"rays": np.zeros((8, 400), np.float32).T}, "contiguous rows"),
         ({"located": np.zeros((400, 2), np.int32)}, "located must have shape"),
         ({"interpolated_grad": np.zeros((400, 16), np.float32)}, "interpolated_grad must have shape"),
-        ({"interpolated_grad": None}, "gradients of what is trained"),
-        ({"intensity_grads": None}, "gradients of what is trained"),
         ({"dropout": [(np.zeros((200, 23), np.uint8), 3)]}, "dropout must have shape"),
         ({"dropout": [(np.zeros((200, 24), np.uint8), 0)]}, "keep something"),
         ({"dropout": [(np.zeros((200, 24), np.uint8), 1)] * 3}, "only the two encodings"),
     ],
 )
-def test_the_core_refuses_what_does_not_fit(rays, changes, message):
-    field, config, shard, samples = shard_and_samples(rays, {}, torch.float32)
-    arguments = GOOD | {
-        "table": field.cells.table,
-        "features": field.cells.features.detach().numpy(),
-        "sdf": shard._sdf.values,
-        "intensity": shard._intensity.values,
+def test_the_core_refuses_batches_that_do_not_fit(rays, changes, message):
+    field, config, _, samples = shard_and_samples(rays, {}, torch.float32)
+    loss = _core.FieldLoss(**core_arguments(field, config))
+    batch = {
         "points": samples.points.numpy(),
         "sdf_m": samples.sdf_m.numpy(),
         "rays": samples.of_ray.numpy(),
+        "num_near": 200,
         "dropout": [],
-        "sigma_m": config.sigma_m,
-        "sdf_weight": 1.0,
-        "intensity_weight": 1.0,
-        "sdf_grads": shard._sdf.gradient_values,
-        "intensity_grads": shard._intensity.gradient_values,
+    }
+    outputs = {
         "located": np.zeros((400, 3), np.int32),
         "interpolated_grad": np.zeros((400, 24), np.float32),
     }
-    assert min(_core.field_loss(**arguments)) > 0
-    with pytest.raises(ValueError, match=message):
-        _core.field_loss(**(arguments | changes))
+    calls = {
+        loss.geometry: {"points": batch["points"], "sdf_m": batch["sdf_m"], "weight": 1.0} | outputs,
+        loss.joint: batch | outputs | {"weights": (1.0, 1.0)},
+        loss.reflectance: batch | {"weight": 1.0},
+    }
+    refused = 0
+    for call, arguments in calls.items():
+        assert np.min(call(**arguments)) > 0
+        if changes.keys() <= arguments.keys():
+            refused += 1
+            with pytest.raises(ValueError, match=message):
+                call(**(arguments | changes))
+    assert refused > 0
+
+
+def test_the_core_refuses_other_types_and_a_missing_network(rays):
+    field, config, _, samples = shard_and_samples(rays, {}, torch.float32)
+    arguments = core_arguments(field, config)
+    outputs = [np.zeros((400, 3), np.int32), np.zeros((400, 24), np.float64)]
+    points, sdf_m = (samples.points.numpy().astype(np.float64), samples.sdf_m.numpy().astype(np.float64))
+    with pytest.raises(TypeError, match="dtype of the features"):
+        _core.FieldLoss(**arguments).geometry(points, sdf_m, 1.0, *outputs)
+    with pytest.raises(TypeError):
+        _core.FieldLoss(**(arguments | {"features": np.zeros((3, 8), np.int32)}))
+    loss = _core.FieldLoss(**(arguments | {"intensity": None}))
+    assert loss.intensity_gradients == []
+    with pytest.raises(ValueError, match="no intensity network"):
+        loss.reflectance(samples.points.numpy(), samples.sdf_m.numpy(), samples.of_ray.numpy(), 200, [], 1.0)
+
+
+def test_the_core_keeps_what_it_reads(rays):
+    field, config, _, samples = shard_and_samples(rays, {}, torch.float32)
+    arguments = core_arguments(field, config)
+    arguments["table"] = _core.VertexTable(
+        field.cells.table.leaf_keys(), config.leaf_size_m, config.num_levels
+    )
+    for name in ("features", "sdf", "intensity"):
+        arguments[name] = copy.deepcopy(arguments[name])
+    loss = _core.FieldLoss(**arguments)
+    batch = (samples.points.numpy(), samples.sdf_m.numpy(), samples.of_ray.numpy(), 200, [], 1.0)
+    before = loss.reflectance(*batch)
+    gradients = loss.intensity_gradients
+    arguments.clear()
+    gc.collect()
+    assert loss.reflectance(*batch) == before
+    del loss
+    gc.collect()
+    assert all(np.isfinite(gradient).all() for gradient in gradients)

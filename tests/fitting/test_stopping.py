@@ -19,6 +19,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import Diverged, FitConfig, Interrupted, _core
+from radarsdf.fitting.gradients import Shard
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.scans import Scans, write_scans
@@ -281,18 +282,23 @@ def test_the_last_step_is_looked_at_too(scene, poisoned):
 @pytest.mark.parametrize("joint", [True, False])
 @pytest.mark.parametrize("name", ["sdf", "intensity"])
 def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypatch, name, joint):
-    field_loss, calls = radarsdf._core.field_loss, 0
+    calls = 0
     stage, of = ("sdf", 10) if joint or name == "sdf" else ("intensity", 20)
     eighth = 8 if stage == "sdf" else 10 + 8
 
-    def failing(**arguments):
-        nonlocal calls
-        calls += 1
-        losses = dict(zip(("sdf", "intensity"), field_loss(**arguments), strict=True))
-        losses[name] *= math.inf if calls == eighth else 1
-        return tuple(losses.values())
+    def failing(of_stage):
+        def gradients(shard, samples):
+            nonlocal calls
+            calls += 1
+            found = of_stage(shard, samples)
+            if calls == eighth:
+                found.losses[name] *= math.inf
+            return found
 
-    monkeypatch.setattr("radarsdf._core.field_loss", failing)
+        return gradients
+
+    for method in ("geometry", "joint", "reflectance"):
+        monkeypatch.setattr(Shard, method, failing(getattr(Shard, method)))
     config = FitConfig(sdf_iterations=10, intensity_iterations=20, batch_size=512, num_threads=1, joint=joint)
     expected = f"the {name} loss is inf at iteration 7 of {of} of the {stage} stage"
     with pytest.raises(Diverged, match=expected) as caught:

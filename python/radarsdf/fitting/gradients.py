@@ -71,8 +71,19 @@ class Shard:
         self._generator = generator
         self._parts = parts
         self._moves_rows = moves_rows
-        self._sdf = _Arrays.of(field.sdf_network)
-        self._intensity = None if field.intensity_network is None else _Arrays.of(field.intensity_network)
+        fourier, network = field.fourier, field.intensity_network
+        self._loss = _core.FieldLoss(
+            table=field.cells.table,
+            features=kernels.view(field.cells.features),
+            frequencies=(fourier.half_width_m, fourier.first_frequency, fourier.num_frequencies),
+            sdf=_layers(field.sdf_network),
+            intensity=None if network is None or config.normals else _layers(network),
+            sees=_sees(network),
+            sigma_m=config.sigma_m,
+            intensity_in_free_space=config.intensity_in_free_space,
+        )
+        self._by_sdf = [torch.from_numpy(gradient) for gradient in self._loss.sdf_gradients]
+        self._by_intensity = [torch.from_numpy(gradient) for gradient in self._loss.intensity_gradients]
 
     def state(self) -> dict[str, Tensor]:
         """What its dropout depends on."""
@@ -83,63 +94,63 @@ class Shard:
 
     def geometry(self, samples: Samples) -> Gradients:
         """Of the SDF's loss alone."""
-        return self._by_core(samples, sdf_weight=1.0, intensity=None)
+        touched = self._untouched(samples)
+        sdf = self._loss.geometry(
+            points=samples.points.numpy(),
+            sdf_m=samples.sdf_m.numpy(),
+            weight=1 / self._parts,
+            located=touched.located.numpy(),
+            interpolated_grad=touched.gradient.numpy(),
+        )
+        return self._with_features({"sdf": sdf / self._parts}, touched, self._by_sdf)
 
     def joint(self, samples: Samples) -> Gradients:
         """Of both losses."""
         if self._config.normals:
             return self._by_autograd(samples, frozen=False)
-        return self._by_core(samples, sdf_weight=self._config.sdf_loss_weight, intensity=self._intensity)
+        touched, sdf_weight = self._untouched(samples), self._config.sdf_loss_weight
+        sdf, intensity = self._loss.joint(
+            **self._batch(samples),
+            weights=(sdf_weight / self._parts, 1 / self._parts),
+            located=touched.located.numpy(),
+            interpolated_grad=touched.gradient.numpy(),
+        )
+        losses = {"sdf": sdf_weight * sdf / self._parts, "intensity": intensity / self._parts}
+        return self._with_features(losses, touched, self._by_sdf + self._by_intensity)
 
     def reflectance(self, samples: Samples) -> Gradients:
         """Of the intensity's loss, by the intensity network: the geometry is frozen."""
         if self._config.normals:
             return self._by_autograd(samples, frozen=True)
-        return self._by_core(samples, sdf_weight=None, intensity=self._intensity)
+        intensity = self._loss.reflectance(**self._batch(samples), weight=1 / self._parts)
+        return Gradients({"intensity": intensity / self._parts}, list(self._by_intensity), None)
 
-    def _by_core(self, samples: Samples, sdf_weight: float | None, intensity: _Arrays | None) -> Gradients:
-        cells, fourier, network = self._field.cells, self._field.fourier, self._field.intensity_network
-        count = 0 if intensity is None else self._seen(samples)
-        dropouts = [] if intensity is None else self._draw_dropouts(count)
-        located = torch.empty((len(samples.points), cells.table.num_levels), dtype=torch.int32)
-        frozen = sdf_weight is None
-        by_interpolated = None if frozen else samples.points.new_empty((len(located), cells.interpolated_dim))
-        sdf, reflectance = _core.field_loss(
-            table=cells.table,
-            features=kernels.view(cells.features),
-            frequencies=(fourier.half_width_m, fourier.first_frequency, fourier.num_frequencies),
-            sdf=self._sdf.values,
-            intensity=None if intensity is None else intensity.values,
-            sees=_sees(network),
-            points=samples.points.numpy(),
-            sdf_m=samples.sdf_m.numpy(),
-            rays=samples.of_ray.numpy(),
-            num_near=samples.num_near,
-            intensity_count=count,
-            dropout=[(dropout.bytes.numpy(), dropout.keep) for dropout in dropouts],
-            sigma_m=self._config.sigma_m,
-            sdf_weight=(sdf_weight or 0.0) / self._parts,
-            intensity_weight=1 / self._parts,
-            sdf_grads=None if frozen else self._sdf.gradient_values,
-            intensity_grads=None if intensity is None else intensity.gradient_values,
-            located=located.numpy(),
-            interpolated_grad=None if by_interpolated is None else by_interpolated.numpy(),
-        )
-        losses: dict[str, float] = {}
-        by_parameters: list[Tensor] = []
-        touched = None
-        if sdf_weight is not None and by_interpolated is not None:
-            losses["sdf"] = sdf_weight * sdf / self._parts
-            if self._moves_rows:
-                touched = Touched(samples.points, located, by_interpolated)
-            else:
-                by_features = kernels.scatter(cells.table, samples.points, located, None, by_interpolated)
-                by_parameters.append(by_features)
-            by_parameters += self._sdf.gradients
-        if intensity is not None:
-            losses["intensity"] = reflectance / self._parts
-            by_parameters += intensity.gradients
-        return Gradients(losses, by_parameters, touched)
+    def _batch(self, samples: Samples) -> dict[str, Any]:
+        """What the core's losses of intensities take of samples."""
+        dropouts = self._draw_dropouts(self._seen(samples))
+        return {
+            "points": samples.points.numpy(),
+            "sdf_m": samples.sdf_m.numpy(),
+            "rays": samples.of_ray.numpy(),
+            "num_near": samples.num_near,
+            "dropout": [(dropout.bytes.numpy(), dropout.keep) for dropout in dropouts],
+        }
+
+    def _untouched(self, samples: Samples) -> Touched:
+        """For the core to fill."""
+        cells, count = self._field.cells, len(samples.points)
+        located = torch.empty((count, cells.table.num_levels), dtype=torch.int32)
+        return Touched(samples.points, located, samples.points.new_empty((count, cells.interpolated_dim)))
+
+    def _with_features(
+        self, losses: dict[str, float], touched: Touched, by_networks: list[Tensor]
+    ) -> Gradients:
+        """With the gradient by all features, unless only those that are touched move."""
+        if self._moves_rows:
+            return Gradients(losses, list(by_networks), touched)
+        table = self._field.cells.table
+        by_features = kernels.scatter(table, touched.points, touched.located, None, touched.gradient)
+        return Gradients(losses, [by_features, *by_networks], None)
 
     def _by_autograd(self, samples: Samples, *, frozen: bool) -> Gradients:
         field = self._field
@@ -176,23 +187,10 @@ class Shard:
         return [Dropout.draw(count, *part, self._generator) for part in parts]
 
 
-@dataclass(frozen=True)
-class _Arrays:
-    """A network for the core."""
-
-    values: tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]
-    """Weights and biases of its layers."""
-    gradients: list[Tensor]
-    """By each of its parameters, in their order."""
-    gradient_values: tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]
-    """The same by weights and by biases."""
-
-    @classmethod
-    def of(cls, network: nn.Module) -> _Arrays:
-        values = [kernels.view(parameter) for parameter in network.parameters()]
-        gradients = [torch.empty_like(parameter) for parameter in network.parameters()]
-        arrays = [gradient.numpy() for gradient in gradients]
-        return cls((values[::2], values[1::2]), gradients, (arrays[::2], arrays[1::2]))
+def _layers(network: nn.Module) -> tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]:
+    """Weights and biases of a network's layers, where they are."""
+    values = [kernels.view(parameter) for parameter in network.parameters()]
+    return values[::2], values[1::2]
 
 
 def _sees(network: IntensityNetwork | None) -> tuple[bool, bool, bool]:
