@@ -186,7 +186,7 @@ class MapLattice:
 @pytest.fixture(scope="module")
 def map_lattice():
     scans = radarsdf.simulate.hugin(frames=20)
-    config = FitConfig(max_range_m=30.0, sdf_iterations=100, num_threads=1)
+    config = FitConfig(num_threads=1, returns={"max_range_m": 30.0}, training={"sdf_iterations": 100})
     radar_map = radarsdf.fit(scans.points, scans.poses, config=config, progress=False)
     part = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(8, 3)
     cells = (2 * radar_map.field.cells.table.leaf_cells()[:, None] + part).reshape(-1, 3).astype(np.int32)

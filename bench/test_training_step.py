@@ -30,7 +30,7 @@ from .conftest import Surface, surface_points
 
 STEPS = 100  # after so many, a training looks through its parameters and keeps them
 STAGES = ("geometry", "joint", "reflectance")
-CONFIG = FitConfig(num_threads=1, drop_ghosts=False, cosine_schedule=False)
+CONFIG = FitConfig(num_threads=1, returns={"drop_ghosts": False}, training={"cosine_schedule": False})
 SHARE = 2  # of a batch: a fit's batches are shared between two threads
 
 
@@ -292,13 +292,14 @@ def test_whole(benchmark, step, rays):
     field.cells.initialise(CONFIG.feature_std)
     scale = IntensityScale.of(rays.intensities) if step.stage != "geometry" else None
     joint = step.stage == "joint"
-    config = dataclasses.replace(
-        CONFIG,
-        batch_size=CONFIG.batch_size // SHARE,
-        intensity_batch_size=CONFIG.intensity_batch_size // SHARE,
-        sdf_iterations=1 if step.frozen else STEPS,
-        intensity_iterations=1 if joint else STEPS,
-        joint=joint,
+    config = CONFIG.override(
+        training={
+            "batch_size": CONFIG.batch_size // SHARE,
+            "intensity_batch_size": CONFIG.intensity_batch_size // SHARE,
+            "sdf_iterations": 1 if step.frozen else STEPS,
+            "intensity_iterations": 1 if joint else STEPS,
+            "joint": joint,
+        }
     )
     losses = []
 

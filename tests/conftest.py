@@ -66,11 +66,13 @@ def sharp_map(scene):
     """Fitted until the plane and the wall are sharp, by numbers of its own: no test of a map's use is a test of the
     default schedule."""
     config = FitConfig(
-        sdf_iterations=150,
-        intensity_iterations=60,
-        batch_size=4096,
-        learning_rate=1e-2,
         min_component_triangles=100,
+        training={
+            "sdf_iterations": 150,
+            "intensity_iterations": 60,
+            "batch_size": 4096,
+            "learning_rate": 1e-2,
+        },
     )
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
 

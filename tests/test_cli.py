@@ -70,7 +70,7 @@ def test_demo_writes_everything_and_prints_the_errors(tmp_path, capsys):
         assert word in printed.out
     assert printed.err == ""
     radar_map = radarsdf.load(out / "map.safetensors")
-    assert radar_map.config.sdf_iterations == 100
+    assert radar_map.config.training.sdf_iterations == 100
     mesh = trimesh.load_mesh(out / "mesh.ply", process=False)
     assert len(mesh.faces) > 0
     assert (out / "picture.png").read_bytes().startswith(b"\x89PNG")
@@ -80,7 +80,7 @@ def test_fit_mesh_eval_chain(scans_file, map_file, tmp_path, capsys):
     radar_map = radarsdf.load(map_file)
     assert radar_map.has_intensity
     assert radar_map.report["returns"] == 4 * 1500  # scans 0 and 3 of six are held out
-    assert (radar_map.config.sdf_iterations, radar_map.config.batch_size) == (40, 1024)
+    assert (radar_map.config.training.sdf_iterations, radar_map.config.training.batch_size) == (40, 1024)
 
     ply, png = tmp_path / "mesh.ply", tmp_path / "mesh.png"
     box = ["--box", "9", "-4", "-1", "18", "4", "1"]
@@ -152,10 +152,7 @@ def test_settings(scans_file, tmp_path):
     ]
     flags = [word for setting in settings for word in ("--set", setting)]
     assert main(["fit", str(scans_file), "-o", str(path), "--paper", *FAST, *flags]) == 0
-    expected = FitConfig.paper(
-        sdf_iterations=40, intensity_iterations=20, batch_size=1024,
-        encoding="octree", sdf_hidden=(8, 8), sigma_m=0.15, normals=True, max_range_m=None, seed=5,
-    )  # fmt: skip
+    expected = FitConfig.paper(seed=5, training={"sdf_iterations": 40, "intensity_iterations": 20, "batch_size": 1024, "sigma_cells": 0.15}, encoding={"kind": "octree"}, networks={"sdf_hidden": (8, 8), "normals": True}, returns={"max_range_m": None})  # fmt: skip
     assert radarsdf.load(path).config == expected
 
 

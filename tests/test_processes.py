@@ -19,7 +19,7 @@ import radarsdf
 import torch
 from radarsdf import FitConfig
 
-QUICK = FitConfig(sdf_iterations=20, intensity_iterations=20, batch_size=1024)
+QUICK = FitConfig(training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024})
 X = np.random.default_rng(0).uniform([8, -5, -1], [20, 5, 3], (30_000, 3))
 
 FORK = """

@@ -40,7 +40,7 @@ def job(request):
         pytest.skip(f"{path} is not there")
     scans = read_scans(path)
     train, test = (scans.select(frames) for frames in holdout(len(scans.points), 5))
-    config = dataclasses.replace(FitConfig(), max_range_m=60.0)
+    config = FitConfig().override(returns={"max_range_m": 60.0})
     radar_map = radarsdf.fit(train.points, train.poses, train.intensities, config=config, progress=False)
     return radar_map, train, test
 

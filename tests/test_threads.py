@@ -13,7 +13,9 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.threads import Workers, resolve_num_threads
 
-QUICK = FitConfig(sdf_iterations=20, intensity_iterations=20, batch_size=1024, num_threads=2)
+QUICK = FitConfig(
+    num_threads=2, training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024}
+)
 
 
 @pytest.fixture(autouse=True)

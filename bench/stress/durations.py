@@ -102,7 +102,7 @@ def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str,
         with_intensity=with_intensities,
     )
     # What PyTorch sets up in a process's first steps is no part of the estimate.
-    small, tiny = street(2000), FitConfig(sdf_iterations=5, intensity_iterations=10)
+    small, tiny = street(2000), FitConfig(training={"sdf_iterations": 5, "intensity_iterations": 10})
     radarsdf.fit(small.points, small.poses, small.intensities, config=tiny, progress=False)
     wall_s, processor_s = time.perf_counter(), time.process_time()
     radarsdf.fit(*returns, config=config, progress=False)

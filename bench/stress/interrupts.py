@@ -73,7 +73,7 @@ def run(returns: int, moments: int) -> bool:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is born without
     scans = street(returns)
     points, poses = scans.points, scans.poses
-    config = FitConfig(sdf_iterations=100)
+    config = FitConfig(training={"sdf_iterations": 100})
     radar_map = radarsdf.fit(points, poses, config=config, progress=False)
     rows, longest_s = [], 0.0
     works: dict[str, Callable[[], Any]] = {

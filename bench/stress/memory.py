@@ -66,7 +66,7 @@ def memory_of_fits(count: int, returns: int = 2000) -> list[float]:
     """MB that this process has after each of so many small fits with a query and a mesh."""
     scans, config = (
         _street(returns, True),
-        FitConfig(sdf_iterations=6, intensity_iterations=12, batch_size=1024),
+        FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 12, "batch_size": 1024}),
     )
     found = []
     for _ in range(count):

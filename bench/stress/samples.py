@@ -25,10 +25,7 @@ from radarsdf.io.scans import Scans, write_scans
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import Workers
 
-_CONFIG = FitConfig(
-    sdf_iterations=2, intensity_iterations=2, batch_size=64, intensity_batch_size=64, sdf_hidden=(4,),
-    intensity_hidden=(4, 3), num_levels=2, fourier_count=2, num_threads=1,
-)  # fmt: skip
+_CONFIG = FitConfig(num_threads=1, training={"sdf_iterations": 2, "intensity_iterations": 2, "batch_size": 64, "intensity_batch_size": 64}, networks={"sdf_hidden": (4,), "intensity_hidden": (4, 3)}, encoding={"num_levels": 2, "fourier_count": 2})  # fmt: skip
 _VALUES: list[Any] = [
     None, True, -1, 0, 1, 12, 13, 2**31, 2**63, 10**400, 1e308, -0.0, float("nan"), float("inf"), "", "x" * 10_000, [],
     [[]], [1e6] * 4, [30_000, 30_000, 30_000], [1] * 20_000, [2**62, 2**62], {}, {"a": {}}, "octree", "tri-quadtree",

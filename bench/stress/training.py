@@ -55,7 +55,7 @@ def fitted(changes: dict[str, Any], iterations: int) -> tuple[RadarMap, str]:
     config = FitConfig(
         **({"batch_size": 256, "intensity_batch_size": 256, "min_range_m": 0.5, "num_threads": 1} | changes)
     )
-    config = dataclasses.replace(config, sdf_iterations=iterations, intensity_iterations=2 * iterations)
+    config = config.override(training={"sdf_iterations": iterations, "intensity_iterations": 2 * iterations})
     points, poses, intensities = room()
     radar_map, end = None, "done"
     try:

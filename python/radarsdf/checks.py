@@ -98,6 +98,15 @@ def positive(value: Any, name: str) -> float:
     return float(array)
 
 
+def not_negative(value: Any, name: str) -> float:
+    """`value` as a finite number of at least zero."""
+    array = real_array(value, name)
+    if array.shape != () or not 0 <= array < np.inf:
+        msg = f"{name} must be at least 0 and finite, not {value!r:.50}"
+        raise ValueError(msg)
+    return float(array)
+
+
 def number(value: Any, name: str) -> float:
     """`value` as a float, infinity allowed."""
     array = real_array(value, name)

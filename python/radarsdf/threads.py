@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-global_generator = threading.Lock()
-"""Held by whoever draws from PyTorch's global generator of random numbers, and puts its state back."""
-
 _lock = threading.Lock()
 _users = 0
 _threads_before = 0
@@ -46,8 +43,8 @@ def _begin_anew() -> None:
 
     A lock that another thread held would never be released. The compiled core sees to its own number of threads.
     """
-    global global_generator, _lock, _users, _blocks
-    global_generator, _lock = threading.Lock(), threading.Lock()
+    global _lock, _users, _blocks  # noqa: PLW0603 - the child begins anew
+    _lock = threading.Lock()
     _users, _blocks = 0, threading.local()
     torch.set_num_threads(1)
 

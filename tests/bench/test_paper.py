@@ -216,4 +216,8 @@ def test_options_keep_the_ranges_of_the_scene():
     options = Options(quick=False, repetitions=1, samples=1, bases=("paper",), peers=())
     scene = load_scene("oculii", frames=2)
     config = options.config("paper", scene, normals=False)
-    assert (config.min_range_m, config.sdf_iterations, config.normals) == (1.0, 1000, False)
+    assert (config.returns.min_range_m, config.training.sdf_iterations, config.networks.normals) == (
+        1.0,
+        1000,
+        False,
+    )

@@ -14,7 +14,14 @@ from radarsdf.budget import durations
 from radarsdf.budget.schedule import Schedule
 from torch import nn
 
-BOTH = FitConfig(sdf_iterations=100, intensity_iterations=300, batch_size=1000, intensity_batch_size=500)
+BOTH = FitConfig(
+    training={
+        "sdf_iterations": 100,
+        "intensity_iterations": 300,
+        "batch_size": 1000,
+        "intensity_batch_size": 500,
+    }
+)
 NAMES = [f.name for f in dataclasses.fields(FitConfig)]
 
 
@@ -37,10 +44,11 @@ def test_all_that_is_counted_has_its_seconds():
     assert all(np.isfinite(amount) and amount >= 0 for amount in work().values())
 
 
-@pytest.mark.parametrize("config", [FitConfig(), FitConfig.paper(), FitConfig(encoding="octree")])
+@pytest.mark.parametrize("config", [FitConfig(), FitConfig.paper(), FitConfig(encoding={"kind": "octree"})])
 def test_multiplications_are_those_of_the_networks(scene, config):
-    config = dataclasses.replace(
-        config, sdf_iterations=1, intensity_iterations=1, normals=False, batch_size=64
+    config = config.override(
+        training={"sdf_iterations": 1, "intensity_iterations": 1, "batch_size": 64},
+        networks={"normals": False},
     )
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
     encoding, *products = durations.widths(config)
@@ -87,7 +95,7 @@ def test_threads_share_what_can_be_shared_as_far_as_there_are_processors(monkeyp
 
 
 def test_the_estimate_is_the_sum(scene):
-    config = dataclasses.replace(BOTH, num_threads=1, drop_ghosts=False)
+    config = BOTH.override(num_threads=1, returns={"drop_ghosts": False})
     estimate = radarsdf.estimate(scene.points, scene.poses, scene.intensities, config=config)
     counted = work(config, returns=estimate.returns, cells=estimate.leaf_cells, rows=estimate.vertices)
     assert estimate.seconds == pytest.approx(sum(durations.SECONDS[k] * v for k, v in counted.items()))

@@ -21,7 +21,7 @@ from bench.growth.street import street
 from bench.stress.memory import peak_of_a_fit
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-QUICK = FitConfig(sdf_iterations=6, intensity_iterations=6, batch_size=512)
+QUICK = FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 6, "batch_size": 512})
 
 
 @LINUX
@@ -38,7 +38,7 @@ def test_the_peak_is_within_half_as_much_again(count, with_intensities, changes)
 def test_counts_are_those_of_the_fit(changes):
     scans = street(20_000)
     points, poses = scans.points, scans.poses
-    config = dataclasses.replace(QUICK, drop_ghosts=False, bridge_cells=0, **changes)
+    config = QUICK.override(**changes, returns={"drop_ghosts": False}, encoding={"bridge_cells": 0})
     estimate = radarsdf.estimate(points, poses, config=config)
     report = radarsdf.fit(points, poses, config=config, progress=False).report
     assert estimate.returns == report["returns_used"]

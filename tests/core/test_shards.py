@@ -94,10 +94,10 @@ def test_same_as_autograd(rays, changes, stage, dtype):
     assert found.losses.keys() == expected.losses.keys()
     for name, loss in found.losses.items():
         assert loss == pytest.approx(expected.losses[name], rel=tolerance)
-        assert loss > 0.01 or (name, config.sdf_loss_weight) == ("sdf", 0)
+        assert loss > 0.01 or (name, config.training.sdf_loss_weight) == ("sdf", 0)
     assert len(found.by_parameters) == len(expected.by_parameters)
     for a, b in zip(found.by_parameters, expected.by_parameters, strict=True):
-        assert b.abs().max() > 0 or (stage == "joint" and config.sdf_loss_weight == 0)
+        assert b.abs().max() > 0 or (stage == "joint" and config.training.sdf_loss_weight == 0)
         torch.testing.assert_close(a, b, rtol=0, atol=tolerance * max(b.abs().max().item(), 1e-3))
 
 

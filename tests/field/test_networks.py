@@ -15,7 +15,7 @@ from radarsdf.field.field import Field
 from radarsdf.field.losses import intensity_loss, sdf_loss
 from radarsdf.field.networks import IntensityNetwork, SDFNetwork
 
-BARE = FitConfig(sdf_input=False, view_direction=False, log_range=False)
+BARE = FitConfig(networks={"sdf_input": False, "view_direction": False, "log_range": False})
 
 
 def inputs(config, count=20, encoding_dim=10):
@@ -27,8 +27,10 @@ def inputs(config, count=20, encoding_dim=10):
     return {
         "encoding": [normal(count, 1), normal(count, encoding_dim - 1)],
         "logit": normal(count),
-        "geometry_feature": normal(count, config.geometry_feature_dim),
-        "normals": torch.nn.functional.normalize(normal(count, 3), dim=1) if config.normals else None,
+        "geometry_feature": normal(count, config.networks.geometry_feature_dim),
+        "normals": torch.nn.functional.normalize(normal(count, 3), dim=1)
+        if config.networks.normals
+        else None,
         "directions": torch.nn.functional.normalize(normal(count, 3), dim=1),
         "ranges_m": 5 + 10 * torch.rand(count, generator=generator),
     }
@@ -51,7 +53,9 @@ def views(points):
 
 @pytest.mark.parametrize("geometry_feature_dim", [0, 15])
 def test_sdf_network(geometry_feature_dim):
-    network = SDFNetwork(10, FitConfig(sdf_hidden=(7, 5), geometry_feature_dim=geometry_feature_dim))
+    network = SDFNetwork(
+        10, FitConfig(networks={"sdf_hidden": (7, 5), "geometry_feature_dim": geometry_feature_dim})
+    )
     logit, feature = network([torch.randn(4, 4), torch.randn(4, 6)])
     assert logit.shape == (4,)
     assert feature.shape == (4, geometry_feature_dim)
@@ -94,7 +98,7 @@ def test_the_intensity_network_sees_what_it_is_told_to(setting, arguments, width
 
 
 def test_range_enters_as_its_logarithm():
-    config = dataclasses.replace(BARE, log_range=True, intensity_hidden=(1,))
+    config = BARE.override(networks={"log_range": True, "intensity_hidden": (1,)})
     network = IntensityNetwork(1, config)
     with torch.no_grad():  # the identity of log10(range / 10 m) + 5
         for layer in (network.layers[0], network.layers[2]):
@@ -112,7 +116,7 @@ def intensity(field, points, *, frozen=True, encoding_factors=None):
 
 
 def test_normals_are_the_normalised_gradient():
-    config = FitConfig(normals=True, sdf_hidden=(8,), intensity_hidden=(8,))
+    config = FitConfig(networks={"normals": True, "sdf_hidden": (8,), "intensity_hidden": (8,)})
     field, points = make_field(config)
     seen = []
     field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[3]))
@@ -124,7 +128,7 @@ def test_normals_are_the_normalised_gradient():
 
 @pytest.mark.parametrize("geometry_frozen", [False, True])
 def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_frozen):
-    field, points = make_field(dataclasses.replace(BARE, sdf_input=True))
+    field, points = make_field(BARE.override(networks={"sdf_input": True}))
     seen = []
     field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[:2]))
     factors = [torch.ones(len(points), dim) for dim in (field.cells.dim, field.fourier.dim)]
@@ -142,7 +146,7 @@ def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_fr
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("geometry_frozen", [False, True])
 def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geometry_frozen):
-    field, points = make_field(FitConfig(normals=normals, geometry_feature_dim=3))
+    field, points = make_field(FitConfig(networks={"normals": normals, "geometry_feature_dim": 3}))
     intensity(field, points, frozen=geometry_frozen).sum().backward()
     geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
     assert all(p.grad is not None and p.grad.any() for p in field.intensity_network.parameters())
@@ -151,7 +155,10 @@ def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geom
 
 def test_the_second_derivative_through_the_normals_is_right():
     # Double precision and smooth: no input but the normal depends on the features.
-    config = dataclasses.replace(BARE, normals=True, sdf_hidden=(6,), intensity_hidden=(6,), fourier_count=2)
+    config = BARE.override(
+        networks={"normals": True, "sdf_hidden": (6,), "intensity_hidden": (6,)},
+        encoding={"fourier_count": 2},
+    )
     field, points = make_field(config)
     field = field.double()
     points = points[:8].double()

@@ -29,7 +29,9 @@ def rays_down(heights, half_m=3.0, spacing_m=0.05):
 
 
 def fit(points, poses, **changes):
-    return radarsdf.fit(points, poses, config=FitConfig.quick(drop_ghosts=False, **changes), progress=False)
+    return radarsdf.fit(
+        points, poses, config=FitConfig.quick(**changes, returns={"drop_ghosts": False}), progress=False
+    )
 
 
 def inner_points(count=500):
@@ -95,7 +97,7 @@ def test_the_quick_mesh_lies_on_the_surface():
 
 def test_intensities_are_fitted_on_the_average():
     scene = ground_and_wall()
-    config = FitConfig.quick(intensity_iterations=200)
+    config = FitConfig.quick(training={"intensity_iterations": 200})
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
     world = scene.points[0] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
     error = np.abs(radar_map.intensity(world, scene.poses[0, :3, 3]) - scene.intensities[0])
@@ -115,7 +117,7 @@ def test_training_goes_on_from_the_average():
 def test_the_mesh_from_vertices_is_that_of_the_field(hidden):
     scene = ground_and_wall()
     radar_map = radarsdf.fit(
-        scene.points, scene.poses, config=FitConfig.quick(sdf_hidden=hidden), progress=False
+        scene.points, scene.poses, config=FitConfig.quick(networks={"sdf_hidden": hidden}), progress=False
     )
     everywhere = [[-100.0] * 3, [100.0] * 3]  # a box: vertices are looked up one by one
     one, other = radar_map.mesh(0.2), radar_map.mesh(0.2, box=everywhere)
@@ -130,7 +132,7 @@ def test_the_mesh_from_vertices_is_that_of_the_field(hidden):
 @pytest.mark.parametrize("hidden", [(2,), (5, 3), (4, 4, 4)])
 def test_the_network_starts_as_one_input(hidden):
     torch.manual_seed(0)
-    network = SDFNetwork(6, FitConfig(sdf_hidden=hidden, geometry_feature_dim=2))
+    network = SDFNetwork(6, FitConfig(networks={"sdf_hidden": hidden, "geometry_feature_dim": 2}))
     network.start_as_input(4)
     encoding = torch.randn(50, 6)
     logit, _ = network([encoding])
@@ -141,10 +143,10 @@ def test_the_network_starts_as_one_input(hidden):
 
 def test_only_an_octree_holds_an_average():
     with pytest.raises(ValueError, match="octree"):
-        FitConfig(start="average")
+        FitConfig(training={"start": "average"})
     with pytest.raises(ValueError, match="start"):
-        FitConfig(start="zero")
+        FitConfig(training={"start": "zero"})
     with pytest.raises(ValueError, match="at least two"):
-        FitConfig.quick(sdf_hidden=(1,))
+        FitConfig.quick(networks={"sdf_hidden": (1,)})
     with pytest.raises(ValueError, match="truncation_m"):
-        FitConfig.quick(truncation_m=0.3)
+        FitConfig.quick(training={"truncation_cells": 0.3})

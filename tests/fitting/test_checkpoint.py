@@ -20,7 +20,13 @@ from safetensors.torch import save_file
 
 # Batches of more rays than there are, so that the order is drawn anew, and two stages.
 QUICK = FitConfig(
-    sdf_iterations=30, intensity_iterations=60, batch_size=1024, intensity_batch_size=700, num_threads=2
+    num_threads=2,
+    training={
+        "sdf_iterations": 30,
+        "intensity_iterations": 60,
+        "batch_size": 1024,
+        "intensity_batch_size": 700,
+    },
 )
 
 
@@ -66,7 +72,7 @@ def test_stopped_again_and_again_it_ends_with_the_same_bits(scene, tmp_path, mon
     config = dataclasses.replace(QUICK, **changes)
     whole = fitted(scene, config=config)
     path = tmp_path / "state"
-    for stops in range(1, 4 if config.joint else 6):  # of 60 iterations in all, or of 90
+    for stops in range(1, 4 if config.training.joint else 6):  # of 60 iterations in all, or of 90
         done = interrupted_after(17, monkeypatch, scene, path, config)
         assert sum(done.values()) == 17 * stops
     resumed = fitted(scene, path, config)
@@ -170,7 +176,9 @@ class TestOtherFiles:
         for content in (b"", b"scans", bytes(100), b"\xff" * 100):
             path.write_bytes(content)
             self.refused(scene, path, "is not a checkpoint of a fit")
-        fitted(scene, config=dataclasses.replace(QUICK, sdf_iterations=1, intensity_iterations=1)).save(path)
+        fitted(scene, config=QUICK.override(training={"sdf_iterations": 1, "intensity_iterations": 1})).save(
+            path
+        )
         self.refused(scene, path, "is not a checkpoint of a fit")
 
     def test_of_another_version(self, scene, path):

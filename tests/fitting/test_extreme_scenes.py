@@ -15,10 +15,7 @@ from radarsdf.returns.rays import prepare
 from ..conftest import SEED, pose
 from ..conftest import ground_and_wall as any_ground_and_wall
 
-QUICK = FitConfig(
-    sdf_iterations=60, intensity_iterations=80, batch_size=512, intensity_batch_size=512, min_range_m=0.0, num_threads=1,
-    min_component_triangles=0, min_support=0.0,
-)  # fmt: skip
+QUICK = FitConfig(num_threads=1, min_component_triangles=0, min_support=0.0, training={"sdf_iterations": 60, "intensity_iterations": 80, "batch_size": 512, "intensity_batch_size": 512}, returns={"min_range_m": 0.0})  # fmt: skip
 LENGTHS = [f.name for f in dataclasses.fields(FitConfig) if f.name.endswith("_m")]
 
 
@@ -77,7 +74,7 @@ def test_of_any_size_where_the_lengths_of_the_configuration_go_along(scale):
     poses = scene.poses.copy()
     poses[:, :3, 3] *= scale
     points = [p * scale for p in scene.points]
-    config = dataclasses.replace(scaled(QUICK, scale), log_range=False)
+    config = scaled(QUICK, scale).override(networks={"log_range": False})
     radar_map = radarsdf.fit(points, poses, scene.intensities, config=config, progress=False)
     finite(radar_map, poses[0, :3, 3])
     assert wall_error_m(radar_map, np.eye(4), scale) < 0.1
@@ -146,7 +143,7 @@ def test_centimetres_for_metres_change_nothing_but_roundings():
     """Tolerance: 1 mm, and 0.1 dB, in the median. The range in log10(range / 10 m) is left out: it knows of metres."""
     scene = ground_and_wall()
     # Cells that look for ghosts are of 0.4 m, whatever the units.
-    config = dataclasses.replace(QUICK, log_range=False, drop_ghosts=False)
+    config = QUICK.override(networks={"log_range": False}, returns={"drop_ghosts": False})
     poses = scene.poses.copy()
     poses[:, :3, 3] *= 100
     metres = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
@@ -176,7 +173,7 @@ SHAPES = {
 def test_returns_on_less_than_a_surface(name, encoding):
     points = SHAPES[name]
     values = None if len(points) == 1 else [np.linspace(0, 1, len(points))]
-    config = dataclasses.replace(QUICK, encoding=encoding)
+    config = QUICK.override(encoding={"kind": encoding})
     radar_map = radarsdf.fit([points], np.eye(4)[None], values, config=config, progress=False)
     finite(radar_map, np.zeros(3))
     assert radar_map.observed(points).all()
@@ -193,7 +190,7 @@ def test_duplicates_weigh_but_add_nothing():
     scene = ground_and_wall(scans=2, returns_per_scan=400)
     twice = [np.concatenate([p] * 5) for p in scene.points]
     # Whether there is a gap or a plane depends on how many returns there are.
-    config = dataclasses.replace(QUICK, bridge_cells=0, onto_planes=False)
+    config = QUICK.override(encoding={"bridge_cells": 0}, returns={"onto_planes": False})
     maps = [radarsdf.fit(p, scene.poses, config=config, progress=False) for p in (scene.points, twice)]
     assert maps[0].report["leaf_cells"] == maps[1].report["leaf_cells"]
     assert abs(wall_error_m(maps[0], np.eye(4)) - wall_error_m(maps[1], np.eye(4))) < 0.1
@@ -202,7 +199,9 @@ def test_duplicates_weigh_but_add_nothing():
 def test_very_many_returns_in_one_cell():
     points = np.random.default_rng(0).uniform([5.0, 0.01, 0.01], [5.15, 0.19, 0.19], (1_000_000, 3))
     points = points.astype(np.float32)
-    radar_map = radarsdf.fit([points], np.eye(4)[None], config=dataclasses.replace(QUICK, sdf_iterations=30))
+    radar_map = radarsdf.fit(
+        [points], np.eye(4)[None], config=QUICK.override(training={"sdf_iterations": 30})
+    )
     finite(radar_map, np.zeros(3))
     assert radar_map.report["leaf_cells"] < 60
     assert radar_map.support.max() == 65535  # and not what is left of it in 16 bits
@@ -223,7 +222,7 @@ def test_returns_at_the_sensor_itself_are_dropped():
 def test_an_outlier_far_away_opens_no_cells_on_its_way(distance_m):
     scene = ground_and_wall(scans=2, returns_per_scan=600)
     points = [scene.points[0], np.concatenate([scene.points[1], [[distance_m, 0.0, 0.0]]])]
-    config = dataclasses.replace(QUICK, sdf_iterations=10)
+    config = QUICK.override(training={"sdf_iterations": 10})
     if distance_m > 2e5:  # beyond the lattice
         with pytest.raises(ValueError, match=r"1 of 1201 returns .* within a million cells .*max_range_m"):
             radarsdf.fit(points, scene.poses, config=config, progress=False)
@@ -233,7 +232,7 @@ def test_an_outlier_far_away_opens_no_cells_on_its_way(distance_m):
         assert 0 <= with_it.report["leaf_cells"] - without.report["leaf_cells"] < 12
         assert np.isfinite(with_it.sdf(points[1] @ scene.poses[1, :3, :3].T + scene.poses[1, :3, 3])).all()
     dropped = radarsdf.fit(
-        points, scene.poses, config=dataclasses.replace(config, max_range_m=1000.0), progress=False
+        points, scene.poses, config=config.override(returns={"max_range_m": 1000.0}), progress=False
     )
     assert dropped.report["returns"] - dropped.report["returns_used"] == 1
 
@@ -243,7 +242,7 @@ def test_scans_of_very_different_sizes():
     points = [scene.points[0], scene.points[1][:1], scene.points[2][:40]]
     values = [scene.intensities[0], scene.intensities[1][:1], scene.intensities[2][:40]]
     for frames in (1, 2):
-        config = dataclasses.replace(QUICK, accumulate_frames=frames)
+        config = QUICK.override(returns={"accumulate_scans": frames})
         radar_map = radarsdf.fit(points, scene.poses, values, config=config, progress=False)
         finite(radar_map, scene.poses[0, :3, 3])
         assert wall_error_m(radar_map, np.eye(4)) < 0.1

@@ -17,7 +17,7 @@ from radarsdf.fitting.sampling import Dropout, RaySampler
 
 from ..conftest import ground_and_wall
 
-QUICK = FitConfig(sdf_iterations=20, intensity_iterations=20, batch_size=1024)
+QUICK = FitConfig(training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024})
 
 
 def test_surface_and_free_space_are_where_they_should_be(radar_map):
@@ -110,26 +110,30 @@ def test_utm_coordinates_change_nothing():
 @pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
 @pytest.mark.parametrize("joint", [False, True])
 def test_every_input_of_the_intensity_network_runs(scene, encoding, joint):
-    config = dataclasses.replace(
-        QUICK, encoding=encoding, joint=joint, normals=True, geometry_feature_dim=15, intensity_iterations=30
+    config = QUICK.override(
+        encoding={"kind": encoding},
+        training={"joint": joint, "intensity_iterations": 30},
+        networks={"normals": True, "geometry_feature_dim": 15},
     )
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     assert np.isfinite(radar_map.intensity(np.array([[15.0, 0, 0]]), np.zeros(3))).all()
-    bare = dataclasses.replace(
-        config, normals=False, geometry_feature_dim=0, sdf_input=False, view_direction=False
+    bare = config.override(
+        networks={"normals": False, "geometry_feature_dim": 0, "sdf_input": False, "view_direction": False}
     )
     assert radarsdf.fit(scene.points, scene.poses, scene.intensities, config=bare).has_intensity
 
 
 def test_frozen_geometry_does_not_move(scene):
     # Without dropout, which depends on the number of iterations and reaches the joint beginning.
-    config = dataclasses.replace(QUICK, joint=True, feature_dropout=0.0, fourier_dropout=0.0)
+    config = QUICK.override(
+        training={"joint": True}, networks={"feature_dropout": 0.0, "fourier_dropout": 0.0}
+    )
     frozen = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     longer = radarsdf.fit(
         scene.points,
         scene.poses,
         scene.intensities,
-        config=dataclasses.replace(config, intensity_iterations=60),
+        config=config.override(training={"intensity_iterations": 60}),
     )
     assert torch.equal(frozen.field.cells.features, longer.field.cells.features)
     weights = [m.field.intensity_network.layers[0].weight for m in (frozen, longer)]
@@ -149,39 +153,39 @@ def test_the_more_often_samples_are_seen_the_more_is_hidden(monkeypatch):
     samples = FitConfig().near_samples * sum(map(len, scene.points))
     for passes in (1, 3, 27):
         shares.clear()
-        config = dataclasses.replace(
-            QUICK,
-            intensity_batch_size=128,
-            intensity_iterations=math.ceil(passes * samples / 128),
-            sdf_iterations=1,
-            feature_dropout=0.8,
-            fourier_dropout=0.4,
+        config = QUICK.override(
+            training={
+                "intensity_batch_size": 128,
+                "intensity_iterations": math.ceil(passes * samples / 128),
+                "sdf_iterations": 1,
+            },
+            networks={"feature_dropout": 0.8, "fourier_dropout": 0.4},
         )
         radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
         expected = passes / (passes + 3)
         assert min(shares) == pytest.approx(0.4 * expected, rel=0.02)
         assert max(shares) == pytest.approx(0.8 * expected, rel=0.02)
     shares.clear()
-    published = dataclasses.replace(QUICK, feature_dropout=0.0, fourier_dropout=0.0)
+    published = QUICK.override(networks={"feature_dropout": 0.0, "fourier_dropout": 0.0})
     radarsdf.fit(scene.points, scene.poses, scene.intensities, config=published)
     assert not shares
 
 
 def test_each_stage_of_the_schedule_begins_at_the_full_rate(scene):
     # A joint fit's second stage once inherited the rate that the first had let fall to nothing.
-    config = dataclasses.replace(QUICK, joint=True, intensity_iterations=20)
+    config = QUICK.override(training={"joint": True, "intensity_iterations": 20})
     after_first, after_second = (
         radarsdf.fit(
             scene.points,
             scene.poses,
             scene.intensities,
-            config=dataclasses.replace(config, intensity_iterations=n),
+            config=config.override(training={"intensity_iterations": n}),
         )
         .field.intensity_network.layers[0]
         .weight
         for n in (20, 40)
     )
-    assert (after_second - after_first).abs().max() > config.intensity_learning_rate
+    assert (after_second - after_first).abs().max() > config.training.intensity_learning_rate
 
 
 @pytest.mark.parametrize(
@@ -291,7 +295,9 @@ def test_a_loss_that_stops_being_finite_stops_the_fit(scene):
         radarsdf.fit(
             scene.points,
             scene.poses,
-            config=FitConfig(learning_rate=1e30, sdf_iterations=50, cosine_schedule=False),
+            config=FitConfig(
+                training={"learning_rate": 1e30, "sdf_iterations": 50, "cosine_schedule": False}
+            ),
         )
 
 
@@ -317,13 +323,15 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     monkeypatch.setattr(
         RaySampler, "spread", lambda self, *args: (drawn_from.append(len(self._rays)), spread(self, *args))[1]
     )
-    config = dataclasses.replace(QUICK, joint=False, drop_ghosts=True, onto_planes=False, num_threads=1)
+    config = QUICK.override(
+        num_threads=1, training={"joint": False}, returns={"drop_ghosts": True, "onto_planes": False}
+    )
     with_ghosts = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     assert with_ghosts.report["ghosts"] == is_ghost.sum()
     assert set(drawn_from) == {len(is_ghost)}
     real = np.split(~is_ghost, np.cumsum([len(p) for p in scene.points])[:-1])
     points = [p[k] for p, k in zip(scene.points, real, strict=True)]
-    config = dataclasses.replace(config, drop_ghosts=False)
+    config = config.override(returns={"drop_ghosts": False})
     without = radarsdf.fit(points, scene.poses, config=config)
     assert with_ghosts.report["leaf_cells"] == without.report["leaf_cells"]
     assert with_ghosts.support.tolist() == without.support.tolist()
@@ -335,7 +343,7 @@ def test_the_number_of_threads_only_rounds_differently(scene):
         radarsdf.fit(
             scene.points,
             scene.poses,
-            config=dataclasses.replace(QUICK, sdf_iterations=20, num_threads=threads),
+            config=QUICK.override(num_threads=threads, training={"sdf_iterations": 20}),
         )
         for threads in (1, 2)
     ]

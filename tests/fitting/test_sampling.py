@@ -41,7 +41,11 @@ DRAWS = {"batch": lambda draw: draw.batch()[0], "spread": lambda draw: draw.spre
 
 def test_neighbours_come_together_and_all_have_their_turn(rays):
     draw = RaySampler(
-        rays, FitConfig(near_samples=1, free_samples=1), 64, torch.Generator().manual_seed(0), neighbours=5
+        rays,
+        FitConfig(sampling={"near_samples": 1, "free_samples": 1}),
+        64,
+        torch.Generator().manual_seed(0),
+        neighbours=5,
     )
     place = np.argsort(draw._original.numpy())  # of each ray in Morton order
     seen = []
@@ -66,7 +70,7 @@ def test_labels_are_the_signed_distance_to_the_return(rays, kind):
 
 
 def test_ranges_of_the_samples(rays):
-    config = FitConfig(near_band_m=0.25, free_from=0.4, free_beyond_m=0.6)
+    config = FitConfig(sampling={"near_band_cells": 0.25, "free_from": 0.4, "free_beyond_cells": 0.6})
     draw = RaySampler(rays, config, 512, torch.Generator().manual_seed(0))
     near, free, lowest_share = [], [], []
     for _ in range(40):

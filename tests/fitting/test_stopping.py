@@ -262,7 +262,7 @@ def poisoned(monkeypatch):
 
 def test_a_gradient_that_is_not_finite_never_reaches_the_map(scene, poisoned):
     poisoned(230)
-    config = FitConfig(sdf_iterations=400, batch_size=512)
+    config = FitConfig(training={"sdf_iterations": 400, "batch_size": 512})
     with pytest.raises(
         Diverged, match=r"not finite at iteration \d+ of 400 of the sdf stage|loss is nan"
     ) as caught:
@@ -276,7 +276,9 @@ def test_a_gradient_that_is_not_finite_never_reaches_the_map(scene, poisoned):
 def test_the_last_step_is_looked_at_too(scene, poisoned):
     poisoned(20)
     with pytest.raises(Diverged, match="iteration 19 of 20"):
-        radarsdf.fit(scene.points, scene.poses, config=FitConfig(sdf_iterations=20, batch_size=512))
+        radarsdf.fit(
+            scene.points, scene.poses, config=FitConfig(training={"sdf_iterations": 20, "batch_size": 512})
+        )
 
 
 @pytest.mark.parametrize("joint", [True, False])
@@ -299,7 +301,10 @@ def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypat
 
     for method in ("geometry", "joint", "reflectance"):
         monkeypatch.setattr(Shard, method, failing(getattr(Shard, method)))
-    config = FitConfig(sdf_iterations=10, intensity_iterations=20, batch_size=512, num_threads=1, joint=joint)
+    config = FitConfig(
+        num_threads=1,
+        training={"sdf_iterations": 10, "intensity_iterations": 20, "batch_size": 512, "joint": joint},
+    )
     expected = f"the {name} loss is inf at iteration 7 of {of} of the {stage} stage"
     with pytest.raises(Diverged, match=expected) as caught:
         radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
@@ -309,7 +314,7 @@ def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypat
 
 def test_the_map_after_a_divergence_has_no_gradients_and_threads_are_restored(scene):
     threads = torch.get_num_threads()
-    config = FitConfig(learning_rate=1e30, sdf_iterations=50, cosine_schedule=False)
+    config = FitConfig(training={"learning_rate": 1e30, "sdf_iterations": 50, "cosine_schedule": False})
     with pytest.raises(Diverged) as caught:
         radarsdf.fit(scene.points, scene.poses, config=config)
     assert not any(p.requires_grad for p in caught.value.radar_map.field.parameters())
@@ -321,7 +326,7 @@ def test_an_interrupted_fit_is_a_keyboard_interrupt_even_where_nobody_defers(sce
         raise KeyboardInterrupt
 
     monkeypatch.setattr("radarsdf.fitting.training.Training.run", interrupt)
-    config = dataclasses.replace(FitConfig(), sdf_iterations=1)
+    config = FitConfig().override(training={"sdf_iterations": 1})
     with pytest.raises(Interrupted, match="while training") as caught:
         radarsdf.fit(scene.points, scene.poses, config=config)
     assert caught.value.radar_map.report["iterations_done"] == {"sdf": 0, "intensity": 0}

@@ -212,7 +212,9 @@ def test_a_box_in_the_world_frame(sharp_map, offset):
 
 def test_small_components_are_dropped():
     few = ground_and_wall(scans=2, returns_per_scan=160)
-    config = radarsdf.FitConfig(sdf_iterations=60, batch_size=1024, min_component_triangles=0)
+    config = radarsdf.FitConfig(
+        min_component_triangles=0, training={"sdf_iterations": 60, "batch_size": 1024}
+    )
     patches = radarsdf.fit(few.points, few.poses, config=config, progress=False)
     whole = patches.mesh()
     labels, sizes = mesh_components(whole.faces.astype(np.int32), len(whole.vertices))
@@ -289,7 +291,7 @@ def test_viewpoints_that_make_no_sense(sharp_map, viewpoint):
 
 
 def test_a_viewpoint_needs_intensities(scene):
-    config = radarsdf.FitConfig(sdf_iterations=1, batch_size=64)
+    config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     bare = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
     with pytest.raises(ValueError, match="fitted without"):
         bare.mesh(viewpoint=SENSOR)
@@ -332,7 +334,7 @@ def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, 
 
 def test_cells_are_skipped_only_where_the_encoding_is_smooth():
     assert _smooth_in_cells(radarsdf.FitConfig())
-    assert _smooth_in_cells(radarsdf.FitConfig(fourier_count=0))
+    assert _smooth_in_cells(radarsdf.FitConfig(encoding={"fourier_count": 0}))
     assert not _smooth_in_cells(radarsdf.FitConfig.paper())  # its finest wavelength is 2.5 cm
 
 

@@ -240,7 +240,7 @@ def test_nbytes_is_that_of_features_and_weights(scene, sharp_map):
     width = sharp_map.field.intensity_network.layers[0].in_features
     intensity = (width * 64 + 64) + 2 * (64 * 64 + 64) + (64 + 1)
     assert sharp_map.nbytes == features + 4 * (sdf + intensity)
-    config = radarsdf.FitConfig(sdf_iterations=1, batch_size=64)
+    config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     assert radarsdf.fit(scene.points, scene.poses, config=config, progress=False).nbytes == features + 4 * sdf
 
 
@@ -250,7 +250,7 @@ def test_repr_says_what_it_is(scene, sharp_map):
         repr(sharp_map)
         == f"RadarMap(surface and reflectance, {cells} cells, {sharp_map.nbytes / 1e6:.1f} MB)"
     )
-    config = radarsdf.FitConfig(sdf_iterations=1, batch_size=64)
+    config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     assert repr(radarsdf.fit(scene.points, scene.poses, config=config)).startswith("RadarMap(surface, ")
 
 
@@ -264,7 +264,7 @@ def test_the_report_counts(scene, sharp_map):
 
 
 def test_a_map_without_intensities_says_so(scene):
-    config = radarsdf.FitConfig(sdf_iterations=1, batch_size=64)
+    config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
     assert not radar_map.has_intensity
     with pytest.raises(ValueError, match="fitted without intensities"):

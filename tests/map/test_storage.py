@@ -19,7 +19,9 @@ from radarsdf.io import files
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-QUICK = FitConfig(sdf_iterations=60, intensity_iterations=8, batch_size=1024, min_component_triangles=0)
+QUICK = FitConfig(
+    min_component_triangles=0, training={"sdf_iterations": 60, "intensity_iterations": 8, "batch_size": 1024}
+)
 SENSOR = np.array([0.5, 0.0, 1.5])
 
 

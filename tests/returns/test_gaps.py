@@ -95,7 +95,7 @@ def test_a_sparse_surface_has_fewer_holes():
     scene = ground_and_wall(scans=4, returns_per_scan=400)
     area = {}
     for cells in (0, 2):
-        config = FitConfig(bridge_cells=cells, min_support=0.0, num_threads=1)
+        config = FitConfig(min_support=0.0, num_threads=1, encoding={"bridge_cells": cells})
         mesh = radarsdf.fit(scene.points, scene.poses, config=config, progress=False).mesh()
         area[cells] = mesh.area
         off_m = np.minimum(np.abs(mesh.vertices[:, 2]), np.abs(mesh.vertices[:, 0] - 20))

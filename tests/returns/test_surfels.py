@@ -102,9 +102,9 @@ def test_planes_of_cells():
 
 def test_a_fit_drops_and_counts_them():
     points, poses, is_ghost = a_wall(ghosts=40)
-    config = FitConfig(sdf_iterations=5, min_range_m=0.0)
+    config = FitConfig(training={"sdf_iterations": 5}, returns={"min_range_m": 0.0})
     with_ghosts, without = (
-        radarsdf.fit(points, poses, config=dataclasses.replace(config, drop_ghosts=drop), progress=False)
+        radarsdf.fit(points, poses, config=config.override(returns={"drop_ghosts": drop}), progress=False)
         for drop in (False, True)
     )
     assert with_ghosts.report["ghosts"] == 0
@@ -271,7 +271,9 @@ def test_a_fit_to_planes_is_nearer_to_the_surface():
     scene = ground_and_wall(noise_m=0.15)
     errors_m = []
     for onto_planes in (False, True):
-        config = FitConfig(onto_planes=onto_planes, sdf_iterations=150, num_threads=2)
+        config = FitConfig(
+            num_threads=2, returns={"onto_planes": onto_planes}, training={"sdf_iterations": 150}
+        )
         vertices = radarsdf.fit(scene.points, scene.poses, config=config).mesh().vertices
         on_wall = (np.abs(vertices[:, 0] - 20) < 0.8) & (vertices[:, 2] > 1) & (vertices[:, 2] < 3)
         errors_m.append(np.sqrt(np.mean((vertices[on_wall, 0] - 20) ** 2)))

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a fit or a mesh will take, before it is begun: an estimate, and an error where there is not so much memory."""
+"""What a fit or a mesh will take, before it begins: an estimate, and an error where there is not so much memory."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,10 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf._core import FEATURE_DIM
 from radarsdf.budget.durations import SECONDS, shared, work_of
 from radarsdf.budget.schedule import Schedule
 from radarsdf.config import FitConfig
-from radarsdf.field.kernels import FEATURE_DIM
+from radarsdf.field.widths import fourier_width, intensity_widths, parameters_of, sdf_widths
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import resolve_num_threads
 
@@ -83,7 +83,7 @@ def estimate(
     True
     """
     config = FitConfig() if config is None else config
-    return estimate_rays(prepare(points, poses, intensities, **config.preparation), config)
+    return estimate_rays(prepare(points, poses, intensities, **config.returns.preparation), config)
 
 
 def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
@@ -113,16 +113,21 @@ def _schedule(rays: Rays, rows: int, config: FitConfig) -> Schedule:
 
 def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
     count, with_intensity = len(rays), rays.intensities is not None
-    parameters = rows * FEATURE_DIM + _network_parameters(config, with_intensity)
+    parameters = rows * FEATURE_DIM + parameters_of(sdf_widths(config))
+    if with_intensity:
+        parameters += parameters_of(intensity_widths(config))
     memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL
-    gradients = 0 if config.row_updates else resolve_num_threads(config.num_threads)
-    memory += 4 * parameters * (_COPIES + gradients) + config.row_updates * rows * _PER_ROW
-    batch_size = max(_schedule(rays, rows, config).batch_size, with_intensity * config.intensity_batch_size)
+    moves_rows = config.moves_rows(with_intensity)
+    gradients = 0 if moves_rows else resolve_num_threads(config.num_threads)
+    memory += 4 * parameters * (_COPIES + gradients) + moves_rows * rows * _PER_ROW
+    batch_size = max(
+        _schedule(rays, rows, config).batch_size, with_intensity * config.training.intensity_batch_size
+    )
     memory += batch_size * _sample_bytes(config)
     if with_intensity:
-        memory += count * (_PER_INTENSITY + config.drop_ghosts * _PER_RETURN_AGAIN)
+        memory += count * (_PER_INTENSITY + config.returns.drop_ghosts * _PER_RETURN_AGAIN)
     passing = count * _PER_RETURN_CHECKED
-    if config.encoding == "octree":
+    if config.encoding.kind == "octree":
         passing = max(passing, _ALWAYS + cells * _PER_CELL + rows * _PER_OCTREE_ROW)
     return int(max(memory, passing))
 
@@ -132,8 +137,11 @@ def check_fit(rays: Rays, config: FitConfig) -> None:
     available = available_bytes() if config.max_memory_bytes is None else config.max_memory_bytes
     # No line of samples meets more cells, and no cell has more corners: where this is little, there is nothing to count.
     cells = len(rays) * (3 * math.ceil(2 * config.near_band_m / config.leaf_size_m) + 3)
-    corners = 12 if config.encoding == "tri-quadtree" else 8
-    if available is None or _fit_bytes(rays, cells, cells * corners * config.num_levels, config) <= available:
+    corners = 12 if config.encoding.kind == "tri-quadtree" else 8
+    if (
+        available is None
+        or _fit_bytes(rays, cells, cells * corners * config.encoding.num_levels, config) <= available
+    ):
         return
     expected = estimate_rays(rays, config)
     if expected.peak_memory_bytes > available:
@@ -186,26 +194,19 @@ def available_bytes(root: Path = Path("/")) -> int | None:
 
 def _sample_bytes(config: FitConfig) -> float:
     """Of a sample in a batch: what its gradient needs of its way through the encoding and the networks."""
-    encoding = config.num_levels * FEATURE_DIM + 6 * config.fourier_count
-    numbers = 2 * encoding + sum(config.sdf_hidden) + sum(config.intensity_hidden)
-    return 4.0 * numbers * (3 if config.normals else 1)  # of normals, the gradient of a gradient
-
-
-def _network_parameters(config: FitConfig, with_intensity: bool) -> int:
-    encoding = config.num_levels * FEATURE_DIM + 6 * config.fourier_count
-    sdf = (encoding, *config.sdf_hidden, 1 + config.geometry_feature_dim)
-    intensity = (encoding + 32 + config.geometry_feature_dim, *config.intensity_hidden, 1)
-    networks = (sdf, intensity) if with_intensity else (sdf,)
-    return sum(a * b for widths in networks for a, b in itertools.pairwise(widths))
+    encoding = config.encoding.num_levels * FEATURE_DIM + fourier_width(config)
+    numbers = 2 * encoding + sum(config.networks.sdf_hidden) + sum(config.networks.intensity_hidden)
+    return 4.0 * numbers * (3 if config.networks.normals else 1)  # of normals, the gradient of a gradient
 
 
 def _count_cells(rays: Rays, config: FitConfig) -> tuple[int, int]:
     """Leaf cells and rows of features, from those pieces of space that a hash puts into a sample."""
     all_axes = (0, 1, 2)
-    planes = [(0, 1), (0, 2), (1, 2)] if config.encoding == "tri-quadtree" else [all_axes]
+    planes = [(0, 1), (0, 2), (1, 2)] if config.encoding.kind == "tri-quadtree" else [all_axes]
     cells = round(sum(_distinct(rays, config, all_axes, [0], corners=False)))
     rows = sum(
-        sum(_distinct(rays, config, axes, list(range(config.num_levels)), corners=True)) for axes in planes
+        sum(_distinct(rays, config, axes, list(range(config.encoding.num_levels)), corners=True))
+        for axes in planes
     )
     return cells, round(rows)
 

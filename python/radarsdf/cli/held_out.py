@@ -40,7 +40,7 @@ def _in_world(scans: Scans, config: FitConfig) -> tuple[Any, Any, Any]:
         scans.points,
         scans.poses,
         scans.intensities,
-        min_range_m=config.min_range_m,
-        max_range_m=config.max_range_m,
+        min_range_m=config.returns.min_range_m,
+        max_range_m=config.returns.max_range_m,
     )
     return *rays.in_world(), rays.intensities

@@ -4,12 +4,17 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from radarsdf._core import Encoding, VertexTable
+from radarsdf._core import FEATURE_DIM, Encoding, VertexTable
 from radarsdf.field import kernels
+
+_FEATURE_STD = 0.05
 
 
 class VertexFeatures(nn.Module):
@@ -34,20 +39,24 @@ class VertexFeatures(nn.Module):
     ) -> None:
         super().__init__()
         self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, self.encoding, num_threads)
-        self.features = nn.Parameter(kernels.large_zeros(self.table.num_rows, kernels.FEATURE_DIM))
+        self.features = nn.Parameter(kernels.large_zeros(self.table.num_rows, FEATURE_DIM))
 
     @property
     def interpolated_dim(self) -> int:
         """Numbers that are interpolated for a point."""
-        return kernels.FEATURE_DIM * self.table.num_levels
+        return FEATURE_DIM * self.table.num_levels
 
-    def initialise(self, std: float) -> None:
-        """Draws the features from N(0, std²)."""
-        nn.init.normal_(self.features, std=std)
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draws the features from N(0, 0.05²) (3QFP)."""
+        nn.init.normal_(self.features, std=_FEATURE_STD, generator=generator)
 
-    def interpolated(self, points: Tensor) -> Tensor:
-        """(N, `interpolated_dim`)."""
-        return kernels.interpolate(self.features, points, self.table)
+    def forward(self, points: Tensor) -> Tensor:
+        """Encoding (N, any) of points (N, 3), local frame, m."""
+        return self.combine(kernels.interpolate(self.features, points, self.table))
+
+    @abstractmethod
+    def combine(self, interpolated: Tensor) -> Tensor:
+        """From what is interpolated, (N, `interpolated_dim`), to the encoding."""
 
     def occupied(self, points: Tensor) -> Tensor:
         """Whether each point (N, 3), local frame, m, lies in an occupied leaf cell: (N,) bool."""
@@ -55,59 +64,40 @@ class VertexFeatures(nn.Module):
 
 
 class TriQuadtree(VertexFeatures):
-    """Quadtrees on the planes xy, xz, yz: planes summed, levels concatenated (3QFP, ICRA 2024).
-
-    ``forward`` takes points (N, 3), local frame, m, and returns (N, 8 · num_levels).
-    """
+    """Quadtrees on the planes xy, xz, yz: planes summed, levels concatenated, (N, 8 · num_levels) (3QFP, ICRA 2024)."""
 
     encoding = Encoding.TRI_QUADTREE
 
-    @property
-    def dim(self) -> int:
-        return self.interpolated_dim
-
-    def forward(self, points: Tensor) -> Tensor:
-        return self.interpolated(points)
+    def combine(self, interpolated: Tensor) -> Tensor:
+        return interpolated
 
 
 class Octree(VertexFeatures):
-    """Features at the eight corners of the cells in space, trilinear, levels summed (SHINE-Mapping, ICRA 2023).
-
-    ``forward`` takes points (N, 3), local frame, m, and returns (N, 8).
-    """
+    """Features at the corners of cells in space, trilinear, levels summed, (N, 8) (SHINE-Mapping, ICRA 2023)."""
 
     encoding = Encoding.OCTREE
-    dim = kernels.FEATURE_DIM
 
-    def forward(self, points: Tensor) -> Tensor:
-        levels = self.interpolated(points)
-        return levels.view(-1, self.table.num_levels, kernels.FEATURE_DIM).sum(1)
+    def combine(self, interpolated: Tensor) -> Tensor:
+        return interpolated.view(-1, self.table.num_levels, FEATURE_DIM).sum(1)
 
 
 class Fourier(nn.Module):
-    """Sine and cosine of 2^k·π·x / half_width for a range of k (3QFP's positional encoding).
+    """Sine and cosine of 2^k·π·x / half_width for k = 0, 1, … (3QFP's positional encoding).
 
     ``forward`` takes points (N, 3), local frame, m, and returns (N, 6 · num_frequencies).
     """
 
-    def __init__(self, half_width_m: float, first_frequency: int, num_frequencies: int) -> None:
+    def __init__(self, half_width_m: float, num_frequencies: int) -> None:
         super().__init__()
         self.half_width_m = half_width_m
-        self.first_frequency = first_frequency
         self.num_frequencies = num_frequencies
 
-    @property
-    def dim(self) -> int:
-        return 6 * self.num_frequencies
-
     def forward(self, points: Tensor) -> Tensor:
-        return kernels.fourier(points, self.half_width_m, self.first_frequency, self.num_frequencies)
+        return kernels.fourier(points, self.half_width_m, 0, self.num_frequencies)
 
 
 class SphericalHarmonics(nn.Module):
     """Real spherical harmonics of degree 0 to 3 ("degree 4" of the paper): unit vectors (N, 3) to (N, 16)."""
-
-    dim = kernels.NUM_SPHERICAL_HARMONICS
 
     def forward(self, directions: Tensor) -> Tensor:
         return kernels.spherical_harmonics(directions)

@@ -57,35 +57,47 @@ class Field(nn.Module):
         self, leaf_keys: NDArray[np.uint64], config: FitConfig, *, with_intensity: bool, num_threads: int = 0
     ) -> None:
         super().__init__()
-        encoding = TriQuadtree if config.encoding == "tri-quadtree" else Octree
+        encoding = TriQuadtree if config.encoding.kind == "tri-quadtree" else Octree
         self.sigma_m = config.sigma_m
-        self.cells = encoding(leaf_keys, config.leaf_size_m, config.num_levels, num_threads)
-        self.fourier = Fourier(config.fourier_half_width_m, config.fourier_first, config.fourier_count)
-        dim = self.cells.dim + self.fourier.dim
-        self.sdf_network = SDFNetwork(dim, config)
-        self.intensity_network = IntensityNetwork(dim, config) if with_intensity else None
+        self.cells = encoding(leaf_keys, config.leaf_size_m, config.encoding.num_levels, num_threads)
+        self.fourier = Fourier(config.fourier_half_width_m, config.encoding.fourier_count)
+        self.sdf_network = SDFNetwork(config)
+        self.intensity_network = IntensityNetwork(config) if with_intensity else None
 
-    def encode(self, points: Tensor) -> tuple[Tensor, ...]:
-        """(N, 3) local, m, to (N, any) each."""
-        cells = self.cells(points)
-        return (cells, self.fourier(points)) if self.fourier.dim else (cells,)
+    def initialise(self, generator: torch.Generator, *, features: bool = True) -> None:
+        """Draws the weights of the networks, then the features, which stay zero where `features` is False (3QFP)."""
+        self.sdf_network.initialise(generator)
+        if self.intensity_network is not None:
+            self.intensity_network.initialise(generator)
+        if features:
+            self.cells.initialise(generator)
 
-    def logit(self, points: Tensor) -> Tensor:
-        """Signed distance / sigma (N,), positive in free space."""
-        return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
+    def encode(self, points: Tensor, interpolated: Tensor | None = None) -> tuple[Tensor, ...]:
+        """(N, 3) local, m, to (N, any) each. `interpolated`: what the cells' features give there, where it is known."""
+        cells = self.cells(points) if interpolated is None else self.cells.combine(interpolated)
+        return (cells, self.fourier(points)) if self.fourier.num_frequencies else (cells,)
+
+    def logit(self, points: Tensor, interpolated: Tensor | None = None) -> Tensor:
+        """Signed distance / sigma (N,), positive in free space. `interpolated`: see :meth:`encode`."""
+        return self.sdf_network(self.encode(points, interpolated))[0]  # type: ignore[no-any-return]
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """(N,) m, positive in free space."""
         return self.logit(points) * self.sigma_m
 
-    def geometry(self, points: Tensor, *, frozen: bool = True) -> Geometry:
-        """All that the intensity network is to know of points (N, 3). `frozen`: none of its graph is kept."""
+    def geometry(
+        self, points: Tensor, *, frozen: bool = True, interpolated: Tensor | None = None
+    ) -> Geometry:
+        """What the intensity network may see of points (N, 3), local, m.
+
+        `frozen`: no gradient reaches features and SDF network. `interpolated`: see :meth:`encode`.
+        """
         wants_normals = self.intensity_network is not None and self.intensity_network.normals
         # The normal is itself a gradient: where it is wanted, its own graph is needed for a moment.
         with torch.set_grad_enabled((torch.is_grad_enabled() and not frozen) or wants_normals):
             if wants_normals:
                 points = points.detach().requires_grad_()
-            encoding = self.encode(points)
+            encoding = self.encode(points, interpolated)
             logit, feature = self.sdf_network(encoding)
             normals = None
             if wants_normals:
@@ -96,7 +108,7 @@ class Field(nn.Module):
             logit, feature = logit.detach(), feature.detach()
         return Geometry(encoding, logit, feature, normals)
 
-    def reflectance(
+    def intensity(
         self,
         geometry: Geometry,
         directions: Tensor,

@@ -22,12 +22,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from radarsdf._core import TaskQueue, VertexTable
+from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, TaskQueue, VertexTable
 from radarsdf._core import fourier as _fourier
 from radarsdf._core import spherical_harmonics as _spherical_harmonics
 
-FEATURE_DIM = 8
-NUM_SPHERICAL_HARMONICS = 16
 _CACHE_LINE = 64  # bytes
 
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import torch
@@ -13,34 +14,49 @@ from torch import Tensor, nn
 from radarsdf.config import FitConfig
 from radarsdf.field.encodings import SphericalHarmonics
 from radarsdf.field.mlp import mlp
+from radarsdf.field.widths import intensity_widths, sdf_widths
 
 
-def _layers(widths: Sequence[int]) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
-        layers.append(nn.Linear(inputs, outputs))
-        if i < len(widths) - 2:
-            layers.append(nn.ReLU())
-    return nn.Sequential(*layers)
+class Network(nn.Module):
+    """Linear layers with ReLU between them. They take no memory until they are initialised or loaded."""
+
+    def __init__(self, widths: Sequence[int]) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
+            layers.append(nn.Linear(inputs, outputs, device="meta", dtype=torch.float32))
+            if i < len(widths) - 2:
+                layers.append(nn.ReLU())
+        self.layers = nn.Sequential(*layers)
+
+    @torch.no_grad()
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draws weights and biases as ``torch.nn.Linear`` does, from a generator of our own."""
+        self.to_empty(device="cpu")
+        for layer in self._linear():
+            nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=generator)
+            bound = 1 / math.sqrt(layer.in_features)
+            nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
+
+    def _linear(self) -> list[nn.Linear]:
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+
+    def _run(self, inputs: Sequence[Tensor]) -> Tensor:
+        """The layers on `inputs` side by side."""
+        layers = [(layer.weight, layer.bias) for layer in self._linear()]
+        return mlp([x for x in inputs if x.shape[1] > 0], layers)
 
 
-def _run(layers: nn.Sequential, inputs: Sequence[Tensor]) -> Tensor:
-    """`layers` on `inputs` side by side."""
-    linear = [(layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear)]
-    return mlp([x for x in inputs if x.shape[1] > 0], linear)
-
-
-class SDFNetwork(nn.Module):
+class SDFNetwork(Network):
     """Encoding of a point to distance / sigma (positive in free space) and, where asked for, a geometry feature."""
 
-    def __init__(self, encoding_dim: int, config: FitConfig) -> None:
-        super().__init__()
-        self.layers = _layers([encoding_dim, *config.sdf_hidden, 1 + config.geometry_feature_dim])
+    def __init__(self, config: FitConfig) -> None:
+        super().__init__(sdf_widths(config))
 
     @torch.no_grad()
     def start_as_input(self, index: int) -> None:
         """Makes the logit one number of the encoding, which two units of each hidden layer carry past the ReLUs."""
-        first, *hidden, last = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        first, *hidden, last = self._linear()
         for layer in (first, *hidden):
             layer.weight[:2] = 0
             layer.bias[:2] = 0
@@ -53,33 +69,25 @@ class SDFNetwork(nn.Module):
 
     def forward(self, encoding: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Encodings (N, any), side by side, to the logit (N,) and the geometry feature (N, geometry_feature_dim)."""
-        out = _run(self.layers, encoding)
+        out = self._run(encoding)
         # A column of several costs its gradient a matrix of zeros: where there is but one, it is the matrix.
         return out.squeeze(1) if out.shape[1] == 1 else out[:, 0], out[:, 1:]
 
 
-class IntensityNetwork(nn.Module):
+class IntensityNetwork(Network):
     """How strongly a point answers a sensor, scaled to about [0, 1].
 
     The radar equation, P ∝ σ / r⁴, needs the range as well as the direction: in dB its logarithm enters linearly.
     """
 
-    def __init__(self, encoding_dim: int, config: FitConfig) -> None:
-        super().__init__()
-        self.sdf_input = config.sdf_input
-        self.view_direction = config.view_direction
-        self.log_range = config.log_range
-        self.normals = config.normals
+    def __init__(self, config: FitConfig) -> None:
+        super().__init__(intensity_widths(config))
+        networks = config.networks
+        self.sdf_input = networks.sdf_input
+        self.view_direction = networks.view_direction
+        self.log_range = networks.log_range
+        self.normals = networks.normals
         self.harmonics = SphericalHarmonics()
-        inputs = (
-            encoding_dim
-            + config.sdf_input
-            + config.geometry_feature_dim
-            + 3 * config.normals
-            + self.harmonics.dim * config.view_direction
-            + config.log_range
-        )
-        self.layers = _layers([inputs, *config.intensity_hidden, 1])
 
     def forward(
         self,
@@ -111,4 +119,4 @@ class IntensityNetwork(nn.Module):
             inputs.append(self.harmonics(directions))
         if self.log_range:
             inputs.append(torch.log10(ranges_m.clamp_min(1e-3) / 10.0)[:, None])
-        return _run(self.layers, inputs).squeeze(1)
+        return self._run(inputs).squeeze(1)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 FORMAT = "radarsdf.checkpoint"
 _EVERY_S = 30.0
 _SHARE = 0.02  # of the time, at most, goes into writing
-_NOT_OF_THE_TRAINING = ("num_threads", "max_memory_bytes", "min_support", "min_component_triangles")
+_NOT_OF_THE_TRAINING = ("num_threads", "max_memory_bytes")
 
 
 class Checkpoint:
@@ -91,8 +91,8 @@ class Checkpoint:
         try:
             with safe_open(self._path, framework="pt") as file:
                 if (names := set(file.keys())) != set(expected):
-                    shards = sum(name.startswith("shard.") and name.endswith(".generator") for name in names)
-                    msg = f"other tensors: perhaps of {shards} threads"
+                    parts = sum(name.startswith("backend.") and name.endswith(".generator") for name in names)
+                    msg = f"other tensors: perhaps of {parts} threads"
                     raise ValueError(msg)
                 for name, tensor in expected.items():
                     shape = tuple(file.get_slice(name).get_shape())

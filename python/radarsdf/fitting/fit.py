@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from os import PathLike
@@ -13,25 +12,20 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf import threads
-from radarsdf._core import CellSet
 from radarsdf.budget.estimate import check_fit
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
-from radarsdf.fitting.averaging import start_from_average
 from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.start import STARTS
 from radarsdf.fitting.stopping import Diverged, Interrupted
+from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.gaps import bridged
-from radarsdf.returns.ghosts import find_ghosts
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import Rays, prepare
-from radarsdf.returns.support import support_of_cells, support_of_points
-from radarsdf.returns.surfels import Surfels
 from radarsdf.threads import Workers
 
 
@@ -95,49 +89,24 @@ def fit(
     clock = _Clock()
     radar_map = None
     try:
-        rays = prepare(points, poses, intensities, **config.preparation)
+        rays = prepare(points, poses, intensities, **config.returns.preparation)
         _check_extent(rays, config)
         check_fit(rays, config)
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
         clock.lap("prepare_s")
         with Workers(config.num_threads) as workers:
-            surface, surfels = rays, None
-            averaged = (
-                MeanRays.of(rays, config.leaf_size_m, workers.num_threads)
-                if config.start == "average"
-                else None
-            )
-            if config.drop_ghosts or config.onto_planes or averaged is not None:
-                surfels = Surfels.of(rays, config.leaf_size_m, workers.num_threads)
-                surface, averaged = _surface(rays, averaged, surfels, config, workers.num_threads)
-                clock.lap("ghosts_s")
-            field = _new_field(surface, averaged, config, workers.num_threads)
-            leaf_keys = field.cells.table.leaf_keys()
+            surface = SurfaceReturns.of(rays, config, workers.num_threads)
+            clock.lap("ghosts_s")
+            start = STARTS[config.training.start](surface, config, workers.num_threads)
+            field = _open_cells(start.leaf_keys(), surface.rays, config, workers.num_threads)
             clock.lap("occupied_cells_s")
-            if averaged is not None and surfels is not None:
-                start_from_average(field, averaged, surfels, config, workers.num_threads)
-                clock.lap("average_s")
-                support = support_of_cells(averaged.keys, averaged.counts, leaf_keys, workers.num_threads)
-            else:
-                support = support_of_points(
-                    surface.points, leaf_keys, config.leaf_size_m, workers.num_threads
-                )
-            clock.lap("support_s")
+            start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
+            support = start.support(field.cells.table.leaf_keys())
+            clock.lap("start_s")
             scale = IntensityScale.of(rays.intensities)
-            training = Training(field, surface, rays, scale, config, workers)
+            training = Training(field, surface.rays, rays, scale, config, workers)
             if saved is not None:
                 saved.resume(training)
-            report = {
-                "returns": sum(len(np.asarray(scan)) for scan in points),
-                "returns_used": len(surface),
-                "ghosts": len(rays) - len(surface),
-                "leaf_cells": len(leaf_keys),
-                "vertices": field.cells.table.num_rows,
-                "iterations": training.iterations,
-                "iterations_done": training.iterations_done,
-                "losses": training.losses,
-                "skipped": _skipped(config, training, scale),
-            }
             # Whole from here on, and better with every iteration: what there is when the training ends too early.
             radar_map = RadarMap(
                 MapContents(
@@ -146,7 +115,17 @@ def fit(
                     intensity_scale=scale,
                     config=config,
                     support=support,
-                    report=report,
+                    report={
+                        "returns": sum(len(np.asarray(scan)) for scan in points),
+                        "returns_used": len(surface.rays),
+                        "ghosts": len(rays) - len(surface.rays),
+                        "leaf_cells": len(support),
+                        "vertices": field.cells.table.num_rows,
+                        "iterations": training.iterations,
+                        "iterations_done": training.iterations_done,
+                        "losses": training.losses,
+                        "skipped": _skipped(config, training, scale),
+                    },
                 )
             )
             training.run(progress, saved)
@@ -163,54 +142,16 @@ def fit(
     return radar_map
 
 
-def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None) -> list[str]:
-    """What the scene did not need, in words."""
-    skipped = []
-    if scale is None:
-        skipped.append("the reflectance network: there are no intensities")
-    else:
-        unused = [("normals", config.normals), ("geometry feature", config.geometry_feature_dim > 0)]
-        skipped += [
-            f"the {name}, which the intensity network does not ask for" for name, used in unused if not used
-        ]
-    if training.passes < 1 and config.sdf_iterations is None:
-        skipped.append(f"{1 - training.passes:.0%} of the samples of a pass: the others said as much")
-    if training.moves_rows and training.iterations["sdf"] > 0:
-        skipped.append("in each iteration, the features that its batch did not touch")
-    return skipped
-
-
-def _surface(
-    rays: Rays, averaged: MeanRays | None, surfels: Surfels, config: FitConfig, num_threads: int
-) -> tuple[Rays, MeanRays | None]:
-    """What the SDF is to learn from: rays without ghosts, and to the planes that their returns make."""
-    kept = None
-    if config.drop_ghosts:
-        kept = ~find_ghosts(surfels, rays, averaged, num_threads)
-        if averaged is not None:
-            averaged = averaged.select(kept[averaged.first])
-    if config.onto_planes and config.sdf_iterations != 0:  # the average has distances to planes in any case
-        rays = surfels.onto_planes(rays)
-    return rays if kept is None else rays.select(kept), averaged
-
-
-def occupied_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
-    """Leaf cells that a near-surface sample can fall into: Morton keys, ascending.
-
-    The line of samples round each return is walked in steps of half a cell instead of being left to chance, so that
-    the map does not depend on the seed.
-    """
-    steps = math.ceil(2 * config.near_band_m / (config.leaf_size_m / 2))
-    cells = CellSet(config.leaf_size_m)
-    for chunk in rays.along(np.linspace(-config.near_band_m, config.near_band_m, steps + 1)):
-        cells.insert(chunk, num_threads)
-    return cells.sorted_keys(num_threads)
+def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, num_threads: int) -> Field:
+    """The field over cells where a surface can lie, and over those that bridge the gaps between them."""
+    leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
+    return Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
 
 
 def _check_extent(rays: Rays, config: FitConfig) -> None:
     """A single outlier must not be met in the middle of the work, nor by an error that does not say what it is."""
     limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m
-    reach_m = max(config.near_band_m, config.truncation_m if config.start == "average" else 0.0)
+    reach_m = max(config.near_band_m, config.truncation_m if config.training.start == "average" else 0.0)
     if np.abs(rays.points).max() + reach_m > limit_m:
         distance_m = np.abs(rays.points).max(axis=1) + reach_m
         outside = int((distance_m > limit_m).sum())
@@ -222,25 +163,24 @@ def _check_extent(rays: Rays, config: FitConfig) -> None:
         raise ValueError(msg)
 
 
-def _new_field(rays: Rays, averaged: MeanRays | None, config: FitConfig, num_threads: int) -> Field:
-    leaf_keys = bridged(
-        occupied_leaf_keys(rays, config, num_threads)
-        if averaged is None
-        else averaged.leaf_keys(config.leaf_size_m, config.near_band_m, num_threads),
-        rays,
-        config.leaf_size_m,
-        config.bridge_cells,
-        num_threads,
-    )
-    # The layers of torch.nn draw from the global generator, of which fits in several threads take turns.
-    with threads.global_generator, torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        field = Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
-        if averaged is None or config.sdf_iterations != 0 or rays.intensities is not None:
-            field.cells.initialise(
-                config.feature_std
-            )  # where nothing else is learnt, the average is all there is
-    return field
+def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None) -> list[str]:
+    """What the scene did not need, in words."""
+    skipped = []
+    if scale is None:
+        skipped.append("the reflectance network: there are no intensities")
+    else:
+        unused = [
+            ("normals", config.networks.normals),
+            ("geometry feature", config.networks.geometry_feature_dim > 0),
+        ]
+        skipped += [
+            f"the {name}, which the intensity network does not ask for" for name, used in unused if not used
+        ]
+    if training.passes < 1 and config.training.sdf_iterations is None:
+        skipped.append(f"{1 - training.passes:.0%} of the samples of a pass: the others said as much")
+    if training.moves_rows and training.iterations["sdf"] > 0:
+        skipped.append("in each iteration, the features that its batch did not touch")
+    return skipped
 
 
 class _Clock:

@@ -5,30 +5,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from radarsdf._core import FEATURE_DIM
 from radarsdf.field import kernels
 from radarsdf.field.encodings import VertexFeatures
+from radarsdf.fitting.gradients import Touched
 from radarsdf.threads import Workers
 
 _BETAS = (0.9, 0.999)
+_EPSILON = 1e-15  # 3QFP
 _Result = TypeVar("_Result")
-
-
-@dataclass(frozen=True)
-class Touched:
-    """What a batch took from the features of cells, and the loss's gradient by that."""
-
-    points: Tensor
-    """(N, 3), local frame, m."""
-    located: Tensor
-    """(N, num_levels) int32, the cells that hold them."""
-    gradient: Tensor
-    """(N, 8 · num_levels), by the interpolated features."""
 
 
 class Adam:
@@ -44,10 +34,9 @@ class Adam:
         Of the next step; `full_rate` is the one at the start.
     """
 
-    def __init__(self, parameters: Iterable[Tensor], learning_rate: float, epsilon: float) -> None:
+    def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         self.parameters = list(parameters)
         self.full_rate = self.learning_rate = learning_rate
-        self._epsilon = epsilon
         self._means = [torch.zeros_like(p) for p in self.parameters]
         self._squares = [torch.zeros_like(p) for p in self.parameters]
         self._step = torch.zeros(())
@@ -78,7 +67,7 @@ class Adam:
             beta1=_BETAS[0],
             beta2=_BETAS[1],
             weight_decay=0.0,
-            eps=self._epsilon,
+            eps=_EPSILON,
             amsgrad=False,
             maximize=False,
         )
@@ -97,14 +86,13 @@ class RowAdam:
         Of the next step; `full_rate` is the one at the start.
     """
 
-    def __init__(self, cells: VertexFeatures, learning_rate: float, epsilon: float) -> None:
+    def __init__(self, cells: VertexFeatures, learning_rate: float) -> None:
         self.full_rate = self.learning_rate = learning_rate
         self.step_count = 0
         self._cells = cells
-        self._epsilon = epsilon
         rows, dtype = len(cells.features), cells.features.dtype
         self._memory = kernels.AdamMemory(
-            moments=kernels.large_zeros(rows, 2 * kernels.FEATURE_DIM, dtype=dtype),
+            moments=kernels.large_zeros(rows, 2 * FEATURE_DIM, dtype=dtype),
             marks=kernels.large_zeros(rows, 2, dtype=torch.int32),
         )
         self._decays = torch.zeros(0, 2, dtype=dtype)
@@ -157,7 +145,7 @@ class RowAdam:
             self._decays,
             step=self.step_count,
             learning_rate=self.learning_rate,
-            epsilon=self._epsilon,
+            epsilon=_EPSILON,
         )
 
         def work(first: Callable[[], _Result] | None) -> _Result | None:

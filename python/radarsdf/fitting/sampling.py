@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from radarsdf._core import cell_keys
+from radarsdf._core import RAY_DIRECTION, RAY_INTENSITY, RAY_POINT, RAY_RANGE, cell_keys
 from radarsdf.config import FitConfig
 from radarsdf.returns.rays import Rays
 
@@ -28,28 +28,21 @@ class Samples:
     """The first `num_near` are near the surface, the others in free space."""
     of_ray: Tensor
     """(B, 7 or 8): return (3), direction (3), range and, where there are any, scaled intensity of each sample's ray."""
-    _places: Tensor
-    _rays_by_place: Tensor
 
     @property
     def directions(self) -> Tensor:
         """(B, 3) unit vectors from the sensor to the return."""
-        return self.of_ray[:, 3:6]
+        return _directions(self.of_ray)
 
     @property
     def ranges_m(self) -> Tensor:
         """(B,) from the sensor to the return."""
-        return self.of_ray[:, 6]
+        return self.of_ray[:, RAY_RANGE]
 
     @property
     def intensities(self) -> Tensor:
         """(B,) of the returns, scaled."""
-        return self.of_ray[:, 7]
-
-    @property
-    def rays(self) -> Tensor:
-        """(B,) int64, index of each sample's ray."""
-        return self._rays_by_place[self._places]
+        return self.of_ray[:, RAY_INTENSITY]
 
 
 class RaySampler:
@@ -76,17 +69,18 @@ class RaySampler:
         self._neighbours = neighbours
         self._generator = generator
         order = np.argsort(cell_keys(np.ascontiguousarray(rays.points), config.leaf_size_m, 1), kind="stable")
-        self._original = torch.from_numpy(order)
         # One gather a batch fetches all there is to know of a ray: 32 bytes, half a cache line.
         columns = [torch.from_numpy(a) for a in (rays.points, rays.directions, rays.ranges_m[:, None])]
         if intensities is not None:
             columns.append(intensities[:, None])
-        self._rays = torch.cat(columns, 1)[self._original]
+        self._rays = torch.cat(columns, 1)[torch.from_numpy(order)]
         self._order = np.zeros(0, np.int64)
         self._order_from = torch.zeros_like(generator.get_state())
         """The generator's state that `_order` was drawn from."""
         self._next = 0
-        near_share = config.near_samples / (config.near_samples + config.free_samples)
+        near_share = config.sampling.near_samples / (
+            config.sampling.near_samples + config.sampling.free_samples
+        )
         self._num_near = max(1, round(batch_size * near_share))
         self._num_free = batch_size - self._num_near
         self._layouts: dict[int, _Layout] = {}
@@ -135,13 +129,13 @@ class RaySampler:
         places = self._take(count)
         sdf_m = (2 * self._uniform(count) - 1) * config.near_band_m
         ray = self._rays.index_select(0, places)
-        points = ray[:, :3] - sdf_m[:, None] * ray[:, 3:6]
-        if config.cross_range_noise_rad > 0:
+        points = _returns(ray) - sdf_m[:, None] * _directions(ray)
+        if config.sampling.cross_range_noise_rad > 0:
             # Isotropic: what it adds along the beam is lost in the width of the band.
             noise = torch.randn(points.shape, generator=self._generator)
-            points += noise * (config.cross_range_noise_rad * ray[:, 6:7])
+            points += noise * (config.sampling.cross_range_noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
-        return self._split(points, sdf_m, ray, places, near, near)
+        return self._split(points, sdf_m, ray, near, near)
 
     def batch(self, parts: int = 1) -> list[Samples]:
         """`batch_size` samples, near the surface and in free space, in parts that each have their share of both."""
@@ -150,31 +144,37 @@ class RaySampler:
         layout = self._layouts[parts]
         places = self._take(max(self._num_near, self._num_free)).index_select(0, layout.index)
         ray = self._rays.index_select(0, places)
-        range_m = ray[:, 6]
+        range_m = ray[:, RAY_RANGE]
         start_m, length_m = (
             torch.addcmul(constant, of_range, range_m) for constant, of_range in (layout.start, layout.length)
         )
         # Drawn for the batch, and then dealt out: the number of parts changes no sample.
         sdf_m = torch.addcmul(start_m, length_m, self._uniform(len(places)).index_select(0, layout.order))
-        points = torch.addcmul(ray[:, :3], sdf_m[:, None], ray[:, 3:6], value=-1)
-        return self._split(points, sdf_m, ray, places, layout.sizes, layout.near)
+        points = torch.addcmul(_returns(ray), sdf_m[:, None], _directions(ray), value=-1)
+        return self._split(points, sdf_m, ray, layout.sizes, layout.near)
 
     def _split(
         self,
         points: Tensor,
         sdf_m: Tensor,
         ray: Tensor,
-        places: Tensor,
         sizes: Sequence[int],
         near: Sequence[int],
     ) -> list[Samples]:
         if len(sizes) == 1:
-            return [Samples(points, sdf_m, near[0], ray, places, self._original)]
-        columns = [torch.split_with_sizes(column, sizes) for column in (points, sdf_m, ray, places)]
+            return [Samples(points, sdf_m, near[0], ray)]
+        columns = [torch.split_with_sizes(column, sizes) for column in (points, sdf_m, ray)]
         return [
-            Samples(x, sdf, num_near, of_ray, place, self._original)
-            for x, sdf, of_ray, place, num_near in zip(*columns, near, strict=True)
+            Samples(x, sdf, num_near, of_ray) for x, sdf, of_ray, num_near in zip(*columns, near, strict=True)
         ]
+
+
+def _returns(rays: Tensor) -> Tensor:
+    return rays[:, RAY_POINT:RAY_DIRECTION]
+
+
+def _directions(rays: Tensor) -> Tensor:
+    return rays[:, RAY_DIRECTION:RAY_RANGE]
 
 
 def share(count: int, part: int, parts: int) -> int:
@@ -209,7 +209,7 @@ class _Layout:
         # Where one kind is rarer, every so many-th ray has one of it: each kind still covers the whole scene.
         index = torch.cat([torch.arange(n) * taken // max(n, 1) for n in (num_near, num_free)])[order]
         # Near samples within the band; free ones uniform in [free_from · range, range + free_beyond] from the sensor.
-        band_m, before = config.near_band_m, 1 - config.free_from
+        band_m, before = config.near_band_m, 1 - config.sampling.free_from
         ends = torch.tensor(
             [[-band_m, 0, 2 * band_m, 0], [-config.free_beyond_m, 0, config.free_beyond_m, before]]
         )[kinds]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The training loop: batches over threads, losses, and the schedule of the two networks."""
+"""The training loop: batches over threads, and the schedule of the two networks."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from radarsdf.budget.schedule import Schedule
 from radarsdf.config import MAX_THREADS, FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
+from radarsdf.fitting.autograd_gradients import AutogradGradients
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.gradients import Gradients, Shard
+from radarsdf.fitting.core_gradients import CoreGradients
+from radarsdf.fitting.gradients import GradientBackend, Gradients, Share
 from radarsdf.fitting.optimiser import Adam, RowAdam
 from radarsdf.fitting.sampling import RaySampler, Samples
 from radarsdf.fitting.stopping import Diverged
@@ -48,7 +50,7 @@ class _Draws:
     ) -> None:
         self._config = config
         self._parts = parts
-        self._generator = torch.Generator().manual_seed(config.seed * _GENERATORS)
+        self._generator = torch.Generator("cpu").manual_seed(config.seed * _GENERATORS)
 
         def sampler(rays: Rays) -> RaySampler:
             unit = None
@@ -79,9 +81,9 @@ class _Draws:
         return self._surface.batch(self._parts)
 
     def of_returns(self) -> list[Samples]:
-        if self._config.intensity_in_free_space:
+        if self._config.training.intensity_in_free_space:
             return self._returns.batch(self._parts)
-        return self._returns.spread(self._config.intensity_batch_size, self._parts)
+        return self._returns.spread(self._config.training.intensity_batch_size, self._parts)
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,29 @@ class _Pauses:
     checkpoint: Checkpoint | None
 
 
+@dataclass(frozen=True)
+class _Stage:
+    """A part of the schedule."""
+
+    name: str
+    """ "sdf" or "intensity"."""
+    iterations: int
+    """How many it has."""
+    iterations_before: int
+    """Of the same name, done by an earlier stage."""
+    counts: tuple[str, ...]
+    """Whose iterations it does: both in a joint beginning."""
+    adams: list[Adam]
+    """Of the parameters that learn, in the order of their gradients."""
+    rows: RowAdam | None
+    """Of the features, where only the touched ones move."""
+    draw: Callable[[], list[Samples]]
+    """A batch, in a part for each thread."""
+    gradients_of: Callable[[tuple[GradientBackend, Samples]], Gradients]
+
+
 class Training:
-    """The schedule: geometry first, then, on frozen geometry, reflectance; or, as published, both from the start.
+    """The schedule: the SDF first, alone or with the intensity, then the intensity on the frozen SDF.
 
     Every batch is split over the threads; their gradients are added in the order of the threads, so the same number of
     threads gives the same bits; another number of threads rounds differently and has another dropout.
@@ -121,31 +144,24 @@ class Training:
         )
         self.iterations = schedule.iterations
         self.passes = schedule.passes
-        parts = min(workers.num_threads, schedule.batch_size, config.intensity_batch_size)
-        self._draws: _Draws | None = None  # where nothing is trained: the returns need not be put in order
-        self._shards: list[Shard] = []
+        parts = min(workers.num_threads, schedule.batch_size, config.training.intensity_batch_size)
+        self._draws: _Draws | None = None  # where nothing is trained, the returns need not be put in order
+        self._backends: list[GradientBackend] = []
         if any(self.iterations.values()):
             self._draws = _Draws(surface, returns, scale, config, schedule, parts)
+            self._backends = _backends(field, config, schedule, parts)
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
-        geometry = list(field.sdf_network.parameters())
+        sdf_parameters = list(field.sdf_network.parameters())
         self._rows = None
-        # Through normals the loss sees the features twice, which only autograd can take apart.
-        if config.row_updates and not (config.joint and config.normals and scale is not None):
-            self._rows = RowAdam(field.cells, config.learning_rate, config.adam_epsilon)
+        if config.moves_rows(scale is not None):
+            self._rows = RowAdam(field.cells, config.training.learning_rate)
         else:
-            geometry = [*field.cells.parameters(), *geometry]
-        if self._draws is not None:
-            for part in range(parts):
-                generator = torch.Generator().manual_seed(config.seed * _GENERATORS + 1 + part)
-                shard = Shard(
-                    field, config, schedule.dropout_scale, generator, parts, moves_rows=self.moves_rows
-                )
-                self._shards.append(shard)
-        self._adams = {"geometry": Adam(geometry, config.learning_rate, config.adam_epsilon)}
+            sdf_parameters = [*field.cells.parameters(), *sdf_parameters]
+        self._adams = {"sdf": Adam(sdf_parameters, config.training.learning_rate)}
         if field.intensity_network is not None:
-            self._adams["reflectance"] = Adam(
-                field.intensity_network.parameters(), config.intensity_learning_rate, config.adam_epsilon
+            self._adams["intensity"] = Adam(
+                field.intensity_network.parameters(), config.training.intensity_learning_rate
             )
 
     @property
@@ -167,8 +183,8 @@ class Training:
             state |= {f"rows.{k}": v for k, v in self._rows.state().items()}
         if self._draws is not None:
             state |= {f"draws.{k}": v for k, v in self._draws.state().items()}
-        for i, shard in enumerate(self._shards):
-            state |= {f"shard.{i}.{k}": v for k, v in shard.state().items()}
+        for i, backend in enumerate(self._backends):
+            state |= {f"backend.{i}.{k}": v for k, v in backend.state().items()}
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -188,8 +204,8 @@ class Training:
             self._rows.restore(_part(state, "rows"))
         if self._draws is not None:
             self._draws.restore(_part(state, "draws"))
-        for i, shard in enumerate(self._shards):
-            shard.restore(_part(state, f"shard.{i}"))
+        for i, backend in enumerate(self._backends):
+            backend.restore(_part(state, f"backend.{i}"))
 
     def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
         """All iterations that are left.
@@ -201,13 +217,12 @@ class Training:
         KeyboardInterrupt
             For Ctrl-C, between two iterations.
         """
-        config, field = self._config, self._field
-        geometry, reflectance = self._adams["geometry"], self._adams.get("reflectance")
-        joint = config.joint and reflectance is not None
-        rest = max(0, self.iterations["intensity"] - (self.iterations["sdf"] if joint else 0))
+        field = self._field
+        stages = self._stages()
         with (
             tqdm(
-                total=self.iterations["sdf"] + rest,
+                total=sum(stage.iterations for stage in stages),
+                initial=sum(self._done(stage) for stage in stages),
                 desc="fit",
                 unit="it",
                 disable=None if progress is None else not progress,
@@ -215,50 +230,75 @@ class Training:
             deferred_interrupts() as interrupted,
         ):
             pauses = _Pauses(bar, interrupted, checkpoint)
-            adams = [geometry, reflectance] if joint and reflectance is not None else [geometry]
-            gradients_of = Shard.joint if joint else Shard.geometry
-            bar.update(sum(self.iterations_done.values()))
-            if self._draws is not None and self.iterations["sdf"]:
-                draw = self._draws.of_surface
-                self._loop("sdf", self.iterations["sdf"], adams, draw, gradients_of, pauses, self._rows)
-            field.cells.requires_grad_(False)
-            field.sdf_network.requires_grad_(False)
-            if self._draws is not None and reflectance is not None and rest:
-                draw = self._draws.of_returns
-                self._loop("intensity", rest, [reflectance], draw, Shard.reflectance, pauses)
+            for stage in stages:
+                if stage.name == "intensity":
+                    field.cells.requires_grad_(False)
+                    field.sdf_network.requires_grad_(False)
+                self._run_stage(stage, pauses)
             if checkpoint is not None:
                 checkpoint.write(self.state())
             if interrupted():  # by now all is done, but whoever pressed it wants to stop more than this
                 raise KeyboardInterrupt
 
-    def _loop(
-        self,
-        name: str,
-        iterations: int,
-        adams: list[Adam],
-        draw: Callable[[], list[Samples]],
-        gradients_of: Callable[[Shard, Samples], Gradients],
-        pauses: _Pauses,
-        rows: RowAdam | None = None,
-    ) -> None:
-        parameters = [p for adam in adams for p in adam.parameters]
+    def _stages(self) -> list[_Stage]:
+        """The SDF, alone or joint with the intensity; then the intensity alone, on frozen features and SDF network."""
+        stages: list[_Stage] = []
+        if self._draws is None:
+            return stages
+        sdf_iterations, intensity_iterations = self.iterations["sdf"], self.iterations["intensity"]
+        sdf_adam, intensity_adam = self._adams["sdf"], self._adams.get("intensity")
+        joint = sdf_iterations if intensity_adam is not None and self._config.training.joint else 0
+        if sdf_iterations:
+            stages.append(
+                _Stage(
+                    name="sdf",
+                    iterations=sdf_iterations,
+                    iterations_before=0,
+                    counts=("sdf", "intensity") if joint else ("sdf",),
+                    adams=[sdf_adam, intensity_adam] if joint and intensity_adam is not None else [sdf_adam],
+                    rows=self._rows,
+                    draw=self._draws.of_surface,
+                    gradients_of=_joint_gradients if joint else _sdf_gradients,
+                )
+            )
+        if intensity_adam is not None and intensity_iterations > joint:
+            stages.append(
+                _Stage(
+                    name="intensity",
+                    iterations=intensity_iterations - joint,
+                    iterations_before=joint,
+                    counts=("intensity",),
+                    adams=[intensity_adam],
+                    rows=None,
+                    draw=self._draws.of_returns,
+                    gradients_of=_intensity_gradients,
+                )
+            )
+        return stages
+
+    def _done(self, stage: _Stage) -> int:
+        """Iterations of a stage that are done."""
+        return max(0, self.iterations_done[stage.name] - stage.iterations_before)
+
+    def _run_stage(self, stage: _Stage, pauses: _Pauses) -> None:
+        rows, iterations = stage.rows, stage.iterations
+        parameters = [p for adam in stage.adams for p in adam.parameters]
         changing = [*parameters, *([] if rows is None else [rows.features])]
         good = [p.detach().clone() for p in changing]
-
-        def gradients(work: tuple[Shard, Samples]) -> Gradients:
-            return gradients_of(*work)
 
         def give_up(fault: str) -> NoReturn:
             for parameter, value in zip(changing, good, strict=True):
                 parameter.data.copy_(value)
-            msg = f"{fault} at iteration {i} of {iterations} of the {name} stage: a lower learning rate may help"
+            msg = f"{fault} at iteration {i} of {iterations} of the {stage.name} stage: a lower learning rate may help"
             raise Diverged(msg)
 
         ahead: list[Samples] | None = None
-        for i in range(self.iterations_done[name], iterations):
+        for i in range(self._done(stage), iterations):
             # From the full rate on in each stage, also for an Adam that has been through another.
-            share = 0.5 * (1 + math.cos(math.pi * i / iterations)) if self._config.cosine_schedule else 1.0
-            found = list(self._workers.map(gradients, list(zip(self._shards, ahead or draw(), strict=True))))
+            cosine = 0.5 * (1 + math.cos(math.pi * i / iterations))
+            share = cosine if self._config.training.cosine_schedule else 1.0
+            work = list(zip(self._backends, ahead or stage.draw(), strict=True))
+            found = list(self._workers.map(stage.gradients_of, work))
             loss = sum(sum(part.losses.values()) for part in found)
             if not math.isfinite(loss):
                 give_up(f"the {_bad_losses(found)} loss is {loss}")
@@ -266,7 +306,7 @@ class Training:
             write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
             look = stop or write or i % _KEEP_EVERY == _KEEP_EVERY - 1 or i == iterations - 1
             # No draw before the state is looked at: it would be that after the next one.
-            rest = functools.partial(_move_networks, found, adams, share, None if look else draw)
+            rest = functools.partial(_move_networks, found, stage.adams, share, None if look else stage.draw)
             if rows is None:
                 ahead = rest()
             else:
@@ -276,8 +316,10 @@ class Training:
                     self._workers,
                     meanwhile=rest,
                 )
-            self.losses[name] = loss
-            self.iterations_done[name] = i + 1
+            self.losses[stage.name] = loss
+            for name in stage.counts:
+                before = stage.iterations_before if name == stage.name else 0
+                self.iterations_done[name] = min(before + i + 1, self.iterations[name])
             pauses.bar.update()
             if look:
                 # The sum is finite only if all are; that it overflows by itself is as bad.
@@ -289,6 +331,34 @@ class Training:
                 pauses.checkpoint.write(self.state())
             if stop:
                 raise KeyboardInterrupt
+
+
+def _backends(field: Field, config: FitConfig, schedule: Schedule, parts: int) -> list[GradientBackend]:
+    """One for each thread."""
+    # Normals are gradients themselves, which the core does not know.
+    normals = field.intensity_network is not None and config.networks.normals
+    kind = AutogradGradients if normals or config.training.gradients == "autograd" else CoreGradients
+    seeds = range(config.seed * _GENERATORS + 1, config.seed * _GENERATORS + 1 + parts)
+    generators = [torch.Generator("cpu").manual_seed(seed) for seed in seeds]
+    return [kind(field, config, Share(parts, schedule.dropout_scale, generator)) for generator in generators]
+
+
+_Work = tuple[GradientBackend, Samples]
+
+
+def _sdf_gradients(work: _Work) -> Gradients:
+    backend, samples = work
+    return backend.sdf(samples)
+
+
+def _joint_gradients(work: _Work) -> Gradients:
+    backend, samples = work
+    return backend.joint(samples)
+
+
+def _intensity_gradients(work: _Work) -> Gradients:
+    backend, samples = work
+    return backend.intensity(samples)
 
 
 def _bad_losses(found: Sequence[Gradients]) -> str:

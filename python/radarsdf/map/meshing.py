@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import MAX_POSITION_M, positive, real_array
+from radarsdf.checks import MAX_POSITION_M, not_negative, positive, real_array, whole_number
+from radarsdf.config import FitConfig
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
@@ -20,6 +21,11 @@ with whole_import():
     import trimesh
 
 
+# Measured: see docs/levers.md.
+_MIN_SUPPORT = 0.12
+_MIN_SUPPORT_OF_AVERAGE = 0.15
+
+
 def extract_mesh(
     contents: MapContents,
     voxel_size: float = 0.1,
@@ -27,12 +33,18 @@ def extract_mesh(
     box: ArrayLike | None = None,
     viewpoint: ArrayLike | None = None,
     min_confidence: float = 0.0,
+    min_support: float | None = None,
+    min_component_triangles: int = 30,
     progress: bool | None = None,
 ) -> trimesh.Trimesh:
     """See :meth:`RadarMap.mesh`."""
     if not 0 <= min_confidence <= 1:
         msg = f"min_confidence must be in [0, 1], not {min_confidence}"
         raise ValueError(msg)
+    if min_support is None:
+        min_support = _MIN_SUPPORT_OF_AVERAGE if _is_average(contents.config) else _MIN_SUPPORT
+    min_support = not_negative(min_support, "min_support")
+    whole_number(min_component_triangles, "min_component_triangles", 0)
     voxel_size = positive(voxel_size, "voxel_size")
     if voxel_size > MAX_POSITION_M:
         msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
@@ -48,9 +60,9 @@ def extract_mesh(
         num_threads=torch.get_num_threads(),
     )
     confidence = queries.confidence(contents, _local(contents, vertices + contents.origin)).numpy()
-    least = max(min_confidence, queries.confidence_of_median(contents, contents.config.min_support))
+    least = max(min_confidence, queries.confidence_of_median(contents, min_support))
     faces = faces[(confidence[faces] >= least).all(axis=1)]
-    kept, faces = _without_small_components(len(vertices), faces, contents.config.min_component_triangles)
+    kept, faces = _without_small_components(len(vertices), faces, min_component_triangles)
     mesh = trimesh.Trimesh(vertices[kept] + contents.origin, faces, process=False)
     mesh.metadata |= {
         "leaf_cells": len(contents.support),
@@ -60,6 +72,11 @@ def extract_mesh(
     if sensor_position is not None:
         _add_intensity(mesh, contents, sensor_position)
     return mesh
+
+
+def _is_average(config: FitConfig) -> bool:
+    """Whether the surface is an average of the rays that was not trained on."""
+    return config.training.start == "average" and config.training.sdf_iterations == 0
 
 
 def _local(contents: MapContents, world: NDArray[np.float64]) -> torch.Tensor:

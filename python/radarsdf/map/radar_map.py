@@ -193,6 +193,8 @@ class RadarMap:
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
         min_confidence: float = 0.0,
+        min_support: float | None = None,
+        min_component_triangles: int = 30,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
         """The surface as triangles: marching cubes on the zero level, only where the map is occupied.
@@ -208,6 +210,12 @@ class RadarMap:
             ``mesh.vertex_attributes["intensity"]``, and colours from dark (low) to bright (high).
         min_confidence : float
             In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out, before small components are.
+        min_support : float, optional
+            Triangles with a vertex that fewer returns support than this share of the map's median are left out (3QFP: 0). A
+            share, since what is much for a sparse sensor is little for a dense one. Default: 0.12, and 0.15 for a surface
+            that is an average.
+        min_component_triangles : int
+            Components of fewer triangles are left out (3QFP: 300, which on sparse scans costs ten points of completion).
         progress : bool, optional
             Whether to show a progress bar. By default only on a terminal.
 
@@ -233,6 +241,8 @@ class RadarMap:
             box=box,
             viewpoint=viewpoint,
             min_confidence=min_confidence,
+            min_support=min_support,
+            min_component_triangles=min_component_triangles,
             progress=progress,
         )
 

@@ -133,7 +133,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
             raise ValueError(msg)
     # The description could ask for more than any machine has. Of as many layers as there are tensors, at most, and
     # without memory, the field only says what shapes these must have.
-    if len(config.sdf_hidden + config.intensity_hidden) > len(tensors):
+    if len(config.networks.sdf_hidden + config.networks.intensity_hidden) > len(tensors):
         msg = "there are fewer tensors than layers"
         raise ValueError(msg)
     with torch.device("meta"):

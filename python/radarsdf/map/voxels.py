@@ -69,13 +69,20 @@ def sample_lattice(
 
 def _smooth_in_cells(config: FitConfig) -> bool:
     """Whether nothing in the encoding swings more than once within two leaf cells."""
-    finest = config.fourier_first + config.fourier_count - 1
-    return config.fourier_count == 0 or 2 * config.fourier_half_width_m / 2**finest >= 2 * config.leaf_size_m
+    finest = config.encoding.fourier_count - 1
+    return (
+        config.encoding.fourier_count == 0
+        or 2 * config.fourier_half_width_m / 2**finest >= 2 * config.leaf_size_m
+    )
 
 
 def _is_grid(config: FitConfig) -> bool:
     """Whether the field at a vertex of the leaf cells is that of its features alone."""
-    return config.encoding == "octree" and config.num_levels == 1 and config.fourier_count == 0
+    return (
+        config.encoding.kind == "octree"
+        and config.encoding.num_levels == 1
+        and config.encoding.fourier_count == 0
+    )
 
 
 def _grid(

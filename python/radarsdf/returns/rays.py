@@ -33,8 +33,6 @@ class Rays:
     """(N,) distance of the return from the sensor."""
     intensities: NDArray[np.float32] | None
     """(N,) sensor units."""
-    scans: NDArray[np.int32]
-    """(N,) which scan each return is from."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -60,7 +58,6 @@ class Rays:
             directions=np.ascontiguousarray(chosen(self.directions)),
             ranges_m=np.ascontiguousarray(chosen(self.ranges_m)),
             intensities=None if self.intensities is None else chosen(self.intensities),
-            scans=chosen(self.scans),
         )
 
     def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -129,7 +126,7 @@ def prepare(
     *,
     min_range_m: float = 0.0,
     max_range_m: float | None = None,
-    accumulate_frames: int = 1,
+    accumulate_scans: int = 1,
     origin: ArrayLike | None = None,
 ) -> Rays:
     """Checks scans and turns them into rays of the local frame.
@@ -144,7 +141,7 @@ def prepare(
         (N_i,) each, sensor units.
     min_range_m, max_range_m : float
         Returns outside are dropped.
-    accumulate_frames : int
+    accumulate_scans : int
         So many consecutive scans are treated as seen from the position of the middle one.
     origin : array_like, optional
         (3,) world, m; the mean of the sensor positions where not given.
@@ -165,12 +162,12 @@ def prepare(
     )
     min_range_m = number(min_range_m, "min_range_m")
     max_range_m = np.inf if max_range_m is None else number(max_range_m, "max_range_m")
-    whole_number(accumulate_frames, "accumulate_frames", 1)
+    whole_number(accumulate_scans, "accumulate_scans", 1)
 
-    kept_points, kept_origins, kept_values, kept_scans = [], [], [], []
+    kept_points, kept_origins, kept_values = [], [], []
     for i, scan in enumerate(scans):
-        first = i - i % accumulate_frames
-        middle = (first + min(first + accumulate_frames, len(scans)) - 1) // 2
+        first = i - i % accumulate_scans
+        middle = (first + min(first + accumulate_scans, len(scans)) - 1) // 2
         ranges = _lengths(scan)
         # A return at the sensor itself has no direction.
         keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= max_range_m)
@@ -178,7 +175,6 @@ def prepare(
         local = kept @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
         kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))
-        kept_scans.append(np.full(len(local), i, np.int32))
         if values is not None:
             kept_values.append(values[i][keep])
     local_points = np.concatenate(kept_points)
@@ -202,5 +198,4 @@ def prepare(
         directions=(rays / ranges[:, None]).astype(np.float32),
         ranges_m=ranges.astype(np.float32),
         intensities=intensity,
-        scans=np.concatenate(kept_scans),
     )

@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Losses and gradients by one call of the compiled core."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from radarsdf import _core
+from radarsdf.config import FitConfig
+from radarsdf.field import kernels
+from radarsdf.field.field import Field
+from radarsdf.fitting.gradients import GradientBackend, Gradients, Share, Touched
+from radarsdf.fitting.sampling import Samples
+
+
+class CoreGradients(GradientBackend):
+    """The core's ``FieldLoss``, which checks the field's arrays once and reads them anew in each call.
+
+    It does not know normals: they are gradients themselves.
+    """
+
+    def __init__(self, field: Field, config: FitConfig, share: Share) -> None:
+        super().__init__(field, config, share)
+        fourier, network, sees = field.fourier, field.intensity_network, config.networks
+        self._loss = _core.FieldLoss(
+            table=field.cells.table,
+            features=kernels.view(field.cells.features),
+            frequencies=(fourier.half_width_m, 0, fourier.num_frequencies),
+            sdf=_layers(field.sdf_network),
+            intensity=None if network is None else _layers(network),
+            sees=(sees.sdf_input, sees.view_direction, sees.log_range),
+            sigma_m=field.sigma_m,
+            intensity_in_free_space=config.training.intensity_in_free_space,
+        )
+        self._by_sdf = [torch.from_numpy(gradient) for gradient in self._loss.sdf_gradients]
+        self._by_intensity = [torch.from_numpy(gradient) for gradient in self._loss.intensity_gradients]
+
+    def sdf(self, samples: Samples) -> Gradients:
+        touched, parts = self._untouched(samples), self._share.parts
+        loss = self._loss.geometry(
+            points=samples.points.numpy(),
+            sdf_m=samples.sdf_m.numpy(),
+            weight=1 / parts,
+            located=touched.located.numpy(),
+            interpolated_grad=touched.gradient.numpy(),
+        )
+        return self._with_features({"sdf": loss / parts}, touched, self._by_sdf)
+
+    def joint(self, samples: Samples) -> Gradients:
+        touched, parts = self._untouched(samples), self._share.parts
+        sdf_weight = self._config.training.sdf_loss_weight
+        sdf, intensity = self._loss.joint(
+            **self._batch(samples),
+            weights=(sdf_weight / parts, 1 / parts),
+            located=touched.located.numpy(),
+            interpolated_grad=touched.gradient.numpy(),
+        )
+        losses = {"sdf": sdf_weight * sdf / parts, "intensity": intensity / parts}
+        return self._with_features(losses, touched, self._by_sdf + self._by_intensity)
+
+    def intensity(self, samples: Samples) -> Gradients:
+        parts = self._share.parts
+        loss = self._loss.reflectance(**self._batch(samples), weight=1 / parts)
+        return Gradients({"intensity": loss / parts}, list(self._by_intensity), None)
+
+    def _batch(self, samples: Samples) -> dict[str, Any]:
+        """What the core's losses of intensities take of samples."""
+        dropouts = self._draw_dropouts(self._num_seen(samples))
+        return {
+            "points": samples.points.numpy(),
+            "sdf_m": samples.sdf_m.numpy(),
+            "rays": samples.of_ray.numpy(),
+            "num_near": samples.num_near,
+            "dropout": [(dropout.bytes.numpy(), dropout.keep) for dropout in dropouts],
+        }
+
+    def _untouched(self, samples: Samples) -> Touched:
+        """Arrays for the core to fill."""
+        cells, count = self._field.cells, len(samples.points)
+        located = torch.empty((count, cells.table.num_levels), dtype=torch.int32, device="cpu")
+        return Touched(samples.points, located, samples.points.new_empty((count, cells.interpolated_dim)))
+
+    def _with_features(
+        self, losses: dict[str, float], touched: Touched, by_networks: list[Tensor]
+    ) -> Gradients:
+        """With the gradient by all features, unless only the touched ones move."""
+        if self._moves_rows:
+            return Gradients(losses, list(by_networks), touched)
+        table = self._field.cells.table
+        by_features = kernels.scatter(table, touched.points, touched.located, None, touched.gradient)
+        return Gradients(losses, [by_features, *by_networks], None)
+
+
+def _layers(network: nn.Module) -> tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]:
+    """Weights and biases of a network's layers, where they are in memory."""
+    values = [kernels.view(parameter) for parameter in network.parameters()]
+    return values[::2], values[1::2]

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a training starts from: noise, or the average of what the rays say."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from radarsdf._core import CellSet
+from radarsdf.config import FitConfig
+from radarsdf.field.field import Field
+from radarsdf.fitting.surface import SurfaceReturns
+from radarsdf.returns.mean_rays import MeanRays
+from radarsdf.returns.rays import Rays
+from radarsdf.returns.support import support_of_cells, support_of_points
+from radarsdf.returns.surfels import Surfels
+
+
+class Start(ABC):
+    """A start decides which cells are open, what the field is at first, and what supports its cells."""
+
+    def __init__(self, surface: SurfaceReturns, config: FitConfig, num_threads: int) -> None:
+        self._surface = surface
+        self._config = config
+        self._num_threads = num_threads
+
+    @abstractmethod
+    def leaf_keys(self) -> NDArray[np.uint64]:
+        """Leaf cells in which a surface can lie: Morton keys, ascending."""
+
+    @abstractmethod
+    def initialise(self, field: Field, generator: torch.Generator) -> None:
+        """Makes the field what training starts from."""
+
+    @abstractmethod
+    def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
+        """(C,) returns in and round each leaf cell."""
+
+
+class FromNoise(Start):
+    """Networks and features are drawn at random (3QFP)."""
+
+    def leaf_keys(self) -> NDArray[np.uint64]:
+        return near_leaf_keys(self._surface.rays, self._config, self._num_threads)
+
+    def initialise(self, field: Field, generator: torch.Generator) -> None:
+        field.initialise(generator)
+
+    def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
+        points, leaf_size_m = self._surface.rays.points, self._config.leaf_size_m
+        return support_of_points(points, leaf_keys, leaf_size_m, self._num_threads)
+
+
+class FromAverage(Start):
+    """The field is the average of the rays' truncated signed distances (Curless and Levoy, 1996). It needs no training."""
+
+    def leaf_keys(self) -> NDArray[np.uint64]:
+        config = self._config
+        return self._means.leaf_keys(config.leaf_size_m, config.near_band_m, self._num_threads)
+
+    def initialise(self, field: Field, generator: torch.Generator) -> None:
+        # Where nothing is learnt, the average is all that the features hold.
+        learns = self._config.training.sdf_iterations != 0 or field.intensity_network is not None
+        field.initialise(generator, features=learns)
+        surfels = self._surface.surfels
+        assert surfels is not None
+        average_rays(field, self._means, surfels, self._config, self._num_threads)
+
+    def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
+        return support_of_cells(self._means.keys, self._means.counts, leaf_keys, self._num_threads)
+
+    @property
+    def _means(self) -> MeanRays:
+        means = self._surface.means
+        assert means is not None
+        return means
+
+
+STARTS: dict[str, type[Start]] = {"noise": FromNoise, "average": FromAverage}
+"""By the names of ``config.training.start``."""
+
+
+def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
+    """Leaf cells that a near-surface sample can fall into: Morton keys, ascending.
+
+    The line of samples round each return is walked in steps of half a cell instead of being left to chance, so that
+    the map does not depend on the seed.
+    """
+    steps = math.ceil(2 * config.near_band_m / (config.leaf_size_m / 2))
+    cells = CellSet(config.leaf_size_m)
+    for chunk in rays.along(np.linspace(-config.near_band_m, config.near_band_m, steps + 1)):
+        cells.insert(chunk, num_threads)
+    return cells.sorted_keys(num_threads)
+
+
+def average_rays(field: Field, rays: MeanRays, surfels: Surfels, config: FitConfig, num_threads: int) -> None:
+    """Makes the field the average over rays, interpolated between the vertices of an octree's leaf cells.
+
+    A ray counts at the vertices of the cells that it goes through, up to `truncation_m` before and behind its end. It
+    counts with the distance to the plane through the returns round its end; where there is no plane, with the distance to
+    the plane across the ray.
+    """
+    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray[rays.first])
+    normals = np.where(
+        plane[:, None] >= 0,
+        surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0,
+        -rays.directions,
+    )
+    distances_m = field.cells.table.average_rays(
+        rays.points,
+        rays.directions,
+        np.ascontiguousarray(normals, np.float32),
+        rays.counts,
+        config.truncation_m,
+        num_threads,
+    )
+    with torch.no_grad():
+        field.cells.features[:, 0] = torch.from_numpy(distances_m) / config.sigma_m
+    field.sdf_network.start_as_input(0)

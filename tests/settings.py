@@ -1,0 +1,23 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Settings by their names alone, for tests that vary one after the other."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from radarsdf import FitConfig
+
+
+def grouped(**settings: Any) -> dict[str, Any]:
+    """Settings without their groups, such as ``sdf_iterations=3``, as arguments of :class:`FitConfig`."""
+    top: dict[str, Any] = {}
+    for name, value in settings.items():
+        for group in ("returns", "encoding", "networks", "sampling", "training"):
+            if name in {field.name for field in dataclasses.fields(getattr(FitConfig(), group))}:
+                top.setdefault(group, {})[name] = value
+                break
+        else:
+            top[name] = value
+    return top
