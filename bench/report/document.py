@@ -54,14 +54,20 @@ def _head(results: Results) -> str:
         f"instruction set {machine['instruction_set']}", f"Python {machine['python']}", f"PyTorch {machine['torch']}",
         machine["compiler"],
     )  # fmt: skip
+    measured = (
+        f"Measured at commit {results['commit']} on {results['date']}, on this machine: {', '.join(parts)}."
+    )
     words = "\n".join(f"- **{word}**: {meaning}" for word, meaning in _WORDS)
-    quick = "\n\n**This was a quick run: its figures mean nothing.**" if results["quick"] else ""
+    warning = (
+        "**This was a quick run: its figures mean nothing.**" if results["quick"] else results.get("note", "")
+    )
+    warning = f"\n\n{_filled(warning)}" if warning else ""
     return f"""# Benchmarks
 
 <!-- Do not edit: `python -m bench.report write` writes this file from bench/results.json. -->
 
-{_filled(f"All figures are of one run, at commit {results['commit']} on {results['date']}. The machine: {', '.join(parts)}.")}
-Times are of this machine, and one time may be off by a third.{quick}
+{_filled(measured)}
+Times are of this machine, and one time may be off by a third.{warning}
 
 Beside this: [what each choice is worth](docs/levers.md), [what was tried and left out](docs/dead_ends.md),
 [the peers, and how to measure](bench/README.md).

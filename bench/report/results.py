@@ -4,6 +4,7 @@
 
 It has these keys: `format`, `commit`, `date`, `quick`, `machine` and `experiments`. An experiment has its `command`, the
 `seconds` that it took and its `rows`. Where something failed, `why_not` says why: of an experiment, or of a row.
+A `note`, where there is one, is shown at the top of the document.
 """
 
 from __future__ import annotations

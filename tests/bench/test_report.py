@@ -132,9 +132,10 @@ def test_an_experiment_without_results_is_named(made_up):
     assert "## Growth" not in text
 
 
-def test_a_quick_run_is_called_one(made_up):
+def test_a_quick_run_is_called_one_and_a_note_is_shown(made_up):
     assert "mean nothing" not in document(made_up)
     assert "mean nothing" in document(made_up | {"quick": True})
+    assert "**taken** with a pinch" in document(made_up | {"note": "**taken** with a pinch"})
 
 
 def test_who_is_ahead_on_real_scans_is_told_from_the_figures(made_up):
