@@ -36,6 +36,11 @@ def _measure(words: argparse.Namespace) -> None:
     """Run each experiment and put it into the file at once: a run that is stopped leaves what it has.
 
     All of them begin a new file; those of `--only` join the file that is there.
+
+    Raises
+    ------
+    ValueError
+        If the file is of another run, or an experiment failed; the others are in the file all the same.
     """
     size = "quick" if words.quick else "long" if words.long else "usual"
     joins = bool(words.only) and words.out.exists()
@@ -43,6 +48,7 @@ def _measure(words: argparse.Namespace) -> None:
     if collected is not None:
         results.merge(collected, results.begin(quick=words.quick))  # to refuse now, and not after minutes
     words.out.parent.mkdir(parents=True, exist_ok=True)
+    failed: list[str] = []
     for name in words.only or NAMES:
         about = (
             f"about {EXPERIMENTS[name].minutes:g} minutes"
@@ -55,7 +61,11 @@ def _measure(words: argparse.Namespace) -> None:
         collected = new if collected is None else results.merge(collected, new, same_process=True)
         write_json(words.out, collected)
         _say(f"{name}: {part.get('why_not') or 'done'}")
+        failed += [name] if part.get("why_not") else []
     _say(f"written: {words.out}")
+    if failed:
+        msg = f"failed: {', '.join(failed)}; the file says why"
+        raise ValueError(msg)
 
 
 def _write(path: Path, root: Path) -> None:

@@ -80,6 +80,8 @@ def _surface(rows: list[Row], _part: dict[str, Any]) -> str:
         "Simulated scenes, whose noise is simpler than that of a real radar. "
         "Shares in %, time in s, memory in MB. The best is in bold."
     )
+    if all(row["method"] != "3QFPI" for row in rows):
+        text += " 3QFPI, which trains for more than a minute, is in the plot below only."
     parts = ["## Surface", _filled(text)]
     for scene, own in tables.by_scene(rows).items():
         if any(row.get("f_score") is not None for row in own):

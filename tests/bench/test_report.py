@@ -245,6 +245,18 @@ def test_only_some_experiments_join_the_file(made_up, tmp_path, monkeypatch):
     assert results.read(path)["commit"] == "0ddba11"
 
 
+def test_a_failed_experiment_is_in_the_file_and_fails_the_command(made_up, tmp_path, monkeypatch):
+    made = made_up | {"experiments": {}}
+    monkeypatch.setattr("bench.report.results.begin", lambda *, quick: copy.deepcopy(made | {"quick": quick}))
+    monkeypatch.setattr(
+        command, "run", lambda name, **_: {"why_not": "tired"} if name == "curve" else {"rows": []}
+    )
+    path = tmp_path / "results.json"
+    with pytest.raises(SystemExit, match="failed: curve"):
+        command.main(["run", "--out", str(path)])
+    assert list(results.read(path)["experiments"]) == list(experiments.NAMES)
+
+
 def test_the_commit_is_that_of_the_files():
     commit = results.commit()
     assert commit == "unknown" or len(commit.removesuffix("-dirty")) >= 7
