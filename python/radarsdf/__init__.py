@@ -54,7 +54,6 @@ if not TYPE_CHECKING:  # type checkers use the imports above, and report every o
         if name not in _MODULES:
             msg = f"module {__name__!r} has no attribute {name!r}"
             raise AttributeError(msg)
-        import_module("torch")  # before the compiled core, so that both share one OpenMP runtime
         module = import_module(_MODULES[name])
         value = module if name in _PACKAGES else getattr(module, name)
         globals()[name] = value  # the next use does not come here

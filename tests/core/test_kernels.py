@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -272,15 +270,6 @@ def test_a_block_of_columns_is_a_valid_gradient():
 @pytest.mark.skipif(
     not Path("/proc/self/maps").exists(), reason="reads the list of loaded libraries from /proc"
 )
-def test_core_and_torch_share_one_openmp_runtime():
-    code = "import radarsdf, pathlib; print(pathlib.Path('/proc/self/maps').read_text())"
-    maps = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    runtimes = {
-        line.split()[-1] for line in maps.splitlines() if "gomp" in line or "iomp" in line or "libomp" in line
-    }
-    assert len(runtimes) == 1
-
-
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("num_levels", [1, 3, 12])

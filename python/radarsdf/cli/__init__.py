@@ -21,6 +21,7 @@ COMMANDS = {
     "fit": "fit a map to scans",
     "mesh": "extract the surface of a map as a triangle mesh",
     "eval": "print the errors of a mesh or a map",
+    "config": "print every setting of a fit with its meaning, as a file for --config",
     "info": "print versions, compiler, instruction set and threads, for bug reports",
 }
 """Name of each command, which is also the name of its module, and its help in one line."""

@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     """Fit a map, or estimate what the fit takes."""
     config = config_of(options)
 
-    import radarsdf
+    from radarsdf import Interrupted, estimate, fit
     from radarsdf.io.scans import read_scans
 
     scans = read_scans(options.scans)
@@ -52,11 +52,11 @@ def run(options: argparse.Namespace) -> None:
         scans = scans.select(holdout(len(scans.points), options.holdout)[0])
     intensities = None if options.geometry_only else scans.intensities
     if options.dry_run:
-        print(radarsdf.estimate(scans.points, scans.poses, intensities, config=config))
+        print(estimate(scans.points, scans.poses, intensities, config=config))
         return
     started_s = time.perf_counter()
     try:
-        radar_map = radarsdf.fit(
+        radar_map = fit(
             scans.points,
             scans.poses,
             intensities,
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
             progress=progress_of(options),
             checkpoint=options.checkpoint,
         )
-    except radarsdf.Interrupted as stop:
+    except Interrupted as stop:
         if stop.radar_map is not None:
             stop.radar_map.save(options.out)
             stop.args = (f"{stop}; the map so far is in {options.out}",)

@@ -34,6 +34,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="C",
         help="leave out the surface whose confidence is below C, 0 to 1; default: 0",
     )
+    parser.add_argument(
+        "--min-support",
+        type=float,
+        metavar="SHARE",
+        help="leave out the surface that fewer returns support than this share of the map's median; "
+        "default: 0.12, for a quick map 0.15",
+    )
+    parser.add_argument(
+        "--min-component",
+        type=int,
+        default=30,
+        metavar="N",
+        help="leave out connected pieces of fewer triangles; default: 30",
+    )
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the mesh as a picture")
     add_quiet(parser)
 
@@ -49,6 +63,8 @@ def run(options: argparse.Namespace) -> None:
         box=box_of(options),
         viewpoint=options.viewpoint,
         min_confidence=options.min_confidence,
+        min_support=options.min_support,
+        min_component_triangles=options.min_component,
         progress=progress_of(options),
     )
     if len(mesh.faces) == 0:

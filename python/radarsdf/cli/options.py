@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -14,6 +15,12 @@ if TYPE_CHECKING:
 
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that :func:`config_of` reads, and ``--quiet``."""
+    add_config_options(parser)
+    add_quiet(parser)
+
+
+def add_config_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that :func:`config_of` reads."""
     presets = parser.add_mutually_exclusive_group()
     presets.add_argument(
         "--paper",
@@ -27,34 +34,45 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         "mesh the map with --voxel 0.2",
     )
     parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="TOML",
+        help="change the settings that this file has; radarsdf config prints all of them",
+    )
+    parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="change a setting of FitConfig; may be repeated",
+        help="change one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated",
     )
-    add_quiet(parser)
 
 
 def config_of(options: argparse.Namespace) -> FitConfig:
-    """The configuration: the chosen preset with the changes of ``--set``."""
-    from radarsdf import FitConfig
+    """The configuration: the chosen preset, then the changes of ``--config``, then those of ``--set``."""
+    from radarsdf.config import FitConfig
+    from radarsdf.config_toml import read_toml
 
-    changes = dict(_setting(text) for text in options.set)
-    base = FitConfig.paper() if options.paper else FitConfig.quick() if options.quick else FitConfig()
-    return FitConfig.from_dict(base.to_dict() | changes)
+    config = FitConfig.paper() if options.paper else FitConfig.quick() if options.quick else FitConfig()
+    if options.config is not None:
+        config = config.override(**read_toml(options.config))
+    for text in options.set:
+        config = config.override(**_setting(text))
+    return config
 
 
-def _setting(text: str) -> tuple[str, Any]:
-    """Name and value of one ``NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
-    name, equals, value = text.partition("=")
+def _setting(text: str) -> dict[str, Any]:
+    """One ``NAME=VALUE`` or ``GROUP.NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
+    path, equals, value = text.partition("=")
     if not equals:
         msg = f"--set takes NAME=VALUE, not {text!r}"
         raise ValueError(msg)
+    group, dot, name = path.partition(".")
     try:
-        return name, ast.literal_eval(value)
+        read = ast.literal_eval(value)
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
-        return name, value
+        read = value
+    return {group: {name: read}} if dot else {path: read}
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:

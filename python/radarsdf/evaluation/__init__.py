@@ -5,6 +5,8 @@
 The functions take meshes and arrays, not maps, so they measure the results of other programs in the same way.
 """
 
+import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
+
 from ._report import format_metrics
 from .intensity import INTENSITY_PROTOCOL, IntensityMetrics, KNNIntensity, holdout, intensity_metrics
 from .surface import PROTOCOL, SurfaceMetrics, adjacent_angles, gamma_from_moments, surface_metrics

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 import trimesh
 from numpy.typing import NDArray
 

@@ -1,0 +1,40 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Calls of the command line within this process."""
+
+from __future__ import annotations
+
+from radarsdf.cli import main
+
+FAST = [
+    "--set",
+    "training.sdf_iterations=40",
+    "--set",
+    "training.intensity_iterations=20",
+    "--set",
+    "training.batch_size=1024",
+    "--quiet",
+]
+"""Options of a fit that takes about a second."""
+
+
+def call(*words):
+    """Exit status of a command. Its words may also be paths or numbers."""
+    return main([str(word) for word in words])
+
+
+def files(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def refusal(capsys, folder, *words):
+    """The error message of a command that fails as it should: status 1, one line, and no file written to the folder."""
+    before = files(folder)
+    capsys.readouterr()
+    assert call(*words) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"radarsdf {words[0]}: ")
+    assert said.endswith("\n")
+    assert said.count("\n") == 1
+    assert files(folder) == before
+    return said

@@ -1,0 +1,40 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A file of scans and a file of a map, made once for all commands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radarsdf.io.scans import Scans, write_scans
+
+from .calls import FAST, call
+
+
+@pytest.fixture(scope="session")
+def scans_file(scene, tmp_path_factory):
+    """Six scans of a plane and a wall, with lidar points on the plane."""
+    truth = np.stack(np.meshgrid(np.arange(9, 19, 0.5), np.arange(-5, 5, 0.5), [0.0]), -1).reshape(-1, 3)
+    path = tmp_path_factory.mktemp("scans") / "scans.npz"
+    write_scans(path, Scans(scene.points, scene.poses, scene.intensities, truth))
+    return path
+
+
+@pytest.fixture(scope="session")
+def map_file(scans_file, tmp_path_factory):
+    """The map of these scans, but for the scans 0 and 3, which are held out."""
+    path = tmp_path_factory.mktemp("map") / "map.safetensors"
+    assert call("fit", scans_file, "-o", path, "--holdout", 3, *FAST) == 0
+    return path
+
+
+@pytest.fixture
+def garbage(tmp_path):
+    """A function: a file of the given name ending whose content is no file of any format."""
+
+    def make(suffix):
+        path = tmp_path / f"garbage{suffix}"
+        path.write_bytes(b"\x93 this is nothing of the kind \x00\xff")
+        return path
+
+    return make

@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""`radarsdf eval`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from radarsdf.io.scans import Scans, write_scans
+
+from .calls import call, refusal
+
+SAMPLES = ["--samples", 20000]
+BOX = ["--box", 9, -4, -1, 18, 4, 1]
+
+
+@pytest.fixture(scope="module")
+def mesh_file(map_file, tmp_path_factory):
+    path = tmp_path_factory.mktemp("mesh") / "mesh.ply"
+    assert call("mesh", map_file, "-o", path, "--quiet") == 0
+    return path
+
+
+def row(printed, name):
+    return next(line for line in printed.splitlines() if line.startswith(name))
+
+
+def test_a_map_and_its_mesh_have_the_same_surface_errors(map_file, mesh_file, scans_file, capsys):
+    rows = []
+    for what in (mesh_file, map_file):
+        capsys.readouterr()
+        assert call("eval", what, scans_file, *SAMPLES, *BOX) == 0
+        printed = capsys.readouterr()
+        assert printed.err == ""
+        assert "intensity" not in printed.out
+        rows.append(row(printed.out, "F-score"))
+    assert rows[0] == rows[1]
+
+
+def test_the_box_is_used(mesh_file, scans_file, tmp_path, capsys):
+    assert call("eval", mesh_file, scans_file, *SAMPLES) == 0
+    everywhere = row(capsys.readouterr().out, "protocol")
+    assert call("eval", mesh_file, scans_file, *SAMPLES, *BOX) == 0
+    assert row(capsys.readouterr().out, "protocol") != everywhere
+    far = ["--box", 900, 900, 900, 901, 901, 901]
+    refusal(capsys, tmp_path, "eval", mesh_file, scans_file, *SAMPLES, *far)
+
+
+def test_held_out_intensities(map_file, scans_file, capsys):
+    assert call("eval", map_file, scans_file, *SAMPLES, "--holdout", 3) == 0
+    printed = capsys.readouterr().out
+    assert "F-score" in printed
+    for name in ("held-out intensity error", "kNN      intensity error"):
+        assert "(3000 returns," in row(printed, name)  # of the scans 0 and 3
+
+
+def test_scans_without_lidar_points(map_file, scene, tmp_path, capsys):
+    path = tmp_path / "scans.npz"
+    write_scans(path, Scans(scene.points, scene.poses, scene.intensities))
+    assert "no lidar_points" in refusal(capsys, tmp_path, "eval", map_file, path)
+    assert call("eval", map_file, path, "--holdout", 3) == 0
+    printed = capsys.readouterr().out
+    assert "F-score" not in printed
+    assert "held-out intensity error" in printed
+
+
+def test_points_of_several_formats(mesh_file, tmp_path, capsys):
+    points = np.random.default_rng(0).uniform([9, -4, 0], [18, 4, 0.01], (500, 3))
+    np.save(tmp_path / "lidar.npy", points)
+    np.savetxt(tmp_path / "lidar.xyz", np.column_stack([points, points]))
+    np.savetxt(tmp_path / "lidar.csv", points, delimiter=",")
+    trimesh.PointCloud(points).export(tmp_path / "lidar.ply")
+    rows = set()
+    for name in ("lidar.npy", "lidar.xyz", "lidar.csv", "lidar.ply"):
+        assert call("eval", mesh_file, tmp_path / name, *SAMPLES) == 0
+        rows.add(row(capsys.readouterr().out, "completion"))
+    assert len(rows) == 1
+
+
+def test_holdout_needs_a_map_and_scans(map_file, mesh_file, scans_file, tmp_path, capsys):
+    for words in ([mesh_file, scans_file], [map_file, mesh_file]):
+        said = refusal(capsys, tmp_path, "eval", *words, "--holdout", 3)
+        assert said == "radarsdf eval: --holdout needs a map and scans\n"
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".npy", ".xyz", ".csv", ".ply", ".obj"])
+def test_files_that_are_no_points(mesh_file, garbage, tmp_path, capsys, suffix):
+    path = garbage(suffix)
+    assert str(path) in refusal(capsys, tmp_path, "eval", mesh_file, path)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".safetensors"])
+def test_files_that_are_no_surface(scans_file, garbage, tmp_path, capsys, suffix):
+    path = garbage(suffix)
+    assert str(path) in refusal(capsys, tmp_path, "eval", path, scans_file)
+
+
+def test_points_are_no_mesh(scans_file, tmp_path, capsys):
+    path = tmp_path / "cloud.ply"
+    trimesh.PointCloud(np.eye(3)).export(path)
+    assert "the mesh has no surface" in refusal(capsys, tmp_path, "eval", path, scans_file)
+
+
+def test_a_scene_of_several_parts_is_no_cloud(mesh_file, tmp_path, capsys):
+    path = tmp_path / "scene.glb"
+    trimesh.Scene([trimesh.creation.box(), trimesh.creation.icosphere()]).export(path)
+    assert f"{path} is not one cloud or mesh" in refusal(capsys, tmp_path, "eval", mesh_file, path)
+
+
+def test_files_that_do_not_exist(mesh_file, scans_file, tmp_path, capsys):
+    absent = tmp_path / "absent.ply"
+    assert "absent.ply" in refusal(capsys, tmp_path, "eval", absent, scans_file)
+    assert "absent.ply" in refusal(capsys, tmp_path, "eval", mesh_file, absent)

@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""`radarsdf fit`. Ctrl-C is tested with the other ends of a fit, `--dry-run` with the estimate."""
+
+from __future__ import annotations
+
+import pytest
+import radarsdf
+
+from .calls import FAST, call, files, refusal
+
+
+def test_the_map_is_of_these_scans_and_settings(map_file):
+    radar_map = radarsdf.load(map_file)
+    assert radar_map.has_intensity
+    assert radar_map.report["returns"] == 4 * 1500  # scans 0 and 3 of six are held out
+    assert (radar_map.config.training.sdf_iterations, radar_map.config.training.batch_size) == (40, 1024)
+
+
+def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
+    path = tmp_path / "map.safetensors"
+    assert call("fit", scans_file, "-o", path, "--quick", "--geometry-only") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("fit ")
+    assert printed.endswith(f", written to {path}\n")
+    radar_map = radarsdf.load(path)
+    assert not radar_map.has_intensity
+    assert radar_map.config == radarsdf.FitConfig.quick()
+    assert radar_map.report["returns"] == 6 * 1500
+
+
+def test_the_checkpoint_is_used_and_removed(scans_file, tmp_path, capsys):
+    state, out = tmp_path / "state", tmp_path / "map.safetensors"
+    state.write_bytes(b"no state of a fit")
+    words = ["fit", scans_file, "-o", out, "--checkpoint", state, *FAST]
+    assert str(state) in refusal(capsys, tmp_path, *words)
+    state.unlink()
+    assert call(*words) == 0
+    assert files(tmp_path) == ["map.safetensors"]
+
+
+def test_a_fit_that_diverges(scans_file, tmp_path, capsys):
+    words = [
+        "fit",
+        scans_file,
+        "-o",
+        tmp_path / "map.safetensors",
+        *FAST,
+        "--set",
+        "training.learning_rate=1e30",
+    ]
+    assert "learning rate" in refusal(capsys, tmp_path, *words)
+
+
+def test_scans_that_do_not_exist(tmp_path, capsys):
+    absent = tmp_path / "absent.npz"
+    assert str(absent) in refusal(capsys, tmp_path, "fit", absent, "-o", tmp_path / "map.safetensors")
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".ply"])
+def test_files_that_are_no_scans(garbage, tmp_path, capsys, suffix):
+    path = garbage(suffix)
+    assert str(path) in refusal(capsys, tmp_path, "fit", path, "-o", tmp_path / "map.safetensors")
+
+
+def test_a_folder_that_does_not_exist(scans_file, tmp_path, capsys):
+    out = tmp_path / "absent" / "map.safetensors"
+    assert "absent" in refusal(capsys, tmp_path, "fit", scans_file, "-o", out, *FAST)

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Imports of the package go downwards, from room to room, and never in a circle."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import radarsdf
+
+ROOT = Path(radarsdf.__file__).parent
+# From the lowest to the highest. A room may import itself and those below it.
+ROOMS = (
+    ("_core", "checks", "interrupts", "threads"),
+    ("config",),
+    ("config_toml",),
+    ("io",),
+    ("returns",),
+    ("field",),
+    ("budget",),
+    ("map",),
+    ("fitting",),
+    ("render",),
+    ("evaluation", "simulate"),
+    ("cli",),
+)
+LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
+
+
+def modules():
+    """Name of each module of the package, and its file. The front door, radarsdf itself, opens to all rooms."""
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        if name not in ("", "__main__"):
+            yield name, path
+
+
+def imports_of(path, name):
+    """What a module imports from the package, in functions too, but not for the type checker alone."""
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for_types = {
+        inner
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if node in for_types:
+            continue
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                base = f"radarsdf.{package}" + (f".{base}" if base else "")
+            names = [f"{base}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        yield from (found.removeprefix("radarsdf.") for found in names if found.startswith("radarsdf."))
+
+
+def graph():
+    known = dict(modules())
+    found = {}
+    for name, path in known.items():
+        uses = set()
+        for target in imports_of(path, name):
+            # `from radarsdf.returns.rays import Rays` names something in a module, or a module in a package.
+            parts = target.split(".")
+            while parts and ".".join(parts) not in known:
+                parts.pop()
+            uses.add(".".join(parts) if parts else target.split(".")[0])
+        found[name] = uses - {name}
+    return found
+
+
+def test_every_room_is_known():
+    assert {name.split(".")[0] for name, _ in modules()} | {"_core"} == set(LEVEL)
+
+
+def test_imports_go_downwards():
+    upwards = [
+        f"{name} imports {target}"
+        for name, targets in graph().items()
+        for target in targets
+        if target.split(".")[0] in LEVEL and LEVEL[target.split(".")[0]] > LEVEL[name.split(".")[0]]
+    ]
+    # The commands use the front door, as users do.
+    assert upwards == []
+    assert len(graph()["fitting.fit"]) > 5  # imports are found at all
+
+
+def test_there_are_no_circles():
+    graphlib.TopologicalSorter(graph()).prepare()  # a CycleError names the circle
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
+def test_pytorch_is_imported_before_the_core():
+    code = """
+import importlib, os, sys
+
+class Finder:
+    def find_spec(name, path=None, target=None):
+        if name in ("torch", "radarsdf._core"):
+            os._exit(name != "torch")
+
+sys.meta_path.insert(0, Finder)
+for name in sys.argv[1:]:
+    if (child := os.fork()) == 0:
+        importlib.import_module(f"radarsdf.{name}")
+        os._exit(0)
+    if os.waitpid(child, 0)[1] != 0:
+        print(name)
+"""
+    names = [name for name, _ in modules()]
+    done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
