@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans from folders: a plain one with poses, and a sequence of SNAIL-Radar.
+"""Scans from folders: a plain folder with poses, or a sequence of SNAIL-Radar.
 
-Frames: every sensor's points are in its own frame, in metres. `T_a_b` takes points of frame b to frame a, and so does a
-file `a_T_b.txt`. Nothing is levelled, shifted or turned beyond that: a world in UTM stays in UTM.
+The points of each sensor are in its own frame, in m. `T_a_b` transforms points of frame b to frame a, and so does the
+matrix in a file `a_T_b.txt`. There is no other transformation: if the poses are in UTM, so is the world frame.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from radarsdf.io.scans import Scans
 from radarsdf.io.trajectory import Trajectory, read_table, read_trajectory
 
 MAX_GAP_S = 0.5
-"""Over a longer time without a pose, no pose is made up."""
+"""Longest time between two poses over which poses are interpolated."""
 
 INTENSITY_FIELDS = ("power", "Power", "intensity", "rcs")
-"""The first of these fields that the scans have is the intensity: Hugin radars call it power, Oculii ones Power."""
+"""Names of the intensity in PCD files, of which the first that is present counts. Hugin: power; Oculii: Power."""
 
-# The calibration of SNAIL-Radar's rig, for sequences that bring no files of their own. The body's axes point forward,
-# left and up; its origin is the lidar's. Source: matlab/Body_T_Xt32.m and Body_T_Oculii.m ("refined"), multiplied out,
-# of github.com/snail-radar/dataset_tools, commit 2f82c2c; the same as in its python/view_radar_lidar.py.
+# The published calibration of the SNAIL-Radar rig, for sequences without calibration files. The axes of the body point
+# forward, left and up; its origin is that of the lidar. Source: matlab/Body_T_Xt32.m and Body_T_Oculii.m ("refined"),
+# multiplied out, of github.com/snail-radar/dataset_tools, commit 2f82c2c. Its python/view_radar_lidar.py has the same.
 _BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _BODY_T_OCULII = np.array(
     [
@@ -41,21 +41,21 @@ _BODY_T_OCULII = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-_LIDAR_RANGE_M = (1.0, 60.0)  # nearer is the platform and who carries it, further is out of the radar's reach
+_LIDAR_RANGE_M = (1.0, 60.0)  # nearer points are on the platform or its operator; the radar sees no farther
 _LIDAR_CELL_M = (
-    0.05  # one lidar point a cell: otherwise most would lie on the ground where the platform stood
+    0.05  # one lidar point per cell: otherwise most would lie on the ground where the platform stood
 )
-_LIDAR_BATCH = 50  # scans between two thinnings, which bounds the memory
-_MAX_SWEEP_S = 1.0  # a point's time further than this from its scan's is in another clock
+_LIDAR_BATCH = 50  # scans from one thinning to the next; bounds the memory
+_MAX_SWEEP_S = 1.0  # larger differences between the times of a point and of its scan mean different clocks
 
 
 def is_snail_radar(folder: Path) -> bool:
-    """Whether the folder is a sequence of SNAIL-Radar with clouds of its Oculii radar."""
+    """Whether the folder is a sequence of SNAIL-Radar with point clouds of the Oculii radar."""
     return (folder / "eagleg7" / "enhanced").is_dir()
 
 
 def is_posed_folder(folder: Path) -> bool:
-    """Whether the folder is one that :func:`read_posed_folder` reads."""
+    """Whether :func:`read_posed_folder` reads the folder."""
     return (folder / "radar").is_dir() and (folder / "poses.txt").is_file()
 
 
@@ -64,34 +64,37 @@ def read_posed_folder(folder: Path, frames: int | None = None) -> Scans:
 
     ::
 
-        radar/1717252210.123456.pcd   one a scan, named by its time, s
-        poses.txt                     lines of: time x y z qx qy qz qw (TUM), T_world_base
-        base_T_radar.txt              optional: 4 x 4, where poses are those of another frame than the radar's
-        lidar.pcd or lidar.ply        optional: the ground truth, world, m
+        radar/1717252210.123456.pcd   one file per scan, named by its time, s
+        poses.txt                     lines of: time x y z qx qy qz qw (TUM format), T_world_base
+        base_T_radar.txt              optional: 4 x 4, if the poses are not those of the radar frame
+        lidar.pcd or lidar.ply        optional: ground truth, world frame, m
 
-    The recordings of Viking Hill (Hugin A3; ROS bags) become such a folder when each message of
-    ``/hugin_raf_1/radar_data`` is a PCD file with the fields x, y, z and power, ``/icp_odom`` (poses of base_link in
-    map) is ``poses.txt``, the radar's mounting from the data set's calibration is ``base_T_radar.txt`` and a reference
-    map, ``*_map_subsampled.pcd``, which is in the same map frame, is ``lidar.pcd``.
+    A recording of Viking Hill (Hugin A3, ROS bags) becomes such a folder as follows:
+
+    - each message of ``/hugin_raf_1/radar_data`` is a PCD file with the fields x, y, z and power;
+    - ``/icp_odom`` (poses of base_link in map) is ``poses.txt``;
+    - the pose of the radar from the calibration of the data set is ``base_T_radar.txt``;
+    - a reference map ``*_map_subsampled.pcd``, which is in the same map frame, is ``lidar.pcd``.
 
     Parameters
     ----------
     folder : Path
-        As above. Returns that are not finite and scans without a return are left out, and scans from before the
-        first pose or after the last one.
+        A folder as above. These are left out: returns that are not finite, scans without a return, and scans before
+        the first or after the last pose.
     frames : int, optional
-        Read the first so many scans only.
+        Number of scans to read, from the first. Default: all.
 
     Returns
     -------
     Scans
-        Points float32, radar frame, m; poses T_world_radar; intensities by `INTENSITY_FIELDS`, None where the scans
-        have none of them; ground truth (M, 3) float64, or None.
+        Points float32, radar frame, m. Poses T_world_radar. Intensities from the first of `INTENSITY_FIELDS` that the
+        first scan has, or None. Ground truth (M, 3) float64, or None.
 
     Raises
     ------
     ValueError
-        If files are missing, damaged or do not fit together, or there is no pose for `MAX_GAP_S` around a scan.
+        If files are missing, damaged or do not fit together, or the poses before and after a scan are more than
+        `MAX_GAP_S` apart.
     OSError
         If a file cannot be read.
     """
@@ -108,26 +111,26 @@ def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
 
         eagleg7/enhanced/1706001766.577286344.pcd   Oculii frame (forward, left, up); intensity: Power
         utm50r_T_xt32.txt                           time x y z qx qy qz qw: the full trajectory of the lidar
-        xt32/1706001766.715735580.pcd               optional: lidar frame (left, back, up)
-        body_T_oculii.txt, body_T_xt32.txt          optional: 4 x 4, in place of the published calibration
-        lidar.pcd or lidar.ply                      optional: a ground truth in place of xt32, UTM zone 50R, m
+        xt32/1706001766.715735580.pcd               optional: lidar scan, lidar frame (left, back, up)
+        body_T_oculii.txt, body_T_xt32.txt          optional: 4 x 4, instead of the published calibration
+        lidar.pcd or lidar.ply                      optional: ground truth instead of xt32, UTM zone 50R, m
 
-    The data set has ``utm50r_T_xt32.txt`` in a folder of its own, ``full_trajs/<date>/<sequence>``: copy it. Only x, y
-    and z of the radar are used; its angles are in the radar's native frame (right, down, forward). The sequence's
-    ``tf_static.launch`` is not read.
+    Copy ``utm50r_T_xt32.txt`` from the data set's folder ``full_trajs/<date>/<sequence>``. Of the radar, only x, y and
+    z are used: its angles are in another frame (right, down, forward). ``tf_static.launch`` is not read.
 
     Parameters
     ----------
     folder : Path
-        As above; scans and returns are left out as in :func:`read_posed_folder`.
+        A folder as above. The same returns and scans are left out as by :func:`read_posed_folder`.
     frames : int, optional
-        Read the first so many scans only, and the lidar from the first to the last of them.
+        Number of scans to read, from the first. Default: all. Lidar scans are read from the first to the last of them.
 
     Returns
     -------
     Scans
-        As of :func:`read_posed_folder`; the world is UTM zone 50R. Of the lidar, points 1 to 60 m away, each moved with
-        the pose at its own time where the files have it, and at most one in a cell of 5 cm.
+        As of :func:`read_posed_folder`, with UTM zone 50R as the world frame. The ground truth holds lidar points with
+        a range of 1 to 60 m, at most one in each cell of 5 cm. Each is moved with the pose at its own time, or at the
+        time of its scan if the file has no field ``timestamp``.
 
     Raises
     ------
@@ -135,7 +138,7 @@ def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
         As :func:`read_posed_folder`.
     """
     if not (folder / "utm50r_T_xt32.txt").is_file():
-        msg = f"{folder} lacks utm50r_T_xt32.txt, which the data set has in full_trajs/<date>/<sequence>: copy it here"
+        msg = f"{folder} lacks utm50r_T_xt32.txt: copy it from full_trajs/<date>/<sequence> of the data set"
         raise ValueError(msg)
     trajectory = read_trajectory(folder / "utm50r_T_xt32.txt")
     T_body_xt32 = _transform(folder / "body_T_xt32.txt", _BODY_T_XT32)
@@ -149,7 +152,7 @@ def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
 
 
 def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
-    """The PCD files of a folder with their times, s, in the order of time."""
+    """Times, s, and paths of the PCD files of a folder, in the order of time."""
     files = []
     for path in folder.glob("*.pcd"):
         try:
@@ -166,14 +169,15 @@ def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
 def _read_radar(
     folder: Path, trajectory: Trajectory, T_base_radar: NDArray[np.float64], frames: int | None
 ) -> tuple[Scans, NDArray[np.float64]]:
-    """Scans without ground truth, and their times, (F,) s."""
+    """F scans without ground truth, and their times (F,), s."""
     files = _stamped_files(folder)
     if not files:
         msg = f"{folder} holds no .pcd files"
         raise ValueError(msg)
     covered = trajectory.covers(np.array([time_s for time_s, _ in files]))
     if not covered.any():
-        msg = f"no scan of {folder}, {files[0][0]} to {files[-1][0]} s, lies within the poses, {trajectory.span()}"
+        span = f"{files[0][0]} to {files[-1][0]} s"
+        msg = f"no scan of {folder} ({span}) lies within the poses ({trajectory.span()})"
         raise ValueError(msg)
     times_s: list[float] = []
     points: list[NDArray[Any]] = []
@@ -209,7 +213,7 @@ def _read_radar(
 
 
 def _read_lidar_map(folder: Path) -> NDArray[np.float64] | None:
-    """``lidar.pcd`` or ``lidar.ply``, (M, 3) world, m, or None where there is neither."""
+    """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``. None if there is neither."""
     if (path := folder / "lidar.pcd").is_file():
         points = _xyz(read_pcd(path), path)
     elif (path := folder / "lidar.ply").is_file():
@@ -229,7 +233,7 @@ def _read_ply(path: Path) -> NDArray[np.float64]:
         return np.asarray(vertices, np.float64)
     except OSError:
         raise
-    except Exception as error:  # what trimesh raises depends on where a damaged file breaks off
+    except Exception as error:  # trimesh raises exceptions of many kinds for damaged files
         msg = f"{path} is not a whole PLY file of points: {error}"
         raise ValueError(msg) from error
 
@@ -237,8 +241,8 @@ def _read_ply(path: Path) -> NDArray[np.float64]:
 def _read_lidar_scans(
     folder: Path, trajectory: Trajectory, first_s: float, last_s: float
 ) -> NDArray[np.float64] | None:
-    """All lidar scans of a span of time in one cloud, (M, 3) world, m, thinned out."""
-    origin = trajectory.positions[0]  # keys are of cells near it: UTM coordinates would be out of their range
+    """Points (M, 3), world frame, m, of all lidar scans between two times, at most one in each cell."""
+    origin = trajectory.positions[0]  # cell keys are relative to it: UTM coordinates are out of their range
     found = [np.zeros((0, 3))]
     for count, world in enumerate(_lidar_scans(folder, trajectory, first_s, last_s), 1):
         found.append(_thin(world - origin))
@@ -260,14 +264,14 @@ def _lidar_scans(
         ranges_m = np.linalg.norm(xyz, axis=1)
         used = (ranges_m >= _LIDAR_RANGE_M[0]) & (ranges_m <= _LIDAR_RANGE_M[1]) & np.isfinite(times_s)
         if (np.abs(times_s[used] - time_s) > _MAX_SWEEP_S).any():
-            msg = f"{path}: the times of its points are not within {_MAX_SWEEP_S} s of its own"
+            msg = f"{path}: the times of its points differ by more than {_MAX_SWEEP_S} s from the time in its name"
             raise ValueError(msg)
         used &= trajectory.covers(times_s)
         yield trajectory.move(xyz[used], times_s[used], MAX_GAP_S)
 
 
 def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The first point in each cell."""
+    """The first point (K, 3) in each cell of points (N, 3)."""
     _, first = np.unique(cell_keys(points, _LIDAR_CELL_M), return_index=True)
     kept: NDArray[np.float64] = points[np.sort(first)]
     return kept
@@ -281,14 +285,14 @@ def _xyz(columns: dict[str, NDArray[Any]], path: Path) -> NDArray[np.float64]:
 
 
 def _transform(path: Path, default: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A 4 x 4 rigid transform from a text file, or the default where there is no file."""
+    """Rigid transform (4, 4) from a text file, or the default if there is no file."""
     if not path.is_file():
         return default
     matrix = read_table(path, 4)
     try:
         poses = check_poses(matrix[None], 1)
     except ValueError as error:
-        msg = f"{path} does not hold a rigid transform, 4 x 4: {error}"
+        msg = f"{path} does not hold a rigid transform: {error}"
         raise ValueError(msg) from error
     transform: NDArray[np.float64] = poses[0]
     return transform

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Point clouds of the Point Cloud Library, pointclouds.org/documentation/tutorials/pcd_file_format.html."""
+"""Files of the Point Cloud Library, pointclouds.org/documentation/tutorials/pcd_file_format.html."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
     Parameters
     ----------
     path : Path
-        A PCD file, version 0.7 or earlier. ``VIEWPOINT`` does not move the points.
+        A PCD file, version 0.7 or earlier. Its ``VIEWPOINT`` is ignored.
 
     Returns
     -------
     dict
-        (N,) array of each field with one number a point, by name; float64 where the file is ASCII.
+        By name, an array (N,) for each field with one number per point. Its dtype is that of the file, or float64 if
+        the file is ASCII.
 
     Raises
     ------
     ValueError
-        If the file is no PCD file, is cut short, or is compressed.
+        If the file is not a PCD file, is cut off, or is compressed.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     try:
         return _read(path)
@@ -65,16 +66,16 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         msg = "FIELDS, SIZE, TYPE and COUNT do not fit together"
         raise ValueError(msg)
     if points < 0 or min(counts) < 1:
-        msg = "a number of points or of values is negative or zero"
+        msg = "the number of points is negative, or a COUNT is zero or negative"
         raise ValueError(msg)
     if header["DATA"] == ["binary"]:
         columns = _binary(body, types, counts, points)
     elif header["DATA"] == ["ascii"]:
         columns = _ascii(body, counts, points)
     else:
-        msg = f"DATA {' '.join(header['DATA'])} cannot be read: pcl_convert_pcd_ascii_binary turns it into binary"
+        msg = f"DATA {' '.join(header['DATA'])} cannot be read: convert it by pcl_convert_pcd_ascii_binary"
         raise ValueError(msg)
-    # Several fields may have the name _, which stands for padding.
+    # The name _ means padding, and several fields may have it.
     return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
 
 
@@ -84,8 +85,8 @@ def _binary(body: bytes, types: list[str], counts: list[int], points: int) -> li
         for i, (kind, count) in enumerate(zip(types, counts, strict=True))
     ]
     record = np.dtype(fields)
-    if len(body) < points * record.itemsize:  # before anything is allocated for so many points
-        msg = f"{points} points need {points * record.itemsize} bytes, {len(body)} are there"
+    if len(body) < points * record.itemsize:  # a wrong header must not allocate much memory
+        msg = f"{points} points need {points * record.itemsize} bytes, but only {len(body)} are there"
         raise ValueError(msg)
     cloud = np.frombuffer(body, record, points)
     return [cloud[f"f{i}"][:, 0] for i in range(len(types))]
@@ -94,7 +95,7 @@ def _binary(body: bytes, types: list[str], counts: list[int], points: int) -> li
 def _ascii(body: bytes, counts: list[int], points: int) -> list[NDArray[Any]]:
     rows = [line.split() for line in body.decode("ascii").splitlines() if line.strip()]
     if len(rows) != points or any(len(row) != sum(counts) for row in rows):
-        msg = f"{points} rows of {sum(counts)} values are announced, others are there"
+        msg = f"the file does not hold {points} rows of {sum(counts)} values, as its header says"
         raise ValueError(msg)
     table = np.array(rows, np.float64).reshape(points, sum(counts))
     first = np.cumsum([0, *counts[:-1]])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans from files. One function a format; all return :class:`Scans`."""
+"""Scans and their ``.npz`` files."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from numpy.typing import NDArray
 from radarsdf.io.files import check_regular_file, write_whole
 
 _ARRAYS = ("points", "frame", "poses", "intensity", "static", "lidar_points")
-# A few megabytes of zeros can unpack to gigabytes. Measurements, which are mostly noise, compress by two to five.
+# A few megabytes of zeros can unpack to gigabytes. Measurements are mostly noise and compress by a factor of 2 to 5.
 _MAX_COMPRESSION = 100
-_ALWAYS_UNPACKED = 1 << 28  # bytes
+_ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are unpacked at any compression
 
 
 @dataclass(frozen=True)
 class Scans:
-    """What a fit needs, and a ground truth where the file has one."""
+    """F scans with poses, and lidar points as ground truth where there are any."""
 
     points: list[NDArray[Any]]
     """F arrays (N_i, 3), sensor frame, m."""
     poses: NDArray[np.float64]
-    """(F, 4, 4) T_world_sensor."""
+    """(F, 4, 4) T_world_sensor, m."""
     intensities: list[NDArray[Any]] | None
-    """F arrays (N_i,), sensor units."""
+    """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
     ground_truth: NDArray[Any] | None = None
-    """(M, 3) lidar points, world, m."""
+    """(M, 3) lidar points, world frame, m."""
 
     def select(self, frames: NDArray[np.int64]) -> Scans:
-        """The scans of these frames only."""
+        """The scans with the numbers `frames`, (K,), in this order."""
         intensities = None if self.intensities is None else [self.intensities[i] for i in frames]
         return Scans([self.points[i] for i in frames], self.poses[frames], intensities, self.ground_truth)
 
@@ -47,26 +47,34 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     Parameters
     ----------
     path : path-like
-        An ``.npz`` file with the arrays ``points`` (N, 3), sensor frame, m; ``frame`` (N,), each return's row in
-        ``poses`` (F, 4, 4), T_world_sensor; and, where there are any, ``intensity`` (N,), ``static`` (N,) bool (only
-        these returns are used) and ``lidar_points`` (M, 3), world, m. Frames without a return are left out.
+        An ``.npz`` file with these arrays:
+
+        - ``points`` (N, 3): returns, sensor frame, m;
+        - ``poses`` (F, 4, 4): T_world_sensor, m;
+        - ``frame`` (N,): row of ``poses`` for each return;
+        - ``intensity`` (N,), optional: sensor units;
+        - ``static`` (N,) bool, optional: only returns with True are used;
+        - ``lidar_points`` (M, 3), optional: ground truth, world frame, m.
+
+    Returns
+    -------
+    Scans
+        One scan for each row of ``poses`` with at least one return.
 
     Raises
     ------
     ValueError
-        If the file is of another kind, or its arrays do not fit together.
+        If the file has another format, or its arrays do not fit together.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     if Path(path).suffix != ".npz":
-        msg = f"{path}: only .npz files of scans can be read"
+        msg = f"{path} is not an .npz file: only .npz files of scans can be read"
         raise ValueError(msg)
     check_regular_file(path)
     try:
         arrays = _read_arrays(Path(path))
-    except (
-        Exception
-    ) as error:  # of which kind, OSError among them, depends on where a damaged file breaks off
+    except Exception as error:  # damaged files raise exceptions of many kinds, among them OSError
         msg = f"{path} is not a whole .npz file: {error}"
         raise ValueError(msg) from error
     if missing := sorted({"points", "frame", "poses"} - set(arrays)):
@@ -99,7 +107,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     order = np.flatnonzero(used)
     order = order[np.argsort(frame[order], kind="stable")]
     frames, first = np.unique(frame[order], return_index=True)
-    rows = np.split(order, first)[1:]  # before the first frame there is nothing
+    rows = np.split(order, first)[1:]  # the part before the first scan is empty
     return Scans(
         points=[points[r] for r in rows],
         poses=poses[frames].astype(np.float64),
@@ -114,7 +122,7 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         members = {name: file.getinfo(f"{name}.npy") for name in _ARRAYS if f"{name}.npy" in names}
         unpacked = sum(member.file_size for member in members.values())
         if unpacked > max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * path.stat().st_size):
-            msg = f"its arrays would unpack to {unpacked} bytes, which is no compression of measurements"
+            msg = f"its arrays would unpack to {unpacked} bytes: measurements do not compress that much"
             raise ValueError(msg)
         arrays = {}
         for name, member in members.items():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses at times, and poses between them."""
+"""Trajectories: poses with times, interpolation between them, and their files."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-_MAX_NORM_ERROR = (
-    1e-2  # of a quaternion: one written with three digits passes, another kind of rotation does not
-)
+_MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses T_world_base of a moving frame, P of them."""
+    """P poses T_world_base of a moving frame `base`."""
 
     times_s: NDArray[np.float64]
     """(P,) ascending, s."""
     positions: NDArray[np.float64]
-    """(P, 3) world, m."""
+    """(P, 3) world frame, m."""
     rotations: Rotation
     """P rotations R_world_base."""
     name: str = "the trajectory"
-    """Where it is from, for messages."""
+    """Its file, for error messages."""
 
     def span(self) -> str:
-        """First and last time, for messages."""
+        """First and last time, for error messages."""
         return f"{self.times_s[0]} to {self.times_s[-1]} s"
 
     def covers(self, times_s: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which times, (N,) s, lie between the first pose and the last."""
+        """Mask (N,) of the times (N,), s, that lie between the first and the last pose."""
         inside: NDArray[np.bool_] = (times_s >= self.times_s[0]) & (times_s <= self.times_s[-1])
         return inside
 
     def poses(self, times_s: NDArray[np.float64], max_gap_s: float) -> NDArray[np.float64]:
-        """(N, 4, 4) T_world_base at the times (N,), s: position linear, rotation spherical in between.
+        """Poses T_world_base (N, 4, 4) at the times (N,), s.
+
+        Between two poses, the position is interpolated linearly and the rotation spherically (slerp).
 
         Raises
         ------
@@ -55,7 +55,13 @@ class Trajectory:
     def move(
         self, points: NDArray[np.float64], times_s: NDArray[np.float64], max_gap_s: float
     ) -> NDArray[np.float64]:
-        """Points (N, 3) of the moving frame, each at its own time (N,) s, to the world; errors as `poses`."""
+        """Points (N, 3) in the world frame, m, of points (N, 3) in the moving frame, each with its own time (N,), s.
+
+        Raises
+        ------
+        ValueError
+            As `poses`.
+        """
         if len(points) == 0:
             return points
         rotations, positions = self._at(times_s, max_gap_s)
@@ -64,7 +70,8 @@ class Trajectory:
 
     def _at(self, times_s: NDArray[np.float64], max_gap_s: float) -> tuple[Rotation, NDArray[np.float64]]:
         if not self.covers(times_s).all():
-            msg = f"{self.name}: no pose at {times_s[~self.covers(times_s)][0]} s: the poses are of {self.span()}"
+            first = times_s[~self.covers(times_s)][0]
+            msg = f"{self.name} has no pose at {first} s: its poses are from {self.span()}"
             raise ValueError(msg)
         after = np.searchsorted(self.times_s, times_s)  # the first pose that is not earlier
         before = np.where(self.times_s[after] == times_s, after, after - 1)
@@ -72,8 +79,8 @@ class Trajectory:
         if (gaps_s > max_gap_s).any():
             worst = int(np.argmax(gaps_s))
             msg = (
-                f"{self.name}: no pose near {times_s[worst]} s: the poses before and after it are {gaps_s[worst]:.3f} s apart, "
-                f"more than {max_gap_s} s"
+                f"{self.name} has no pose near {times_s[worst]} s: the poses before and after it are "
+                f"{gaps_s[worst]:.3f} s apart, more than {max_gap_s} s"
             )
             raise ValueError(msg)
         positions = [np.interp(times_s, self.times_s, self.positions[:, axis]) for axis in range(3)]
@@ -81,15 +88,15 @@ class Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Reads poses in TUM's form: lines of ``time x y z qx qy qz qw``, s and m, and comments after ``#``.
+    """Reads a trajectory in the TUM format: lines of ``time x y z qx qy qz qw``, s and m, and comments after ``#``.
 
     Raises
     ------
     ValueError
-        If the file is not such a one, has fewer than two poses, times that do not ascend or quaternions that are not
-        of unit length.
+        If the file has another format or fewer than two poses, or if times do not ascend or quaternions do not have
+        unit length.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     table = read_table(path, 8)
     if len(table) < 2 or not (np.diff(table[:, 0]) > 0).all():
@@ -102,7 +109,15 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def read_table(path: Path, columns: int) -> NDArray[np.float64]:
-    """A text file of finite numbers, (R, columns) float64; a ValueError if it is something else."""
+    """Reads a text file of finite numbers, (R, columns) float64, with comments after ``#``.
+
+    Raises
+    ------
+    ValueError
+        If the file holds anything else.
+    OSError
+        If the file cannot be read.
+    """
     try:
         lines = [line.partition("#")[0] for line in path.read_text("utf-8").splitlines()]
         table = np.array([line.split() for line in lines if line.strip()], np.float64)

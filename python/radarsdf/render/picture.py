@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Pictures of a mesh without a display, OpenGL or a viewer: a small rasteriser in NumPy."""
+"""Pictures of a mesh, drawn in NumPy: no display, OpenGL or viewer is needed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _Floats = NDArray[np.float64]
 
-_SUPERSAMPLING = 2  # subpixels per pixel and axis, averaged: edges without stairs
+_SUPERSAMPLING = 2  # subpixels per pixel and axis, which are averaged for smooth edges
 
 
 def render(
@@ -31,24 +31,24 @@ def render(
     height: int = 1000,
     viewpoint: ArrayLike | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw a mesh, lit from over the viewer's shoulder, on white.
+    """Draw a mesh on white, lit from behind the viewer, upper left.
 
     Parameters
     ----------
-    mesh
-        The surface; z is up. Both sides of a triangle are drawn.
-    colors
-        (V, 3) or (V, 4) uint8 of the vertices; alpha is ignored. None draws in light grey.
-    width, height
+    mesh : trimesh.Trimesh
+        The surface, m, with z up. Both sides of a triangle are drawn.
+    colors : (V, 3) or (V, 4) array_like of uint8, optional
+        Colours of the vertices. Alpha is ignored. None draws in light grey.
+    width, height : int
         Size of the picture in pixels.
-    viewpoint
-        (3,) where the viewer stands, world frame, metres; the view is turned and zoomed to the mesh. None
-        looks down obliquely on its longer side. Triangles wholly or partly behind the viewer are
-        not drawn.
+    viewpoint : (3,) array_like, optional
+        Position of the viewer, world frame, m. The view is directed and zoomed to the mesh. None looks down obliquely
+        on its longer side. Triangles that are partly behind the viewer are not drawn.
 
     Returns
     -------
     (height, width, 3) uint8
+        Red, green and blue.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def render(
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
     if len(faces) == 0:
-        msg = "there is nothing to draw: the mesh has no triangles"
+        msg = "the mesh has no triangles to draw"
         raise ValueError(msg)
     rgb = np.array(NEUTRAL)[None].repeat(len(vertices), axis=0) if colors is None else np.asarray(colors)
     if rgb.shape not in {(len(vertices), 3), (len(vertices), 4)}:
@@ -69,7 +69,7 @@ def render(
     eye, axes = _camera(vertices[np.unique(faces)], viewpoint, origin)
     fine = (height * _SUPERSAMPLING, width * _SUPERSAMPLING)
     x, y, nearness = project((vertices - eye) @ axes.T, faces, fine)
-    faces = faces[np.isfinite(nearness[faces]).all(axis=1)]  # entirely before the viewer
+    faces = faces[np.isfinite(nearness[faces]).all(axis=1)]  # entirely in front of the viewer
     ids, near = rasterise(x[faces], y[faces], nearness[faces], fine)
 
     image = np.full((*fine, 3), 255.0, dtype=np.float32)
@@ -80,7 +80,7 @@ def render(
         part = part[ids.flat[part] >= 0]
         f = ids.flat[part]
         weight = barycentric(x[faces[f]], y[faces[f]], part % fine[1], part // fine[1])
-        weight *= nearness[faces[f]]  # linear on the screen to linear in space
+        weight *= nearness[faces[f]]  # perspective correction: now linear in space, not in the picture
         weight /= weight.sum(axis=1, keepdims=True)
         normal = np.einsum("ni,nij->nj", weight, normals[f])
         to_eye = eye - np.einsum("ni,nij->nj", weight, vertices[faces[f]])
@@ -106,31 +106,33 @@ def save_picture(
     height: int = 1000,
     viewpoint: ArrayLike | None = None,
 ) -> None:
-    """Save a PNG picture of a mesh, with a colour bar if it is coloured by a scalar.
+    """Save a PNG picture of a mesh, with a colour bar if a scalar gives the colours.
 
     Parameters
     ----------
-    path
-        Where the PNG goes.
-    mesh
-        The surface; z is up.
-    scalar
-        (V,) a value per vertex, such as its intensity; NaN is drawn grey. None draws the surface alone.
-    label
-        Beside the colour bar; name the unit.
-    low, high
-        Limits of the colours; None takes the 2nd and 98th percentile.
-    width, height
+    path : path-like
+        The PNG file. An old file is replaced once the new one is complete.
+    mesh : trimesh.Trimesh
+        The surface, m, with z up.
+    scalar : (V,) array_like, optional
+        A value for each vertex, such as its intensity. NaN is drawn grey. None draws the surface in light grey.
+    label : str
+        Text at the colour bar. It should name the unit.
+    low, high : float, optional
+        Limits of the colours. None means the 2nd and the 98th percentile.
+    width, height : int
         Size of the picture in pixels.
-    viewpoint
-        See `render`.
+    viewpoint : (3,) array_like, optional
+        As in `render`.
 
     Raises
     ------
     ImportError
-        If matplotlib is not installed; it is an optional extra.
+        If matplotlib is not installed. It comes with the extra `demo`.
     ValueError
-        See `render` and `intensity_colors`; or if `scalar` has a wrong shape.
+        As `render` and `intensity_colors`, or if `scalar` has a wrong shape.
+    OSError
+        If the file cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
@@ -172,14 +174,14 @@ def save_picture(
 
 
 def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tuple[_Floats, _Floats]:
-    """Where the eye is, and the unit vectors right, up and forward."""
-    low, high = np.percentile(points, [0.5, 99.5], axis=0)  # a few flying triangles do not decide
+    """Position (3,) of the eye relative to `origin`, and the unit vectors right, up and forward, (3, 3)."""
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)  # a few stray triangles must not decide
     center, radius = 0.5 * (low + high), max(float(np.linalg.norm(high - low)) / 2, 1e-6)
     if viewpoint is None:
         spread = points[:, :2] - points[:, :2].mean(axis=0)
         along = np.linalg.eigh(spread.T @ spread)[1][:, 1]
         across = np.array([along[1], -along[0]])
-        across *= -1.0 if across[1] > 0 else 1.0  # from the south, if there is a choice
+        across *= -1.0 if across[1] > 0 else 1.0  # of the two sides, the southern one
         turn, rise = np.deg2rad(25.0), np.deg2rad(36.0)
         flat = np.cos(turn) * across + np.sin(turn) * np.array([-across[1], across[0]])
         eye = center + 2.6 * radius * np.array([*(np.cos(rise) * flat), np.sin(rise)])
@@ -194,7 +196,7 @@ def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tu
         forward = np.array([0.0, 1.0, 0.0])
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
-    if np.linalg.norm(right) < 1e-6:  # straight down or up: north is at the top
+    if np.linalg.norm(right) < 1e-6:  # looking straight down or up: north is at the top
         right = np.array([1.0, 0.0, 0.0])
     right = right / np.linalg.norm(right)
     return eye, np.stack([right, np.cross(right, forward), forward])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Triangles to pixels: visibility, weights of the corners, normals, contours."""
+"""Rasterisation of triangles: visibility, barycentric weights, normals and contours."""
 
 from __future__ import annotations
 
@@ -11,22 +11,37 @@ _Floats = NDArray[np.float64]
 _Integers = NDArray[np.int64]
 
 PIXELS_AT_ONCE = 1 << 21  # bounds the memory
-_CREASE = np.cos(np.deg2rad(40.0))  # sharper edges are drawn sharp, others shaded smoothly
+_CREASE = np.cos(np.deg2rad(40.0))  # edges with a larger angle are drawn sharp, others are shaded smoothly
 
 
 def project(seen: _Floats, faces: _Integers, size: tuple[int, int]) -> tuple[_Floats, _Floats, _Floats]:
-    """Pixel coordinates and 1 / depth (NaN behind the viewer), zoomed so that the mesh fills the picture."""
+    """Perspective projection of the vertices, zoomed so that the mesh fills the picture.
+
+    Parameters
+    ----------
+    seen : (V, 3) float64
+        Vertices relative to the eye along right, up and forward, m.
+    faces : (F, 3) int64
+        The triangles.
+    size : (int, int)
+        Height and width of the picture, pixels.
+
+    Returns
+    -------
+    x, y, nearness : (V,) float64
+        Column and row, pixels, and 1 / depth, which is NaN behind the viewer.
+    """
     depth = seen[:, 2]
     depth = np.where(depth > 1e-3 * np.abs(depth).max(), depth, np.nan)
     u, v = seen[:, 0] / depth, -seen[:, 1] / depth
     used = np.unique(faces)
-    wide = np.hypot(u[used], v[used]) > 1.5  # no lens is wider
+    wide = np.hypot(u[used], v[used]) > 1.5  # more than 56° from the axis: the zoom ignores these vertices
     used = used[np.isfinite(depth[used]) & ~wide]
     if len(used) == 0:
         return u, v, np.full(len(u), np.nan)
     screen = np.stack([u[used], v[used]])
     low, high = np.percentile(screen, [2, 98], axis=1)
-    reach = 0.2 * (high - low)  # all of a compact scene, but a few flying triangles do not make it small
+    reach = 0.2 * (high - low)  # all of a compact scene, yet a few stray triangles must not make it small
     low, high = np.maximum(low - reach, screen.min(axis=1)), np.minimum(high + reach, screen.max(axis=1))
     focal = 0.93 * float(np.min(np.array(size[::-1]) / np.maximum(high - low, 1e-9)))
     middle = 0.5 * (low + high)
@@ -34,11 +49,24 @@ def project(seen: _Floats, faces: _Integers, size: tuple[int, int]) -> tuple[_Fl
 
 
 def rasterise(x: _Floats, y: _Floats, nearness: _Floats, size: tuple[int, int]) -> tuple[_Integers, _Floats]:
-    """Index of the nearest of the triangles (F, 3) at each pixel's centre (-1: none) and its 1 / depth.
+    """Index of the nearest triangle at the centre of each pixel, -1 where there is none, and its 1 / depth.
 
-    Line by line: a line at a pixel's centre enters a triangle through one edge and leaves it through another.
-    Both triangles of an edge compute the same crossing, and a pixel belongs to the one on its right, so
-    there are neither gaps nor overlaps.
+    Scan-line conversion: each line of pixel centres enters a triangle through one edge and leaves it through another.
+    Both triangles at an edge compute the same crossing, and a pixel on it belongs to the triangle on the right, so
+    there are no gaps and no overlaps.
+
+    Parameters
+    ----------
+    x, y, nearness : (F, 3) float64
+        Column, row and 1 / depth of the corners of the triangles.
+    size : (int, int)
+        Height and width of the picture, pixels.
+
+    Returns
+    -------
+    ids : (height, width) int64
+    nearest : (height, width) float64
+        0 where there is no triangle.
     """
     height, width = size
     ids, nearest = np.full(height * width, -1, dtype=np.int64), np.zeros(height * width)
@@ -73,13 +101,16 @@ def rasterise(x: _Floats, y: _Floats, nearness: _Floats, size: tuple[int, int]) 
 
 
 def _expand(counts: _Integers) -> tuple[_Integers, _Integers]:
-    """For counts 2, 0, 3: the owners 0 0 2 2 2 and the places 0 1 0 1 2 among them."""
+    """Index of the owner, and number within the owner, of each item: for counts 2, 0, 3, 0 0 2 2 2 and 0 1 0 1 2."""
     owner = np.repeat(np.arange(len(counts)), counts)
     return owner, np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def barycentric(x: _Floats, y: _Floats, column: _Integers, row: _Integers) -> _Floats:
-    """Weights (N, 3) of the corners at pixels' centres; kept within the triangle, for slivers' sake."""
+    """Barycentric weights (N, 3) of the corners at pixel centres.
+
+    They are clipped to [0, 1], because for very thin triangles rounding can put the centre outside.
+    """
     px, py = column + 0.5, row + 0.5
     a = (x[:, 1] - px) * (y[:, 2] - py) - (x[:, 2] - px) * (y[:, 1] - py)
     b = (x[:, 2] - px) * (y[:, 0] - py) - (x[:, 0] - px) * (y[:, 2] - py)
@@ -90,7 +121,7 @@ def barycentric(x: _Floats, y: _Floats, column: _Integers, row: _Integers) -> _F
 
 
 def corner_normals(vertices: _Floats, faces: _Integers) -> _Floats:
-    """Normals (F, 3, 3) of each triangle's corners: the vertex's where the surface is smooth, else its own."""
+    """Normals (F, 3, 3) at the corners of triangles: of the vertex on smooth surfaces, else of the triangle."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     own = np.cross(b - a, c - a)
     shared = np.zeros_like(vertices)
@@ -103,9 +134,9 @@ def corner_normals(vertices: _Floats, faces: _Integers) -> _Floats:
 
 
 def contours(nearness: _Floats, step: int) -> NDArray[np.float32]:
-    """Darken what has something nearer beside it (eye-dome lighting): steps and edges stand out.
+    """Factors (height, width) of the brightness by eye-dome lighting: a pixel with nearer pixels beside it is darker.
 
-    `step` is how far beside, in pixels.
+    This makes steps and edges visible. `step` is the distance to the pixels beside it, in pixels.
     """
     far = -np.log(np.where(nearness > 0, nearness, np.nan)).astype(np.float32)
     far[np.isnan(far)] = np.inf
