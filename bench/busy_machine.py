@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How much a busy process beside it slows a fit down: `python bench/busy_machine.py`.
+"""Slowdown of a fit by another busy process: `python bench/busy_machine.py`.
 
-Each row is a fit in a fresh process, once alone and once beside a process that keeps one core busy. Its fair share of
-two cores with three claimants is two thirds, so a slowdown of up to 1.5 is fair. The last rows run one operation of
-PyTorch on OpenMP's threads, which is what a fit would otherwise consist of.
+Each row is a fit in a new process, once alone and once while another process keeps one core busy. If three threads
+share two cores, each gets two thirds of a core, so a ratio of up to 1.5 is fair. The last rows run one operation on
+the OpenMP threads of PyTorch: without threads of its own, a fit would consist of such operations.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ print(time.perf_counter() - started)
 ROWS = {
     "fit": (FIT, {}),
     "fit, torch imported first": ("import torch\n" + FIT, {}),
-    "200 operations on OpenMP's threads": (OPERATION, {}),
+    "200 operations on OpenMP threads": (OPERATION, {}),
     "... with OMP_WAIT_POLICY=passive": (OPERATION, {"OMP_WAIT_POLICY": "passive"}),
 }
 
@@ -53,7 +53,7 @@ def seconds(code: str, environment: dict[str, str]) -> float:
 
 
 def main() -> None:
-    print("| what | alone, s | beside a busy process, s | ratio |\n|---|---|---|---|")
+    print("| case | alone, s | beside a busy process, s | ratio |\n|---|---|---|---|")
     for name, (code, environment) in ROWS.items():
         alone = seconds(code, environment)
         with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as busy:

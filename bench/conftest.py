@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Data that several benches share: made once, fixed by seeds, realistic in how memory is hit."""
+"""Test data that several benchmarks share. Seeds fix it, and its memory accesses are as those of a real fit."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ LEAF_M = 0.2
 NUM_LEVELS = 3
 FEATURE_DIM = 8
 PLANES = ((0, 1), (0, 2), (1, 2))
-_BIAS = 1 << 20  # of the table's lattice coordinates
+_BIAS = 1 << 20  # added to lattice coordinates, as in `VertexTable`, so that they are not negative
 
 
 def surface_points(count, seed=0, half_m=24.0, dtype=np.float32):
-    """Rolling ground with two walls, and the noise of a radar's returns."""
+    """Points (count, 3), m, on rolling ground with two walls, with the noise of radar returns."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-half_m, half_m, (2, count))
     z = 0.8 * np.sin(0.3 * x) + 0.5 * np.cos(0.2 * y)
@@ -37,7 +37,7 @@ def surface_points(count, seed=0, half_m=24.0, dtype=np.float32):
 
 
 def _spread(values):
-    """Bits of non-negative integers, three apart."""
+    """The bits of non-negative integers with two zeros between each, as in a Morton code."""
     out = np.zeros(values.shape, np.uint64)
     for bit in range(21):
         out |= ((values >> bit & 1).astype(np.uint64)) << np.uint64(3 * bit)
@@ -46,13 +46,13 @@ def _spread(values):
 
 @dataclass(frozen=True)
 class Surface:
-    """A table, and the rows and weights that plain NumPy finds for its points."""
+    """A vertex table with features, and a reference for its rows and weights in NumPy."""
 
     table: VertexTable
     features: torch.Tensor
 
     def rows_and_weights(self, points):
-        """(N, levels, 12) rows and weights: levels, planes, vertices numbered as the table documents it."""
+        """Rows and weights, (N, levels, 12) each, in the order that `VertexTable` documents."""
         leaf = self._leaf_cells()
         u = points.astype(np.float32) * np.float32(1 / LEAF_M)
         cell = np.floor(u).astype(np.int64) + _BIAS
@@ -77,9 +77,9 @@ class Surface:
         return np.stack(rows, 1).reshape(shape), np.stack(weights, 1).astype(np.float32).reshape(shape)
 
     def dense_planes(self):
-        """The same features in all cells of the scene's box: (8, H, W) for each level and plane, 0 where there are none.
+        """The features as images (8, H, W) of the whole scene, one for each level and plane, 0 where there are none.
 
-        With each, the lower corner and the upper one of its vertices, lattice coordinates of its level.
+        With each image come the lower and the upper corner of its vertices, in lattice coordinates of its level.
         """
         leaf = self._leaf_cells()
         rows, _ = self.rows_and_weights(((leaf - _BIAS + 0.5) * LEAF_M).astype(np.float32))
@@ -122,7 +122,7 @@ def dense_planes(surface):
 
 @dataclass(frozen=True)
 class Batch:
-    """Points, and what NumPy says of their interpolated features."""
+    """Points of a training batch, and a checksum of their interpolated features from NumPy."""
 
     points: torch.Tensor
     rows: torch.Tensor
@@ -130,12 +130,12 @@ class Batch:
     total: float
     """Sum of the interpolated features."""
     scale: float
-    """Its size, were the signs of the features random."""
+    """Expected size of `total` for features of random sign: the scale for its error."""
 
 
 @pytest.fixture(scope="session", params=[8192, 262144])
 def batch(request, surface):
-    """Points inside the surface's cells in the order of a training batch (Morton)."""
+    """Points in the cells of the surface, in the order of a training batch (Morton)."""
     points = surface_points(1_500_000)[: request.param]
     points = np.ascontiguousarray(points[np.argsort(cell_keys(points, LEAF_M), kind="stable")])
     rows, weights = surface.rows_and_weights(points)
@@ -149,7 +149,7 @@ def batch(request, surface):
 
 @pytest.fixture(scope="session")
 def roofline(tmp_path_factory):
-    """`roofline.cpp`, compiled for this machine."""
+    """The library of `roofline.cpp`, compiled for this machine."""
     compiler = shutil.which(os.environ.get("CXX", "c++"))
     if compiler is None:
         pytest.skip("no C++ compiler for roofline.cpp")

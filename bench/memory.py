@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What this process takes, as Linux counts it. Nothing but the standard library: the peers' Pythons come here, too."""
+"""Memory of this process on Linux. Only the standard library is imported: the Python of a peer may have no radarsdf."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from pathlib import Path
 
 
 def memory_bytes(field: str) -> int:
-    """VmRSS (now) or VmHWM (the most so far), or -1 where nobody says. Not ru_maxrss: a child starts with its parent's."""
+    """Resident memory of this process, bytes: now (`VmRSS`) or its peak (`VmHWM`). -1 where Linux does not tell.
+
+    ``ru_maxrss`` is not used: a child process inherits that of its parent.
+    """
     status = Path("/proc/self/status")
     if not status.exists():
         return -1

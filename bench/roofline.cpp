@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// How fast interpolation could be: the same rows gathered, and gradients scattered to them, with rows and weights known
-// beforehand. Point n has, at each of 3 levels, 12 rows of 8 floats and their weights. test_kernels.py compiles this
-// for the machine at hand, and checks its results.
+// Lower bound for the time of the interpolation: the same rows are read, and gradients are added to the same rows, but
+// rows and weights are known in advance. Point n has, at each of 3 levels, 12 rows of 8 floats and their weights.
+// test_kernels.py compiles this file for the machine, and checks its results.
 #include <omp.h>
 #include <string.h>
 
@@ -26,7 +26,7 @@ inline void store(float* row, Row values) { memcpy(row, &values, sizeof values);
 
 inline std::int64_t offset(std::int32_t row) { return static_cast<std::int64_t>(row) * kDim; }
 
-// Planes are counted through all levels.
+// Planes are numbered over all levels.
 inline void scatter(const std::int32_t* rows, const float* weights, const float* __restrict out_grad,
                     std::int64_t begin, std::int64_t end, int first_plane, int last_plane, float* __restrict gradient) {
   for (std::int64_t n = begin; n < end; ++n) {
@@ -59,7 +59,8 @@ void gather(const float* features, const std::int32_t* rows, const float* weight
   }
 }
 
-// Each thread has a part of the points and a gradient of its own, (threads, num_rows, 8) zeros; the first is the sum.
+// Each thread has a part of the points and its own gradient. gradients: (threads, num_rows, 8) zeros; the first becomes
+// the sum.
 void scatter_to_copies(const std::int32_t* rows, const float* weights, const float* out_grad, std::int64_t count,
                        float* gradients, std::int64_t num_rows, int threads) {
 #pragma omp parallel num_threads(threads)
@@ -75,7 +76,8 @@ void scatter_to_copies(const std::int32_t* rows, const float* weights, const flo
   }
 }
 
-// Each thread has all points, but only some planes, which share no rows: no copies, as in csrc/encodings.cpp.
+// Each thread has all points, but only some planes. Planes share no rows, so there is one gradient without copies, as in
+// csrc/encodings.cpp.
 void scatter_by_planes(const std::int32_t* rows, const float* weights, const float* out_grad, std::int64_t count,
                        float* gradient, int threads) {
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The kernels of encoding against the same computation in plain PyTorch, and against a bare loop in C++.
+"""Speed of the encoding kernels against the same computation in PyTorch, and against a simple loop in C++.
 
-Each case asserts a checksum from NumPy in double precision, so that a wrong answer cannot win. Ratios within a group
-and one run mean something; times of different runs or machines do not: see README.md.
+Each case checks its result against NumPy in double precision, so that a wrong result cannot be the fastest. Compare
+only times of one group and one run, not those of different runs or machines: see README.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .conftest import FEATURE_DIM, LEAF_M, NUM_LEVELS, PLANES, surface_points
 
 
 class Differentiated:
-    """A way to interpolate that PyTorch differentiates: `function` of the tensors `features`."""
+    """An interpolation `function` of the tensors `features`, which PyTorch differentiates."""
 
     def __init__(self, features, function):
         self._features = [tensor.clone().requires_grad_() for tensor in features]
@@ -33,7 +33,7 @@ class Differentiated:
             return self._function(*self._features)
 
     def backward(self, out_grad):
-        """Of one forward pass, which is not counted."""
+        """Gradients of the features. The forward pass runs only once and is not measured."""
         if self._out is None:
             self._out = self._function(*self._features)
         return torch.autograd.grad(self._out, self._features, out_grad, retain_graph=True)
@@ -65,7 +65,7 @@ def embedding_bag(surface, batch, _fixture):
 
 
 def grid_sample(_surface, batch, fixture):
-    """Without a table: planes that are full wherever the scene's box is."""
+    """Dense planes over the whole scene, without a table."""
     planes, grids = [], []
     for i, (plane, lower, upper) in enumerate(fixture("dense_planes")):
         u = batch.points.numpy()[:, PLANES[i % 3]].astype(np.float64) / (LEAF_M * 2 ** (i // 3))
@@ -88,7 +88,7 @@ def grid_sample(_surface, batch, fixture):
 
 
 class Roofline:
-    """No operation of PyTorch: the loops of roofline.cpp, the gradient by one of their two schemes."""
+    """The loops of roofline.cpp, with one of its two schemes for the gradient."""
 
     def __init__(self, library, surface, batch, threads, scheme):
         self._library, self._scheme = library, scheme
@@ -136,7 +136,7 @@ FORWARD = {
     "grid_sample, dense": grid_sample,
 }
 ROOFLINE = {"roofline": roofline_way(0, "copies")}
-# Which is best depends on the threads, and on how many rows there are for a point.
+# The best scheme depends on the number of threads, and on the number of rows for each point.
 ROOFLINES = {
     "roofline, one thread": roofline_way(1, "copies"),
     "roofline, a copy for each thread": roofline_way(0, "copies"),
@@ -146,7 +146,7 @@ ROOFLINES = {
 
 @pytest.fixture
 def way(request, surface, batch):
-    """The parametrised way, and the features that it is given, whatever their form."""
+    """An implementation of the interpolation, and its feature tensors."""
     return request.param(surface, batch, request.getfixturevalue)
 
 
@@ -177,7 +177,7 @@ def test_interpolation_forward_and_backward(benchmark, batch, way):
 
 
 def check_gradients(gradients, features, batch):
-    # The output is linear in the features, and so their product with its gradient is the output again.
+    # The output is linear in the features, so the product of features and gradients is the sum of the outputs.
     pairs = zip(gradients, features, strict=True)
     total = sum((gradient.double() * own.double()).sum().item() for gradient, own in pairs)
     assert abs(total - batch.total) < 1e-3 * batch.scale

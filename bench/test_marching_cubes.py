@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Marching cubes against its peers on the same float32 samples, one thread unless the case says otherwise.
+"""Speed of marching cubes against other programs on the same float32 samples, on one thread unless the case says more.
 
-Groups: each field, the lattice and the extraction of a shell, a real map by cells and by its whole box, and the same
-surface in eight times the volume. Each case checks the number of triangles or the area of its mesh, so that a wrong answer cannot win. The peers keep
-their usual outputs: VTK float32 points and int64 cells, scikit-image also normals and values, PyMCubes float64 and
-int64; ours are float64 and int32.
+Groups: two fields; lattice and extraction of a shell; a real map by its cells and by its whole box; the same surface in
+eight times the volume. Each case checks the number of triangles or the area of its mesh, so that a wrong result cannot
+be the fastest. Each program has its usual outputs: VTK float32 points and int64 cells, scikit-image also normals and
+values, PyMCubes float64 and int64. Ours are float64 and int32.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ def gyroid_192():
     return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
 
 
-# The volume, its triangles (a few of the gyroid's samples are rounded to either side of 0) and their area in cells.
+# The volume, the number of triangles, which rounding can change a little, and their area in cells.
 FIELDS = {
     "sphere256": (sphere_256, 392_252, 4 * np.pi * (0.8 * 255 / 2) ** 2),
     "gyroid192": (gyroid_192, 1_415_084, None),
@@ -72,7 +72,7 @@ def test_dense_masked(benchmark, field):
 
 
 class FlyingEdges:
-    """VTK's filter on a volume, and its mesh as arrays."""
+    """Marching cubes of VTK on a volume."""
 
     def __init__(self, volume, backend, threads):
         vtk = pytest.importorskip("vtk", reason="vtk is not installed")
@@ -98,7 +98,7 @@ class FlyingEdges:
 
     @staticmethod
     def arrays(mesh):
-        """Vertices (V, 3), x y z where the volume's axes are z y x, and faces (F, 3)."""
+        """Vertices (V, 3) and faces (F, 3). The axes x, y, z are the axes 2, 1, 0 of the volume."""
         from vtk.util.numpy_support import vtk_to_numpy  # noqa: PLC0415
 
         faces = vtk_to_numpy(mesh.GetPolys().GetConnectivityArray()).reshape(-1, 3)
@@ -119,7 +119,7 @@ def test_scikit_image(benchmark, field):
     benchmark.group = field_group(field)
     measure = pytest.importorskip("skimage.measure", reason="scikit-image is not installed")
     vertices, faces, *_ = benchmark(measure.marching_cubes, field[0], 0.0)
-    check_mesh(vertices, faces, field, rel=0.01)  # it solves ambiguous cells in another way
+    check_mesh(vertices, faces, field, rel=0.01)  # it treats ambiguous cells differently
 
 
 def test_pymcubes(benchmark, field):
@@ -131,7 +131,7 @@ def test_pymcubes(benchmark, field):
 
 @pytest.fixture(scope="module")
 def shell():
-    """Cells within about two of a sphere's surface, each several times and in no order, as points fall into them."""
+    """Cells of random points within 2 cells of a sphere, several times each and in random order."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(6_000_000, 3))
     points *= (200 + rng.uniform(-2, 2, size=(len(points), 1))) / np.linalg.norm(
@@ -199,7 +199,7 @@ def map_lattice():
     volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)
     at = tuple((corners - lower).T)
     volume[at], mask[at] = values, True
-    # The mask lets no cell in that the map has not: each eight have a corner in the middle, which is theirs alone.
+    # The mask admits no cells outside the map: a leaf cell has 2 x 2 x 2 voxels, whose common corner no other cell has.
     return MapLattice(cells, values, volume, mask, lower)
 
 
@@ -209,7 +209,7 @@ def map_group(lattice):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_map_by_cells(benchmark, map_lattice, threads):
-    """Lattice and extraction; the network has been asked for the corners' distances already, here and in all."""
+    """Lattice and extraction. As in all cases, the network's distances at the corners are computed before."""
     benchmark.group = map_group(map_lattice)
 
     def run():
@@ -233,7 +233,7 @@ def test_map_by_its_box(benchmark, map_lattice, threads):
 
 @FLYING_EDGES
 def test_map_vtk_flying_edges(benchmark, map_lattice, backend, threads):
-    """VTK knows no mask: it also makes the border of the unknown a surface."""
+    """VTK has no mask, so its mesh also has a surface at the border of the map."""
     benchmark.group = map_group(map_lattice)
     mesh = benchmark(FlyingEdges(map_lattice.volume, backend, threads).run)
     check_map(*FlyingEdges.arrays(mesh), map_lattice.crossed_edges(of_cells=False))
@@ -242,7 +242,7 @@ def test_map_vtk_flying_edges(benchmark, map_lattice, backend, threads):
 def check_map(vertices, faces, crossed_edges):
     assert len(vertices) == crossed_edges
     assert np.array_equal(np.unique(faces), np.arange(len(vertices)))
-    # Twice as many on a closed surface; borders take away, handles add.
+    # A closed surface has twice as many triangles as vertices. Borders reduce the number, handles increase it.
     assert 1.2 * len(vertices) < len(faces) < 2.1 * len(vertices)
 
 
@@ -263,7 +263,7 @@ def test_dense_in_a_larger_volume(benchmark, times):
 
 @pytest.mark.parametrize("times", [1, 8])
 def test_sparse_in_a_larger_volume(benchmark, times):
-    """The eight octants of the sphere moved apart: as much surface, but all of it in other places."""
+    """The eight octants of the sphere are moved apart: the surface stays as large."""
     benchmark.group = "one sphere, in 1 and 8 times the volume"
     axis = np.arange(-HALF, HALF - 1, dtype=np.int32)
     cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -272,7 +272,7 @@ def test_sparse_in_a_larger_volume(benchmark, times):
     cells += np.where(cells < 0, -apart, apart).astype(np.int32)
     _, corners, cell_corners = sparse_lattice(cells)
     octant = np.zeros(corners.shape, np.int32)
-    octant[cell_corners] = np.where(cells < 0, -apart, apart)[:, None]  # moved apart, octants share no corner
+    octant[cell_corners] = np.where(cells < 0, -apart, apart)[:, None]  # octants share no corner once apart
     values = (np.linalg.norm(corners - octant, axis=1) - (RADIUS + 0.3)).astype(np.float32)
 
     def run():
@@ -287,4 +287,4 @@ def test_components(benchmark):
     vertices, faces = marching_cubes(gyroid_192())
     _, sizes = benchmark(mesh_components, faces, len(vertices))
     assert sizes.sum() == len(faces)
-    assert sizes.max() == len(faces) - 2  # and two corners of the volume
+    assert sizes.max() == len(faces) - 2  # the other components are one triangle at each of two corners

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A training step as one of two threads runs it: the whole, its parts, and what its matrix products alone would take.
+"""Time of a training step on one of two threads: the whole step, its parts, and its matrix products alone.
 
-A group for each of the schedule's stages: geometry alone, joint with the reflectance, and reflectance on frozen
-geometry. A round is `STEPS` steps in all cases of a group, so that their ratios can be read off. The whole is
-`Training` itself, which has the losses and gradients from the core in one call; the parts are rebuilt here as the field
-and the losses define them, one after the other through autograd.
+There is a group for each stage of the schedule: geometry alone, geometry and intensity together, and intensity with
+frozen geometry. A round has `STEPS` steps in all cases of a group, so that times can be compared. The whole step is
+that of `Training`, which gets losses and gradients from the core in one call. The parts are rebuilt here with autograd,
+from the definitions of field and losses.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from radarsdf.threads import Workers
 
 from .conftest import Surface, surface_points
 
-STEPS = 100  # after so many, a training looks through its parameters and keeps them
-STAGES = ("geometry", "joint", "reflectance")
+STEPS = 100  # after this many steps, a training checks its parameters and keeps a copy
+STAGES = ("geometry", "joint", "intensity")
 CONFIG = FitConfig(num_threads=1, returns={"drop_ghosts": False}, training={"cosine_schedule": False})
-SHARE = 2  # of a batch: a fit's batches are shared between two threads
+SHARE = 2  # a fit divides its batches among two threads
 
 
 class Step:
-    """One stage of a fit on one thread: data, networks, and the parts of a step as functions."""
+    """One stage of a fit on one thread: its data and networks, and the parts of a step as methods."""
 
     def __init__(self, stage, rays, leaf_keys):
         self.stage = stage
-        self.frozen = stage == "reflectance"
+        self.frozen = stage == "intensity"
         self.size = (CONFIG.intensity_batch_size if self.frozen else CONFIG.batch_size) // SHARE
         torch.manual_seed(0)
         self.field = Field(leaf_keys, CONFIG, with_intensity=stage != "geometry")
@@ -53,7 +53,7 @@ class Step:
         self.sampler = RaySampler(rays, CONFIG, self.size, self.generator, intensities=unit)
 
     def samples(self):
-        """Samples, and the dropout of what the intensity network sees."""
+        """Samples, and dropout factors for the inputs of the intensity network."""
         (samples,) = self.sampler.spread(self.size) if self.frozen else self.sampler.batch()
         if self.stage == "geometry":
             return samples, None
@@ -70,7 +70,7 @@ class Step:
             return self.field.encode(samples.points)
 
     def losses(self, samples, dropout, encoding):
-        """Of the stage: the SDF's, the intensity's or both."""
+        """Losses of the stage: of the SDF, of the intensity, or both."""
         with torch.set_grad_enabled(not self.frozen):
             logit, feature = self.field.sdf_network(encoding)
         losses = [] if self.frozen else [sdf_loss(logit, samples.sdf_m, CONFIG.sigma_m)]
@@ -88,7 +88,7 @@ class Step:
         return losses
 
     def products(self):
-        """Operands of all matrix products of the layers: forward, gradient of the weights, gradient of the inputs."""
+        """Operands of all matrix products of the layers: forward, gradients of the weights, gradients of the inputs."""
         layers = []
         if not self.frozen:
             layers.append((self.field.sdf_network.layers, self.size, True))
@@ -136,7 +136,7 @@ def step(request, rays, leaf_keys):
 
 
 def measured(benchmark, step, function, *arguments):
-    """What `function` gives the last time."""
+    """Measure `function`, and return its last result."""
     benchmark.group = f"training step, {step.stage}, {step.size} samples, {STEPS} steps a round"
 
     def run():
@@ -152,7 +152,7 @@ def test_samples(benchmark, step, rays):
     ray = samples.rays.numpy()
     points = rays.points[ray] - samples.sdf_m.numpy()[:, None] * rays.directions[ray]
     off_m = np.linalg.norm(points - samples.points.numpy(), axis=1)
-    # Of the reflectance stage, they are spread across the beam.
+    # In the last stage, samples are spread across the beam.
     spread_m = CONFIG.cross_range_noise_rad * rays.ranges_m[ray] if step.frozen else 1e-5
     assert (off_m < 6 * spread_m).all()
     assert np.median(off_m / spread_m) > 1 or not step.frozen
@@ -216,8 +216,9 @@ def test_backward(benchmark, step):
     gradients = measured(
         benchmark, step, lambda: torch.autograd.grad(loss, step.parameters, retain_graph=True)
     )
-    # Down its gradient, the loss falls by that's square. The forward pass, which is checked above, says whether it does:
-    # in double precision, and for the features apart, since the networks' gradient is larger.
+    # The slope of the loss along its gradient is the squared length of the gradient. The forward pass, which is checked
+    # above, gives this slope by finite differences: in double precision, and separately for the features, because the
+    # gradient of the networks is larger.
     step.field.double()
     exact = {name: getattr(samples, name).double() for name in ("points", "sdf_m", "of_ray")}
     samples = dataclasses.replace(samples, **exact)
@@ -251,9 +252,9 @@ def test_adam(benchmark, step):
         steps += 1
 
     measured(benchmark, step, run)
-    # Of gradients that never change, means and squares are the gradient and its square: each step is of one length.
+    # With a constant gradient, each step of Adam has the length of the learning rate.
     check_moves(step, before, gradients, steps * CONFIG.learning_rate)
-    # Then one that is twice as large.
+    # Then a gradient that is twice as large.
     before = [p.detach().clone() for p in step.parameters]
     adam.step([2 * gradient for gradient in gradients])
     mean = (0.9 * (1 - 0.9**steps) + 0.1 * 2) / (1 - 0.9 ** (steps + 1))
@@ -271,7 +272,7 @@ def check_moves(step, before, gradients, length):
 
 
 def test_matrix_products(benchmark, step):
-    """Those of the networks alone, forward and backward: no encoding, no loss, no bias, no ReLU, no optimiser."""
+    """Matrix products of the networks, forward and backward: no encoding, loss, bias, ReLU or optimiser."""
     operands = step.products()
 
     def run():
@@ -285,7 +286,7 @@ def test_matrix_products(benchmark, step):
 
 
 def test_whole(benchmark, step, rays):
-    """`STEPS` steps of `Training` on one thread; those of frozen geometry come after one of geometry."""
+    """`STEPS` steps of `Training` on one thread. The stage with frozen geometry follows one step of geometry."""
     field = Field(
         step.field.cells.table.leaf_keys(), CONFIG, with_intensity=step.stage != "geometry", num_threads=1
     )
@@ -304,7 +305,7 @@ def test_whole(benchmark, step, rays):
     losses = []
 
     def setup():
-        field.requires_grad_(True)  # a training leaves all frozen
+        field.requires_grad_(True)  # a training freezes all parameters at its end
         training = Training(field, rays, rays, scale, config, workers)
         return (training,), {}
 
@@ -315,10 +316,10 @@ def test_whole(benchmark, step, rays):
     benchmark.group = f"training step, {step.stage}, {step.size} samples, {STEPS} steps a round"
     with Workers(1) as workers:
         benchmark.pedantic(run, setup=setup, rounds=10, warmup_rounds=1)
-        if len(losses) == 1:  # nothing is timed: enough to learn something
+        if len(losses) == 1:  # with --benchmark-disable there is one round, too few steps for the check below
             for _ in range(4):
                 run(*setup()[0])
     name = "intensity" if step.frozen else "sdf"
     samples, dropout = step.samples()
     untrained = sum(step.losses(samples, dropout, step.encoded(samples))).item()
-    assert losses[-1][name] < 0.75 * untrained  # a round goes on where the one before ended
+    assert losses[-1][name] < 0.75 * untrained  # each round continues the training of the one before

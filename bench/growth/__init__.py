@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How time and memory grow with the returns and with the scene: `python -m bench.growth`, on Linux."""
+"""Growth of time and memory with the returns and the size of the scene: `python -m bench.growth`, on Linux."""

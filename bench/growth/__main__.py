@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How time and memory grow: `python -m bench.growth fits|surfels`, on Linux.
+"""Growth of time and memory: `python -m bench.growth fits|surfels`, on Linux.
 
-Each row runs in a process of its own. Prints a Markdown table as it goes, and writes it and the numbers to
+Each row runs in its own process. The table is printed row by row, and written with all numbers to
 `bench_results/growth_fits.md` and `.json`, or `growth_surfels`.
 """
 
@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
         rows.append(case | _in_a_process(words.table, case))
         lines.append(line(rows[-1], columns))
         print(lines[-1], flush=True)
-        # After each row, so that an interrupted run of hours leaves what it has.
+        # After each row, so that an interrupted run of hours keeps its rows.
         write_json(stem.with_suffix(".json"), {"table": words.table, **made, "rows": rows})
         stem.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     if failed := sum("why_not" in row for row in rows):
@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def line(row: dict[str, Any], columns: tuple[tuple[str, str, str], ...]) -> str:
-    """A row of the table; what has no number is a dash, and the reason follows."""
+    """A row of the table. A dash stands for a missing number, and the reason follows the row."""
     cells = ["–" if row.get(key) is None else _text(row[key], form) for key, _, form in columns]
     return f"| {' | '.join(cells)} |" + (f" {row['why_not']}" if "why_not" in row else "")
 
@@ -70,7 +70,8 @@ def _text(value: Any, form: str) -> str:
 
 
 def _in_a_process(table: str, case: dict[str, Any]) -> dict[str, Any]:
-    # Without the threshold, memory of the scene that was freed but kept would hide some of the peak.
+    # With this threshold, the C library returns large freed blocks to the system. Otherwise freed memory of the scene
+    # would be used again, and would hide a part of the peak.
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}
     done = subprocess.run(
         [sys.executable, "-m", "bench.growth", table, "--row", json.dumps(case)],
@@ -92,22 +93,28 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--out", type=Path, default=Path("bench_results"), help="folder; default: bench_results"
     )
-    parser.add_argument("--quick", action="store_true", help="only see that it runs, in some seconds")
+    parser.add_argument("--quick", action="store_true", help="only check that it runs, in some seconds")
     parser.add_argument(
         "--returns",
         type=lambda text: int(float(text)),
         nargs="+",
         default=[],
-        help="fits: how many; default: 1e4 to 1e7",
+        help="fits: numbers of returns; default: 1e4 to 1e7",
     )
     parser.add_argument(
-        "--sizes", type=float, nargs="+", default=[], help="fits: length, m; default: 50 500 5000"
+        "--sizes",
+        type=float,
+        nargs="+",
+        default=[],
+        help="fits: lengths of the street, m; default: 50 500 5000",
     )
-    parser.add_argument("--threads", type=int, nargs="+", default=[], help="fits: default: 1 and 2")
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[], help="fits: numbers of threads; default: 1 and 2"
+    )
     parser.add_argument(
         "--every",
         action="store_true",
-        help="fits: each size with each number of returns, not only with a million, nor these only at 500 m",
+        help="fits: all combinations of size and returns; default: sizes with 1e6 returns, returns at 500 m",
     )
     parser.add_argument("--row", help=argparse.SUPPRESS)
     return parser

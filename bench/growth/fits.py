@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Whole fits, each in a process of its own: over the returns, over the length of the scene, threads, intensities."""
+"""Time and memory of whole fits, over returns, length of the scene, threads, and with or without intensities."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from .street import Street, street
 
 _RETURNS = (10**4, 10**5, 10**6, 10**7)
 _SIZES_M = (50.0, 500.0, 5000.0)
-# Where the other is varied.
-_SIZE_M = 500.0
-_COUNT = 10**6
-_OFF_M = 0.2  # from the surface: where the signs are looked at
+_SIZE_M = 500.0  # while the returns vary
+_COUNT = 10**6  # while the size varies
+_OFF_M = 0.2  # distance to the surface of the points at which the sign of the SDF is checked
 _LEAST_RIGHT = 0.6
 
 COLUMNS = (
@@ -31,7 +30,7 @@ COLUMNS = (
     ("wall_s", "wall, s", ".2f"),
     ("cpu_s", "processor, s", ".2f"),
     ("peak_mb", "peak, MB", ".0f"),
-    ("before_mb", "of it before, MB", ".0f"),
+    ("before_mb", "before the fit, MB", ".0f"),
     ("prepare_s", "prepare, s", ".2f"),
     ("ghosts_s", "ghosts, s", ".2f"),
     ("occupied_cells_s", "cells, s", ".2f"),
@@ -39,7 +38,7 @@ COLUMNS = (
     ("support_s", "support, s", ".2f"),
     ("leaf_cells", "leaf cells", ","),
     ("map_mb", "map, MB", ".1f"),
-    ("right", "signs right", ".1%"),
+    ("right", "correct signs", ".1%"),
     ("mae", "MAE, dB", ".2f"),
 )
 
@@ -47,7 +46,7 @@ COLUMNS = (
 def cases(
     *, quick: bool, returns: list[int], sizes_m: list[float], threads: list[int], every: bool
 ) -> list[dict[str, Any]]:
-    """Arguments of `row`: one variable at a time, or every combination of what is named."""
+    """Arguments of `row`: either returns or size varies, or with `every` all their combinations."""
     if quick:
         counts_and_sizes = {(returns[0] if returns else 10**4, sizes_m[0] if sizes_m else 50.0): None}
     elif every:
@@ -74,7 +73,13 @@ def cases(
 
 
 def row(*, returns: int, size_m: float, threads: int, intensities: bool, quick: bool) -> dict[str, Any]:
-    """Time, memory and stages of one fit, and whether its map is one of the street."""
+    """Time, memory and stages of one fit, and the errors of its map.
+
+    Raises
+    ------
+    RuntimeError
+        If returns are missing, or the map is not one of the street: a failed fit must not count as a fast one.
+    """
     scans = street(returns, size_m)
     changes: dict[str, Any] = {"sdf_iterations": 60, "intensity_iterations": 120} if quick else {}
     config = FitConfig(num_threads=threads, **changes)
@@ -102,17 +107,17 @@ def row(*, returns: int, size_m: float, threads: int, intensities: bool, quick: 
 
 
 def _errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
-    """Share of right signs just before and behind the true surface, and the error of the intensity there.
+    """Share of correct signs in front of and behind the true surface, and the error of the intensity on it.
 
     Raises
     ------
     RuntimeError
-        Where the map is not one of this street: a fit that failed must not look fast.
+        If the signs are hardly better than chance, or the intensities worse than a constant.
     """
     hits, sensors = scans.hits.astype(np.float64), scans.hit_sensors.astype(np.float64)
     rays = hits - sensors
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # Along the normal, not the ray, which may graze the surface: outwards is up, or away from the walls.
+    # The points are moved along the normal: a ray can be almost parallel to the surface.
     normals = np.zeros_like(hits)
     on_ground = np.abs(hits[:, 2]) < 1e-2
     on_side = ~on_ground & (np.abs(np.abs(hits[:, 1]) - 25) < 1e-2)
@@ -123,7 +128,7 @@ def _errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
     front, back = (radar_map.sdf(hits[known] + side * _OFF_M * normals[known]) for side in (1, -1))
     right = float(((front > 0).mean() + (back < 0).mean()) / 2)
     if not right > _LEAST_RIGHT:
-        msg = f"{right:.0%} of the signs are right, where half would be chance"
+        msg = f"only {right:.0%} of the signs are correct, and 50% would be chance"
         raise RuntimeError(msg)
     errors = {"right": right}
     if radar_map.has_intensity:
@@ -131,6 +136,6 @@ def _errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
         errors["mae"] = float(np.abs(predicted - scans.hit_intensities[known]).mean())
         spread = float(np.abs(scans.hit_intensities - np.median(scans.hit_intensities)).mean())
         if not errors["mae"] < spread:
-            msg = f"the intensity's error is {errors['mae']:.2f} dB, and that of a constant {spread:.2f}"
+            msg = f"the error of the intensity is {errors['mae']:.2f} dB, that of a constant {spread:.2f} dB"
             raise RuntimeError(msg)
     return errors

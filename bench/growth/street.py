@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A street of any length, seen by any number of returns: cheap to make, and the truth about it is known.
+"""A simulated street of any length with any number of returns: fast to compute, and its true surface is known.
 
-Walls 25 m to either side of a straight path and one at each end, flat ground 2 m below the sensor. What meets none of
-them within 100 m is clutter at 30 to 100 m, and a tenth are ghosts. The intensity is that of the radar equation, in dB:
-falling with the fourth power of the range, from ground and from stripes of wall that differ in strength.
+There are walls 25 m to the left and right of a straight path and one at each end, and flat ground 2 m below the sensor.
+Rays that hit nothing within 100 m give clutter at 30 to 100 m, and a tenth of the returns within 70 m are ghosts. The
+intensity in dB follows the radar equation: it falls with the fourth power of the range, and differs between stripes of
+the walls.
 """
 
 from __future__ import annotations
@@ -23,26 +24,26 @@ _REACH_M = 100.0
 
 @dataclass(frozen=True)
 class Street:
-    """F scans along the path, which begins at one end and stops at the other."""
+    """F scans along the street from one end to the other."""
 
     points: list[NDArray[np.float32]]
-    """F arrays (N_i, 3), sensor frame (the world's axes), m."""
+    """F arrays (N_i, 3), sensor frame, m. Its axes are those of the world."""
     poses: NDArray[np.float64]
     """(F, 4, 4) T_world_sensor."""
     intensities: list[NDArray[np.float32]]
     """F arrays (N_i,), dB."""
     hits: NDArray[np.float32]
-    """(M, 3) places on the true surfaces that returns came from, world, m."""
+    """(M, 3) points on the true surfaces that caused returns, world frame, m."""
     hit_intensities: NDArray[np.float32]
-    """(M,) what the sensor would have measured of them without noise, dB."""
+    """(M,) intensities of `hits` without noise, dB."""
     hit_sensors: NDArray[np.float32]
-    """(M, 3) where they were seen from, world, m."""
+    """(M, 3) positions of the sensor for `hits`, world frame, m."""
 
 
 def street(count: int, size_m: float | None = None, seed: int = 0, num_hits: int = 20_000) -> Street:
-    """`count` returns of a street, and the truth of up to `num_hits` of them.
+    """A street with `count` returns, and the truth about some of them, approximately `num_hits`.
 
-    It is `size_m` long, or 200 m and another for every 5,000 returns, so that their density stays as it is.
+    It is `size_m` long. The default is 200 m + 1 m for every 5,000 returns, which keeps their density almost constant.
     """
     size_m = 200 + count / 5000 if size_m is None else size_m
     rng = np.random.default_rng(seed)
@@ -65,7 +66,7 @@ def street(count: int, size_m: float | None = None, seed: int = 0, num_hits: int
 def _scan(
     count: int, sensor: NDArray[np.float32], size_m: np.float32, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], ...]:
-    """Points and intensities of one scan; of those that are neither ghosts nor clutter, hits, intensities, sensors."""
+    """Points and intensities of one scan; hits, noiseless intensities and sensor positions of the true returns."""
     azimuth = rng.random(count, np.float32) * np.float32(2 * np.pi)
     elevation = rng.random(count, np.float32) * np.float32(0.31) - np.float32(0.06)
     flat = np.cos(elevation)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Finding ghosts and counting support, each row in a process of its own; the street grows with the returns."""
+"""Time and memory of the ghost search and of the support count. The length of the street grows with the returns."""
 
 from __future__ import annotations
 
@@ -41,7 +41,13 @@ def cases(*, quick: bool) -> list[dict[str, Any]]:
 
 
 def row(returns: int, threads: int) -> dict[str, Any]:
-    """Seconds of processor and of wall, and the peak of memory over what there was before, of both."""
+    """Processor time, wall time and growth of the peak memory, of ghost search and of support count.
+
+    Raises
+    ------
+    RuntimeError
+        If the numbers of ghosts or of cells with support are implausible.
+    """
     scans = street(returns)
     rays = prepare(scans.points, scans.poses)
     del scans
@@ -55,7 +61,7 @@ def row(returns: int, threads: int) -> dict[str, Any]:
     counts, support = _measured(
         "support", lambda: support_of_points(kept.points, leaf_keys, config.leaf_size_m, threads)
     )
-    # A tenth of those that hit something within 70 m are ghosts, and every cell lies within 0.3 m of a return.
+    # A tenth of the returns within 70 m are ghosts, and every cell is within 0.3 m of a return.
     if not 0.02 * returns < is_ghost.sum() < 0.15 * returns or not (counts > 0).mean() > 0.5:
         msg = (
             f"{is_ghost.sum()} ghosts of {returns} returns, {(counts > 0).mean():.0%} of the cells supported"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Other methods for the same job, each run in a process of its own; see `interface`.
+"""Other methods of surface reconstruction, each run in its own process; see `interface`.
 
-Imports nothing: the children of Pythons too old for radarsdf come through here.
+This module imports nothing, because Pythons that are too old for radarsdf import it as well.
 """

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One reconstruction in a process of its own: `python -m bench.peers.child METHOD OPTIONS SCANS RESULT`.
+"""One reconstruction in its own process: `python -m bench.peers.child METHOD OPTIONS SCANS RESULT`.
 
-METHOD is `module:function` of this package, which gives a `Made` or its first fields, OPTIONS its keywords as JSON, SCANS
-and RESULT are .npz files. A process of its own gives each method a fresh peak of memory, its own Python where it needs one, and nobody else's crash. Needs NumPy
-and what the method needs, so that it runs where radarsdf does not.
+METHOD is a `module:function` of this package that returns a `Made` or its first fields. OPTIONS are its keywords as
+JSON. SCANS and RESULT are .npz files. In its own process, the peak memory is that of the method alone, a crash does not
+stop the others, and the Python can be another one. Besides NumPy, only the method's packages are needed.
 """
 
 from __future__ import annotations
@@ -32,28 +32,31 @@ class ScanArrays:
     intensities: np.ndarray | None  # (N,) sensor units
 
     def world(self) -> np.ndarray:
-        """(N, 3) float64, world, m."""
+        """Returns (N, 3) float64, world frame, m."""
         T = self.poses[self.frame]
         return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], self.points.astype(np.float64)) + T[:, :3, 3])
 
     def sensors(self) -> np.ndarray:
-        """(N, 3) float64, where each return was seen from, world, m."""
+        """Position of the sensor for each return, (N, 3) float64, world frame, m."""
         return self.poses[self.frame, :3, 3]
 
 
 class Made(NamedTuple):
-    """What a method makes of some scans."""
+    """Result of a method."""
 
     vertices: np.ndarray
-    """(V, 3) world, m."""
+    """(V, 3) world frame, m."""
     faces: np.ndarray
     """(F, 3) rows of the vertices."""
     map_bytes: int | None = None
-    """Of the map that the mesh was made of, where there is one."""
+    """Size of the map that the mesh was extracted from, if there is one."""
     report: dict[str, Any] | None = None
-    """What the method says of itself, as JSON has it."""
+    """Any numbers of the method, in types of JSON."""
     intensity: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    """Of points seen by sensors, both (N, 3), world, m: (N,) sensor units. Asked for when time and memory are known."""
+    """Predicts intensities (N,), sensor units, of points (N, 3) seen from positions (N, 3), world frame, m.
+
+    It is called once time and memory are measured.
+    """
 
 
 def main() -> None:

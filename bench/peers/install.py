@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Make VDBFusion's environment: `python -m bench.peers.install [PYTHON]`.
+"""Install VDBFusion in its own environment: `python -m bench.peers.install [PYTHON]`.
 
-Its wheels (0.1.6) are for CPython up to 3.10 and want NumPy below 2, so it gets an environment of its own, of the named
-Python or the first fitting one on the path or among pyenv's. Open3D comes with the extra `peers` instead.
+Its wheels (0.1.6) need CPython 3.8 to 3.10 and NumPy below 2. PYTHON names the interpreter; the default is the first
+suitable one on the path or of pyenv. Open3D comes with the extra `peers` instead.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def _candidates() -> Iterator[str]:
 
 
 def _runs(python: str) -> bool:
-    """Whether it is there and a version that the wheels are for; a version manager's stand-in may have none behind it."""
+    """Whether the command runs a suitable Python. A version manager may provide the command without the version."""
     code = "import sys; sys.exit(not (3, 8) <= sys.version_info < (3, 11))"
     try:
         return subprocess.run([python, "-c", code], capture_output=True, check=False).returncode == 0
@@ -41,7 +41,7 @@ def _runs(python: str) -> bool:
 def main() -> None:
     python = next(filter(_runs, _candidates()), None)
     if python is None:
-        sys.exit(f"VDBFusion needs a CPython of {', '.join(_VERSIONS)}: name one as the argument")
+        sys.exit(f"VDBFusion needs CPython {', '.join(_VERSIONS)}: give its command as the argument")
     subprocess.run([python, "-m", "venv", "--clear", str(VDBFUSION_ENVIRONMENT)], check=True)
     pip = [str(VDBFUSION_ENVIRONMENT / "bin" / "python"), "-m", "pip", "install", "--quiet"]
     subprocess.run([*pip, "vdbfusion==0.1.6", "numpy<2"], check=True)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The methods to compare with, and `reconstruct`, which runs one of them.
+"""The peers, which are the methods to compare with, and `reconstruct`, which runs one of them.
 
-Nothing of a peer is imported here: each runs in a child process (see `child`), and where it cannot run the result says
-why, so that it stays in the tables.
+Each peer runs in a child process (see `child`), and nothing of it is imported here. If it cannot run, the result says
+why, and the peer stays in the tables.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 VDBFUSION_ENVIRONMENT = ROOT / "build" / "peers" / "vdbfusion"
 INSTALL = {
     "open3d": "pip install '.[peers]', on Debian after apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1",
-    "vdbfusion": "python -m bench.peers.install, with a CPython of 3.8 to 3.10 at hand",
+    "vdbfusion": "python -m bench.peers.install, which needs CPython 3.8 to 3.10",
 }
 
 
@@ -33,18 +33,18 @@ class Peer:
     """A method with its settings."""
 
     name: str
-    """As the tables call it."""
+    """Name in the tables."""
     method: str
     """`module:function` in this package."""
     options: dict[str, Any]
-    """Keywords of the function; the paper's values."""
+    """Keywords of the function, with the values of the paper."""
     needs: str = ""
-    """What has to be importable besides NumPy."""
+    """The package that it imports besides NumPy."""
     intensities: bool = False
-    """Whether it is given the intensities."""
+    """Whether it uses the intensities."""
 
     def with_changes(self, **changes: Any) -> Peer:
-        """The same fit of ours with other settings; other methods are returned as they are."""
+        """The same peer with other settings of `FitConfig`. Methods of other packages are returned unchanged."""
         if "changes" not in self.options:
             return self
         return replace(self, options=self.options | {"changes": self.options["changes"] | changes})
@@ -62,7 +62,7 @@ PEERS = {
         Peer("BPA", "open3d_meshes:ball_pivoting", {"radius_m": 0.1}, "open3d"),
         Peer("Poisson", "open3d_meshes:poisson", {"depth": 12}, "open3d"),
         Peer("VDBFusion", "vdbfusion_tsdf:vdbfusion", {"voxel_m": 0.2}, "vdbfusion"),
-        # SHINE-Mapping's representation and 3QFP in this package, at the learning rate that both publish.
+        # 3QFP and the representation of SHINE-Mapping, computed by this package with the published learning rate.
         _fit("SHINE (octree)", "paper", encoding="octree", fourier_count=0, learning_rate=1e-2),
         _fit("3QFP", "paper", learning_rate=1e-2),
         _fit("3QFPI", "paper", intensities=True),
@@ -72,25 +72,25 @@ PEERS = {
         _fit("radarsdf, intensities", "default", intensities=True),
     )
 }
-"""By name, in the order of the paper's Table I; those of this package last."""
+"""By name, in the order of Table I of the paper. The configurations of this package come last."""
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What a peer made of some scans, or why it made nothing."""
+    """Result of a peer, or the reason why there is none."""
 
     mesh: trimesh.Trimesh | None
     why_not: str = ""
     seconds: float | None = None
-    """Wall time from returns in memory to triangles in memory; imports and files are not counted."""
+    """Wall time from returns in memory to triangles in memory, without imports and files."""
     peak_bytes: int | None = None
-    """Largest resident memory of its process, interpreter and libraries included."""
+    """Peak resident memory of its process, with interpreter and libraries."""
     map_bytes: int | None = None
-    """Of the map that the mesh was made of, where there is one."""
+    """Size of the map that the mesh was extracted from, if there is one."""
     report: dict[str, Any] = field(default_factory=dict)
-    """What it says of itself: of a fit, `RadarMap.report` and the seconds of the mesh."""
+    """Any numbers of the method. For a fit: `RadarMap.report` and the time of the mesh."""
     intensity: np.ndarray | None = None
-    """At the queries, sensor units, where there were any and it can tell."""
+    """(N,) predicted intensities at the queries, sensor units. None if the method predicts none."""
 
 
 def reconstruct(
@@ -113,15 +113,15 @@ def reconstruct(
     points
         F arrays (N_i, 3), sensor frame, m.
     poses
-        (F, 4, 4) T_world_sensor.
+        (F, 4, 4) T_world_sensor, m.
     intensities
-        F arrays (N_i,), sensor units; given to those peers that use them.
+        F arrays (N_i,), sensor units. Only peers with `Peer.intensities` get them.
     min_range_m, max_range_m
-        Nearer and farther returns are dropped, for all peers alike.
+        Nearer and farther returns are dropped, for all peers.
     queries
-        Points and the positions of the sensors that see them, (N, 3) and (N, 3), world, m: where to predict intensities.
+        Points (N, 3) and sensor positions (N, 3), world frame, m, for which intensities are predicted.
     timeout_s
-        After this, the peer is stopped and has no result.
+        The peer is stopped after this time, and has no result.
     """
     python, why_not = _interpreter(peer.needs)
     if python is None:
@@ -130,13 +130,13 @@ def reconstruct(
     sensor_points = np.concatenate([np.asarray(p, np.float32).reshape(-1, 3) for p in points])
     range_m = np.linalg.norm(sensor_points, axis=1)
     kept = (range_m >= min_range_m) & (range_m <= (np.inf if max_range_m is None else max_range_m))
-    # Peers that compute in float32 are not to suffer from UTM coordinates.
+    # A local origin, because peers that compute in float32 cannot resolve UTM coordinates.
     origin = poses[0, :3, 3].copy()
     local_poses = poses.copy()
     local_poses[:, :3, 3] -= origin
     if not kept.any():
         return Reconstruction(None, "no returns within the ranges")
-    used, frame = np.unique(frame[kept], return_inverse=True)  # a scan may have lost its returns
+    used, frame = np.unique(frame[kept], return_inverse=True)  # a scan may have no returns left
     arrays = {"points": sensor_points[kept], "frame": frame, "poses": local_poses[used]}
     if peer.intensities and intensities is not None:
         arrays["intensities"] = np.concatenate(intensities)[kept]
@@ -144,7 +144,7 @@ def reconstruct(
         arrays |= {"query_points": queries[0] - origin, "query_sensors": queries[1] - origin}
     options = dict(peer.options)
     if "changes" in options:
-        options["changes"] = {"min_range_m": 0.0} | options["changes"]  # the ranges are cut already
+        options["changes"] = {"min_range_m": 0.0} | options["changes"]  # near returns are dropped already
     with tempfile.TemporaryDirectory() as folder:
         scans_path, result_path = Path(folder) / "scans.npz", Path(folder) / "result.npz"
         np.savez(scans_path, **arrays)
@@ -168,14 +168,14 @@ def reconstruct(
             report, intensity = json.loads(result["report"].item()), result.get("intensity")
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if len(faces) == 0:
-        return Reconstruction(None, "it made no triangles", seconds)
+        return Reconstruction(None, "the mesh has no triangles", seconds)
     peak, map_bytes = (None if size < 0 else size for size in (peak, map_bytes))
     return Reconstruction(mesh, "", seconds, peak, map_bytes, report, intensity)
 
 
 @cache
 def _interpreter(needs: str) -> tuple[str | None, str]:
-    """A Python that can import `needs`, or why there is none."""
+    """A Python that can import `needs`, or None and the reason."""
     candidates = [sys.executable]
     if needs == "vdbfusion":
         candidates += [str(VDBFUSION_ENVIRONMENT / "bin" / "python")]
@@ -194,7 +194,7 @@ def _interpreter(needs: str) -> tuple[str | None, str]:
 
 
 def failure(done: subprocess.CompletedProcess[str]) -> str:
-    """Why a process failed, in one line."""
+    """The reason why a process failed, in one line."""
     if done.returncode < 0:
         return f"killed by signal {-done.returncode}" + (" (out of memory?)" if done.returncode == -9 else "")
     lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""α-shapes, ball pivoting and Poisson reconstruction through Open3D, on the union of all returns."""
+"""α-shapes, ball pivoting and Poisson reconstruction by Open3D, on all returns together."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import open3d as o3d
 
 from .child import ScanArrays
 
-Mesh = tuple[np.ndarray, np.ndarray, None]  # vertices, faces; none of these methods has a map besides
+Mesh = tuple[np.ndarray, np.ndarray, None]  # vertices, faces; these methods have no map
 
 _NORMAL_NEIGHBOURS = 30  # Open3D's default
 
 
 def alpha_shapes(scans: ScanArrays, alpha_m: float) -> Mesh:
-    """Faces of the Delaunay tetrahedra with a circumscribed ball below `alpha_m` (Edelsbrunner, Kirkpatrick, Seidel)."""
+    """Faces of the Delaunay tetrahedra whose circumscribed ball is smaller than `alpha_m` (Edelsbrunner et al.)."""
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scans.world()))
     return _arrays(o3d.geometry.TriangleMesh.create_from_point_cloud_alpha_shape(cloud, alpha_m))
 
 
 def ball_pivoting(scans: ScanArrays, radius_m: float) -> Mesh:
-    """Triangles that a rolling ball of `radius_m` comes to rest on (Bernardini et al.)."""
+    """Triangles on whose corners a ball of `radius_m` comes to rest as it rolls over the points (Bernardini et al.)."""
     cloud = _with_normals(scans)
     radii = o3d.utility.DoubleVector([radius_m])
     return _arrays(o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii))
@@ -35,7 +35,7 @@ def poisson(scans: ScanArrays, depth: int) -> Mesh:
 
 
 def _with_normals(scans: ScanArrays) -> o3d.geometry.PointCloud:
-    """Normals of the neighbours' plane, turned towards the sensor that saw the point."""
+    """Points with normals of the plane through their neighbours, which point towards the sensor."""
     world = scans.world()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(world))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))

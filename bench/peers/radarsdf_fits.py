@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""This package as a peer among the others: the default, the published configurations and SHINE's representation."""
+"""This package as a peer: its default, the published configurations, and the representation of SHINE-Mapping."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-import radarsdf.map.meshing  # with trimesh: imported by the first mesh otherwise, and counted
+import radarsdf.map.meshing  # else the first mesh would import it and trimesh, in the measured time
 
 from .child import Made, ScanArrays
 
@@ -21,9 +21,9 @@ _BASES = {
 
 
 def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], voxel_m: float = 0.1) -> Made:
-    """Fit and mesh. `base` is one of `_BASES`; intensities are used where `scans` has them."""
+    """Fit a map and extract its mesh. `base` names one of `_BASES`. Intensities are used if `scans` has them."""
     settings = _BASES[base].to_dict() | changes
-    config = radarsdf.FitConfig.from_dict(settings)  # not keywords: JSON knows no tuples
+    config = radarsdf.FitConfig.from_dict(settings)  # it turns the lists of JSON into tuples
     frames = [np.flatnonzero(scans.frame == i) for i in range(len(scans.poses))]
     radar_map = radarsdf.fit(
         [scans.points[own] for own in frames],
