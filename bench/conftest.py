@@ -20,18 +20,19 @@ LEAF_M = 0.2
 NUM_LEVELS = 3
 FEATURE_DIM = 8
 PLANES = ((0, 1), (0, 2), (1, 2))
+_HALF_M = 24.0  # half the width of the scene of `surface_points`
 _BIAS = 1 << 20  # added to lattice coordinates, as in `VertexTable`, so that they are not negative
 
 
-def surface_points(count, seed=0, half_m=24.0, dtype=np.float32):
+def surface_points(count, seed=0, dtype=np.float32):
     """Points (count, 3), m, on rolling ground with two walls, with the noise of radar returns."""
     rng = np.random.default_rng(seed)
-    x, y = rng.uniform(-half_m, half_m, (2, count))
+    x, y = rng.uniform(-_HALF_M, _HALF_M, (2, count))
     z = 0.8 * np.sin(0.3 * x) + 0.5 * np.cos(0.2 * y)
     wall = rng.random(count) < 0.2
     z = np.where(wall, rng.uniform(0, 5, count), z)
-    x = np.where(wall & (y > 0), half_m / 2 + 0 * x, x)
-    y = np.where(wall & (y <= 0), half_m / 3 + 0 * y, y)
+    x = np.where(wall & (y > 0), _HALF_M / 2 + 0 * x, x)
+    y = np.where(wall & (y <= 0), _HALF_M / 3 + 0 * y, y)
     points = np.column_stack([x, y, z]) + rng.uniform(-0.25, 0.25, (count, 3))
     return points.astype(dtype)
 

@@ -20,6 +20,7 @@ _MAX_STEP_M = 10.0  # between scans
 _WALL_M = 25.0
 _HEIGHT_M = 2.0
 _REACH_M = 100.0
+_NUM_HITS = 20_000
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,13 @@ class Street:
     """(M, 3) positions of the sensor for `hits`, world frame, m."""
 
 
-def street(count: int, size_m: float | None = None, seed: int = 0, num_hits: int = 20_000) -> Street:
-    """A street with `count` returns, and the truth about some of them, approximately `num_hits`.
+def street(count: int, size_m: float | None = None) -> Street:
+    """A street with `count` returns, and the truth about some of them, approximately `_NUM_HITS`.
 
     It is `size_m` long. The default is 200 m + 1 m for every 5,000 returns, which keeps their density almost constant.
     """
     size_m = 200 + count / 5000 if size_m is None else size_m
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     frames = max(-(-count // _MAX_SCAN), round(size_m / _MAX_STEP_M), 2)
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 0, 3] = (np.arange(frames) + 0.5) / frames * size_m
@@ -57,7 +58,7 @@ def street(count: int, size_m: float | None = None, seed: int = 0, num_hits: int
         scan, intensity, *truth = _scan(own, pose[:3, 3].astype(np.float32), np.float32(size_m), rng)
         points.append(scan)
         intensities.append(intensity)
-        some = slice(-(-num_hits // frames))
+        some = slice(-(-_NUM_HITS // frames))
         truths.append([part[some] for part in truth])
     hits, hit_intensities, hit_sensors = (np.concatenate(parts) for parts in zip(*truths, strict=True))
     return Street(points, poses, intensities, hits, hit_intensities, hit_sensors)

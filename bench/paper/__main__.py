@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The paper's experiments, one command each: `python -m bench.paper EXPERIMENT [SCENE ...]`."""
+"""The experiments of the paper, one command each: `python -m bench.paper EXPERIMENT [SCENE ...]`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _QUICK_FRAMES = 4
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one experiment; write its table, numbers and plot, and print the table."""
+    """Run one experiment, write its table, numbers and plot, and print the table."""
     parser = _parser()
     words = parser.parse_args(arguments)
     experiment = EXPERIMENTS[words.experiment]
@@ -73,9 +73,9 @@ def main(arguments: list[str] | None = None) -> None:
         for task in bar:
             bar.set_description(task.label)
             rows += task.run()
-            # After each task, so that an interrupted run of hours leaves what it has.
+            # After each task, so that an interrupted run of hours keeps its rows.
             write_json(stem.with_suffix(".json"), {"experiment": words.experiment, **made, "rows": rows})
-    heading = f"## {experiment.title}" + (", a quick run whose numbers mean nothing" if quick else "")
+    heading = f"## {experiment.title}" + (", quick run: the numbers are meaningless" if quick else "")
     origin = f"`{made['command']}`, commit {made['commit']}, {made['processor']}, {made['threads']} threads"
     table = "\n\n".join(
         [heading, experiment.table(rows), f"{origin}; protocols {', '.join(made['protocols'])}.\n"]
@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _changes(settings: list[str]) -> dict[str, Any]:
-    """`NAME=VALUE` words as changes of a configuration that has them all."""
+    """Changes of `FitConfig` from words `NAME=VALUE`; a ValueError if one of them is not valid."""
     changes: dict[str, Any] = {}
     for setting in settings:
         name, _, text = setting.partition("=")
@@ -106,24 +106,32 @@ def _parser() -> argparse.ArgumentParser:
         "scenes",
         nargs="*",
         metavar="SCENE",
-        help="simulated scenes by name, .npz files, folders; see bench/README.md",
+        help="name of a simulated scene, .npz file or folder; see bench/README.md",
     )
     parser.add_argument(
         "--out", type=Path, default=Path("bench_results"), help="folder; default: bench_results"
     )
     parser.add_argument(
-        "--quick", action="store_true", help="only see that everything runs, in a minute or so"
+        "--quick", action="store_true", help="only check that everything runs, in about a minute"
     )
-    parser.add_argument("--repetitions", type=int, help="with another seed each; default: as in the paper")
-    parser.add_argument("--samples", type=int, help="points on a mesh; default: 10000000")
+    parser.add_argument(
+        "--repetitions", type=int, help="number of fits with different seeds; default: as in the paper"
+    )
+    parser.add_argument("--samples", type=int, help="points on a mesh for its errors; default: 10000000")
     parser.add_argument(
         "--meshes",
         action="store_true",
         help="surface, sparse, curve: also write each mesh and a picture of it",
     )
-    parser.add_argument("--frames", type=int, help="of each scene; default: all")
-    parser.add_argument("--scene-seed", type=int, default=0, help="of simulated scenes; default: 0")
-    parser.add_argument("--peers", nargs="+", default=[], metavar="PEER", help=f"default: {', '.join(PEERS)}")
+    parser.add_argument("--frames", type=int, help="number of scans of each scene; default: all")
+    parser.add_argument("--scene-seed", type=int, default=0, help="seed of simulated scenes; default: 0")
+    parser.add_argument(
+        "--peers",
+        nargs="+",
+        default=[],
+        metavar="PEER",
+        help=f"methods to compare; default: {', '.join(PEERS)}",
+    )
     parser.add_argument(
         "--base", nargs="+", choices=("default", "paper"), help="configurations of this package"
     )
@@ -132,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         nargs=6,
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="to evaluate, world, m",
+        help="region for the surface errors, world frame, m",
     )
     parser.add_argument(
         "--set",
@@ -140,7 +148,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="curve: one more point, with these settings of FitConfig; may be repeated",
+        help="curve: also measure these settings of FitConfig; may be repeated",
     )
     return parser
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the inputs of the intensity network are worth (Table III)."""
+"""Error of the intensity without one of the inputs of its network (Table III)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_de
 from .report import figure, markdown
 from .scenes import Scene
 
-# "Full" has every input of the paper's, also where the default configuration does without.
+# All inputs of the paper, also those that the default configuration does not use.
 _FULL: dict[str, Any] = {
     "normals": True,
     "geometry_feature_dim": 15,
@@ -24,7 +24,8 @@ _FULL: dict[str, Any] = {
 }
 _VARIANTS: dict[str, dict[str, Any]] = {
     "full": {},
-    # Features and intensity network learn from the intensities alone, as "training only the intensity network" says.
+    # Without the SDF loss, features and intensity network learn from the intensities alone: our reading of the paper's
+    # "training only the intensity network".
     "w/o SDF": {"sdf_input": False, "normals": False, "geometry_feature_dim": 0, "sdf_loss_weight": 0.0},
     "w/o SDF normals": {"normals": False},
     "w/o geometry feature": {"geometry_feature_dim": 0},
@@ -33,7 +34,7 @@ _VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One for each configuration, variant and repetition."""
+    """One task for each configuration, variant and repetition."""
     if scene.intensities is None:
         why_not = "the scene has no intensities"
         return [
@@ -61,7 +62,7 @@ def _repetition(scene: Scene, options: Options, base: str, variant: str, seed: i
 
 
 def table(rows: list[Row]) -> str:
-    """A line for each scene and configuration, a pair of columns for each variant."""
+    """One row for each scene and configuration, one column for each variant."""
     cells = []
     for (scene, base), own in groups(rows, "scene", "base").items():
         if why_not := own[0].get("why_not"):

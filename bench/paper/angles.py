@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Histogram of the angles between adjacent triangles, of all methods (figure)."""
+"""Histograms of the angles between adjacent triangles of all methods (figure)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BINS = np.linspace(0, np.pi, 181)
 
 
 def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One for each peer."""
+    """One task for each peer."""
     return [Task(f"{scene.name}: {name}", partial(_rows, scene, name, options)) for name in options.peers]
 
 
@@ -29,7 +29,7 @@ def _rows(scene: Scene, name: str, options: Options) -> list[Row]:
         return [row | {"why_not": result.why_not}]
     angles = adjacent_angles(result.mesh, box=scene.box)
     if len(angles) == 0:
-        return [row | {"why_not": "no two triangles share an edge"}]
+        return [row | {"why_not": "no two triangles in the box share an edge"}]
     shape, mean, variance = gamma_from_moments(angles)
     row |= {"gamma_shape": shape, "gamma_mean": mean, "gamma_variance": variance}
     row["below_5_degrees"] = float(np.mean(angles < np.deg2rad(5)))
@@ -37,7 +37,7 @@ def _rows(scene: Scene, name: str, options: Options) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """The Gamma distributions, and the share of edges across which the surface goes straight on."""
+    """Parameters of the Gamma distributions, and the share of edges where the surface is almost plane."""
     cells = [
         [row["scene"], row["method"], *_numbers(row)] if not row.get("why_not")
         else [row["scene"], f"{row['method']}: {row['why_not']}", "–", "–", "–", "–"]

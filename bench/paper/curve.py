@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Run time against error: what is the best map that one can have in so many seconds?
+"""Run time against error, for methods, training budgets and settings.
 
-Every method sees the frames that are not held out, in a process of its own. Its seconds are those from returns in memory
-to triangles in memory; held-out intensities are predicted afterwards.
+Each method gets the scans that are not held out, and runs in its own process. Its time is from returns in memory to
+triangles in memory. The intensities of the held-out scans are predicted afterwards.
 """
 
 from __future__ import annotations
@@ -22,12 +22,11 @@ from .experiment import Experiment, Options, Row, Task, groups
 from .report import Column, figure, metric_table
 from .scenes import Scene
 
-# Training budgets, in units of the default's.
+# Training budgets, relative to the default.
 _FACTORS = {"1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "1/2": 1 / 2, "1": 1.0, "2": 2.0, "4": 4.0}
 _QUICK_FACTORS = ("1/16",)
 _OURS = ("radarsdf", "radarsdf, intensities")
-# What a fit may do or leave out, the other way round than the default has it; intensities are in all of them, since the
-# line without is that lever.
+# Settings that differ from the default, measured one by one, with intensities.
 _LEVERS: tuple[dict[str, Any], ...] = (
     {"drop_ghosts": False},
     {"min_support": 0.0},
@@ -53,6 +52,7 @@ _COLUMNS: tuple[Column, ...] = (
     *(_SURFACE[key] for key in ("completion_error_m", "completion_ratio")),
     ("mae", "held-out MAE", 1, 3, False),
 )
+_LABELS = {"lever": "other settings", "peer": "peers"}
 _PANELS = (
     ("f_score_all", "F-score, nothing discarded, %", 100),
     ("f_score", "F-score, %", 100),
@@ -61,7 +61,7 @@ _PANELS = (
 
 
 def budget(factor: float) -> dict[str, Any]:
-    """Settings of a fit that trains `factor` times as long as the default does."""
+    """Settings of a fit that trains `factor` times as long as the default."""
     default = FitConfig()
     return {
         "sdf_passes": default.sdf_passes * factor,
@@ -72,7 +72,7 @@ def budget(factor: float) -> dict[str, Any]:
 
 
 def _methods(options: Options) -> list[tuple[str, str, Peer]]:
-    """Of each, the line or kind of point that it belongs to, its name and itself."""
+    """Kind (a line of the plot, "lever" or "peer"), name and peer of each method."""
     found = []
     for line in _OURS:
         for factor in _QUICK_FACTORS if options.quick else _FACTORS:
@@ -81,13 +81,13 @@ def _methods(options: Options) -> list[tuple[str, str, Peer]]:
     for changes in (*(_LEVERS[:1] if options.quick else _LEVERS), *options.levers):
         name = ", ".join(f"{key}={value}" for key, value in changes.items())
         found.append(("lever", name, PEERS[_OURS[1]].with_changes(**changes)))
-    # Ours is in the lines already, at a budget of 1.
+    # The fits of this package are in the lines already, with a budget of 1.
     found += [("peer", name, PEERS[name]) for name in options.peers if name not in _OURS]
     return found
 
 
 def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One for each method and repetition, the methods by turns, so that what slows the machine down slows all."""
+    """One task for each repetition and method. The methods take turns, so a slow phase of the machine affects all."""
     return [
         Task(f"{scene.name}: {name}, seed {seed}", partial(_row, scene, options, kind, name, peer, seed))
         for seed in range(options.repetitions)
@@ -111,7 +111,7 @@ def _row(scene: Scene, options: Options, kind: str, name: str, peer: Peer, seed:
 
 
 def medians(rows: list[Row]) -> list[Row]:
-    """One row for each method: the median of each number over the repetitions that have it."""
+    """One row for each method: the median of each number over the repetitions."""
     found = []
     for same in groups(rows, "method").values():
         row = dict(same[0])
@@ -125,7 +125,7 @@ def medians(rows: list[Row]) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """A table for each scene, medians over the repetitions; the best of a column in bold."""
+    """A table of medians for each scene, with the best value of each column in bold."""
     parts = []
     for (scene,), own in groups(rows, "scene").items():
         methods = medians(own)
@@ -134,14 +134,14 @@ def table(rows: list[Row]) -> str:
             f"### {scene}, {own[0]['returns']:,} returns, medians of {1 + max(r['repetition'] for r in own)}"
         )
         if floor is not None:
-            heading += f", floor of the MAE {floor:.2f}"
+            heading += f", noise floor of the MAE {floor:.2f}"
         missing = [f"- {row['method']}: {row['why_not']}" for row in methods if row["why_not"]]
         parts.append("\n".join([heading, "", metric_table(methods, _COLUMNS), *missing]))
     return "\n\n".join(parts)
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """Each error over time: budgets as lines, levers and peers as points."""
+    """Each error over time, with budgets as lines, and settings and peers as points."""
     scenes = groups([row for row in rows if row.get("seconds") is not None], "scene")
     with figure(path, rows=len(_PANELS), columns=max(1, len(scenes)), size=(6, 4)) as axes:
         for column, ((scene,), own) in zip(axes.T, scenes.items(), strict=False):
@@ -157,7 +157,7 @@ def _panel(ax: Any, rows: list[Row], key: str, factor: float) -> None:
         if kind in _OURS:
             ax.plot(x, y, "o-", ms=4, label=kind)
             continue
-        ax.plot(x, y, "x" if kind == "lever" else "s", ms=4, label=f"{kind}s")
+        ax.plot(x, y, "x" if kind == "lever" else "s", ms=4, label=_LABELS[kind])
         for row, *at in zip(same, x, y, strict=True):
             ax.annotate(row["method"], at, xytext=(3, 3), textcoords="offset points", fontsize=5)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What an experiment is: tasks that give rows, a table of the rows, and a plot of them."""
+"""Experiments: tasks that return rows, and functions that make a table and a plot of the rows."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
 from .scenes import Scene
 
 Row = dict[str, Any]
-"""One result: plain numbers, words and arrays, among them always `scene`, and `why_not` where there is no result."""
+"""One result: numbers, words and arrays. It always has `scene`, and `why_not` if a result is missing."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line says."""
+    """Options of the command line."""
 
     quick: bool
-    """Whether it is only to be seen that everything runs: the numbers then mean nothing."""
+    """Only check that everything runs. The numbers are then meaningless."""
     repetitions: int
     samples: int
-    """Points on a mesh."""
+    """Points on a mesh for its errors."""
     bases: tuple[str, ...]
     """Configurations of this package: "default", "paper"."""
     peers: tuple[str, ...]
     """Names of `PEERS`."""
     meshes: Path | None = None
-    """Folder for the meshes of `measure` and pictures of them."""
+    """Folder for the meshes of `measure` and their pictures."""
     levers: tuple[dict[str, Any], ...] = ()
-    """Changes of the configuration to try besides those of the experiment."""
+    """Settings that `curve` measures besides its own."""
 
     def config(self, base: str, scene: Scene, **changes: Any) -> FitConfig:
-        """A configuration with the scene's ranges."""
+        """The configuration `base` with the ranges of the scene and other changes."""
         ranges = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
         short = {"sdf_iterations": 20, "intensity_iterations": 40} if self.quick else {}
         settings = ranges | short | changes
         return FitConfig.paper(**settings) if base == "paper" else FitConfig(**settings)
 
     def reconstruct(self, method: str | Peer, scene: Scene, held_out: Scene | None = None) -> Reconstruction:
-        """A peer's surface of a scene, and with `held_out` its intensities at the returns of that."""
+        """The surface of a peer for a scene. With `held_out`, also its intensities at the returns of that scene."""
         peer = PEERS[method] if isinstance(method, str) else method
         if self.quick:
             peer = peer.with_changes(sdf_iterations=20, intensity_iterations=40)
@@ -65,9 +65,9 @@ class Options:
         )
 
     def measure(self, method: str | Peer, scene: Scene, held_out: Scene | None = None) -> Row:
-        """Time, memory and errors of a peer's surface of a scene, or why there are none.
+        """Time, memory and surface errors of a peer for a scene, or the reason why there are none.
 
-        With `held_out`, also the errors of the intensity at the returns of that, where the peer predicts it.
+        With `held_out`, also its intensity errors at the returns of that scene.
         """
         name = method if isinstance(method, str) else method.name
         if scene.ground_truth is None:
@@ -86,14 +86,14 @@ class Options:
             save_picture(f"{stem}.png", _cropped(result.mesh, scene.ground_truth))
         try:
             metrics = surface_metrics(result.mesh, scene.ground_truth, box=scene.box, samples=self.samples)
-        except ValueError as error:  # nothing of it in the box
+        except ValueError as error:  # no part of the mesh is in the box
             return row | {"why_not": str(error)}
         return row | {"triangles": len(result.mesh.faces), **metrics}
 
 
 @dataclass(frozen=True)
 class Task:
-    """A piece of an experiment, long enough to be waited for."""
+    """A part of an experiment, shown in the progress bar."""
 
     label: str
     run: Callable[[], Iterable[Row]]
@@ -105,29 +105,35 @@ class Experiment:
 
     title: str
     scenes: tuple[str, ...]
-    """Those it runs on where none are named."""
+    """The scenes by default."""
     tasks: Callable[[Scene, Options], list[Task]]
     table: Callable[[list[Row]], str]
     plot: Callable[[list[Row], Path], None]
     repetitions: int = 1
-    """As in the paper."""
+    """Number of fits with different seeds, as in the paper."""
     bases: tuple[str, ...] = ("default", "paper")
 
 
 def _cropped(mesh: trimesh.Trimesh, ground_truth: np.ndarray) -> trimesh.Trimesh:
-    """What lies within the bounds of the ground truth, or else all: sheets far outside would shrink the rest."""
+    """The triangles within the bounds of the ground truth, or all if there are none.
+
+    In a picture of the whole mesh, surfaces far outside would make the scene small.
+    """
     middle = mesh.triangles_center
     inside = ((middle >= ground_truth.min(axis=0)) & (middle <= ground_truth.max(axis=0))).all(axis=1)
     return trimesh.Trimesh(mesh.vertices, mesh.faces[inside if inside.any() else slice(None)], process=False)
 
 
 def fit(scene: Scene, config: FitConfig) -> RadarMap:
-    """A map of all frames of a scene, with intensities if it has them."""
+    """A map of all scans of a scene, with intensities if it has them."""
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
 
 
 def world_returns(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """World points (N, 3), sensor positions (N, 3) and intensities (N,) of the returns that the scene's ranges keep."""
+    """Points (N, 3) and sensor positions (N, 3), world frame, m, and intensities (N,), sensor units.
+
+    They are those of the returns within the ranges of the scene.
+    """
     rays = radarsdf.returns.rays.prepare(
         scene.points,
         scene.poses,
@@ -140,7 +146,7 @@ def world_returns(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def groups(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Rows with the same values of `keys` together, in the order of their first."""
+    """Rows grouped by the values of `keys`, in the order of the first row of each group."""
     found: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         found.setdefault(tuple(row.get(key) for key in keys), []).append(row)
@@ -148,7 +154,7 @@ def groups(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
 
 
 def mean_and_deviation(rows: list[Row], key: str) -> str:
-    """`3.24 ± 0.04` over repetitions, or one number where there is one."""
+    """Mean and standard deviation over the rows, such as `3.24 ± 0.04`, or the number if there is only one."""
     values = [row[key] for row in rows if row.get(key) is not None]
     if not values:
         return "–"

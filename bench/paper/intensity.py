@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Held-out intensity against the nearest-neighbour baseline (Table II)."""
+"""Errors of intensities on held-out scans, and of the nearest-neighbour baseline (Table II)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .scenes import Scene
 
 
 def tasks(scene: Scene, options: Options) -> list[Task]:
-    """The baseline, and each configuration as often as asked for, with another seed each time."""
+    """One task for the baseline, and one for each configuration and seed."""
     if scene.intensities is None:
         why_not = "the scene has no intensities"
         return [Task(scene.name, lambda: [{"scene": scene.name, "method": "all", "why_not": why_not}])]
@@ -51,7 +51,7 @@ _NAMES = {"default": "radarsdf", "paper": "3QFPI"}
 
 
 def table(rows: list[Row]) -> str:
-    """Mean and deviation over the repetitions; the floor is the error of the simulator's noiseless intensities."""
+    """Mean and deviation over the repetitions. The noise floor is `Simulation.intensity_noise_floor`."""
     cells = []
     for (scene,), own in groups(rows, "scene").items():
         if why_not := own[0].get("why_not"):
@@ -64,12 +64,12 @@ def table(rows: list[Row]) -> str:
                 "–" if floor is None else f"{floor:.2f}", f"{own[0]['lowest']:.0f} – {own[0]['highest']:.0f}",
             ])  # fmt: skip
     return markdown(
-        ["scene", "method", "MAE", "MedAE", "floor of the MAE", "range of the intensities"], cells
+        ["scene", "method", "MAE", "MedAE", "noise floor of the MAE", "range of the intensities"], cells
     )
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """MAE of each method, a group of bars for each scene, the floor as a line."""
+    """MAE of each method, with a group of bars for each scene and the noise floor as a line."""
     scenes = groups([row for row in rows if "mae" in row], "scene")
     methods = list(groups([row for own in scenes.values() for row in own], "method"))
     with figure(path, size=(2 + 1.5 * max(1, len(scenes)), 3.6)) as axes:
@@ -81,7 +81,9 @@ def plot(rows: list[Row], path: Path) -> None:
                     ax.bar(i + 0.25 * j, np.mean(values), 0.22, yerr=np.std(values), color=f"C{j}",
                            label=method if i == 0 else None)  # fmt: skip
             if (floor := own[0].get("noise_floor")) is not None:
-                ax.hlines(floor, i - 0.15, i + 0.65, "black", "dashed", label="floor" if i == 0 else None)
+                ax.hlines(
+                    floor, i - 0.15, i + 0.65, "black", "dashed", label="noise floor" if i == 0 else None
+                )
         ax.set_xticks([i + 0.25 for i in range(len(scenes))], [scene for (scene,) in scenes])
         ax.set_ylabel("held-out MAE, sensor units")
 

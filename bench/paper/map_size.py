@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Bytes of a map over the number of frames (figure)."""
+"""Size of a map over the number of scans (figure)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .experiment import Experiment, Options, Row, Task, fit, groups
 from .report import figure, markdown
 from .scenes import Scene
 
-_STEPS = (10, 5, 3, 2, 1)  # 117 frames become the paper's 12, 24, 39, 59 and 117
+_STEPS = (10, 5, 3, 2, 1)  # of 117 scans, these leave 12, 24, 39, 59 and 117 as in the paper
 _BYTES_PER_RETURN = 16  # x, y, z and intensity in float32
 _REFERENCE = "SHINE (octree)"
 _MAPS = {
@@ -23,14 +23,14 @@ _MAPS = {
 
 
 def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One for each number of frames and method."""
+    """One task for each number of scans and method."""
     found = []
     for n in _STEPS:
         part = scene.every_nth(n)
-        found.append(Task(f"{scene.name}: VDBFusion, {len(part)} frames", partial(_others, part, options)))
+        found.append(Task(f"{scene.name}: VDBFusion, {len(part)} scans", partial(_others, part, options)))
         for name in _MAPS:
             found.append(
-                Task(f"{scene.name}: {name}, {len(part)} frames", partial(_ours, part, name, options))
+                Task(f"{scene.name}: {name}, {len(part)} scans", partial(_ours, part, name, options))
             )
     return found
 
@@ -46,7 +46,7 @@ def _others(scene: Scene, options: Options) -> list[Row]:
 
 def _ours(scene: Scene, name: str, options: Options) -> list[Row]:
     base, changes, with_intensity = _MAPS[name]
-    # The size depends on where returns are, not on how long was trained.
+    # The size does not depend on the training, so one iteration is enough.
     config = options.config(base, scene, **(changes | {"sdf_iterations": 1, "intensity_iterations": 1}))
     if not with_intensity:
         scene = scene.without_intensities()
@@ -60,7 +60,7 @@ def _ours(scene: Scene, name: str, options: Options) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """MB, and the share of the octree's size; in brackets the whole file, cells and settings included."""
+    """MB of features and weights, in brackets the whole file, and the size relative to the octree."""
     parts = []
     for (scene,), own in groups(rows, "scene").items():
         by_method = groups(own, "method")
@@ -77,13 +77,13 @@ def table(rows: list[Row]) -> str:
                 )
             why_not = next((row["why_not"] for row in same if row.get("why_not")), "")
             cells.append([f"{method}: {why_not}" if why_not else method, *numbers])
-        frames = [f"{row['frames']} frames" for row in by_method[(_REFERENCE,)]]
-        parts += [f"### {scene}: MB and share of {_REFERENCE}", markdown(["method", *frames], cells)]
+        columns = [f"{row['frames']} scans" for row in by_method[(_REFERENCE,)]]
+        parts += [f"### {scene}: MB, and share of {_REFERENCE}", markdown(["method", *columns], cells)]
     return "\n\n".join(parts)
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """MB over frames."""
+    """Size in MB over the number of scans."""
     scenes = groups([row for row in rows if row.get("bytes") is not None], "scene")
     with figure(path, columns=max(1, len(scenes))) as axes:
         for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
@@ -91,8 +91,8 @@ def plot(rows: list[Row], path: Path) -> None:
                 ax.plot(
                     [r["frames"] for r in same], [r["bytes"] / 1e6 for r in same], "o-", ms=3, label=method
                 )
-            ax.set(title=scene, xlabel="frames", ylabel="map, MB")
+            ax.set(title=scene, xlabel="scans", ylabel="map, MB")
             ax.grid(alpha=0.3)
 
 
-EXPERIMENT = Experiment("Map size over the number of frames", ("hugin", "oculii", "wall"), tasks, table, plot)
+EXPERIMENT = Experiment("Map size over the number of scans", ("hugin", "oculii", "wall"), tasks, table, plot)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Results as files: Markdown, JSON with everything that is needed to repeat them, and pictures."""
+"""Results as files: tables in Markdown, numbers in JSON with all that is needed to repeat them, and plots."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def provenance(module: str = "bench.paper") -> dict[str, Any]:
-    """Command, commit and machine."""
+    """Command, commit, machine and versions."""
     return {
         "command": " ".join([f"python -m {module}", *sys.argv[1:]]),
         "commit": _commit(),
@@ -52,7 +52,7 @@ def _processor() -> str:
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write `values`; arrays become lists, and what is not finite becomes null."""
+    """Write `values` as JSON. Arrays become lists, and numbers that are not finite become null."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
@@ -67,7 +67,7 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose columns are aligned, for people who read it as text."""
+    """A Markdown table with aligned columns."""
     table = [list(header), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = [
@@ -78,11 +78,12 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 Column = tuple[str, str, float, int, bool | None]
-"""Key of a row, heading, factor to its unit, digits, and whether more is better (None: neither)."""
+"""Key in the rows, heading, factor to the unit of the heading, digits, and whether the highest or the lowest value is
+best: True, False or None (no best)."""
 
 
 def metric_table(rows: Sequence[dict[str, Any]], columns: Sequence[Column]) -> str:
-    """A line for each method; the best of a column in bold."""
+    """A table with one row for each method and the best value of each column in bold."""
     cells = [[row["method"] for row in rows]]
     for key, _, factor, digits, highest in columns:
         values = [row.get(key) for row in rows]
@@ -93,7 +94,7 @@ def metric_table(rows: Sequence[dict[str, Any]], columns: Sequence[Column]) -> s
 
 
 def best_in_bold(cells: list[str], values: Sequence[float | None], *, highest: bool) -> list[str]:
-    """The cells of a column, the best value's in bold, equals (as printed) with it."""
+    """The cells of a column with the best value in bold, also where several print the same."""
     known = [value for value in values if value is not None]
     if not known:
         return cells
@@ -108,7 +109,7 @@ def best_in_bold(cells: list[str], values: Sequence[float | None], *, highest: b
 def figure(
     path: Path, rows: int = 1, columns: int = 1, size: tuple[float, float] = (5, 3.6)
 ) -> Iterator[Any]:
-    """A grid of axes, (rows, columns), that becomes a picture file."""
+    """Axes (rows, columns) of a plot, which is written to `path` at the end of the ``with`` block."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - tables need no matplotlib
 
     drawing = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The scenes on which the experiments run, all in one form: simulated ones, files and folders of recorded ones."""
+"""The scenes of the experiments: simulated ones, and recorded ones from files and folders."""
 
 from __future__ import annotations
 
@@ -19,50 +19,46 @@ from radarsdf.simulate import SCENES, Simulation
 from scipy.spatial import cKDTree
 
 SEEN_BY_RADAR_M = 1.0
-"""Lidar sees all round: a lidar point further than this from every return says nothing about a radar map."""
+"""A lidar sees in all directions. Lidar points farther than this from every return do not count as ground truth."""
 
-# What returns nearer or further than these are dropped, and every how many-th scan is held out.
 _MIN_RANGE_M = 2.5
 _MIN_RANGE_OCULII_M = 1.0
 _MAX_RANGE_FILE_M = 60.0
 _HOLDOUT_EVERY = 10
 _HOLDOUT_EVERY_SHORT = 5
-_SHORT_FRAMES = 50  # every tenth of fewer scans would be too few to measure on
+_SHORT_FRAMES = 50  # of fewer scans, every tenth would be too few for a test
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Scans of one place, with what is known about it and how it is to be used.
-
-    F frames, N_i returns in frame i.
-    """
+    """F scans of one place with N_i returns in scan i, its ground truth, and settings of the experiments."""
 
     name: str
     points: list[NDArray[np.float32]]
     """F arrays (N_i, 3), sensor frame, m."""
     poses: NDArray[np.float64]
-    """(F, 4, 4) T_world_sensor."""
+    """(F, 4, 4) T_world_sensor, m."""
     intensities: list[NDArray[np.float32]] | None
     """F arrays (N_i,), sensor units."""
     ground_truth: NDArray[np.float64] | None = None
-    """(M, 3) lidar points, world, m."""
+    """(M, 3) lidar points, world frame, m."""
     box: NDArray[np.float64] | None = None
-    """(2, 3) lower and upper corner of what is evaluated, world, m. None: everything is."""
+    """(2, 3) lower and upper corner of the region for the surface errors, world frame, m. None: everywhere."""
     holdout_every: int = _HOLDOUT_EVERY
-    """The first frame and then every so many-th is for testing."""
+    """Scans 0, `holdout_every`, 2 · `holdout_every`, … are held out."""
     min_range_m: float = _MIN_RANGE_M
-    """Returns nearer than this are for `FitConfig` to drop: `points` holds them."""
+    """Setting of `FitConfig`: nearer returns are dropped by the fit. `points` still holds them."""
     max_range_m: float | None = None
-    """Returns further than this, likewise. None: none are dropped."""
+    """Setting of `FitConfig`: farther returns are dropped by the fit. None: none are."""
     simulation: Simulation | None = None
-    """Where the scene is simulated: the same frames, with everything a recorded scene does not tell."""
+    """The truth about the same scans if the scene is simulated."""
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Number of scans."""
         return len(self.points)
 
     def every_nth(self, n: int) -> Scene:
-        """The frames 0, n, 2n, …; the ground truth stays whole.
+        """The scans 0, n, 2n, … with the whole ground truth.
 
         Raises
         ------
@@ -75,16 +71,16 @@ class Scene:
         return self._select(np.arange(0, len(self), n))
 
     def without_intensities(self) -> Scene:
-        """The geometry only."""
+        """The scene without intensities."""
         return dataclasses.replace(self, intensities=None)
 
     def split(self) -> tuple[Scene, Scene]:
-        """The frames to fit, and the held-out ones: the first and then every `holdout_every`-th.
+        """The scans to fit, and the held-out scans; see `holdout_every`.
 
         Raises
         ------
         ValueError
-            If the scene has fewer than two frames.
+            If the scene has fewer than two scans.
         """
         train, test = holdout(len(self), self.holdout_every)
         return self._select(train), self._select(test)
@@ -118,30 +114,30 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
     spec : str
         One of
 
-        - the name of a simulated scene, of `radarsdf.simulate.SCENES`;
-        - an ``.npz`` file as :func:`radarsdf.io.scans.read_scans` reads it: only static returns are used, and of the
-          lidar points those within 1 m of a return that is 2.5 to 60 m from its sensor;
-        - a folder as :func:`.folders.read_posed_folder` reads it: recordings of Viking Hill, exported from ROS bags;
-        - a sequence of SNAIL-Radar as :func:`.folders.read_snail_radar` reads it.
+        - the name of a simulated scene in `radarsdf.simulate.SCENES`;
+        - an ``.npz`` file for :func:`radarsdf.io.scans.read_scans`. Only lidar points within 1 m of a return that is
+          2.5 to 60 m from its sensor are ground truth;
+        - a folder for :func:`radarsdf.io.folders.read_posed_folder`, such as a recording of Viking Hill;
+        - a sequence of SNAIL-Radar for :func:`radarsdf.io.folders.read_snail_radar`.
 
-        The ground truth of a folder is all of it: `box` is for cutting it.
+        All lidar points of a folder are ground truth. Use `box` to select a part.
     frames : int, optional
-        How many: a simulated scene has so many along its whole path, a recorded one the first so many.
+        Number of scans. A simulated scene has them along its whole path; of a recorded scene they are the first ones.
     seed : int
-        Of a simulated scene; recorded ones ignore it.
-    box : array_like, optional
-        (2, 3) lower and upper corner of what is to be evaluated, world, m.
+        Seed of a simulated scene. Recorded scenes ignore it.
+    box : (2, 3) array_like, optional
+        Lower and upper corner of the region for the surface errors, world frame, m.
 
     Raises
     ------
     ValueError
-        If there is no such scene, its files are damaged or of another kind, or `frames` is below 2 (one of them is
-        held out) or `box` no box.
+        If there is no such scene, its files are damaged or have another format, `frames` is below 2 or `box` is not a
+        box.
     OSError
         If a file cannot be read.
     """
     if frames is not None and frames < 2:
-        msg = f"frames must be at least 2, one of them to be held out, not {frames}"
+        msg = f"frames must be at least 2, since one scan is held out, not {frames}"
         raise ValueError(msg)
     if spec in SCENES:
         scene = _simulated(SCENES[spec](seed=seed, frames=frames))
@@ -155,7 +151,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
     else:
         msg = (
             f"no scene {spec!r}: expected a simulated scene ({', '.join(sorted(SCENES))}), an .npz file of scans, "
-            "a folder with radar/*.pcd and poses.txt (ROS bags, such as Viking Hill's, must be exported to one) or "
+            "a folder with radar/*.pcd and poses.txt (export ROS bags, such as those of Viking Hill, to one) or "
             "a sequence of SNAIL-Radar with eagleg7/enhanced/*.pcd and utm50r_T_xt32.txt"
         )
         raise ValueError(msg)
@@ -197,7 +193,7 @@ def _recorded(name: str, scans: Scans, frames: int | None) -> Scene:
 
 
 def _seen_by_both(scene: Scene) -> NDArray[np.float64] | None:
-    """The lidar points, (M, 3) world m, within 1 m of a return that the scene's ranges keep."""
+    """Lidar points (M, 3), world frame, m, within `SEEN_BY_RADAR_M` of a return within the ranges of the scene."""
     lidar = scene.ground_truth
     if lidar is None:
         return None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Completion where only every n-th frame is given (figure)."""
+"""Completion with only every n-th scan (figure)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .scenes import Scene
 
 
 def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One for each n and peer."""
+    """One task for each n and peer."""
     steps = (1, 2) if options.quick else range(1, 11)
     return [
         Task(f"{scene.name}: {name}, n = {n}", partial(_rows, scene, name, n, options))
@@ -28,7 +28,7 @@ def _rows(scene: Scene, name: str, n: int, options: Options) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """Completion ratio, and what the largest n leaves of that of n = 1; then the outliers, without which it is no merit."""
+    """Completion ratio and its decrease from n = 1 to the largest n; and outliers, which a high completion can cost."""
     parts = []
     for (scene,), own in groups(rows, "scene").items():
         steps = sorted({row["n"] for row in own})
@@ -41,7 +41,7 @@ def table(rows: list[Row]) -> str:
                 fall = f"{100 * (1 - last / first):.1f}" if first and last is not None else "–"
                 why_not = next((row["why_not"] for row in same if row.get("why_not")), "")
                 cells.append([f"{method}: {why_not}" if why_not else method, *numbers, fall])
-            header = [heading, *(f"n = {n}" for n in steps), f"1 → {steps[-1]}, relative fall, %"]
+            header = [heading, *(f"n = {n}" for n in steps), f"1 → {steps[-1]}, relative decrease, %"]
             parts += [f"### {scene}: {heading}", markdown(header, cells)]
     return "\n\n".join(parts)
 
@@ -59,8 +59,8 @@ def plot(rows: list[Row], path: Path) -> None:
                     ms=3,
                     label=method,
                 )
-            ax.set(title=scene, xlabel="every n-th frame", ylabel="completion ratio, %")
+            ax.set(title=scene, xlabel="every n-th scan", ylabel="completion ratio, %")
             ax.grid(alpha=0.3)
 
 
-EXPERIMENT = Experiment("Completion with every n-th frame", ("hugin", "oculii"), tasks, table, plot)
+EXPERIMENT = Experiment("Completion with every n-th scan", ("hugin", "oculii"), tasks, table, plot)

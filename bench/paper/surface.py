@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Surface quality of all methods (Table I), with time and memory beside it."""
+"""Surface errors, time and memory of all methods (Table I)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLUMNS: tuple[Column, ...] = (
     ("completion_error_m", "compl. error, cm", 100, 2, False),
     ("completion_ratio", "compl. ratio, %", 100, 2, True),
     ("f_score", "F-score, %", 100, 2, True),
-    ("f_score_all", "F, nothing discarded, %", 100, 2, True),
+    ("f_score_all", "F-score, nothing discarded, %", 100, 2, True),
     ("gamma_shape", "Gamma shape", 1, 2, None),
     ("gamma_mean", "mean, rad", 1, 3, False),
     ("gamma_variance", "variance", 1, 3, False),
@@ -29,7 +29,7 @@ COLUMNS: tuple[Column, ...] = (
 
 
 def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One for each peer."""
+    """One task for each peer."""
     return [Task(f"{scene.name}: {name}", partial(_rows, scene, name, options)) for name in options.peers]
 
 
@@ -39,7 +39,7 @@ def _rows(scene: Scene, name: str, options: Options) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """A table for each scene; the best of a column in bold."""
+    """A table for each scene, with the best value of each column in bold."""
     parts = []
     for (scene,), own in groups(rows, "scene").items():
         text = metric_table(own, COLUMNS)
@@ -49,7 +49,7 @@ def table(rows: list[Row]) -> str:
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """F-score with nothing discarded over time: whatever time one has, what is the best surface in it?"""
+    """F-score with nothing discarded over time."""
     scenes = groups([row for row in rows if "f_score_all" in row], "scene")
     with figure(path, columns=max(1, len(scenes))) as axes:
         for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""View-dependent intensity round the corner reflector, with and without the viewing direction (figure)."""
+"""View-dependent intensity of a corner reflector, with and without the viewing direction as input (figure)."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from .scenes import Scene
 
 _VARIANTS = {"full": True, "w/o viewing direction": False}
 _ANGLES_DEG = np.arange(-90, 91, 15)
-_REFLECTOR_M = 0.6  # nearer returns are the reflector's: edges of 0.3 to 0.4 m, and the noise across the beam
+_REFLECTOR_M = 0.6  # nearer returns belong to the reflector: edges of 0.3 to 0.4 m, and noise across the beam
 
 
 def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One for each configuration, with and without the viewing direction."""
+    """One task for each configuration, with and without the viewing direction."""
     return [
         Task(f"{scene.name}: {base}, {variant}", partial(_rows, scene, options, base, variant))
         for base in options.bases
@@ -45,7 +45,10 @@ def _rows(scene: Scene, options: Options, base: str, variant: str) -> list[Row]:
 
 
 def _reflector(scene: Scene) -> np.ndarray:
-    """(3,) world, m: the centre of the circle that the sensor drove, at the height of its strongest returns."""
+    """Position (3,) of the reflector, world frame, m.
+
+    It is the centre of the circle that the sensor drove, at the height of the strongest returns there.
+    """
     x, y = scene.poses[:, :2, 3].T - scene.poses[:, :2, 3].mean(axis=0)[:, None]
     # |p - c|² = r² is linear in c and r² - |c|².
     a, b, _ = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], 1), x**2 + y**2, rcond=None)[0]
@@ -59,18 +62,16 @@ def _reflector(scene: Scene) -> np.ndarray:
 
 
 def _angle_deg(sensors: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Azimuth, degrees, from which each return was seen, 0 in the middle of the path round `place`."""
+    """Azimuth (N,), degrees, of the sensor positions (N, 3) as seen from `place`, 0 in the middle of the path."""
     offset = sensors[:, :2] - place[:2]
     azimuth = np.arctan2(offset[:, 1], offset[:, 0])
-    middle = np.angle(
-        np.exp(1j * np.unique(azimuth)).mean()
-    )  # one a frame: frames with many returns are not nearer
+    middle = np.angle(np.exp(1j * np.unique(azimuth)).mean())  # each scan counts once, not each return
     angle: np.ndarray = np.rad2deg(np.angle(np.exp(1j * (azimuth - middle))))
     return angle
 
 
 def _noiseless(scene: Scene) -> np.ndarray:
-    """The simulator's noiseless intensities of the returns that the ranges keep; NaN where a return is false."""
+    """Noiseless intensities of the simulated returns within the ranges of the scene; NaN for false returns."""
     assert scene.simulation is not None
     ranges = [np.linalg.norm(p, axis=1) for p in scene.points]
     furthest = np.inf if scene.max_range_m is None else scene.max_range_m
@@ -80,7 +81,7 @@ def _noiseless(scene: Scene) -> np.ndarray:
 
 
 def _error(row: Row, selected: np.ndarray) -> str:
-    """Mean error against the measurement and, where it is known, against the truth."""
+    """Mean absolute error against the measured and, if it is known, the noiseless intensity."""
     if not selected.any():
         return "–"
     error = np.abs(row["predicted"] - row["measured"])[selected].mean()
@@ -92,7 +93,7 @@ def _error(row: Row, selected: np.ndarray) -> str:
 
 
 def table(rows: list[Row]) -> str:
-    """Error by the angle from which the reflector is seen, of the returns at it and of all others."""
+    """Errors over the angle of view, separately for returns at the reflector and for all others."""
     parts = []
     for (scene,), own in groups(rows, "scene").items():
         if why_not := own[0].get("why_not"):
@@ -108,15 +109,14 @@ def table(rows: list[Row]) -> str:
                 ]
                 cells.append([row["base"], row["variant"], _error(row, place), *by_angle])
             header = ["configuration", "variant", "all", *(f"{a} to {a + 15}°" for a in _ANGLES_DEG[:-1])]
-            note = "MAE, against the measured intensity" + (
-                " / against the noiseless one" if "truth" in own[0] else ""
-            )
+            note = "MAE against the measured intensity"
+            note += " / against the noiseless intensity" if "truth" in own[0] else ""
             parts.append(f"### {scene}, {heading}: {note}\n\n{markdown(header, cells)}")
     return "\n\n".join(parts)
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """A line for each configuration: what was measured, over place and angle, and the errors of both variants."""
+    """For each configuration: measured intensities, errors of both variants, and intensities over the angle of view."""
     panels = groups([row for row in rows if "predicted" in row], "scene", "base")
     with figure(path, rows=max(1, len(panels)), columns=4) as axes:
         for line, ((scene, base), own) in zip(axes, panels.items(), strict=False):
@@ -154,4 +154,4 @@ def _lobe(ax: Any, rows: list[Row]) -> None:
     ax.set(title="at the reflector", xlabel="seen from, °", ylabel="intensity")
 
 
-EXPERIMENT = Experiment("View-dependent intensity round the corner reflector", ("wall",), tasks, table, plot)
+EXPERIMENT = Experiment("View-dependent intensity of the corner reflector", ("wall",), tasks, table, plot)

@@ -15,38 +15,42 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m bench.stress", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     kernels = commands.add_parser("kernels", help="rounding errors of the kernels against float64")
-    kernels.add_argument("--largest", type=int, default=1_000_000, help="batch; default: 1000000")
-    files = commands.add_parser("files", help="damaged files into every reader")
+    kernels.add_argument("--largest", type=int, default=1_000_000, help="largest batch; default: 1000000")
+    files = commands.add_parser("files", help="damaged files for every reader")
     files.add_argument("--count", type=int, default=100_000, help="files in all; default: 100000")
     files.add_argument("--seed", type=int, default=0)
     files.add_argument("--only", nargs="+", metavar="READER", help="default: all")
-    save = commands.add_parser("save", help="savers killed at random moments")
+    save = commands.add_parser("save", help="processes killed at random times while they save a map")
     save.add_argument("--count", type=int, default=200, help="kills; default: 200")
     random = commands.add_parser("arguments", help="random arguments for the public functions")
-    random.add_argument("--count", type=int, default=2000, help="examples for each; default: 2000")
-    interrupts = commands.add_parser("interrupts", help="Ctrl-C at many moments of a fit and of a mesh")
+    random.add_argument("--count", type=int, default=2000, help="examples per function; default: 2000")
+    interrupts = commands.add_parser("interrupts", help="Ctrl-C at many times during a fit and a mesh")
     interrupts.add_argument("--returns", type=int, default=3_000_000, help="default: 3000000")
-    interrupts.add_argument("--count", type=int, default=40, help="of each; default: 40")
+    interrupts.add_argument("--count", type=int, default=40, help="interrupts of each; default: 40")
     memory = commands.add_parser(
         "memory", help="memory of fits against their estimates, and of many fits in a row"
     )
-    memory.add_argument("--largest", type=int, default=3_000_000, help="returns; default: 3000000")
+    memory.add_argument("--largest", type=int, default=3_000_000, help="most returns; default: 3000000")
     memory.add_argument("--count", type=int, default=100, help="fits in a row; default: 100")
-    durations = commands.add_parser("durations", help="seconds of fits against their estimates")
-    durations.add_argument("--largest", type=int, default=1_000_000, help="returns; default: 1000000")
-    durations.add_argument("--repetitions", type=int, default=2, help="the fastest counts; default: 2")
+    durations = commands.add_parser("durations", help="time of fits against their estimates")
+    durations.add_argument("--largest", type=int, default=1_000_000, help="most returns; default: 1000000")
+    durations.add_argument(
+        "--repetitions", type=int, default=2, help="fits per case, of which the fastest counts; default: 2"
+    )
     training = commands.add_parser("training", help="extreme settings, and very many iterations")
-    training.add_argument("--iterations", type=int, default=1000, help="of each case; default: 1000")
-    training.add_argument("--longest", type=int, default=100_000, help="of the default; default: 100000")
-    seeds = commands.add_parser("seeds", help="how much the errors depend on the seed")
+    training.add_argument("--iterations", type=int, default=1000, help="per case; default: 1000")
+    training.add_argument(
+        "--longest", type=int, default=100_000, help="iterations of the last case; default: 100000"
+    )
+    seeds = commands.add_parser("seeds", help="variation of the errors with the seed")
     seeds.add_argument("scenes", nargs="*", default=["hugin"], metavar="SCENE", help="default: hugin")
     seeds.add_argument("--count", type=int, default=10, help="seeds; default: 10")
-    seeds.add_argument("--quick", action="store_true", help="only see that it runs")
+    seeds.add_argument("--quick", action="store_true", help="only check that it runs")
     return parser
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one of them; a failure ends the program with status 1."""
+    """Run one command. A failure ends the program with status 1."""
     words = _parser().parse_args(arguments)
     if words.command == "kernels":
         from .kernels import BATCHES, run  # noqa: PLC0415 - each command imports what it needs

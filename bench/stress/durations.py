@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How long fits take, against the estimate that is made before; and the constants of the estimate, measured anew."""
+"""Time of fits against their estimates, and the constants of the estimate calibrated on this machine."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scipy.optimize import nnls
 from bench.growth.street import street
 from bench.paper.report import markdown
 
-WITHIN = 2.0
+WITHIN = 2.0  # largest factor between estimate and measurement
 PRESETS: dict[str, Callable[..., FitConfig]] = {
     "default": FitConfig,
     "quick": FitConfig.quick,
@@ -51,25 +51,25 @@ CASES: list[tuple[int, bool, str, dict[str, Any]]] = [
     (1_000_000, True, "default", SHORT),
     (1_000_000, False, "default", {"sdf_iterations": 20, "leaf_size_m": 0.8, "num_threads": 1}),
 ]
-"""Returns, whether with intensities, preset, settings."""
+"""Number of returns, with intensities or without, preset, settings."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """What was expected of a fit, and what it took."""
+    """Estimated and measured time of a fit."""
 
     estimated_s: float
     work: dict[str, float]
-    """As counted before."""
+    """Amounts of work, as of `durations.work_of`."""
     wall_s: float
     processor_s: float
-    """Of all threads: it hardly depends on what else the machine does."""
+    """Processor time of all threads. Other processes hardly change it."""
 
 
 def measured(
     count: int, with_intensities: bool, preset: str, changes: dict[str, Any], repetitions: int
 ) -> Fit:
-    """The fastest of so many fits, each in its own process."""
+    """The shortest times of `repetitions` fits, each in its own process."""
     case = json.dumps([count, with_intensities, preset, changes])
     command = [sys.executable, "-m", "bench.stress.durations", case]
     fits = []
@@ -101,7 +101,7 @@ def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str,
         rows=estimate.vertices,
         with_intensity=with_intensities,
     )
-    # What PyTorch sets up in a process's first steps is no part of the estimate.
+    # A small fit first: the estimate does not include what PyTorch sets up in its first steps.
     small, tiny = street(2000), FitConfig(training={"sdf_iterations": 5, "intensity_iterations": 10})
     radarsdf.fit(small.points, small.poses, small.intensities, config=tiny, progress=False)
     wall_s, processor_s = time.perf_counter(), time.process_time()
@@ -111,7 +111,7 @@ def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str,
 
 
 def constants(fits: list[Fit]) -> dict[str, float]:
-    """Of each kind of work the seconds, none negative, that leave the least sum of squared relative errors."""
+    """Seconds per unit of each kind of work, by non-negative least squares of the relative errors."""
     kinds = list(durations.SECONDS)
     shares = np.array([[fit.work[kind] / fit.processor_s for kind in kinds] for fit in fits])
     scale = shares.max(axis=0).clip(1e-30)
@@ -120,7 +120,7 @@ def constants(fits: list[Fit]) -> dict[str, float]:
 
 
 def run(largest: int, repetitions: int) -> bool:
-    """Print the table, and the constants that would fit it best; whether all estimates are within the factor."""
+    """Print the table and the calibrated constants. True if all estimates are within the factor `WITHIN`."""
     cases = [case for case in CASES if case[0] <= largest]
     fits = []
     for case in cases:

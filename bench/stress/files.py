@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Damaged and hostile files into every reader: each is read, or refused by a ValueError or OSError that names it."""
+"""Damaged and malicious files: every reader must read a file, or raise a ValueError or OSError that names it."""
 
 from __future__ import annotations
 
@@ -30,23 +30,25 @@ from bench.paper.report import markdown
 from . import samples
 from .mutations import boundaries, mutate
 
-MAX_GROWTH_BYTES = 1 << 29  # all files together: any one is below 100 kB
-MAX_SECONDS = 5.0  # of the processor, for one file
+MAX_GROWTH_BYTES = 1 << 29  # of the peak memory over all files, each of which is below 100 kB
+MAX_SECONDS = 5.0  # processor time for one file
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A function that reads files, valid files for it, and how to damage them with knowledge of their format."""
+    """A function that reads files, and the files to test it with."""
 
     read: Callable[[Path], object]
     name: str
-    """Of the file."""
+    """Name of the file."""
     valid: Callable[[], list[bytes]]
+    """Returns valid files."""
     hostile: Callable[[np.random.Generator], bytes] | None = None
+    """Returns a file that is damaged with knowledge of its format."""
 
 
 def _load(path: Path) -> None:
-    """A map that loads also answers."""
+    """Loads a map and queries it."""
     radar_map = radarsdf.load(path)
     x = np.zeros((2, 3))
     assert radar_map.sdf(x).shape == radar_map.observed(x).shape == (2,)
@@ -83,16 +85,16 @@ def _mesh(path: Path) -> None:
 
 
 def _folder(path: Path) -> None:
-    """A folder in which everything but the file is whole; ValueErrors name files of the folder."""
+    """Reads a folder with the damaged file among valid ones. A ValueError may name any file of the folder."""
     folder = path.parent if path.parent.name != "radar" else path.parent.parent
     try:
         scans = read_posed_folder(folder)
     except ValueError as error:
-        if str(folder) in str(error):  # perhaps of another file, which does not fit to this one
+        if str(folder) in str(error):  # a valid file is named if it does not fit to the damaged one
             msg = f"{path}: {error}"
             raise ValueError(msg) from error
         raise
-    assert 1 <= len(scans.points) == len(scans.poses) <= 2  # a scan that the poses do not cover is left out
+    assert 1 <= len(scans.points) == len(scans.poses) <= 2  # one of the two scans may have no pose
 
 
 READERS = {
@@ -114,7 +116,7 @@ READERS = {
 
 @dataclass
 class Outcomes:
-    """What became of a reader's files."""
+    """Results of one reader."""
 
     counts: collections.Counter[str] = field(default_factory=collections.Counter)
     failures: list[str] = field(default_factory=list)
@@ -122,7 +124,7 @@ class Outcomes:
 
 
 def damaged(reader: Reader, seed: int) -> Iterator[bytes]:
-    """Files without end, the same for the same seed: first the valid ones, whole and cut at every boundary."""
+    """Endless files, the same for the same seed. First come the valid ones, whole and cut at every boundary."""
     valid = reader.valid()
     for data in valid:
         yield data
@@ -137,7 +139,7 @@ def damaged(reader: Reader, seed: int) -> Iterator[bytes]:
 
 
 def try_file(reader: Reader, path: Path, data: bytes, outcomes: Outcomes) -> None:
-    """Read `data` from a file at `path`, and note what happened."""
+    """Read `data` from a file at `path`, and add the result to `outcomes`."""
     path.write_bytes(data)
     started = time.process_time()
     try:
@@ -164,14 +166,14 @@ def try_file(reader: Reader, path: Path, data: bytes, outcomes: Outcomes) -> Non
 
 
 def place(reader: Reader, folder: Path) -> Path:
-    """Where the reader's file belongs, and the whole files round it."""
+    """Path of the file of a reader in `folder`. For `read_posed_folder`, the other files are written."""
     if reader.read is _folder:
         samples.write_folder(folder)
     return folder / reader.name
 
 
 def run(count: int, seed: int, only: list[str] | None = None) -> bool:
-    """Read `count` files in all and print what became of them; whether all was well."""
+    """Read `count` files in all and print the results. True if there was no failure."""
     shared_memory = Path("/dev/shm")
     names = only or list(READERS)
     rows: list[list[str]] = []
@@ -180,7 +182,7 @@ def run(count: int, seed: int, only: list[str] | None = None) -> bool:
         for name in names:
             reader = READERS[name]
             path = place(reader, Path(folder))
-            # A first file, so that what is imported on the way does not count as growth.
+            # The first file only loads modules, whose memory must not count as growth.
             try_file(reader, path, reader.valid()[0], Outcomes())
             before = _peak_bytes()
             outcomes = Outcomes()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Ctrl-C at many moments of a fit and of a mesh: how long until it ends, and whether it hands back a map."""
+"""Ctrl-C at many times during a fit and a mesh: the time until it ends, and whether a fit returns a map."""
 
 from __future__ import annotations
 
@@ -24,11 +24,21 @@ from bench.paper.report import markdown
 MAX_WAIT_S = 1.0
 
 
-def waits(
-    work: Callable[[], Any], moments: int, seed: int = 0
-) -> tuple[float, np.ndarray, list[Any], list[str]]:
-    """Seconds of the whole work, from each signal to the end, the maps that it gave, and where each signal found it."""
-    rng = np.random.default_rng(seed)
+def waits(work: Callable[[], Any], moments: int) -> tuple[float, np.ndarray, list[Any], list[str]]:
+    """Interrupt `work` at `moments` random times.
+
+    Returns
+    -------
+    whole_s : float
+        Time of the work without interrupt.
+    waits_s : (M,) float64
+        Time from each signal to the end.
+    maps : list
+        Maps of the interrupted fits, or None.
+    places : list of str
+        Line of code at each signal.
+    """
+    rng = np.random.default_rng(0)
     started_s = time.perf_counter()
     work()
     whole_s = time.perf_counter() - started_s
@@ -57,7 +67,7 @@ def waits(
 
 
 def _place() -> str:
-    """File, line and function of this package that the main thread is in."""
+    """File, line and function of this package that the main thread is running."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None and "radarsdf" not in Path(frame.f_code.co_filename).parts:
         frame = frame.f_back
@@ -69,8 +79,8 @@ def _place() -> str:
 
 
 def run(returns: int, moments: int) -> bool:
-    """Print the table for a fit of a street, and for its mesh; whether no wait was too long."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is born without
+    """Print the table for a fit of a street and for its mesh. True if no wait was longer than `MAX_WAIT_S`."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores SIGINT
     scans = street(returns)
     points, poses = scans.points, scans.poses
     config = FitConfig(training={"sdf_iterations": 100})
@@ -91,14 +101,14 @@ def run(returns: int, moments: int) -> bool:
     print(
         markdown(
             [
-                "what",
+                "work",
                 "returns",
-                "whole, s",
+                "uninterrupted, s",
                 "signals",
                 "with a map",
                 "median wait, s",
                 "longest wait, s",
-                "where",
+                "code at the longest wait",
             ],
             rows,
         )

@@ -25,15 +25,15 @@ NUM_LEVELS = 3
 BATCHES = (0, 1, 7, 8191, 8192, 1_000_000)
 ENCODINGS = {"tri-quadtree": _core.Encoding.TRI_QUADTREE, "octree": _core.Encoding.OCTREE}
 _SURFACE_POINTS = 8000
-_OFTEN = 100_000  # larger batches only once for each type: the reference takes a minute for a million points
+_OFTEN = 100_000  # larger batches run only once per type: the reference takes a minute for a million points
 _EXTENT_M = 8.0
-_LAST_M = ((1 << 20) - (1 << 12) - 1) * LEAF_M  # in the last cell of the lattice, as all levels have it
+_LAST_M = ((1 << 20) - (1 << 12) - 1) * LEAF_M  # in the last cell that the lattice has at all levels
 OFFSETS_M = {"500 m away": 500.0, "last cells": _LAST_M}
 PLACES = ("anywhere", "on borders", "500 m away", "last cells")
 
 
 def points_of(place: str, count: int, dtype: Any, seed: int = 0) -> Array:
-    """Points (count, 3), m, on or beside occupied cells: anywhere, on borders of cells and next to them, or far out."""
+    """Points (count, 3), m, in and beside occupied cells, at one of `PLACES` or in "one cell"."""
     rng = np.random.default_rng([seed, count])
     points = surface(rng, count, offset_m=OFFSETS_M.get(place, 0.0)).astype(dtype)
     if place == "last cells":
@@ -58,7 +58,7 @@ def surface(rng: np.random.Generator, count: int, offset_m: float = 0.0) -> Arra
 
 @functools.cache
 def table_and_reference(place: str, dtype: Any, encoding: Any) -> tuple[_core.VertexTable, Reference]:
-    """Cells round all points that `points_of` gives for the place."""
+    """Table of the cells of `points_of` for the place, and its reference."""
     cells = _core.CellSet(LEAF_M)
     cells.insert(np.ascontiguousarray(points_of(place, _SURFACE_POINTS, dtype, seed=1)))
     table = _core.VertexTable(cells.sorted_keys(), LEAF_M, NUM_LEVELS, encoding)
@@ -66,7 +66,7 @@ def table_and_reference(place: str, dtype: Any, encoding: Any) -> tuple[_core.Ve
 
 
 def relative_error(got: Array, exact: tuple[Array, Array]) -> float:
-    """Largest |error| / sum of |terms|; where there are no terms the result must be zero."""
+    """Largest |error| / Σ|terms|. Where there are no terms, the result must be zero."""
     value, scale = exact
     error = np.abs(got.astype(np.float64) - value)
     assert not error[scale == 0].any()
@@ -74,7 +74,7 @@ def relative_error(got: Array, exact: tuple[Array, Array]) -> float:
 
 
 def interpolation_errors(place: str, count: int, dtype: Any, encoding: Any) -> dict[str, float]:
-    """Largest relative error of each sum; the first derivatives are "backward", those along directions the second."""
+    """Largest relative error of the features y and of their gradients dF and dx; the same of derivatives along v."""
     table, reference = table_and_reference(place, dtype, encoding)
     assert table.num_rows == reference.num_rows
     rng = np.random.default_rng(count)
@@ -86,7 +86,7 @@ def interpolation_errors(place: str, count: int, dtype: Any, encoding: Any) -> d
     table.locate(points, located)
     errors = {}
     for name, directions in (("", None), (" along v", v)):
-        # Filled by the core, which must write every number of the first and the last.
+        # The core must write every number of these two.
         out, points_grad = np.full_like(g, np.nan), np.full_like(points, np.nan)
         features_grad = np.zeros_like(features)
         table.interpolate(features, points, located, directions, out)
@@ -100,13 +100,13 @@ def interpolation_errors(place: str, count: int, dtype: Any, encoding: Any) -> d
     return errors
 
 
-def fourier_error(
-    count: int, dtype: Any, half_width_m: float = 409.6, frequencies: int = 16
-) -> dict[str, float]:
-    """Largest absolute error of sines and cosines, and relative one of the first and second derivative.
+def fourier_error(count: int, dtype: Any) -> dict[str, float]:
+    """Largest absolute error of sines and cosines, and largest relative error of the first and second derivative.
 
-    The reference takes the kernel's rounded position in units of the half width, x̂: all of the rest is the kernel's.
+    The reference starts with the position in units of the half width, rounded as in the kernel. The error is that of
+    everything after that.
     """
+    half_width_m, frequencies = 409.6, 16
     rng = np.random.default_rng(count)
     points = rng.uniform(-500, 500, (count, 3)).astype(dtype)
     points[: count // 8] = np.round(points[: count // 8])
@@ -128,7 +128,7 @@ def fourier_error(
     terms2 = [-sine_g * np.sin(angle) * w**2, -cosine_g * np.cos(angle) * w**2]
 
     def sums(parts: list[Array], factor: Array | float = 1.0) -> tuple[Array, Array]:
-        # Scaled by the largest that the terms can be: a sine near zero has no relative accuracy to ask for.
+        # The scale has the largest possible value of each term, because a sine near zero has no relative accuracy.
         size = (np.abs(sine_g) + np.abs(cosine_g)) * (w if parts is terms else w**2)
         return sum(parts).sum(1) * factor, size.sum(1) * np.abs(factor)  # type: ignore[union-attr]
 
@@ -140,7 +140,7 @@ def fourier_error(
 
 
 def harmonics_error(count: int, dtype: Any) -> float:
-    """Largest absolute error of the spherical harmonics of unit vectors; of these the largest value is about 1."""
+    """Largest absolute error of the spherical harmonics of unit vectors. Their largest value is about 1."""
     directions = np.random.default_rng(count).normal(size=(count, 3))
     rounded = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(dtype)
     got = kernels.spherical_harmonics(torch.from_numpy(rounded)).double().numpy()
@@ -148,7 +148,7 @@ def harmonics_error(count: int, dtype: Any) -> float:
 
 
 def harmonics(directions: Array) -> Array:
-    """(N, 16) real spherical harmonics of degree 0 to 3 from cos, sin and Legendre functions, in long double."""
+    """Real spherical harmonics (N, 16) of degree 0 to 3 from their definition with Legendre functions, long double."""
     x, y, z = directions.T
     rho, azimuth = np.hypot(x, y), np.arctan2(y, x)
     legendre = {
@@ -170,7 +170,7 @@ def harmonics(directions: Array) -> Array:
 
 
 def one_row_error(count: int, dtype: Any, *, same_sign: bool) -> float:
-    """Largest relative error of gradients that are sums over a whole batch in one cell."""
+    """Largest relative error of the gradients if all points of a batch are in one cell."""
     table, reference = table_and_reference("one cell", dtype, _core.Encoding.TRI_QUADTREE)
     rng = np.random.default_rng(count)
     points = points_of("one cell", count, dtype)
@@ -214,11 +214,11 @@ def run(batches: tuple[int, ...] = BATCHES) -> None:
         print(markdown(header, rows), flush=True)
 
         print(
-            f"\n## {isa}: gradient of the rows of one cell that every sample hits, largest |error| / Σ|terms|\n"
+            f"\n## {isa}: gradient of the features with all samples in one cell, largest |error| / Σ|terms|\n"
         )
         rows = [
             [f"{count:,}", np.dtype(dtype).name, *(f"{one_row_error(count, dtype, same_sign=s):.1e}" for s in (True, False))]
             for count, dtype in itertools.product((512, 4096, 65_536, 1_000_000), (np.float32, np.float64))
         ]  # fmt: skip
-        print(markdown(["samples", "type", "of one sign", "of both"], rows), flush=True)
+        print(markdown(["samples", "type", "terms of one sign", "terms of both signs"], rows), flush=True)
     _core.set_instruction_set(before)

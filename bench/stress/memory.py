@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Memory of fits: against the estimate that is made before, and over many fits in one process. On Linux."""
+"""Memory of fits against their estimates, and over many fits in one process. On Linux."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ CASES: list[tuple[int, bool, dict[str, Any]]] = [
     (3_000_000, False, {}),
     (3_000_000, True, {}),
 ]
-"""Returns, whether with intensities, settings."""
-WITHIN = 1.5
-MAX_GROWTH_MB = 8.0  # from a tenth of the fits to the last
+"""Number of returns, with intensities or without, settings."""
+WITHIN = 1.5  # largest factor between estimate and measurement
+MAX_GROWTH_MB = 8.0  # after the first tenth of the fits
 SHORT: dict[str, Any] = {"sdf_iterations": 60, "intensity_iterations": 72, "batch_size": 16384}
-"""The peak is reached once most rows have moved: pages of zeros take no memory."""
+"""Enough iterations for the peak: pages of zeros take no memory until the training writes to them."""
 
 
 def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
@@ -43,9 +43,10 @@ def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
 
 
 def peak_of_a_fit(count: int, with_intensities: bool, changes: dict[str, Any]) -> tuple[Estimate, float]:
-    """The estimate, and the measured peak over what there was before, bytes, in a process of its own."""
+    """The estimate, and the measured growth of the peak memory, bytes, in a new process."""
     case = json.dumps([count, with_intensities, SHORT | changes])
-    # Without the threshold, memory that was freed but kept would hide some of the peak.
+    # With this threshold, the C library returns large freed blocks to the system. Otherwise freed memory would be used
+    # again, and would hide a part of the peak.
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}
     command = [sys.executable, "-m", "bench.stress.memory", case]
     done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
@@ -62,10 +63,10 @@ def _measure(count: int, with_intensities: bool, changes: dict[str, Any]) -> Non
     print(json.dumps([vars(estimate), memory_bytes("VmHWM") - before]))
 
 
-def memory_of_fits(count: int, returns: int = 2000) -> list[float]:
-    """MB that this process has after each of so many small fits with a query and a mesh."""
+def memory_of_fits(count: int) -> list[float]:
+    """Resident memory of this process, MB, after each of `count` small fits with a query and a mesh."""
     scans, config = (
-        _street(returns, True),
+        _street(2000, True),
         FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 12, "batch_size": 1024}),
     )
     found = []
@@ -78,7 +79,7 @@ def memory_of_fits(count: int, returns: int = 2000) -> list[float]:
 
 
 def run(largest: int, fits: int) -> bool:
-    """Print the two tables; whether the estimates are within the factor, and the fits leave nothing behind."""
+    """Print the two tables. True if all estimates are within the factor `WITHIN`, and no fit leaks memory."""
     rows, good = [], True
     for count, with_intensities, changes in CASES:
         if count <= largest:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Damage to the bytes of a file, without knowledge of what they mean."""
+"""Random damage to the bytes of a file of any format."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _INTEGERS = [0, 1, 0xFF, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1, 2**4
 
 
 def boundaries(data: bytes) -> list[int]:
-    """Lengths to cut a file at: every one of the first bytes, round line ends, NULs to something, and the end."""
+    """Lengths at which to cut a file: the first bytes, line ends, zip headers, ends of zeros, and just before the end."""
     ends = set(range(min(len(data), 64)))
     for match in list(re.finditer(rb"\n|PK..|\x00[^\x00]", data, re.DOTALL))[:200]:
         ends |= {match.start(), match.start() + 1, match.end()}
@@ -28,7 +28,7 @@ def boundaries(data: bytes) -> list[int]:
 
 
 def mutate(rng: np.random.Generator, data: bytes, others: list[bytes]) -> bytes:
-    """One to three random changes."""
+    """`data` with one to three random changes, some with parts of `others`."""
     for _ in range(rng.integers(1, 4)):
         data = _one_of(rng, _CHANGES)(rng, data, others)
     return data
@@ -39,7 +39,7 @@ def _one_of(rng: np.random.Generator, items: Sequence[_Item]) -> _Item:
 
 
 def _position(rng: np.random.Generator, data: bytes) -> int:
-    """Anywhere, but half of the time where headers are: near the beginning or the end."""
+    """A random position, in half of the cases near the beginning or the end, where headers are."""
     size = max(len(data), 1)
     if rng.random() < 0.5:
         return int(rng.integers(size))
@@ -86,7 +86,7 @@ def _splice(rng: np.random.Generator, data: bytes, others: list[bytes]) -> bytes
 
 
 def _number(rng: np.random.Generator, data: bytes, _: list[bytes]) -> bytes:
-    """Another number in place of one that is written out."""
+    """A number in the text of the file is replaced."""
     matches = list(_NUMBER.finditer(data[:20_000]))
     if not matches:
         return data

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Interpolation in float64, in plain NumPy, for a million points: what the kernels are measured against.
+"""Interpolation in NumPy and float64: the reference for the errors of the kernels.
 
-Only the position in units of cells is rounded as in the kernel: on a border, a rounding decides which of two cells a
-point is in, both are right, and the gradients by the points differ.
+Only the position in units of cells is rounded as in the kernel. On the border of two cells, this rounding decides in
+which of them a point is. Both are correct, but their gradients by the position differ.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _BIAS = 1 << 20
 
 
 def morton(coordinates: Array) -> Array:
-    """(…, 3) lattice coordinates as interleaved bits, (…,) uint64."""
+    """Morton keys (…,) uint64 of lattice coordinates (…, 3): their interleaved bits."""
     key = np.zeros(coordinates.shape[:-1], np.uint64)
     for bit, axis in itertools.product(range(21), range(3)):
         value = (coordinates[..., axis].astype(np.int64) >> bit) & 1
@@ -31,7 +31,7 @@ def morton(coordinates: Array) -> Array:
 
 @dataclass(frozen=True)
 class Level:
-    """One level of cells: biased coordinates, sorted keys, and for each group of axes the keys of its vertices."""
+    """Sorted Morton keys of the cells of one level; sorted keys of the vertices and first row of each group of axes."""
 
     cell_keys: Array
     vertex_keys: list[Array]
@@ -39,11 +39,11 @@ class Level:
 
 
 class Reference:
-    """The sums of csrc/interpolation_kernels.hpp on a set of leaf cells (C, 3).
+    """The sums of the interpolation kernels of csrc/ on a set of leaf cells (C, 3).
 
-    Each method returns the sum and its scale: the sum of its terms' absolute values, with 1 in place of each linear
-    basis function f and 1 - f. An error divided by the scale is what rounding can be blamed for: terms may cancel, and
-    beside a vertex f is known to a rounding of 1, not of itself.
+    Each method returns the sum and its scale: the sum of the absolute values of its terms, with 1 instead of each
+    linear basis function f and 1 - f. Rounding errors are proportional to this scale, not to the sum: terms may cancel,
+    and near a vertex the rounding error of f is that of 1.
     """
 
     def __init__(self, leaf_cells: Array, leaf_size_m: float, num_levels: int, encoding: Any) -> None:
@@ -66,7 +66,7 @@ class Reference:
 
     @staticmethod
     def _corners(cells: Array, group: tuple[int, ...]) -> Array:
-        """(N, 2^axes, 3) vertices of cells (N, 3), zero along the axes that the group leaves out."""
+        """Vertices (N, 2^axes, 3) of cells (N, 3), with zeros along the axes that are not in the group."""
         steps = np.zeros((2 ** len(group), 3), np.int64)
         for i, axis in enumerate(group):
             steps[:, axis] = np.arange(len(steps)) >> i & 1
@@ -75,22 +75,22 @@ class Reference:
         return corners
 
     def _located(self, points: Array, level: int) -> tuple[Array, Array, Array]:
-        """Whether each point is in a cell, its biased cell, and where in it, in float64."""
+        """Mask of the points in occupied cells (N,), their biased cells (N, 3), and positions in the cells (N, 3)."""
         inverse = points.dtype.type(1.0 / self.leaf_size_m)
         leaf = np.floor(points * inverse).astype(np.int64) + _BIAS
         cell = leaf >> level
         keys = self.levels[level].cell_keys
         found = np.searchsorted(keys, morton(cell))
         inside = keys[np.minimum(found, len(keys) - 1)] == morton(cell)
-        # The kernels' own rounding of the position in cells, 2^-24 of it in float32 (0.03 mm at 500 m), is that of the
-        # coordinates once more. What is measured is all the rest.
+        # The rounding of the position in cells is 2^-24 of it in float32 (0.03 mm at 500 m), as that of the coordinates
+        # themselves. It is not part of the error.
         u = (points * inverse).astype(np.float64) / 2**level
         return inside, cell, u - (cell - (_BIAS >> level))
 
     def _terms(self, points: Array, directions: Array | None) -> Any:
-        """For each level and group: level, points inside, rows (N, K), W (N, K, 2) and dW/dx (N, K, 3, 2).
+        """For each level and group: level, mask of points, rows (N, K), W (N, K, 2) and dW/dx (N, K, 3, 2).
 
-        Of the pair at the end, the second is the scale.
+        The last axis holds the value and its scale.
         """
         inverse = np.float64(points.dtype.type(1.0 / self.leaf_size_m))
         for level, group_number in itertools.product(range(len(self.levels)), range(len(self.groups))):
@@ -105,7 +105,7 @@ class Reference:
             v = None
             if directions is not None:
                 along = directions[inside].astype(np.float64).T
-                v = np.stack([along, np.abs(along)], -1)  # (3, N, 2): v[axis] scales a basis and its scale
+                v = np.stack([along, np.abs(along)], -1)  # (3, N, 2): factors of a value and of its scale
             corners = 2 ** len(group)
             weights = np.zeros((len(f), corners, 2))
             gradients = np.zeros((len(f), corners, 3, 2))
@@ -115,7 +115,7 @@ class Reference:
                 slopes = np.where(upper, 1, -1) * inverse / 2**level
 
                 def basis(*derived: int, parts: tuple[Array, Array] = (factors, slopes)) -> Array:
-                    """Product of the basis functions, or of the derivatives along some axes, and its scale: (N, 2)."""
+                    """Product of the basis functions, with derivatives along some axes, and its scale: (N, 2)."""
                     product = np.ones((len(parts[0]), 2))
                     for axis in group:  # noqa: B023 - called within this iteration
                         if axis in derived:
@@ -136,7 +136,7 @@ class Reference:
             yield level, inside, rows, weights, gradients
 
     def interpolate(self, features: Array, points: Array, directions: Array | None) -> tuple[Array, Array]:
-        """(N, 8 · levels) y = W F."""
+        """Features y = W F, (N, 8 · levels)."""
         out = np.zeros((len(points), len(self.levels), 8, 2))
         F = features.astype(np.float64)
         for level, inside, rows, weights, _ in self._terms(points, directions):
@@ -147,7 +147,7 @@ class Reference:
         return flat[..., 0], flat[..., 1]
 
     def scatter(self, out_grad: Array, points: Array, directions: Array | None) -> tuple[Array, Array]:
-        """(num_rows, 8) Wᵀ g."""
+        """Gradient Wᵀ g of the features, (num_rows, 8)."""
         total = np.zeros((self.num_rows, 8, 2))
         g = self._by_level(out_grad)
         for level, inside, rows, weights, _ in self._terms(points, directions):
@@ -160,7 +160,7 @@ class Reference:
     def coordinate_gradient(
         self, features: Array, out_grad: Array, points: Array, directions: Array | None
     ) -> tuple[Array, Array]:
-        """(N, 3) d(W F · g)/dx."""
+        """Gradient d(W F · g)/dx of the positions, (N, 3)."""
         total = np.zeros((len(points), 3, 2))
         F, g = features.astype(np.float64), self._by_level(out_grad)
         for level, inside, rows, _, gradients in self._terms(points, directions):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Small valid files of every kind, and hostile ones whose outermost layer is whole."""
+"""Small valid files of every format, and malicious ones whose container is valid."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def maps() -> list[bytes]:
 
 @functools.cache
 def training() -> Training:
-    """One that the files of :func:`checkpoints` belong to, of the scans and the configuration of :func:`fit_of_checkpoints`."""
+    """The training of :func:`fit_of_checkpoints`, to which the files of :func:`checkpoints` belong."""
     rays, config = fit_of_checkpoints()
     keys = occupied_leaf_keys(rays, config, 1)
     field = Field(keys, config, with_intensity=True, num_threads=1)
@@ -68,7 +68,7 @@ def training() -> Training:
 
 @functools.cache
 def fit_of_checkpoints() -> tuple[Rays, FitConfig]:
-    """Rays and configuration."""
+    """Rays and configuration of a small fit."""
     scans = _small_scans(True)
     return prepare(scans.points, scans.poses, scans.intensities, **_CONFIG.preparation), _CONFIG
 
@@ -99,7 +99,7 @@ def arrays() -> list[bytes]:
 
 
 def hostile_map(rng: np.random.Generator) -> bytes:
-    """A map whose header is valid JSON of the right length, with one to three of its values exchanged."""
+    """A map whose header is valid JSON of the correct length, with one to three changed values."""
     data = maps()[rng.integers(2)]
     size = int.from_bytes(data[:8], "little")
     header, body = json.loads(data[8 : 8 + size]), data[8 + size :]
@@ -134,14 +134,14 @@ def hostile_map(rng: np.random.Generator) -> bytes:
     text = json.dumps(header).encode()
     if rng.random() < 0.1:  # the same key twice
         text = text[:-1] + b"," + text[1:]
-    if rng.random() < 0.1:  # numbers that are not
+    if rng.random() < 0.1:  # NaN, infinities and extreme numbers
         body = bytes(rng.choice(np.array([0, 0x7F, 0x80, 0xFF, 0xC0], np.uint8), len(body)))
     return len(text).to_bytes(8, "little") + text + body
 
 
 @functools.cache
 def scans() -> list[bytes]:
-    """Compressed and plain, with and without intensities."""
+    """Files of scans, compressed and uncompressed, with and without intensities."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         for with_intensity in (True, False):
@@ -155,7 +155,7 @@ def scans() -> list[bytes]:
 
 
 def hostile_scans(rng: np.random.Generator) -> bytes:
-    """A zip file that is whole, of members that are not."""
+    """A valid zip file with malicious members."""
     with np.load(io.BytesIO(scans()[0])) as file:
         arrays: dict[str, Any] = {name: _npy(array) for name, array in file.items()}
         arrays["static"] = _npy(np.ones(len(file["frame"]), bool))
@@ -261,7 +261,7 @@ def clouds() -> list[bytes]:
 
 
 def trajectories() -> list[bytes]:
-    """Poses that cover the times of the folder's scans."""
+    """Poses that cover the times of the scans of `write_folder`."""
     rows = [
         f"{99.8 + 0.2 * i:.3f} {0.1 * i} 2.5 -1e-3 0 0 {np.sin(0.1 * i):.9f} {np.cos(0.1 * i):.9f}\n"
         for i in range(6)
@@ -270,13 +270,13 @@ def trajectories() -> list[bytes]:
 
 
 def transforms() -> list[bytes]:
-    """A mounting, 4 x 4."""
+    """A rigid transform, 4 x 4, as text."""
     return [b"0 -1 0 0.5\n1 0 0 0\n0 0 1 -0.2 # z\n0 0 0 1\n"]
 
 
 @functools.cache
 def meshes() -> list[bytes]:
-    """PLY files of points, binary and ASCII, and one of a mesh."""
+    """PLY files of points and of a mesh, binary and ASCII."""
     make_cloud: Any = trimesh.PointCloud
     cloud = make_cloud(np.random.default_rng(2).normal(size=(9, 3)))
     box: Any = trimesh.creation.box()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A process that saves two maps to one file by turns is killed, and disks are full: the file is always one of the two."""
+"""Killed processes and full disks while two maps are saved to one file in turn: the file is always one of the two."""
 
 from __future__ import annotations
 
@@ -31,15 +31,22 @@ while True:
 """
 
 
-def kill_savers(folder: Path, kills: int, seed: int = 0) -> tuple[list[int], int]:
-    """How often the file held each of the versions after a kill, and how many temporary files were left behind.
+def kill_savers(folder: Path, kills: int) -> tuple[list[int], int]:
+    """Kill processes that save two maps to one file in turn.
+
+    Returns
+    -------
+    found : list of int
+        How often the file was each of the two maps.
+    left : int
+        Number of temporary files that were left.
 
     Raises
     ------
     AssertionError
         If the file is anything else, or does not load.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     versions = []
     for i, data in enumerate(samples.maps()):
         (folder / f"version{i}.safetensors").write_bytes(data)
@@ -61,7 +68,7 @@ def kill_savers(folder: Path, kills: int, seed: int = 0) -> tuple[list[int], int
         assert saver.wait() == -signal.SIGKILL
         saver.stdout.close()
         found[versions.index(_content(target))] += 1
-        # What a killed process has no chance to remove; it is hidden, and named after the file.
+        # The temporary file of a killed process is hidden, and named after the file.
         for temporary in saved.glob(f".{target.name}.*"):
             temporary.unlink()
             left += 1
@@ -70,19 +77,24 @@ def kill_savers(folder: Path, kills: int, seed: int = 0) -> tuple[list[int], int
 
 
 def _content(path: Path) -> bytes:
-    """All numbers of a map. Not the bytes of its file: in what order safetensors writes metadata is left to chance."""
+    """All numbers of a map. The bytes of its file are not compared: safetensors writes metadata in random order."""
     field = radarsdf.load(path).field
     numbers = [field.cells.table.leaf_keys(), *(tensor.numpy() for tensor in field.state_dict().values())]
     return b"".join(array.tobytes() for array in numbers)
 
 
 def fill_disk(folder: Path) -> list[int]:
-    """Saves a map onto disks of ever more pages, on each of which an older one lies; the sizes for which there was no room.
+    """Save a map on disks of increasing size, on each of which there is an older map.
+
+    Returns
+    -------
+    list of int
+        Sizes of the disks that were too small, in pages.
 
     Raises
     ------
     AssertionError
-        If after an error the old map is not whole, or anything else is there; or after none, the new one.
+        If the file is not the old map after an error, or not the new one without, or if there is another file.
     PermissionError
         If this process may not mount a disk.
     """
@@ -114,17 +126,17 @@ def fill_disk(folder: Path) -> list[int]:
 
 
 def run(kills: int) -> None:
-    """Print what the file was after each kill, and on full disks."""
+    """Print the results of the kills and of the full disks."""
     with tempfile.TemporaryDirectory() as folder:
         found, left = kill_savers(Path(folder), kills)
     rows = [[str(kills), *map(str, found), "0", str(left)]]
-    print(
-        markdown(["kills", "first version", "second version", "anything else", "temporary files left"], rows)
-    )
+    print(markdown(["kills", "first map", "second map", "anything else", "temporary files left"], rows))
     with tempfile.TemporaryDirectory() as folder:
         try:
             refused = fill_disk(Path(folder))
         except (PermissionError, FileNotFoundError) as error:
-            print(f"no full disk: {error}")
+            print(f"full disks were not tested: {error}")
             return
-    print(f"disks of {refused[0]} to {refused[-1]} pages were full: the old map stayed, and nothing else")
+    print(
+        f"disks of {refused[0]} to {refused[-1]} pages were too small: the old map remained, and no other file"
+    )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How much the default configuration's errors depend on its seed: surface and held-out intensity of ten fits."""
+"""Variation of the errors of the default configuration with its seed, of surface and held-out intensity."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from bench.paper.experiment import Options, Row, fit, mean_and_deviation, world_
 from bench.paper.report import markdown
 from bench.paper.scenes import Scene, load_scene
 
-COLUMNS = {"f_score": "F-score, %", "f_score_all": "F, all, %", "mae": "held-out MAE"}
+COLUMNS = {"f_score": "F-score, %", "f_score_all": "F-score, nothing discarded, %", "mae": "held-out MAE"}
 
 
 def rows_of(scene: Scene, options: Options) -> list[Row]:
-    """A row for each seed; the surface of all scans but those held out for the intensity."""
+    """A row for each seed. The fit gets all scans that are not held out for the intensity."""
     train, test = scene.split()
     rows = []
     for seed in tqdm(range(options.repetitions), scene.name, unit="fit", disable=None):
@@ -36,12 +36,12 @@ def rows_of(scene: Scene, options: Options) -> list[Row]:
 
 
 def run(specs: Sequence[str], count: int, *, quick: bool) -> None:
-    """Print a row for each scene: mean ± deviation over the seeds."""
+    """Print a row for each scene, with mean ± standard deviation over the seeds."""
     options = Options(quick, 2 if quick else count, 100_000 if quick else 10_000_000, ("default",), ())
     cells = []
     for spec in specs:
         rows = rows_of(load_scene(spec, frames=4 if quick else None), options)
         cells.append([rows[0]["scene"], str(len(rows)), *(mean_and_deviation(rows, key) for key in COLUMNS)])
     if quick:
-        print("a quick run whose numbers mean nothing")
+        print("quick run: the numbers are meaningless")
     print(markdown(["scene", "seeds", *COLUMNS.values()], cells))

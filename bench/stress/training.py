@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Training at the edges of its settings, and for very long: every number of the map stays finite, or the fit says where."""
+"""Training with extreme settings, and for very long: all numbers of a map stay finite, or a fit raises `Diverged`."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ CASES: dict[str, dict[str, Any]] = {
        (1e-4, 1e-3, 1e-1, 1.0)},
     "learning rates 1, constant": {"learning_rate": 1.0, "intensity_learning_rate": 1.0, "cosine_schedule": False},
     **{f"sigma {s:g} m": {"sigma_m": s} for s in (1e-3, 1e-2, 1.0, 10.0)},
-    # Labels of hundreds of sigmas, and logits that overtake them.
+    # Labels of many sigmas, which saturate, and large logits.
     "saturated": {"sigma_m": 1e-3, "free_beyond_m": 50.0, "learning_rate": 0.1},
     "no free space": {"free_samples": 0},
     "batches of one": {"batch_size": 1, "intensity_batch_size": 1},
     "one near sample": {"near_samples": 1, "free_samples": 1000},
     "all of 3QFPI": {"normals": True, "geometry_feature_dim": 15, "intensity_in_free_space": True},
-    "most is dropped": {"feature_dropout": 0.95, "fourier_dropout": 0.95},
+    "dropout of 95 %": {"feature_dropout": 0.95, "fourier_dropout": 0.95},
     "features of 1e6": {"feature_std": 1e6},
 }  # fmt: skip
-"""Settings beside the default."""
+"""Settings that differ from the default."""
 
 
-def room(returns: int = 300, seed: int = 0) -> tuple[list[Any], Any, list[Any]]:
-    """Three scans, poses and intensities of a box of 8 m x 8 m x 3 m seen from within."""
-    rng = np.random.default_rng(seed)
+def room() -> tuple[list[Any], Any, list[Any]]:
+    """Points, poses and intensities of three scans in a room of 8 m x 8 m x 3 m."""
+    rng = np.random.default_rng(0)
     points, poses, intensities = [], np.eye(4)[None].repeat(3, 0), []
     for i, pose in enumerate(poses):
         pose[:3, 3] = [0.2 * i, 0.0, 0.0]
-        rays = rng.normal(size=(returns, 3))
+        rays = rng.normal(size=(300, 3))
         walls_m = (np.where(rays > 0, [4, 4, 1.5], [-4, -4, -1.5]) - pose[:3, 3]) / rays
         points.append(rays * walls_m.min(axis=1, keepdims=True))
         intensities.append(60 - 40 * np.log10(np.linalg.norm(points[-1], axis=1)))
@@ -45,12 +45,12 @@ def room(returns: int = 300, seed: int = 0) -> tuple[list[Any], Any, list[Any]]:
 
 
 def fitted(changes: dict[str, Any], iterations: int) -> tuple[RadarMap, str]:
-    """A map of the room, and how the fit ended.
+    """A map of the room, and "done" or the message of `Diverged`.
 
     Raises
     ------
     AssertionError
-        If any number of the map, or of its answers, is not finite.
+        If a number of the map, of a query or of the mesh is not finite.
     """
     config = FitConfig(
         **({"batch_size": 256, "intensity_batch_size": 256, "min_range_m": 0.5, "num_threads": 1} | changes)
@@ -73,7 +73,7 @@ def fitted(changes: dict[str, Any], iterations: int) -> tuple[RadarMap, str]:
 
 
 def free_and_solid(radar_map: RadarMap) -> tuple[float, float]:
-    """Shares of places 0.2 m in front of the walls that are free, and 0.2 m behind them that are not."""
+    """Share of points 0.2 m in front of the walls that are free, and of points 0.2 m behind that are solid."""
     rng = np.random.default_rng(2)
     rays = rng.normal(size=(2000, 3))
     on_wall = rays * (np.array([4, 4, 1.5]) / np.abs(rays)).min(axis=1, keepdims=True)
@@ -83,7 +83,7 @@ def free_and_solid(radar_map: RadarMap) -> tuple[float, float]:
 
 
 def run(iterations: int, longest: int) -> None:
-    """Print a row for each case, and one for the longest fit."""
+    """Print a row for each case, and one for a fit of `longest` iterations."""
     rows = []
     for name, changes in [*CASES.items(), ("default, long", {})]:
         count = longest if name == "default, long" else iterations
