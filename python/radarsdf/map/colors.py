@@ -7,31 +7,31 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Indigo to yellow through magenta and orange: lightness 0.32 to 0.93 in OKLab, in steps that look equally large.
+# From indigo through magenta and orange to yellow. The lightness grows from 0.32 to 0.93 in OKLab, in equal steps.
 _ANCHORS = np.array(
     [
         [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
         [245, 113, 79], [253, 156, 70], [254, 197, 84], [249, 237, 82],
     ]
 )  # fmt: skip
-NEUTRAL = (190, 196, 204)  # surfaces without a value
+NEUTRAL = (190, 196, 204)  # light grey, for surfaces without a value
 
 
 def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
-    """Colours of a perceptually uniform map, dark indigo at `low` to bright yellow at `high`.
+    """Colours of a perceptually uniform colour map, from dark indigo at `low` to bright yellow at `high`.
 
     Parameters
     ----------
-    values
-        (N,) scalars. Those outside the limits take the colour of the nearer one; NaN, such as the intensity of
-        an unobserved vertex, is grey.
-    low, high
-        Limits, low ≤ high; where they are equal, everything takes the middle colour.
+    values : (N,) array_like
+        Scalars. Values outside the limits have the colour of the nearer limit. NaN is grey, such as the intensity of a
+        vertex that was not observed.
+    low, high : float
+        Limits, low ≤ high. If they are equal, all values have the middle colour.
 
     Returns
     -------
     (N, 4) uint8
-        Red, green, blue and an alpha of 255.
+        Red, green, blue, and alpha, which is 255.
 
     Raises
     ------
