@@ -15,6 +15,7 @@ import trimesh
 from radarsdf import FitConfig, RadarMap
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 from radarsdf.render.picture import save_picture
+from radarsdf.returns.rays import prepare
 
 from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
 
@@ -134,7 +135,7 @@ def world_returns(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     They are those of the returns within the ranges of the scene.
     """
-    rays = radarsdf.returns.rays.prepare(
+    rays = prepare(
         scene.points,
         scene.poses,
         scene.intensities,

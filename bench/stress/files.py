@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-from radarsdf.cli import _read_mesh, _read_points
+from radarsdf.cli.eval import read_mesh, read_points
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.io.folders import read_posed_folder
 from radarsdf.io.pcd import read_pcd
@@ -76,11 +76,11 @@ def _checkpoint(path: Path) -> None:
 
 
 def _points(path: Path) -> None:
-    assert isinstance(_read_points(path), np.ndarray)
+    assert isinstance(read_points(path), np.ndarray)
 
 
 def _mesh(path: Path) -> None:
-    mesh = _read_mesh(path)
+    mesh = read_mesh(path)
     assert np.asarray(mesh.faces).ndim == 2
 
 
