@@ -160,18 +160,19 @@ def test_sparse_extraction(benchmark, shell, threads):
 
 @dataclass(frozen=True, eq=False)
 class MapLattice:
-    """A fitted map's cells and the signed distance at their corners, as its mesh is made of them."""
+    """The voxels of a fitted map and the signed distances at their corners, as for its mesh."""
 
-    cells: np.ndarray  # (M, 3)
-    values: np.ndarray  # of the corners, in the order of sparse_lattice
-    volume: np.ndarray  # the whole box, 1 where the map says nothing
-    mask: np.ndarray  # of the box: what the map says something about
-    lower: np.ndarray  # (3,) lattice coordinates of the box's corner
+    cells: np.ndarray  # (M, 3) voxels
+    values: np.ndarray  # signed distances at the corners, m, in the order of sparse_lattice
+    volume: np.ndarray  # signed distances in the whole box, m; 1 outside the map
+    mask: np.ndarray  # where `volume` is in the map
+    lower: np.ndarray  # (3,) lattice coordinates of the lower corner of the box
 
-    @cache  # noqa: B019 - as long as the module runs, there is one
+    @cache  # noqa: B019 - the fixture makes only one
     def crossed_edges(self, *, of_cells):
-        """How many edges of the map's cells, or of the box, the surface crosses: each holds one vertex of a mesh."""
-        in_use = np.full(np.add(self.volume.shape, 1), not of_cells)  # cells, one beyond each side of the box
+        """Number of edges of the map's voxels, or of the box, that the surface crosses. A mesh has a vertex on each."""
+        # The voxels that count, with one more on each side of the box.
+        in_use = np.full(np.add(self.volume.shape, 1), not of_cells)
         in_use[tuple((self.cells - self.lower + 1).T)] = True
         positive, count = self.volume > 0, 0
         for axis in range(3):

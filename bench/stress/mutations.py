@@ -20,7 +20,7 @@ _INTEGERS = [0, 1, 0xFF, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1, 2**4
 
 
 def boundaries(data: bytes) -> list[int]:
-    """Lengths at which to cut a file: the first bytes, line ends, zip headers, ends of zeros, and just before the end."""
+    """Lengths at which to cut a file: in the first bytes, at line ends, zip headers, ends of zeros and at the end."""
     ends = set(range(min(len(data), 64)))
     for match in list(re.finditer(rb"\n|PK..|\x00[^\x00]", data, re.DOTALL))[:200]:
         ends |= {match.start(), match.start() + 1, match.end()}
