@@ -1,6 +1,6 @@
 # One place for the warnings and sanitizers of every target of ours.
 option(RADARSDF_WERROR "Treat warnings as errors (CI)" OFF)
-set(RADARSDF_SANITIZE "" CACHE STRING "Sanitizers to build with: address,undefined or thread (tools/sanitize.sh)")
+set(RADARSDF_SANITIZE "" CACHE STRING "Sanitizers to build with: address,undefined or thread (tools/test_core.sh, tools/sanitize.sh)")
 
 function(radarsdf_compiler_options target)
   target_compile_features(${target} PUBLIC cxx_std_17)
