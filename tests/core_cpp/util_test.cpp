@@ -1,0 +1,135 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include <doctest/doctest.h>
+
+#include <algorithm>
+#include <atomic>
+#include <bitset>
+#include <chrono>
+#include <random>
+#include <stdexcept>
+#include <thread>
+#include <vector>
+
+#include "helpers.hpp"
+#include "util/bits.hpp"
+#include "util/instruction_set.hpp"
+#include "util/large_array.hpp"
+#include "util/parallel.hpp"
+#include "util/parallel_sort.hpp"
+
+TEST_CASE("bits are counted and found as std::bitset does") {
+  std::mt19937_64 generator(1);
+  for (int i = 0; i < 10000; ++i) {
+    const std::uint64_t bits = (generator() & generator() & generator()) << (i % 64);
+    REQUIRE(radarsdf::count_bits(bits) == static_cast<int>(std::bitset<64>(bits).count()));
+    if (bits == 0) continue;
+    const int lowest = radarsdf::lowest_bit(bits);
+    REQUIRE((bits >> lowest & 1) == 1);
+    REQUIRE(bits % (std::uint64_t{1} << lowest) == 0);
+  }
+  CHECK(radarsdf::count_bits(~std::uint64_t{0}) == 64);
+  CHECK(radarsdf::lowest_bit(std::uint64_t{1} << 63) == 63);
+  CHECK(radarsdf::lowest_bit(std::uint32_t{1} << 31) == 31);
+}
+
+TEST_CASE("each task runs once") {
+  for (const int threads : test::kThreads) {
+    std::vector<std::atomic<int>> runs(1000);
+    radarsdf::parallel_tasks(1000, threads, [&](std::int64_t i) { ++runs[static_cast<std::size_t>(i)]; });
+    CHECK(std::all_of(runs.begin(), runs.end(), [](const std::atomic<int>& n) { return n == 1; }));
+    radarsdf::parallel_tasks(0, threads, [](std::int64_t) { FAIL("there is no task"); });
+  }
+}
+
+TEST_CASE("blocks cover a range without overlap and are not too long") {
+  for (const int threads : test::kThreads) {
+    for (const std::int64_t size : {0, 1, 511, 512, 100000, 1 << 20}) {
+      std::vector<std::atomic<int>> visits(static_cast<std::size_t>(size));
+      std::atomic<std::int64_t> longest{0};
+      radarsdf::parallel_blocks(size, 512, threads, [&](std::int64_t begin, std::int64_t end) {
+        for (std::int64_t i = begin; i < end; ++i) ++visits[static_cast<std::size_t>(i)];
+        std::int64_t known = longest;
+        while (known < end - begin && !longest.compare_exchange_weak(known, end - begin)) {
+        }
+      });
+      CHECK(std::all_of(visits.begin(), visits.end(), [](const std::atomic<int>& n) { return n == 1; }));
+      CHECK(longest <= 1 << 18);
+    }
+  }
+}
+
+TEST_CASE("the exception of a task is the caller's, and ends the other tasks") {
+  for (const int threads : test::kThreads) {
+    std::atomic<int> begun{0};
+    const auto run = [&] {
+      radarsdf::parallel_tasks(100000, threads, [&](std::int64_t) {
+        ++begun;
+        throw std::runtime_error("of a task");
+      });
+    };
+    CHECK_THROWS_WITH_AS(run(), "of a task", std::runtime_error);
+    CHECK(begun < 1000);
+  }
+}
+
+TEST_CASE("a check for interrupts may end a call, on the calling thread") {
+  static std::atomic<int> asked;
+  for (const int threads : test::kThreads) {
+    asked = 0;
+    radarsdf::set_interrupt_check([] {
+      ++asked;
+      throw std::runtime_error("interrupted");
+    });
+    const auto run = [&] {
+      // Half a second on one thread: it is asked at most ten times a second.
+      radarsdf::parallel_tasks(500 * threads, threads, [](std::int64_t) {
+        std::this_thread::sleep_for(std::chrono::milliseconds(1));
+        radarsdf::check_interrupt();
+      });
+    };
+    CHECK_THROWS_WITH_AS(run(), "interrupted", std::runtime_error);
+    radarsdf::set_interrupt_check(nullptr);
+    CHECK(asked == 1);
+  }
+}
+
+TEST_CASE("a number of threads is positive and has an upper bound") {
+  CHECK(radarsdf::resolve_num_threads(1) == 1);
+  CHECK(radarsdf::resolve_num_threads(0) >= 1);
+  CHECK(radarsdf::resolve_num_threads(1 << 30) <= 1024);
+}
+
+TEST_CASE("numbers are sorted, whatever the threads") {
+  std::mt19937_64 generator(2);
+  for (const std::size_t size : {std::size_t{0}, std::size_t{1}, std::size_t{1000}, std::size_t{300001}}) {
+    std::vector<std::uint64_t> numbers(size);
+    for (std::uint64_t& number : numbers) number = generator() >> 40;  // some of them equal
+    std::vector<std::uint64_t> expected = numbers;
+    std::sort(expected.begin(), expected.end());
+    for (const int threads : test::kThreads) {
+      std::vector<std::uint64_t> sorted = numbers;
+      radarsdf::parallel_sort(sorted, threads);
+      CHECK(sorted == expected);
+    }
+  }
+}
+
+TEST_CASE("the baseline is always there, and names are understood") {
+  const auto available = radarsdf::available_instruction_sets();
+  REQUIRE(!available.empty());
+  CHECK(available[0] == radarsdf::InstructionSet::kBaseline);
+  for (const radarsdf::InstructionSet isa : available) {
+    CHECK(radarsdf::instruction_set_from_name(radarsdf::instruction_set_name(isa)) == isa);
+  }
+  CHECK_THROWS_AS(radarsdf::instruction_set_from_name("sse9"), std::invalid_argument);
+}
+
+TEST_CASE("large memory is usable from end to end") {
+  const auto array = radarsdf::large_array<double>(3 << 20);  // 24 MB: huge pages are asked for
+  std::fill_n(array.get(), 3 << 20, 1.5);
+  CHECK(array[(3 << 20) - 1] == 1.5);
+  radarsdf::LargeVector<int> numbers;
+  for (int i = 0; i < 5000000; ++i) numbers.push_back(i);
+  CHECK(numbers[4999999] == 4999999);
+}
