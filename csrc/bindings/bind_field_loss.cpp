@@ -141,14 +141,14 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       "`intensity`: weights and biases of their layers, `intensity` may be None; `sees`: whether the intensity "
       "network sees SDF, viewing direction and range. The arrays are read anew by each call, where they are.");
   cls.def(
-      "geometry",
+      "sdf",
       [](const AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, double weight,
          Array<std::int32_t>& located, Array<T>& interpolated_grad) {
         const FieldLoss<T>& loss = self.of<T>().loss();
         const LossBatch<T> batch = points_of(points, sdf_m);
         const FeatureGradients<T> gradients = by_features(loss, batch.count, located, interpolated_grad);
         const py::gil_scoped_release release;
-        return loss.geometry(batch, weight, gradients);
+        return loss.sdf(batch, weight, gradients);
       },
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "weight"_a, "located"_a.noconvert(),
       "interpolated_grad"_a.noconvert(),
@@ -169,21 +169,22 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       },
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_near"_a, "dropout"_a, "weights"_a,
       "located"_a.noconvert(), "interpolated_grad"_a.noconvert(),
-      "Like `geometry`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. "
+      "Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. "
       "`rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two "
       "pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of "
       "cells and positions.");
   cls.def(
-      "reflectance",
+      "intensity",
       [](const AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Rows<T>& rays,
          std::int64_t num_near, const std::vector<Bytes>& dropout, double weight) {
         const FieldLoss<T>& loss = self.of<T>().loss();
         const LossBatch<T> batch = rays_of(loss, points, sdf_m, rays, num_near, dropout);
         const py::gil_scoped_release release;
-        return loss.reflectance(batch, weight);
+        return loss.intensity(batch, weight);
       },
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_near"_a, "dropout"_a, "weight"_a,
-      "Like `joint`, of the intensities alone while the geometry is frozen: writes to `intensity_gradients` only.");
+      "Like `joint`, of the intensities alone while the SDF network and the features are frozen: writes to "
+      "`intensity_gradients` only.");
 }
 
 }  // namespace

@@ -29,9 +29,9 @@ double mean(std::int64_t count) { return 1 / static_cast<double>(std::max<std::i
 template <typename T>
 struct Request {
   FieldLosses weights;
-  const std::vector<LayerGradients<T>>* sdf;        // null: the geometry is frozen and has no loss
+  const std::vector<LayerGradients<T>>* sdf;        // null: features and SDF network are frozen, without a loss
   const std::vector<LayerGradients<T>>* intensity;  // null: there is no loss of intensities
-  FeatureGradients<T> by_features;                  // `interpolated` is null where the geometry is frozen
+  FeatureGradients<T> by_features;                  // `interpolated` is null where they are frozen
 };
 
 template <typename T>
@@ -273,7 +273,7 @@ void FieldLoss<T>::check_intensity() const {
 }
 
 template <typename T>
-double FieldLoss<T>::geometry(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features) const {
+double FieldLoss<T>::sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features) const {
   const Request<T> request{{weight, 0}, &gradients_.sdf, nullptr, by_features};
   return Pass<T>(parameters_, options_, batch, request, 0).run().sdf;
 }
@@ -287,7 +287,7 @@ FieldLosses FieldLoss<T>::joint(const LossBatch<T>& batch, FieldLosses weights,
 }
 
 template <typename T>
-double FieldLoss<T>::reflectance(const LossBatch<T>& batch, double weight) const {
+double FieldLoss<T>::intensity(const LossBatch<T>& batch, double weight) const {
   check_intensity();
   const auto located = large_array<std::int32_t>(batch.count * parameters_.table->num_levels());
   const Request<T> request{{0, weight}, nullptr, &gradients_.intensity, {located.get(), nullptr}};

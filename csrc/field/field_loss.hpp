@@ -68,7 +68,7 @@ struct Dropout {
   int keep = 256;
 };
 
-// Samples on rays. The geometry needs points and labels only.
+// Samples on rays. The loss of the signed distances needs points and labels only.
 template <typename T>
 struct LossBatch {
   const T* points;  // (count, 3) local frame, m
@@ -107,11 +107,11 @@ class FieldLoss {
   }
 
   // The loss of the signed distances alone.
-  double geometry(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features) const;
+  double sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features) const;
   // Both losses.
   FieldLosses joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features) const;
-  // The loss of the intensities, by the intensity network alone: the geometry is frozen.
-  double reflectance(const LossBatch<T>& batch, double weight) const;
+  // The loss of the intensities, by the intensity network alone: features and SDF network are frozen.
+  double intensity(const LossBatch<T>& batch, double weight) const;
 
  private:
   void check_intensity() const;

@@ -397,28 +397,40 @@ class FieldLoss:
         `features` (num_rows, 8); `frequencies`: half width (m), the first exponent and how many; `sdf` and `intensity`: weights and biases of their layers, `intensity` may be None; `sees`: whether the intensity network sees SDF, viewing direction and range. The arrays are read anew by each call, where they are.
         """
     @typing.overload
-    def geometry(
+    def intensity(
         self,
         points: numpy.typing.NDArray[numpy.float32],
         sdf_m: numpy.typing.NDArray[numpy.float32],
+        rays: numpy.typing.NDArray[numpy.float32],
+        num_near: typing.SupportsInt | typing.SupportsIndex,
+        dropout: collections.abc.Sequence[
+            tuple[
+                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
+                typing.SupportsInt | typing.SupportsIndex,
+            ]
+        ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
-        located: numpy.typing.NDArray[numpy.int32],
-        interpolated_grad: numpy.typing.NDArray[numpy.float32],
     ) -> float:
         """
-        The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of `weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        Like `joint`, of the intensities alone while the SDF network and the features are frozen: writes to `intensity_gradients` only.
         """
     @typing.overload
-    def geometry(
+    def intensity(
         self,
         points: numpy.typing.NDArray[numpy.float64],
         sdf_m: numpy.typing.NDArray[numpy.float64],
+        rays: numpy.typing.NDArray[numpy.float64],
+        num_near: typing.SupportsInt | typing.SupportsIndex,
+        dropout: collections.abc.Sequence[
+            tuple[
+                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
+                typing.SupportsInt | typing.SupportsIndex,
+            ]
+        ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
-        located: numpy.typing.NDArray[numpy.int32],
-        interpolated_grad: numpy.typing.NDArray[numpy.float64],
     ) -> float:
         """
-        The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of `weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        Like `joint`, of the intensities alone while the SDF network and the features are frozen: writes to `intensity_gradients` only.
         """
     @typing.overload
     def joint(
@@ -440,7 +452,7 @@ class FieldLoss:
         interpolated_grad: numpy.typing.NDArray[numpy.float32],
     ) -> tuple[float, float]:
         """
-        Like `geometry`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
+        Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
         """
     @typing.overload
     def joint(
@@ -462,43 +474,31 @@ class FieldLoss:
         interpolated_grad: numpy.typing.NDArray[numpy.float64],
     ) -> tuple[float, float]:
         """
-        Like `geometry`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
+        Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
         """
     @typing.overload
-    def reflectance(
+    def sdf(
         self,
         points: numpy.typing.NDArray[numpy.float32],
         sdf_m: numpy.typing.NDArray[numpy.float32],
-        rays: numpy.typing.NDArray[numpy.float32],
-        num_near: typing.SupportsInt | typing.SupportsIndex,
-        dropout: collections.abc.Sequence[
-            tuple[
-                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
-                typing.SupportsInt | typing.SupportsIndex,
-            ]
-        ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
+        located: numpy.typing.NDArray[numpy.int32],
+        interpolated_grad: numpy.typing.NDArray[numpy.float32],
     ) -> float:
         """
-        Like `joint`, of the intensities alone while the geometry is frozen: writes to `intensity_gradients` only.
+        The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of `weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
         """
     @typing.overload
-    def reflectance(
+    def sdf(
         self,
         points: numpy.typing.NDArray[numpy.float64],
         sdf_m: numpy.typing.NDArray[numpy.float64],
-        rays: numpy.typing.NDArray[numpy.float64],
-        num_near: typing.SupportsInt | typing.SupportsIndex,
-        dropout: collections.abc.Sequence[
-            tuple[
-                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
-                typing.SupportsInt | typing.SupportsIndex,
-            ]
-        ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
+        located: numpy.typing.NDArray[numpy.int32],
+        interpolated_grad: numpy.typing.NDArray[numpy.float64],
     ) -> float:
         """
-        Like `joint`, of the intensities alone while the geometry is frozen: writes to `intensity_gradients` only.
+        The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of `weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
         """
     @property
     def intensity_gradients(

@@ -216,7 +216,7 @@ TEST_CASE("the gradients of the losses are those of differences") {
       Scene scene(encoding, {all, all, all}, all);
       const FieldLoss<double> loss = scene.loss();
 
-      const auto geometry = [&] { return 0.7 * loss.geometry(scene.batch(), 0.7, scene.by_features()); };
+      const auto geometry = [&] { return 0.7 * loss.sdf(scene.batch(), 0.7, scene.by_features()); };
       geometry();
       check_gradient(scene.features, scene.features_gradient(), geometry);
       check_network(scene.sdf, geometry);
@@ -232,7 +232,7 @@ TEST_CASE("the gradients of the losses are those of differences") {
       check_network(scene.intensity, joint);
 
       const auto by_sdf = scene.sdf.by_weights;
-      const auto reflectance = [&] { return 1.3 * loss.reflectance(scene.batch(), 1.3); };
+      const auto reflectance = [&] { return 1.3 * loss.intensity(scene.batch(), 1.3); };
       reflectance();
       check_network(scene.intensity, reflectance);
       CHECK(scene.sdf.by_weights == by_sdf);  // the geometry is frozen
@@ -274,8 +274,8 @@ TEST_CASE("a loss of parts that do not fit is refused") {
   FieldParameters<double> alone = scene.parameters();
   alone.intensity.clear();
   const FieldLoss<double> geometry(alone, {0.1, false}, {scene.sdf.gradients, {}});
-  CHECK(geometry.geometry(scene.batch(), 1, scene.by_features()) > 0);
-  CHECK_THROWS_AS(geometry.reflectance(scene.batch(), 1), std::invalid_argument);
+  CHECK(geometry.sdf(scene.batch(), 1, scene.by_features()) > 0);
+  CHECK_THROWS_AS(geometry.intensity(scene.batch(), 1), std::invalid_argument);
   CHECK_THROWS_AS(geometry.joint(scene.batch(), {1, 1}, scene.by_features()), std::invalid_argument);
 }
 

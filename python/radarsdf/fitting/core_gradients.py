@@ -42,7 +42,7 @@ class CoreGradients(GradientBackend):
 
     def sdf(self, samples: Samples) -> Gradients:
         touched, parts = self._untouched(samples), self._share.parts
-        loss = self._loss.geometry(
+        loss = self._loss.sdf(
             points=samples.points.numpy(),
             sdf_m=samples.sdf_m.numpy(),
             weight=1 / parts,
@@ -65,7 +65,7 @@ class CoreGradients(GradientBackend):
 
     def intensity(self, samples: Samples) -> Gradients:
         parts = self._share.parts
-        loss = self._loss.reflectance(**self._batch(samples), weight=1 / parts)
+        loss = self._loss.intensity(**self._batch(samples), weight=1 / parts)
         return Gradients({"intensity": loss / parts}, list(self._by_intensity), None)
 
     def _batch(self, samples: Samples) -> dict[str, Any]:
