@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import re
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
@@ -255,6 +255,23 @@ class FitConfig:
     """Where along the rays the training looks."""
     training: Annotated[TrainingConfig, BeforeValidator(_from_mapping(TrainingConfig))] = TrainingConfig()
     """Losses, schedule and optimiser."""
+
+    if TYPE_CHECKING:  # a group can be given as a dict, and is never read as one
+
+        def __init__(
+            self,
+            *,
+            leaf_size_m: float = ...,
+            effort: float = ...,
+            seed: int = ...,
+            num_threads: int = ...,
+            max_memory_bytes: int | None = ...,
+            returns: ReturnsConfig | Mapping[str, Any] = ...,
+            encoding: EncodingConfig | Mapping[str, Any] = ...,
+            networks: NetworksConfig | Mapping[str, Any] = ...,
+            sampling: SamplingConfig | Mapping[str, Any] = ...,
+            training: TrainingConfig | Mapping[str, Any] = ...,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         if self.training.start == "average":
