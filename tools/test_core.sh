@@ -39,7 +39,8 @@ case "${1:-plain}" in
     # Not in Python: PyTorch brings gcc's OpenMP, whose barriers ThreadSanitizer does not see. LLVM's tells it of them
     # through Archer.
     folder=build/test_core_thread
-    build $folder race_check -DRADARSDF_SANITIZE=thread -DCMAKE_BUILD_TYPE=RelWithDebInfo \
+    # Clang's -Wconversion also warns of signs: no errors of these.
+    build $folder race_check -DRADARSDF_WERROR=OFF -DRADARSDF_SANITIZE=thread -DCMAKE_BUILD_TYPE=RelWithDebInfo \
       -DCMAKE_CXX_COMPILER="${CLANGXX:-clang++}"
     program=$folder/tests/core_cpp/race_check
     openmp=$(ldd $program | awk '/libomp/ { print $3; exit }')

@@ -60,7 +60,8 @@ void bind_adam(VertexTableClass& cls) {
 }  // namespace
 
 void bind_optimiser(py::module_& m, VertexTableClass& table) {
-  py::class_<TaskQueue>(m, "TaskQueue", "What of an `adam_step` is left for whoever calls it next.").def(py::init<>());
+  py::class_<TaskQueue>(m, "TaskQueue", "Shares the work of one `adam_step` between several calls of it.")
+      .def(py::init<>());
   bind_adam<float>(table);
   bind_adam<double>(table);
 }

@@ -11,7 +11,7 @@
 namespace radarsdf {
 namespace {
 
-// A thread is woken for about 50 us of work: waking one costs a few.
+// About 50 us of work: to wake a thread for it costs a few us.
 constexpr std::int64_t kMinPoints = 512;
 
 }  // namespace

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The two losses of a batch and their gradients, from points to the gradients of what is learnt, in one call: as dozens
-// of PyTorch's operations, two threads of a fit waited for the interpreter's lock during half of each iteration.
+// The two losses of a batch and the gradients of all parameters, in one call. Written as dozens of PyTorch's
+// operations, it let two threads of a fit wait for the interpreter's lock during half of each iteration.
 #pragma once
 
 #include <cstdint>

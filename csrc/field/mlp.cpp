@@ -13,8 +13,8 @@ namespace radarsdf {
 namespace {
 
 constexpr std::int64_t kTile = 64;         // rows that go through all layers together
-constexpr std::int64_t kMinRows = 512;     // for which a thread is woken
-constexpr std::int64_t kPieceRows = 2048;  // whose gradients are summed before they are added to those of others
+constexpr std::int64_t kMinRows = 512;     // that are worth waking a thread for
+constexpr std::int64_t kPieceRows = 2048;  // that are summed together; then the sums of the pieces are added
 constexpr std::int64_t kMaxPieces = 16;
 
 template <typename T>

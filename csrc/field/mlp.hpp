@@ -1,9 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// A network of linear layers with ReLU between them, forward and backward, a few rows at a time through all layers:
-// what lies between two layers stays in the cache, and an iteration of training waits for the interpreter twice instead
-// of a dozen times.
+// A network of linear layers with ReLU between them, forward and backward. A few rows at a time go through all layers,
+// so that the numbers between two layers stay in the cache.
 #pragma once
 
 #include <cstdint>

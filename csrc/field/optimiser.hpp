@@ -14,7 +14,7 @@
 
 namespace radarsdf {
 
-// Numbers from 0 on for whoever comes first, so that threads of the caller's own share work.
+// Hands out the numbers 0, 1, 2 and so on, each once. With it, threads of the caller share the tasks of one step.
 class TaskQueue {
  public:
   int take() { return next_.fetch_add(1, std::memory_order_relaxed); }

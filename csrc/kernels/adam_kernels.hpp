@@ -17,8 +17,9 @@ struct RowMark {
   std::int32_t place;      // 1 + that of its sum among the sums of the step at hand; 0: the step has not touched it
 };
 
-// One step. What a row missed since it last moved fades as it would have with gradients of zero; only the movement that
-// those would still have caused is left out. So a step costs the rows that it touches, not the map.
+// One step. It visits only the rows that the batch touches, so its cost does not grow with the map. The moments of a
+// row fade for the steps that it missed, as with gradients of zero. Adam would also have moved the row in these steps,
+// by what was left of its mean gradient: that movement is left out.
 template <typename T>
 struct AdamStep {
   T* features;        // (rows, 8)

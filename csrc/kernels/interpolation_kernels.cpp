@@ -128,7 +128,7 @@ template <typename T>
 struct TouchedRows {
   RowSums<T> touched;
   void add(std::int32_t row, Features<T> gradient) {
-    // Without a branch: whether a row has been touched is a toss, and a wrong guess costs more than the sum.
+    // Without a branch: the processor cannot predict whether a row is new, and a wrong guess costs more than the sum.
     const std::int32_t known = touched.marks[row].place;
     touched.rows[touched.count] = row;
     touched.count += known == 0;
@@ -139,8 +139,8 @@ struct TouchedRows {
   }
 };
 
-// The group is a constant, so that what concerns the others is left out; and all is passed by value, or each store into
-// the sums could have changed it.
+// The group is a constant, so that the compiler drops the code of the other groups. Arguments are passed by value: of
+// references, the compiler would have to assume that each store into the sums changes them.
 template <typename C, bool kDirectional, int kGroup, typename T, typename Sums>
 Sums scatter(Interpolation<T> in, const T* __restrict out_grad, std::int64_t stride, Sums sums, int level,
              std::int64_t begin, std::int64_t end) {

@@ -25,8 +25,8 @@ struct Interpolation {
   T inverse_leaf_size;  // 1/m
 };
 
-// Sums of the rows that a batch touches, and which these are, in the order in which they first were. Side by side, they
-// stay in the cache, which sums at the rows' own places would leave on a large map.
+// Sums for the rows that a batch touches, in the order in which it first touches them. They lie side by side and stay
+// in the cache. Sums at the places of the rows would be spread over the memory of a large map.
 template <typename T>
 struct RowSums {
   RowMark* marks;      // of every row

@@ -14,7 +14,8 @@ constexpr int kVectorBytes = 32, kRows = 4;
 #else
 constexpr int kVectorBytes = 16, kRows = 4;
 #endif
-constexpr int kVectors = 2;  // side by side. kRows · kVectors sums hide the latency of four of two multipliers
+constexpr int kVectors =
+    2;  // side by side. Two multipliers with a latency of four need eight sums at once: kRows · kVectors or more
 
 // A block of c, whose sums stay in registers.
 template <int kBlockRows, int kBlockVectors, typename T>

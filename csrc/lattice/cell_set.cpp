@@ -44,7 +44,8 @@ void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uin
   if (!inside) throw std::invalid_argument("points must be finite and within a million cells of the origin");
 }
 
-// Bits that FlatMap does not use for the slot, or the partitions would fill unevenly.
+// By bits of the hash that FlatMap does not use. With the same bits, all keys of a partition would lie in one part of
+// its slots.
 std::size_t CellSet::partition_of(std::uint64_t block) {
   return static_cast<std::size_t>((hash_key(block) >> 16) % kPartitions);
 }

@@ -108,8 +108,8 @@ class BlockMasks {
   std::vector<Block> blocks_;
 };
 
-// The parts of a block whose coordinate along an axis is 0 and 2; 1; 3. In Morton order its bits are `axis` and `axis`
-// + 3.
+// The parts of a block that lie at even places along an axis (0 and 2), at place 1, and at place 3. A part's place is
+// two bits of its Morton number: bit `axis` is the low one and bit `axis + 3` the high one.
 constexpr std::uint64_t parts_where(int axis, bool low_bit, bool any_high_bit, bool high_bit) {
   std::uint64_t mask = 0;
   for (int i = 0; i < 64; ++i) {
@@ -201,7 +201,7 @@ std::int64_t assign_rows(const VertexGroup& group, const std::vector<std::uint64
   return num_vertices;
 }
 
-// Cells of the next coarser level, and the links of the parents to the children.
+// Cells of the next coarser level.
 std::vector<std::uint64_t> parents_of(const std::vector<std::uint64_t>& keys) {
   std::vector<std::uint64_t> parents;
   for (const std::uint64_t key : keys) {

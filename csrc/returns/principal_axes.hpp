@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Eigenvalues and eigenvectors of many symmetric 3 x 3 matrices, by Jacobi's rotations: LAPACK takes most of its time
-// for being called.
+// Eigenvalues and eigenvectors of many symmetric 3 x 3 matrices, by Jacobi's rotations. For matrices as small as these,
+// LAPACK spends most of its time on the call itself.
 #pragma once
 
 #include <cstdint>

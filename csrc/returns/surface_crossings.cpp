@@ -83,8 +83,8 @@ class CellWalk {
     return next_m_[2] < next_m_[axis] ? 2 : axis;
   }
 
-  // The first lattice cell of the cube that the ray goes through: rounding the position gives it but for one cell, and
-  // the distances of the faces decide, those that are equally far in nearest_axis's order.
+  // The first lattice cell of the cube that the ray goes through. The rounded position may be one cell off; then the
+  // distances of the faces decide. Faces at the same distance count in the order of nearest_axis.
   LatticeCell entered_cell() const {
     LatticeCell cell;
     for (int axis = 0; axis < 3; ++axis) {

@@ -23,8 +23,8 @@ constexpr int axis_bit(int axis) { return 4 >> axis; }
 
 constexpr CellEdge cell_edge(int edge) {
   const int axis = edge / 4;
-  const int rest = edge % 4;             // the two bits of the corner that are not the axis's own,
-  const int below = axis_bit(axis) - 1;  // of which those below it keep their place and those above move up
+  const int rest = edge % 4;             // the corner's other two bits: those below the axis's bit stay,
+  const int below = axis_bit(axis) - 1;  // those above it move up by one
   return {(rest & ~below) << 1 | (rest & below), axis};
 }
 

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Memory of many megabytes. It asks for huge pages, as NumPy's arrays do: with small ones, a quarter of the time of a
-// large mesh went into their faults, and of a look-up in a large map into finding out where they are.
+// Memory of many megabytes. It asks for huge pages, as NumPy's arrays do. With small pages, page faults took a quarter
+// of the time of a large mesh, and address translation a quarter of that of a look-up in a large map.
 #pragma once
 
 #include <cstddef>

@@ -51,8 +51,8 @@ void parallel_tasks(std::int64_t num_tasks, int num_threads, const Task& task) {
   if (error) std::rethrow_exception(error);
 }
 
-// Runs body(begin, end) over [0, size) in blocks; no thread is woken for less than min_block items. A block is so short
-// that whoever wants to interrupt the call does not wait for its end.
+// Runs body(begin, end) over [0, size) in blocks; no thread is woken for less than min_block items. A block has an
+// upper bound, so that an interrupt does not wait long for its end.
 template <typename Body>
 void parallel_blocks(std::int64_t size, std::int64_t min_block, int num_threads, const Body& body) {
   if (size <= 0) return;
