@@ -348,7 +348,7 @@ class VertexTable:
 
 class TaskQueue:
     """
-    What of an `adam_step` is left for whoever calls it next.
+    Shares the work of one `adam_step` between several calls of it.
     """
     def __init__(self) -> None: ...
 
