@@ -203,7 +203,7 @@ TEST_CASE("a mask and NaN leave out the cells that they touch") {
   CHECK(measure(cut).area == doctest::Approx(2 * kPi * 1.2 * 1.1).epsilon(0.01));  // a cap of height 1.1
 }
 
-TEST_CASE("two spheres are two components, of a face each at least") {
+TEST_CASE("two spheres are two components") {
   const auto volume = spheres({{-0.9, 0, 0, 0.7}, {0.9, 0, 0, 0.5}});
   const Mesh mesh = radarsdf::marching_cubes_dense(volume.data(), kShape, nullptr, kLattice, 0, 1);
   CHECK(euler_characteristic(mesh) == 4);
