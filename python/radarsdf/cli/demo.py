@@ -35,10 +35,13 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf import fit
     from radarsdf.cli.held_out import print_intensity_errors
     from radarsdf.evaluation import format_metrics, holdout, surface_metrics
+    from radarsdf.io.files import check_outputs
+    from radarsdf.io.meshes import write_mesh
     from radarsdf.io.scans import Scans, write_scans
     from radarsdf.render.picture import save_picture
 
     options.out.mkdir(parents=True, exist_ok=True)
+    check_outputs(options.out / name for name in ("scans.npz", "map.safetensors", "mesh.ply", "picture.png"))
     simulation = radarsdf.simulate.SCENES[options.scene](frames=options.frames)
     scans = Scans(simulation.points, simulation.poses, simulation.intensities, simulation.ground_truth)
     train, test = holdout(len(scans.points))
@@ -58,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
 
     write_scans(options.out / "scans.npz", scans)
     radar_map.save(options.out / "map.safetensors")
-    mesh.export(options.out / "mesh.ply")
+    write_mesh(options.out / "mesh.ply", mesh)
     files = ["scans.npz", "map.safetensors", "mesh.ply"]
     try:
         save_picture(options.out / "picture.png", mesh, scalar=mesh.vertex_attributes["intensity"])

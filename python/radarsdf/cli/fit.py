@@ -43,8 +43,10 @@ def run(options: argparse.Namespace) -> None:
     config = config_of(options)
 
     from radarsdf import Interrupted, estimate, fit
+    from radarsdf.io.files import check_outputs
     from radarsdf.io.scans import read_scans
 
+    check_outputs([options.out, options.checkpoint], [options.scans])
     scans = read_scans(options.scans)
     if options.holdout:
         from radarsdf.evaluation import holdout

@@ -55,8 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Extract the mesh, write it, draw it."""
     import radarsdf
+    from radarsdf.io.files import check_outputs
+    from radarsdf.io.meshes import check_mesh_path, origin_path, write_mesh
     from radarsdf.render.picture import save_picture
 
+    check_mesh_path(options.out)
+    check_outputs([options.out, options.picture], [options.map])
     radar_map = radarsdf.load(options.map)
     mesh = radar_map.mesh(
         options.voxel,
@@ -70,8 +74,10 @@ def run(options: argparse.Namespace) -> None:
     if len(mesh.faces) == 0:
         msg = f"{options.map} has no surface here: nothing written"
         raise ValueError(msg)
-    mesh.export(options.out)
+    origin = write_mesh(options.out, mesh)
     print(f"{len(mesh.vertices)} vertices and {len(mesh.faces)} triangles written to {options.out}")
+    if origin is not None:
+        print(f"in a local frame, whose origin is in {origin_path(options.out)}")
     if options.picture:
         save_picture(options.picture, mesh, scalar=mesh.vertex_attributes.get("intensity"))
         print(f"picture written to {options.picture}")

@@ -4,11 +4,18 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import stat
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
+
+_MAX_NAME_BYTES = 255  # of nearly all file systems
+_MAX_PART_OF_NAME = (
+    50  # characters, of at most four bytes: the temporary name must not be longer than the limit
+)
 
 
 def check_regular_file(path: str | PathLike[str]) -> None:
@@ -30,26 +37,82 @@ def check_regular_file(path: str | PathLike[str]) -> None:
         pass
 
 
-def write_whole(path: str | PathLike[str], data: bytes) -> None:
-    """Writes a file whole or not at all: an old file at `path` is replaced once the new one is on the disk.
+def check_outputs(
+    outputs: Iterable[str | PathLike[str] | None], inputs: Iterable[str | PathLike[str] | None] = ()
+) -> None:
+    """Raises unless each output can be written, and is neither an input nor another output. To be called before the work.
 
-    A process that is killed while it writes may leave a hidden file in the same folder, named `.NAME.` and 16
-    hexadecimal digits.
+    A path that is None is ignored. Links are followed.
 
     Raises
     ------
+    ValueError
+        If an output is the same file as an input or another output, or exists and is no regular file.
+    OSError
+        If an output's folder does not exist or cannot be written to, or the output is a folder.
+    """
+    taken = {os.path.realpath(path): path for path in inputs if path is not None}
+    for path in outputs:
+        if path is None:
+            continue
+        target = os.path.realpath(path)
+        if target in taken:
+            msg = f"{path} is the same file as {taken[target]}, which would be lost: give another name"
+            raise ValueError(msg)
+        taken[target] = path
+        _check_target(Path(target), path)
+        _, temporary = _open_beside(Path(target))
+        temporary.unlink()
+
+
+def write_whole(path: str | PathLike[str], data: bytes) -> None:
+    """Writes a file whole or not at all: an old file at `path` is replaced once the new one is on the disk.
+
+    A link is followed, and the old file's permissions stay. A process that is killed while it writes may leave a hidden
+    file in the same folder, named `.NAME.` and 16 hexadecimal digits.
+
+    Raises
+    ------
+    ValueError
+        If `path` is a pipe, a socket or a device: it would be replaced by a file.
     OSError
         If the file cannot be written. The old file is then as before.
     """
-    target = Path(path)
-    # Not tempfile: only the owner may read its files, and the rename keeps their permissions.
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
+    target = Path(os.path.realpath(path))
+    mode = _check_target(target, path)
+    descriptor, temporary = _open_beside(target)
     try:
-        with temporary.open("xb") as file:
+        with os.fdopen(descriptor, "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
+        if mode is not None:
+            temporary.chmod(mode)
         temporary.replace(target)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _check_target(target: Path, named: str | PathLike[str]) -> int | None:
+    """Permissions of the file that would be replaced; None if there is none."""
+    try:
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        return None
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(named))
+    if not stat.S_ISREG(mode):
+        msg = f"{named} is not a regular file"
+        raise ValueError(msg)
+    return stat.S_IMODE(mode)
+
+
+def _open_beside(target: Path) -> tuple[int, Path]:
+    """A new file in the same folder, since only within a file system does a rename replace at once."""
+    if len(os.fsencode(target.name)) > _MAX_NAME_BYTES:
+        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
+    temporary = target.with_name(f".{target.name[:_MAX_PART_OF_NAME]}.{secrets.token_hex(8)}")
+    # Not tempfile: only the owner may read its files, and the rename would keep that.
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+    return os.open(temporary, flags, 0o666), temporary

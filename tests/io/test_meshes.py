@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Meshes in UTM coordinates survive their files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from radarsdf.io.meshes import MESH_SUFFIXES, origin_path, write_mesh
+
+UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
+
+
+def sphere(origin=UTM_M):
+    mesh = trimesh.creation.icosphere(3, 5.0)
+    mesh.vertices = mesh.vertices + origin
+    mesh.vertex_attributes["confidence"] = np.linspace(0, 1, len(mesh.vertices), dtype=np.float32)
+    return mesh
+
+
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+def test_vertices_are_right_to_a_tenth_of_a_millimetre(tmp_path, suffix):
+    mesh, path = sphere(), tmp_path / f"mesh{suffix}"
+    origin = write_mesh(path, mesh)
+    read = trimesh.load_mesh(path, process=False)
+    vertices = np.asarray(read.triangles).reshape(-1, 3)
+    if origin is not None:
+        assert json.loads(origin_path(path).read_text())["origin"] == origin.tolist()
+        vertices = vertices + origin
+    np.testing.assert_allclose(vertices, np.asarray(mesh.triangles).reshape(-1, 3), atol=1e-4)
+    assert (origin is None) == (suffix not in (".stl", ".glb"))
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".glb"])
+def test_near_the_origin_coordinates_are_those_of_the_world(tmp_path, suffix):
+    assert write_mesh(tmp_path / f"mesh{suffix}", sphere(origin=0.0)) is None
+    assert [path.name for path in tmp_path.iterdir()] == [f"mesh{suffix}"]
+
+
+def test_ply_keeps_attributes_colours_and_faces(tmp_path):
+    mesh = sphere()
+    mesh.visual = trimesh.visual.ColorVisuals(
+        mesh, vertex_colors=np.arange(4 * len(mesh.vertices)).reshape(-1, 4) % 256
+    )
+    write_mesh(tmp_path / "mesh.ply", mesh)
+    read = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    np.testing.assert_array_equal(read.vertices, mesh.vertices)  # to the bit
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    np.testing.assert_array_equal(read.visual.vertex_colors, mesh.visual.vertex_colors)
+    header = (tmp_path / "mesh.ply").read_bytes()[:500]
+    assert b"property double x" in header
+    confidence = read.metadata["_ply_raw"]["vertex"]["data"]["confidence"].ravel()
+    np.testing.assert_array_equal(confidence, mesh.vertex_attributes["confidence"])
+
+
+def test_other_formats_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"can be written as \.ply"):
+        write_mesh(tmp_path / "mesh.dae", sphere())
+    assert list(tmp_path.iterdir()) == []
