@@ -20,6 +20,7 @@ from radarsdf._core import CellSet
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.field.losses import intensity_loss, sdf_loss
+from radarsdf.field.widths import cells_width, fourier_width
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.fitting.sampling import Dropout, RaySampler
 from radarsdf.fitting.training import Training
@@ -40,10 +41,11 @@ class Step:
     def __init__(self, stage, rays, leaf_keys):
         self.stage = stage
         self.frozen = stage == "intensity"
-        self.size = (CONFIG.intensity_batch_size if self.frozen else CONFIG.batch_size) // SHARE
-        torch.manual_seed(0)
+        self.size = (
+            CONFIG.training.intensity_batch_size if self.frozen else CONFIG.training.batch_size
+        ) // SHARE
         self.field = Field(leaf_keys, CONFIG, with_intensity=stage != "geometry")
-        self.field.cells.initialise(CONFIG.feature_std)
+        self.field.initialise(torch.Generator().manual_seed(0))
         if self.frozen:
             self.field.cells.requires_grad_(False)
             self.field.sdf_network.requires_grad_(False)
@@ -57,8 +59,8 @@ class Step:
         (samples,) = self.sampler.spread(self.size) if self.frozen else self.sampler.batch()
         if self.stage == "geometry":
             return samples, None
-        dims = (self.field.cells.dim, self.field.fourier.dim)
-        dropouts = (CONFIG.feature_dropout, CONFIG.fourier_dropout)
+        dims = (cells_width(CONFIG), fourier_width(CONFIG))
+        dropouts = (CONFIG.networks.feature_dropout, CONFIG.networks.fourier_dropout)
         factors = [
             Dropout.draw(samples.num_near, dim, share, self.generator).factors
             for dim, share in zip(dims, dropouts, strict=True)
@@ -149,19 +151,20 @@ def measured(benchmark, step, function, *arguments):
 
 def test_samples(benchmark, step, rays):
     samples, dropout = measured(benchmark, step, step.samples)
-    ray = samples.rays.numpy()
-    points = rays.points[ray] - samples.sdf_m.numpy()[:, None] * rays.directions[ray]
+    points = (samples.of_ray[:, :3] - samples.sdf_m[:, None] * samples.directions).numpy()
     off_m = np.linalg.norm(points - samples.points.numpy(), axis=1)
     # In the last stage, samples are spread across the beam.
-    spread_m = CONFIG.cross_range_noise_rad * rays.ranges_m[ray] if step.frozen else 1e-5
+    spread_m = CONFIG.sampling.cross_range_noise_rad * samples.ranges_m.numpy() if step.frozen else 1e-5
     assert (off_m < 6 * spread_m).all()
     assert np.median(off_m / spread_m) > 1 or not step.frozen
     assert len(samples.points) == step.size
-    assert len(np.unique(ray)) > 0.45 * step.size
+    returns = np.unique(samples.of_ray[:, :3].numpy(), axis=0)
+    assert np.isin(returns, rays.points).all()
+    assert len(returns) > 0.45 * step.size
     if dropout is not None:
         factors = torch.cat(dropout, 1)
         assert factors.mean().item() == pytest.approx(1, abs=0.05)
-        assert (factors == 0).float().mean().item() > CONFIG.fourier_dropout
+        assert (factors == 0).float().mean().item() > CONFIG.networks.fourier_dropout
 
 
 def test_encodings_forward(benchmark, step):
@@ -243,7 +246,7 @@ def test_adam(benchmark, step):
     loss = sum(step.losses(samples, dropout, step.encoded(samples)))
     gradients = torch.autograd.grad(loss, step.parameters)
     before = [p.detach().clone() for p in step.parameters]
-    adam = Adam(step.parameters, CONFIG.learning_rate, CONFIG.adam_epsilon)
+    adam = Adam(step.parameters, CONFIG.training.learning_rate)
     steps = 0
 
     def run():
@@ -253,13 +256,13 @@ def test_adam(benchmark, step):
 
     measured(benchmark, step, run)
     # With a constant gradient, each step of Adam has the length of the learning rate.
-    check_moves(step, before, gradients, steps * CONFIG.learning_rate)
+    check_moves(step, before, gradients, steps * CONFIG.training.learning_rate)
     # Then a gradient that is twice as large.
     before = [p.detach().clone() for p in step.parameters]
     adam.step([2 * gradient for gradient in gradients])
     mean = (0.9 * (1 - 0.9**steps) + 0.1 * 2) / (1 - 0.9 ** (steps + 1))
     square = (0.999 * (1 - 0.999**steps) + 0.001 * 4) / (1 - 0.999 ** (steps + 1))
-    check_moves(step, before, gradients, CONFIG.learning_rate * mean / square**0.5)
+    check_moves(step, before, gradients, CONFIG.training.learning_rate * mean / square**0.5)
 
 
 def check_moves(step, before, gradients, length):
@@ -290,13 +293,13 @@ def test_whole(benchmark, step, rays):
     field = Field(
         step.field.cells.table.leaf_keys(), CONFIG, with_intensity=step.stage != "geometry", num_threads=1
     )
-    field.cells.initialise(CONFIG.feature_std)
+    field.initialise(torch.Generator().manual_seed(0))
     scale = IntensityScale.of(rays.intensities) if step.stage != "geometry" else None
     joint = step.stage == "joint"
     config = CONFIG.override(
         training={
-            "batch_size": CONFIG.batch_size // SHARE,
-            "intensity_batch_size": CONFIG.intensity_batch_size // SHARE,
+            "batch_size": CONFIG.training.batch_size // SHARE,
+            "intensity_batch_size": CONFIG.training.intensity_batch_size // SHARE,
             "sdf_iterations": 1 if step.frozen else STEPS,
             "intensity_iterations": 1 if joint else STEPS,
             "joint": joint,

@@ -66,7 +66,6 @@ def sharp_map(scene):
     """Fitted until the plane and the wall are sharp, by numbers of its own: no test of a map's use is a test of the
     default schedule."""
     config = FitConfig(
-        min_component_triangles=100,
         training={
             "sdf_iterations": 150,
             "intensity_iterations": 60,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from radarsdf import FitConfig
-from radarsdf.fitting.fit import occupied_leaf_keys
+from radarsdf.fitting.start import near_leaf_keys
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.support import support_of_points
@@ -57,7 +57,7 @@ def row(returns: int, threads: int) -> dict[str, Any]:
         lambda: find_ghosts(Surfels.of(rays, config.leaf_size_m, threads), rays, num_threads=threads),
     )
     kept = rays.select(~is_ghost)
-    leaf_keys = occupied_leaf_keys(kept, config, threads)
+    leaf_keys = near_leaf_keys(kept, config, threads)
     counts, support = _measured(
         "support", lambda: support_of_points(kept.points, leaf_keys, config.leaf_size_m, threads)
     )

@@ -5,16 +5,16 @@
 from __future__ import annotations
 
 import argparse
-import ast
+import inspect
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from radarsdf import FitConfig
+from radarsdf import FitConfig, RadarMap
 from tqdm import tqdm
 
 from bench.peers.interface import PEERS
+from bench.settings import Changes, parsed
 
 from . import ablation, angles, curve, intensity, map_size, sparse, surface, views
 from .experiment import Experiment, Options, Row
@@ -86,16 +86,13 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"written: {', '.join(str(stem.with_suffix(suffix)) for suffix in ('.md', '.json', '.png'))}")
 
 
-def _changes(settings: list[str]) -> dict[str, Any]:
-    """Changes of `FitConfig` from words `NAME=VALUE`; a ValueError if one of them is not valid."""
-    changes: dict[str, Any] = {}
-    for setting in settings:
-        name, _, text = setting.partition("=")
-        try:
-            changes[name] = ast.literal_eval(text)
-        except (SyntaxError, ValueError):
-            changes[name] = text  # a word, such as octree
-    FitConfig.from_dict(FitConfig().to_dict() | changes)
+def _changes(settings: list[str]) -> Changes:
+    """`NAME=VALUE` words as changes of a configuration, and under `mesh` of a mesh, that has them all."""
+    changes = parsed(settings)
+    FitConfig().override(**{name: value for name, value in changes.items() if name != "mesh"})
+    if unknown := set(changes.get("mesh", {})) - set(inspect.signature(RadarMap.mesh).parameters):
+        msg = f"unknown setting mesh.{min(unknown)}"
+        raise ValueError(msg)
     return changes
 
 
@@ -148,7 +145,8 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="curve: also measure these settings of FitConfig; may be repeated",
+        help="curve: one more point, with these settings of FitConfig, such as training.joint=False, or of the mesh, such as "
+        "mesh.min_support=0; may be repeated",
     )
     return parser
 

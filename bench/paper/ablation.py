@@ -6,30 +6,31 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from radarsdf.evaluation import intensity_metrics
+
+from bench.settings import Changes, merged
 
 from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, world_returns
 from .report import figure, markdown
 from .scenes import Scene
 
 # All inputs of the paper, also those that the default configuration does not use.
-_FULL: dict[str, Any] = {
-    "normals": True,
-    "geometry_feature_dim": 15,
-    "sdf_input": True,
-    "view_direction": True,
+_FULL: Changes = {
+    "networks": {"normals": True, "geometry_feature_dim": 15, "sdf_input": True, "view_direction": True}
 }
-_VARIANTS: dict[str, dict[str, Any]] = {
+_VARIANTS: dict[str, Changes] = {
     "full": {},
     # Without the SDF loss, features and intensity network learn from the intensities alone: our reading of the paper's
     # "training only the intensity network".
-    "w/o SDF": {"sdf_input": False, "normals": False, "geometry_feature_dim": 0, "sdf_loss_weight": 0.0},
-    "w/o SDF normals": {"normals": False},
-    "w/o geometry feature": {"geometry_feature_dim": 0},
-    "w/o viewing direction": {"view_direction": False},
+    "w/o SDF": {
+        "networks": {"sdf_input": False, "normals": False, "geometry_feature_dim": 0},
+        "training": {"sdf_loss_weight": 0.0},
+    },
+    "w/o SDF normals": {"networks": {"normals": False}},
+    "w/o geometry feature": {"networks": {"geometry_feature_dim": 0}},
+    "w/o viewing direction": {"networks": {"view_direction": False}},
 }
 
 
@@ -55,7 +56,7 @@ def tasks(scene: Scene, options: Options) -> list[Task]:
 
 def _repetition(scene: Scene, options: Options, base: str, variant: str, seed: int) -> list[Row]:
     train, test = scene.split()
-    config = options.config(base, scene, seed=seed, **(_FULL | _VARIANTS[variant]))
+    config = options.config(base, scene, seed=seed, **merged(_FULL, _VARIANTS[variant]))
     x, sensors, measured = world_returns(test)
     metrics = intensity_metrics(fit(train, config).intensity(x, sensors), measured)
     return [{"scene": scene.name, "base": base, "variant": variant, "seed": seed, **metrics}]

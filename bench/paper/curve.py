@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from radarsdf import FitConfig
 
 from bench.peers.interface import PEERS, Peer
+from bench.settings import Changes, flat
 
 from . import surface
 from .experiment import Experiment, Options, Row, Task, groups
@@ -27,20 +27,20 @@ _FACTORS = {"1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "1/2": 1 / 2, "1": 1.0, 
 _QUICK_FACTORS = ("1/16",)
 _OURS = ("radarsdf", "radarsdf, intensities")
 # Settings that differ from the default, measured one by one, with intensities.
-_LEVERS: tuple[dict[str, Any], ...] = (
-    {"drop_ghosts": False},
-    {"min_support": 0.0},
-    {"bridge_cells": 0},
-    {"row_updates": False},
-    {"joint": False},
-    {"fourier_count": 16},
-    {"normals": True},
-    {"geometry_feature_dim": 15},
-    {"encoding": "octree"},
-    {"feature_dropout": 0.0, "fourier_dropout": 0.0},
-    {"cross_range_noise_rad": 0.0},
-    {"intensity_hidden": (64, 64)},
-    {"batch_size": 8192},
+_LEVERS: tuple[Changes, ...] = (
+    {"returns": {"drop_ghosts": False}},
+    {"mesh": {"min_support": 0.0}},
+    {"encoding": {"bridge_cells": 0}},
+    {"training": {"row_updates": False}},
+    {"training": {"joint": False}},
+    {"encoding": {"fourier_count": 16}},
+    {"networks": {"normals": True}},
+    {"networks": {"geometry_feature_dim": 15}},
+    {"encoding": {"kind": "octree"}},
+    {"networks": {"feature_dropout": 0.0, "fourier_dropout": 0.0}},
+    {"sampling": {"cross_range_noise_rad": 0.0}},
+    {"networks": {"intensity_hidden": (64, 64)}},
+    {"training": {"batch_size": 8192}},
 )
 _SURFACE = {column[0]: column for column in surface.COLUMNS}
 _COLUMNS: tuple[Column, ...] = (
@@ -60,15 +60,9 @@ _PANELS = (
 )
 
 
-def budget(factor: float) -> dict[str, Any]:
+def budget(factor: float) -> Changes:
     """Settings of a fit that trains `factor` times as long as the default."""
-    default = FitConfig()
-    return {
-        "sdf_passes": default.sdf_passes * factor,
-        "min_sdf_iterations": max(1, round(default.min_sdf_iterations * factor)),
-        "intensity_passes": default.intensity_passes * factor,
-        "min_intensity_iterations": max(1, round(default.min_intensity_iterations * factor)),
-    }
+    return {"effort": factor}
 
 
 def _methods(options: Options) -> list[tuple[str, str, Peer]]:
@@ -79,7 +73,7 @@ def _methods(options: Options) -> list[tuple[str, str, Peer]]:
             peer = PEERS[line].with_changes(**budget(_FACTORS[factor]))
             found.append((line, f"{line}, × {factor}", peer))
     for changes in (*(_LEVERS[:1] if options.quick else _LEVERS), *options.levers):
-        name = ", ".join(f"{key}={value}" for key, value in changes.items())
+        name = ", ".join(f"{key}={value}" for key, value in flat(changes).items())
         found.append(("lever", name, PEERS[_OURS[1]].with_changes(**changes)))
     # The fits of this package are in the lines already, with a budget of 1.
     found += [("peer", name, PEERS[name]) for name in options.peers if name not in _OURS]

@@ -18,11 +18,14 @@ from radarsdf.render.picture import save_picture
 from radarsdf.returns.rays import prepare
 
 from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
+from bench.settings import Changes, merged
 
 from .scenes import Scene
 
 Row = dict[str, Any]
 """One result: numbers, words and arrays. It always has `scene`, and `why_not` if a result is missing."""
+
+_SHORT: Changes = {"training": {"sdf_iterations": 20, "intensity_iterations": 40}}
 
 
 @dataclass(frozen=True)
@@ -40,21 +43,20 @@ class Options:
     """Names of `PEERS`."""
     meshes: Path | None = None
     """Folder for the meshes of `measure` and their pictures."""
-    levers: tuple[dict[str, Any], ...] = ()
-    """Settings that `curve` measures besides its own."""
+    levers: tuple[Changes, ...] = ()
+    """Settings, and under `mesh` arguments of the mesh, that `curve` measures besides its own."""
 
     def config(self, base: str, scene: Scene, **changes: Any) -> FitConfig:
         """The configuration `base` with the ranges of the scene and other changes."""
-        ranges = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
-        short = {"sdf_iterations": 20, "intensity_iterations": 40} if self.quick else {}
-        settings = ranges | short | changes
-        return FitConfig.paper(**settings) if base == "paper" else FitConfig(**settings)
+        config = FitConfig.paper() if base == "paper" else FitConfig()
+        config = config.override(returns={"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m})
+        return config.override(**merged(_SHORT if self.quick else {}, changes))
 
     def reconstruct(self, method: str | Peer, scene: Scene, held_out: Scene | None = None) -> Reconstruction:
         """The surface of a peer for a scene. With `held_out`, also its intensities at the returns of that scene."""
         peer = PEERS[method] if isinstance(method, str) else method
         if self.quick:
-            peer = peer.with_changes(sdf_iterations=20, intensity_iterations=40)
+            peer = peer.with_changes(**_SHORT)
         return reconstruct(
             peer,
             scene.points,

@@ -8,6 +8,8 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
+from bench.settings import Changes, merged
+
 from .experiment import Experiment, Options, Row, Task, fit, groups
 from .report import figure, markdown
 from .scenes import Scene
@@ -15,8 +17,8 @@ from .scenes import Scene
 _STEPS = (10, 5, 3, 2, 1)  # of 117 scans, these leave 12, 24, 39, 59 and 117 as in the paper
 _BYTES_PER_RETURN = 16  # x, y, z and intensity in float32
 _REFERENCE = "SHINE (octree)"
-_MAPS = {
-    _REFERENCE: ("paper", {"encoding": "octree", "fourier_count": 0}, False),
+_MAPS: dict[str, tuple[str, Changes, bool]] = {
+    _REFERENCE: ("paper", {"encoding": {"kind": "octree", "fourier_count": 0}}, False),
     "3QFPI": ("paper", {}, True),
     "radarsdf": ("default", {}, True),
 }
@@ -47,7 +49,8 @@ def _others(scene: Scene, options: Options) -> list[Row]:
 def _ours(scene: Scene, name: str, options: Options) -> list[Row]:
     base, changes, with_intensity = _MAPS[name]
     # The size does not depend on the training, so one iteration is enough.
-    config = options.config(base, scene, **(changes | {"sdf_iterations": 1, "intensity_iterations": 1}))
+    short: Changes = {"training": {"sdf_iterations": 1, "intensity_iterations": 1}}
+    config = options.config(base, scene, **merged(changes, short))
     if not with_intensity:
         scene = scene.without_intensities()
     radar_map = fit(scene, config)

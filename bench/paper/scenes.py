@@ -145,7 +145,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
         scene = _file(Path(spec), frames)
     elif is_snail_radar(Path(spec)):
         scene = _recorded(Path(spec).resolve().name, read_snail_radar(Path(spec), frames), frames)
-        scene = scene.override(returns={"min_range_m": _MIN_RANGE_OCULII_M})
+        scene = dataclasses.replace(scene, min_range_m=_MIN_RANGE_OCULII_M)
     elif is_posed_folder(Path(spec)):
         scene = _recorded(Path(spec).resolve().name, read_posed_folder(Path(spec), frames), frames)
     else:
@@ -173,9 +173,10 @@ def _simulated(simulation: Simulation) -> Scene:
 def _file(path: Path, frames: int | None) -> Scene:
     scans = read_scans(path)
     scene = _recorded(path.stem, scans, frames)
-    scene = scene.override(
+    scene = dataclasses.replace(
+        scene,
         holdout_every=_HOLDOUT_EVERY_SHORT if len(scans.points) < _SHORT_FRAMES else _HOLDOUT_EVERY,
-        returns={"max_range_m": _MAX_RANGE_FILE_M},
+        max_range_m=_MAX_RANGE_FILE_M,
     )
     return dataclasses.replace(scene, ground_truth=_seen_by_both(scene))
 

@@ -34,7 +34,7 @@ def _rows(scene: Scene, options: Options, base: str, variant: str) -> list[Row]:
     if scene.intensities is None:
         return [row | {"why_not": "the scene has no intensities"}]
     train, test = scene.split()
-    radar_map = fit(train, options.config(base, scene, view_direction=_VARIANTS[variant]))
+    radar_map = fit(train, options.config(base, scene, networks={"view_direction": _VARIANTS[variant]}))
     x, sensors, measured = world_returns(test)
     reflector = _reflector(scene)
     row |= {"angle_deg": _angle_deg(sensors, reflector), "distance_m": np.linalg.norm(x - reflector, axis=1)}

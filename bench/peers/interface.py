@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from bench.settings import Changes, merged
+
 ROOT = Path(__file__).resolve().parents[2]
 VDBFUSION_ENVIRONMENT = ROOT / "build" / "peers" / "vdbfusion"
 INSTALL = {
@@ -43,16 +45,29 @@ class Peer:
     intensities: bool = False
     """Whether it uses the intensities."""
 
-    def with_changes(self, **changes: Any) -> Peer:
-        """The same peer with other settings of `FitConfig`. Methods of other packages are returned unchanged."""
+    def with_changes(self, *, mesh: dict[str, Any] | None = None, **changes: Any) -> Peer:
+        """The same peer with other settings of `FitConfig` and other arguments of its mesh. Methods of other packages stay."""
         if "changes" not in self.options:
             return self
-        return replace(self, options=self.options | {"changes": self.options["changes"] | changes})
+        options = {
+            "changes": merged(self.options["changes"], changes),
+            "mesh": self.options["mesh"] | (mesh or {}),
+        }
+        return replace(self, options=self.options | options)
+
+
+# What the published mesh leaves out.
+_MESHES: dict[str, dict[str, Any]] = {"paper": {"min_support": 0.0, "min_component_triangles": 300}}
 
 
 def _fit(name: str, base: str, *, intensities: bool = False, voxel_m: float = 0.1, **changes: Any) -> Peer:
-    options = {"base": base, "changes": changes, "voxel_m": voxel_m}
+    mesh = {"voxel_size": voxel_m} | _MESHES.get(base, {})
+    options = {"base": base, "changes": changes, "mesh": mesh}
     return Peer(name, "radarsdf_fits:radarsdf_fit", options, needs="radarsdf", intensities=intensities)
+
+
+_OCTREE: Changes = {"encoding": {"kind": "octree"}}
+_PUBLISHED_RATE: Changes = {"training": {"learning_rate": 1e-2}}
 
 
 PEERS = {
@@ -63,11 +78,13 @@ PEERS = {
         Peer("Poisson", "open3d_meshes:poisson", {"depth": 12}, "open3d"),
         Peer("VDBFusion", "vdbfusion_tsdf:vdbfusion", {"voxel_m": 0.2}, "vdbfusion"),
         # 3QFP and the representation of SHINE-Mapping, computed by this package with the published learning rate.
-        _fit("SHINE (octree)", "paper", encoding="octree", fourier_count=0, learning_rate=1e-2),
-        _fit("3QFP", "paper", learning_rate=1e-2),
+        _fit(
+            "SHINE (octree)", "paper", **merged(_OCTREE, {"encoding": {"fourier_count": 0}}, _PUBLISHED_RATE)
+        ),
+        _fit("3QFP", "paper", **_PUBLISHED_RATE),
         _fit("3QFPI", "paper", intensities=True),
         _fit("radarsdf, quick", "quick", voxel_m=0.2),
-        _fit("radarsdf, octree", "default", encoding="octree"),
+        _fit("radarsdf, octree", "default", **_OCTREE),
         _fit("radarsdf", "default"),
         _fit("radarsdf, intensities", "default", intensities=True),
     )
@@ -144,7 +161,8 @@ def reconstruct(
         arrays |= {"query_points": queries[0] - origin, "query_sensors": queries[1] - origin}
     options = dict(peer.options)
     if "changes" in options:
-        options["changes"] = {"min_range_m": 0.0} | options["changes"]  # near returns are dropped already
+        # The ranges are cut already.
+        options["changes"] = merged({"returns": {"min_range_m": 0.0}}, options["changes"])
     with tempfile.TemporaryDirectory() as folder:
         scans_path, result_path = Path(folder) / "scans.npz", Path(folder) / "result.npz"
         np.savez(scans_path, **arrays)

@@ -20,10 +20,9 @@ _BASES = {
 }
 
 
-def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], voxel_m: float = 0.1) -> Made:
-    """Fit a map and extract its mesh. `base` names one of `_BASES`. Intensities are used if `scans` has them."""
-    settings = _BASES[base].to_dict() | changes
-    config = radarsdf.FitConfig.from_dict(settings)  # it turns the lists of JSON into tuples
+def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], mesh: dict[str, Any]) -> Made:
+    """Fit and mesh. `base` is one of `_BASES`, `mesh` has arguments of the mesh; intensities are used where there are any."""
+    config = _BASES[base].override(**changes)
     frames = [np.flatnonzero(scans.frame == i) for i in range(len(scans.poses))]
     radar_map = radarsdf.fit(
         [scans.points[own] for own in frames],
@@ -33,7 +32,7 @@ def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], voxel_m:
         progress=False,
     )
     started = time.perf_counter()
-    mesh = radar_map.mesh(voxel_m, progress=False)
+    surface = radar_map.mesh(**mesh, progress=False)
     report = radar_map.report | {"mesh_s": time.perf_counter() - started}
     intensity = radar_map.intensity if radar_map.has_intensity else None
-    return Made(mesh.vertices, mesh.faces, radar_map.nbytes, report, intensity)
+    return Made(surface.vertices, surface.faces, radar_map.nbytes, report, intensity)

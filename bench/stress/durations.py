@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import radarsdf
@@ -21,35 +20,46 @@ from scipy.optimize import nnls
 
 from bench.growth.street import street
 from bench.paper.report import markdown
+from bench.settings import Changes, flat, merged
 
-WITHIN = 2.0  # largest factor between estimate and measurement
-PRESETS: dict[str, Callable[..., FitConfig]] = {
+WITHIN = 2.0
+PRESETS: dict[str, Callable[[], FitConfig]] = {
     "default": FitConfig,
     "quick": FitConfig.quick,
     "paper": FitConfig.paper,
 }
-SHORT: dict[str, Any] = {"sdf_iterations": 100, "intensity_iterations": 300}
-CASES: list[tuple[int, bool, str, dict[str, Any]]] = [
+SHORT: Changes = {"training": {"sdf_iterations": 100, "intensity_iterations": 300}}
+CASES: list[tuple[int, bool, str, Changes]] = [
     (10_000, True, "default", {}),
     (30_000, False, "default", {}),
     (30_000, True, "default", {"num_threads": 1}),
-    (30_000, True, "default", {"joint": False}),
-    (30_000, True, "default", SHORT | {"encoding": "octree"}),
-    (30_000, True, "default", SHORT | {"sdf_hidden": (128, 128), "intensity_hidden": (128, 128, 128)}),
-    (30_000, True, "default", SHORT | {"num_levels": 6, "fourier_count": 16}),
-    (30_000, True, "default", SHORT | {"batch_size": 32768, "intensity_batch_size": 32768}),
+    (30_000, True, "default", {"training": {"joint": False}}),
+    (30_000, True, "default", SHORT | {"encoding": {"kind": "octree"}}),
+    (
+        30_000,
+        True,
+        "default",
+        SHORT | {"networks": {"sdf_hidden": (128, 128), "intensity_hidden": (128, 128, 128)}},
+    ),
+    (30_000, True, "default", SHORT | {"encoding": {"num_levels": 6, "fourier_count": 16}}),
+    (
+        30_000,
+        True,
+        "default",
+        merged(SHORT, {"training": {"batch_size": 32768, "intensity_batch_size": 32768}}),
+    ),
     (10_000, True, "paper", SHORT),
     (100_000, False, "paper", SHORT | {"num_threads": 1}),
     (100_000, True, "default", {}),
     (100_000, False, "default", {"num_threads": 1}),
     (100_000, False, "quick", {}),
-    (300_000, False, "default", {"sdf_iterations": 300}),
-    (300_000, False, "default", {"sdf_iterations": 50, "row_updates": False}),
+    (300_000, False, "default", {"training": {"sdf_iterations": 300}}),
+    (300_000, False, "default", {"training": {"sdf_iterations": 50, "row_updates": False}}),
     (300_000, False, "quick", {"num_threads": 1}),
     (1_000_000, False, "quick", {}),
-    (1_000_000, False, "default", {"sdf_iterations": 100, "drop_ghosts": False}),
+    (1_000_000, False, "default", {"training": {"sdf_iterations": 100}, "returns": {"drop_ghosts": False}}),
     (1_000_000, True, "default", SHORT),
-    (1_000_000, False, "default", {"sdf_iterations": 20, "leaf_size_m": 0.8, "num_threads": 1}),
+    (1_000_000, False, "default", {"training": {"sdf_iterations": 20}, "leaf_size_m": 0.8, "num_threads": 1}),
 ]
 """Number of returns, with intensities or without, preset, settings."""
 
@@ -66,9 +76,7 @@ class Fit:
     """Processor time of all threads. Other processes hardly change it."""
 
 
-def measured(
-    count: int, with_intensities: bool, preset: str, changes: dict[str, Any], repetitions: int
-) -> Fit:
+def measured(count: int, with_intensities: bool, preset: str, changes: Changes, repetitions: int) -> Fit:
     """The shortest times of `repetitions` fits, each in its own process."""
     case = json.dumps([count, with_intensities, preset, changes])
     command = [sys.executable, "-m", "bench.stress.durations", case]
@@ -80,11 +88,10 @@ def measured(
     return dataclasses.replace(min(fits, key=lambda fit: fit.wall_s), processor_s=least_s)
 
 
-def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str, Any]) -> None:
+def _measure(count: int, with_intensities: bool, preset: str, changes: Changes) -> None:
     scene = street(count)
     returns = (scene.points, scene.poses, scene.intensities if with_intensities else None)
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
-    config = PRESETS[preset](**settings)
+    config = PRESETS[preset]().override(**changes)
     estimate = radarsdf.estimate(*returns, config=config)
     schedule = Schedule.of(
         config,
@@ -102,7 +109,10 @@ def _measure(count: int, with_intensities: bool, preset: str, changes: dict[str,
         with_intensity=with_intensities,
     )
     # A small fit first: the estimate does not include what PyTorch sets up in its first steps.
-    small, tiny = street(2000), FitConfig(training={"sdf_iterations": 5, "intensity_iterations": 10})
+    small, tiny = (
+        street(2000),
+        FitConfig().override(training={"sdf_iterations": 5, "intensity_iterations": 10}),
+    )
     radarsdf.fit(small.points, small.poses, small.intensities, config=tiny, progress=False)
     wall_s, processor_s = time.perf_counter(), time.process_time()
     radarsdf.fit(*returns, config=config, progress=False)
@@ -129,7 +139,7 @@ def run(largest: int, repetitions: int) -> bool:
     anew = constants(fits)
     rows, good = [], True
     for (count, with_intensities, preset, changes), fit in zip(cases, fits, strict=True):
-        settings = ", ".join([preset, *(f"{k} {v}" for k, v in changes.items())])
+        settings = ", ".join([preset, *(f"{k} {v}" for k, v in flat(changes).items())])
         estimated_s, anew_s = (
             sum(seconds[kind] * fit.work[kind] for kind in seconds) for seconds in (durations.SECONDS, anew)
         )

@@ -83,7 +83,7 @@ def run(returns: int, moments: int) -> bool:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores SIGINT
     scans = street(returns)
     points, poses = scans.points, scans.poses
-    config = FitConfig(training={"sdf_iterations": 100})
+    config = FitConfig().override(training={"sdf_iterations": 100})
     radar_map = radarsdf.fit(points, poses, config=config, progress=False)
     rows, longest_s = [], 0.0
     works: dict[str, Callable[[], Any]] = {

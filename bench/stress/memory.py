@@ -18,22 +18,23 @@ from radarsdf import Estimate, FitConfig
 from bench.growth.street import street
 from bench.memory import memory_bytes
 from bench.paper.report import markdown
+from bench.settings import Changes, flat, merged
 
-CASES: list[tuple[int, bool, dict[str, Any]]] = [
+CASES: list[tuple[int, bool, Changes]] = [
     (10_000, True, {}),
     (100_000, False, {}),
     (100_000, True, {}),
-    (100_000, True, {"batch_size": 65536, "intensity_batch_size": 65536}),
-    (300_000, True, {"encoding": "octree"}),
-    (1_000_000, True, {"drop_ghosts": False, "leaf_size_m": 0.8}),
+    (100_000, True, {"training": {"batch_size": 65536, "intensity_batch_size": 65536}}),
+    (300_000, True, {"encoding": {"kind": "octree"}}),
+    (1_000_000, True, {"returns": {"drop_ghosts": False}, "leaf_size_m": 0.8}),
     (1_000_000, True, {}),
     (3_000_000, False, {}),
     (3_000_000, True, {}),
 ]
-"""Number of returns, with intensities or without, settings."""
-WITHIN = 1.5  # largest factor between estimate and measurement
-MAX_GROWTH_MB = 8.0  # after the first tenth of the fits
-SHORT: dict[str, Any] = {"sdf_iterations": 60, "intensity_iterations": 72, "batch_size": 16384}
+"""Returns, whether with intensities, settings."""
+WITHIN = 1.5
+MAX_GROWTH_MB = 8.0  # from a tenth of the fits to the last
+SHORT: Changes = {"training": {"sdf_iterations": 60, "intensity_iterations": 72, "batch_size": 16384}}
 """Enough iterations for the peak: pages of zeros take no memory until the training writes to them."""
 
 
@@ -42,9 +43,9 @@ def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
     return scans.points, scans.poses, scans.intensities if with_intensities else None
 
 
-def peak_of_a_fit(count: int, with_intensities: bool, changes: dict[str, Any]) -> tuple[Estimate, float]:
+def peak_of_a_fit(count: int, with_intensities: bool, changes: Changes) -> tuple[Estimate, float]:
     """The estimate, and the measured growth of the peak memory, bytes, in a new process."""
-    case = json.dumps([count, with_intensities, SHORT | changes])
+    case = json.dumps([count, with_intensities, merged(SHORT, changes)])
     # With this threshold, the C library returns large freed blocks to the system. Otherwise freed memory would be used
     # again, and would hide a part of the peak.
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}
@@ -54,8 +55,8 @@ def peak_of_a_fit(count: int, with_intensities: bool, changes: dict[str, Any]) -
     return Estimate(**values), peak
 
 
-def _measure(count: int, with_intensities: bool, changes: dict[str, Any]) -> None:
-    scans, config = _street(count, with_intensities), FitConfig(**changes)
+def _measure(count: int, with_intensities: bool, changes: Changes) -> None:
+    scans, config = _street(count, with_intensities), FitConfig().override(**changes)
     estimate = radarsdf.estimate(*scans, config=config)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
     before = memory_bytes("VmRSS")
@@ -67,7 +68,7 @@ def memory_of_fits(count: int) -> list[float]:
     """Resident memory of this process, MB, after each of `count` small fits with a query and a mesh."""
     scans, config = (
         _street(2000, True),
-        FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 12, "batch_size": 1024}),
+        FitConfig().override(training={"sdf_iterations": 6, "intensity_iterations": 12, "batch_size": 1024}),
     )
     found = []
     for _ in range(count):
@@ -85,7 +86,7 @@ def run(largest: int, fits: int) -> bool:
         if count <= largest:
             estimate, peak = peak_of_a_fit(count, with_intensities, changes)
             good &= 1 / WITHIN < estimate.peak_memory_bytes / peak < WITHIN
-            settings = ", ".join(f"{k} {v}" for k, v in changes.items()) or "default"
+            settings = ", ".join(f"{k} {v}" for k, v in flat(changes).items()) or "default"
             rows.append(
                 [f"{count:,}", "yes" if with_intensities else "no", settings, f"{estimate.leaf_cells:,}"]
                 + [f"{peak / 1e6:.0f}", f"{estimate.peak_memory_bytes / 1e6:.0f}"]

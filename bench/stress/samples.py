@@ -14,18 +14,23 @@ from typing import Any
 
 import numpy as np
 import radarsdf
+import torch
 import trimesh
 from radarsdf import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.fit import occupied_leaf_keys
+from radarsdf.fitting.start import near_leaf_keys
 from radarsdf.fitting.training import Training
 from radarsdf.io.scans import Scans, write_scans
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import Workers
 
-_CONFIG = FitConfig(num_threads=1, training={"sdf_iterations": 2, "intensity_iterations": 2, "batch_size": 64, "intensity_batch_size": 64}, networks={"sdf_hidden": (4,), "intensity_hidden": (4, 3)}, encoding={"num_levels": 2, "fourier_count": 2})  # fmt: skip
+_CONFIG = FitConfig(num_threads=1).override(
+    training={"sdf_iterations": 2, "intensity_iterations": 2, "batch_size": 64, "intensity_batch_size": 64},
+    networks={"sdf_hidden": (4,), "intensity_hidden": (4, 3)},
+    encoding={"num_levels": 2, "fourier_count": 2},
+)
 _VALUES: list[Any] = [
     None, True, -1, 0, 1, 12, 13, 2**31, 2**63, 10**400, 1e308, -0.0, float("nan"), float("inf"), "", "x" * 10_000, [],
     [[]], [1e6] * 4, [30_000, 30_000, 30_000], [1] * 20_000, [2**62, 2**62], {}, {"a": {}}, "octree", "tri-quadtree",
@@ -48,7 +53,7 @@ def maps() -> list[bytes]:
     with tempfile.TemporaryDirectory() as folder:
         for with_intensity, encoding in ((True, "tri-quadtree"), (False, "octree")):
             scans = _small_scans(with_intensity)
-            config = FitConfig.from_dict(_CONFIG.to_dict() | {"encoding": encoding})
+            config = _CONFIG.override(encoding={"kind": encoding})
             path = Path(folder) / "map.safetensors"
             radarsdf.fit(scans.points, scans.poses, scans.intensities, config=config, progress=False).save(
                 path
@@ -61,8 +66,9 @@ def maps() -> list[bytes]:
 def training() -> Training:
     """The training of :func:`fit_of_checkpoints`, to which the files of :func:`checkpoints` belong."""
     rays, config = fit_of_checkpoints()
-    keys = occupied_leaf_keys(rays, config, 1)
+    keys = near_leaf_keys(rays, config, 1)
     field = Field(keys, config, with_intensity=True, num_threads=1)
+    field.initialise(torch.Generator().manual_seed(0))
     return Training(field, rays, rays, IntensityScale.of(rays.intensities), config, Workers(1))
 
 
@@ -70,7 +76,7 @@ def training() -> Training:
 def fit_of_checkpoints() -> tuple[Rays, FitConfig]:
     """Rays and configuration of a small fit."""
     scans = _small_scans(True)
-    return prepare(scans.points, scans.poses, scans.intensities, **_CONFIG.preparation), _CONFIG
+    return prepare(scans.points, scans.poses, scans.intensities, **_CONFIG.returns.preparation), _CONFIG
 
 
 @functools.cache
@@ -98,6 +104,12 @@ def arrays() -> list[bytes]:
     return [_npy(rng.normal(size=(9, 3)).astype(dtype)) for dtype in (np.float32, np.float64, np.int16)]
 
 
+def _settings(config: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
+    """All settings, and all groups as a whole: the dict that each is in, and its name there."""
+    groups = [config, *(value for value in config.values() if isinstance(value, dict))]
+    return [(group, name) for group in groups for name in group]
+
+
 def hostile_map(rng: np.random.Generator) -> bytes:
     """A map whose header is valid JSON of the correct length, with one to three changed values."""
     data = maps()[rng.integers(2)]
@@ -110,9 +122,11 @@ def hostile_map(rng: np.random.Generator) -> bytes:
         tensor = header[tensors[rng.integers(len(tensors))]]
         match rng.integers(6):
             case 0 | 1:
-                settings = list(description["config"]) if isinstance(description.get("config"), dict) else []
+                config = description.get("config")
+                settings = _settings(config) if isinstance(config, dict) else []
                 if settings:
-                    description["config"][settings[rng.integers(len(settings))]] = value
+                    group, name = settings[rng.integers(len(settings))]
+                    group[name] = value
             case 2:
                 description[str(rng.choice(["config", "report", "intensity_scale", "more"]))] = value
             case 3:

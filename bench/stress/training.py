@@ -11,21 +11,28 @@ import radarsdf
 from radarsdf import Diverged, FitConfig, RadarMap
 
 from bench.paper.report import markdown
+from bench.settings import Changes, merged
 
-CASES: dict[str, dict[str, Any]] = {
+CASES: dict[str, Changes] = {
     "default": {},
-    **{f"learning rates {r:g}": {"learning_rate": r, "intensity_learning_rate": r} for r in
+    **{f"learning rates {r:g}": {"training": {"learning_rate": r, "intensity_learning_rate": r}} for r in
        (1e-4, 1e-3, 1e-1, 1.0)},
-    "learning rates 1, constant": {"learning_rate": 1.0, "intensity_learning_rate": 1.0, "cosine_schedule": False},
-    **{f"sigma {s:g} m": {"sigma_m": s} for s in (1e-3, 1e-2, 1.0, 10.0)},
+    "learning rates 1, constant": {
+        "training": {"learning_rate": 1.0, "intensity_learning_rate": 1.0, "cosine_schedule": False}
+    },
+    # Of 1 mm, 1 cm, 1 m and 10 m.
+    **{f"sigma of {s:g} cells": {"training": {"sigma_cells": s}} for s in (0.005, 0.05, 5.0, 50.0)},
     # Labels of many sigmas, which saturate, and large logits.
-    "saturated": {"sigma_m": 1e-3, "free_beyond_m": 50.0, "learning_rate": 0.1},
-    "no free space": {"free_samples": 0},
-    "batches of one": {"batch_size": 1, "intensity_batch_size": 1},
-    "one near sample": {"near_samples": 1, "free_samples": 1000},
-    "all of 3QFPI": {"normals": True, "geometry_feature_dim": 15, "intensity_in_free_space": True},
-    "dropout of 95 %": {"feature_dropout": 0.95, "fourier_dropout": 0.95},
-    "features of 1e6": {"feature_std": 1e6},
+    "saturated": {
+        "training": {"sigma_cells": 0.005, "learning_rate": 0.1}, "sampling": {"free_beyond_cells": 250.0}
+    },
+    "no free space": {"sampling": {"free_samples": 0}},
+    "batches of one": {"training": {"batch_size": 1, "intensity_batch_size": 1}},
+    "one near sample": {"sampling": {"near_samples": 1, "free_samples": 1000}},
+    "all of 3QFPI": {
+        "networks": {"normals": True, "geometry_feature_dim": 15}, "training": {"intensity_in_free_space": True}
+    },
+    "dropout of 95 %": {"networks": {"feature_dropout": 0.95, "fourier_dropout": 0.95}},
 }  # fmt: skip
 """Settings that differ from the default."""
 
@@ -43,18 +50,21 @@ def room() -> tuple[list[Any], Any, list[Any]]:
     return points, poses, intensities
 
 
-def fitted(changes: dict[str, Any], iterations: int) -> tuple[RadarMap, str]:
-    """A map of the room, and "done" or the message of `Diverged`.
+def fitted(changes: Changes, iterations: int) -> tuple[RadarMap, str]:
+    """A map of the room, and how the fit ended.
 
     Raises
     ------
     AssertionError
         If a number of the map, of a query or of the mesh is not finite.
     """
-    config = FitConfig(
-        **({"batch_size": 256, "intensity_batch_size": 256, "min_range_m": 0.5, "num_threads": 1} | changes)
+    config = FitConfig(num_threads=1).override(
+        **merged(
+            {"returns": {"min_range_m": 0.5}, "training": {"batch_size": 256, "intensity_batch_size": 256}},
+            changes,
+            {"training": {"sdf_iterations": iterations, "intensity_iterations": 2 * iterations}},
+        )
     )
-    config = config.override(training={"sdf_iterations": iterations, "intensity_iterations": 2 * iterations})
     points, poses, intensities = room()
     radar_map, end = None, "done"
     try:

@@ -4,15 +4,16 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 
 import numpy as np
 import pytest
 import trimesh
-from radarsdf import FitConfig
+from radarsdf import FitConfig, RadarMap
 
 from bench.paper import __main__ as command
-from bench.paper.curve import budget, medians
+from bench.paper.curve import _LEVERS, budget, medians
 from bench.paper.experiment import Options, mean_and_deviation, world_returns
 from bench.paper.report import best_in_bold, markdown, write_json
 from bench.paper.scenes import load_scene
@@ -99,19 +100,27 @@ def test_map_size_of_the_octree_is_the_reference(tmp_path):
 @pytest.mark.usefixtures("peers")
 def test_curve_has_budgets_levers_and_peers(tmp_path):
     words = ("curve", "wall", "--peers", "BPA", "Poisson", "radarsdf", "--repetitions", "3")
-    table, values = run(tmp_path, *words, "--set", "encoding=octree", "num_levels=2")
+    table, values = run(tmp_path, *words, "--set", "encoding.kind=octree", "encoding.num_levels=2")
     rows = values["rows"]
     assert [row["repetition"] for row in rows] == sorted([0, 1, 2] * (len(rows) // 3))  # the methods by turns
     methods = {row["method"]: row for row in rows}
-    ours = methods["radarsdf, intensities, × 1/16"]["settings"]["changes"]
-    assert (ours["min_sdf_iterations"], ours["sdf_passes"], ours["intensity_passes"]) == (9, 1 / 16, 1 / 16)
-    assert methods["drop_ghosts=False"]["settings"]["changes"] == {"drop_ghosts": False}
-    assert methods["encoding=octree, num_levels=2"]["kind"] == "lever"
+    assert methods["radarsdf, intensities, × 1/16"]["settings"]["changes"] == {"effort": 1 / 16}
+    assert methods["returns.drop_ghosts=False"]["settings"]["changes"] == {"returns": {"drop_ghosts": False}}
+    octree = methods["encoding.kind=octree, encoding.num_levels=2"]
+    assert octree["kind"] == "lever"
+    assert octree["settings"]["changes"] == {"encoding": {"kind": "octree", "num_levels": 2}}
     assert methods["BPA"]["kind"] == "peer"
     assert "radarsdf" not in methods  # a line, not a peer
     assert methods["BPA"]["seconds"] == 4.0  # of the frames that are not held out
     assert "medians of 3" in table
     assert "- Poisson: Open3D is not here" in table
+
+
+@pytest.mark.parametrize("lever", _LEVERS, ids=str)
+def test_each_lever_is_the_other_way_round_than_the_default(lever):
+    settings = {name: value for name, value in lever.items() if name != "mesh"}
+    assert (FitConfig().override(**settings) != FitConfig()) == bool(settings)
+    assert set(lever.get("mesh", {})) <= set(inspect.signature(RadarMap.mesh).parameters)
 
 
 def test_a_budget_of_one_is_the_default():
@@ -182,6 +191,8 @@ def test_unknown_peers_and_scenes_are_refused(tmp_path):
         command.main(["surface", "wall", "--peers", "nonsense", "--out", str(tmp_path)])
     with pytest.raises(SystemExit):
         command.main(["curve", "wall", "--set", "nonsense=1", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit):
+        command.main(["curve", "wall", "--set", "mesh.nonsense=1", "--out", str(tmp_path)])
     with pytest.raises(SystemExit, match="no scene 'nowhere'"):
         command.main(["surface", "nowhere", "--out", str(tmp_path)])
 
@@ -215,7 +226,7 @@ def test_json_has_no_infinity(tmp_path):
 def test_options_keep_the_ranges_of_the_scene():
     options = Options(quick=False, repetitions=1, samples=1, bases=("paper",), peers=())
     scene = load_scene("oculii", frames=2)
-    config = options.config("paper", scene, normals=False)
+    config = options.config("paper", scene, networks={"normals": False})
     assert (config.returns.min_range_m, config.training.sdf_iterations, config.networks.normals) == (
         1.0,
         1000,

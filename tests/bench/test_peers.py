@@ -13,7 +13,7 @@ import radarsdf
 
 from bench.peers.interface import PEERS, Peer, reconstruct
 
-OURS = PEERS["radarsdf"].with_changes(sdf_iterations=60, min_component_triangles=20)
+OURS = PEERS["radarsdf"].with_changes(training={"sdf_iterations": 60}, mesh={"min_component_triangles": 20})
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +23,29 @@ def scans():
 
 def test_the_paper_s_methods_are_there_in_its_order():
     assert list(PEERS)[:5] == ["α-shapes", "BPA", "Poisson", "VDBFusion", "SHINE (octree)"]
+
+
+def test_changes_of_a_group_leave_its_other_settings():
+    peer = PEERS["SHINE (octree)"].with_changes(encoding={"num_levels": 2}, seed=1, mesh={"voxel_size": 0.3})
+    assert peer.options["changes"] == {
+        "encoding": {"kind": "octree", "fourier_count": 0, "num_levels": 2},
+        "training": {"learning_rate": 1e-2},
+        "seed": 1,
+    }
+    assert peer.options["mesh"] == {"voxel_size": 0.3, "min_support": 0.0, "min_component_triangles": 300}
+    assert "num_levels" not in PEERS["SHINE (octree)"].options["changes"]["encoding"]
+
+
+def test_the_published_mesh_leaves_out_what_was_published():
+    meshes = {name: peer.options["mesh"] for name, peer in PEERS.items() if "mesh" in peer.options}
+    published = {name for name, mesh in meshes.items() if "min_component_triangles" in mesh}
+    assert published == {"SHINE (octree)", "3QFP", "3QFPI"}
+    assert meshes["radarsdf, quick"] == {"voxel_size": 0.2}
+
+
+def test_the_mesh_s_arguments_arrive(scans):
+    done = reconstruct(OURS.with_changes(mesh={"min_component_triangles": 10**9}), scans.points, scans.poses)
+    assert done.why_not == "it made no triangles"
 
 
 def test_far_from_the_origin_the_same_mesh_comes_out_there(scans):
@@ -42,7 +65,9 @@ def test_far_from_the_origin_the_same_mesh_comes_out_there(scans):
 
 
 def test_intensities_are_predicted_at_queries_in_the_world(scans):
-    peer = PEERS["radarsdf, intensities"].with_changes(sdf_iterations=60, intensity_iterations=300)
+    peer = PEERS["radarsdf, intensities"].with_changes(
+        training={"sdf_iterations": 60, "intensity_iterations": 300}
+    )
     poses = scans.poses.copy()
     poses[:, :3, 3] += [5e5, 5.4e6, 100.0]
     at = [points @ pose[:3, :3].T + pose[:3, 3] for points, pose in zip(scans.points, poses, strict=True)]

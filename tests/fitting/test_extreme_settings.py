@@ -26,6 +26,6 @@ def test_a_rate_of_a_tenth_still_finds_them():
 
 
 def test_what_overflows_is_said_and_the_map_before_is_kept():
-    radar_map, end = fitted({"learning_rate": 1e30, "cosine_schedule": False}, 40)
+    radar_map, end = fitted({"training": {"learning_rate": 1e30, "cosine_schedule": False}}, 40)
     assert "loss is" in end or "not finite" in end
     assert sum(radar_map.report["iterations_done"].values()) < 80
