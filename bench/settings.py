@@ -1,0 +1,48 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Changes of a configuration as nested dicts, which go through JSON: put together, and as words."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable
+from typing import Any
+
+Changes = dict[str, Any]
+"""Settings of the top of a `FitConfig`, and for each group a dict of those of its settings that change."""
+
+
+def merged(*changes: Changes) -> Changes:
+    """All changes together; of the same setting, the last one counts."""
+    found: Changes = {}
+    for part in changes:
+        for name, value in part.items():
+            before = found.get(name)
+            both = isinstance(before, dict) and isinstance(value, dict)
+            found[name] = before | value if both else value
+    return found
+
+
+def flat(changes: Changes) -> Changes:
+    """Values by names such as ``training.joint``."""
+    found: Changes = {}
+    for name, value in changes.items():
+        inner = (
+            {f"{name}.{key}": own for key, own in value.items()} if isinstance(value, dict) else {name: value}
+        )
+        found |= inner
+    return found
+
+
+def parsed(words: Iterable[str]) -> Changes:
+    """Of words such as ``training.joint=False``. A value that is not a Python literal, such as octree, is a string."""
+    found: Changes = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        try:
+            value = ast.literal_eval(text)
+        except (SyntaxError, ValueError):
+            value = text
+        group, dot, own = name.partition(".")
+        found = merged(found, {group: {own: value}} if dot else {group: value})
+    return found
