@@ -32,8 +32,12 @@ class Network(nn.Module):
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:
         """Draws weights and biases as ``torch.nn.Linear`` does, from a generator of our own."""
-        self.to_empty(device="cpu")
         for layer in self._linear():
+            # Not to_empty(), which imports SymPy: a second.
+            layer.weight, layer.bias = (
+                nn.Parameter(torch.empty(p.shape, dtype=p.dtype, device="cpu"))
+                for p in (layer.weight, layer.bias)
+            )
             nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=generator)
             bound = 1 / math.sqrt(layer.in_features)
             nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
