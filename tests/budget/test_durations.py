@@ -4,15 +4,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import radarsdf
+import torch
 from radarsdf import FitConfig
 from radarsdf.budget import durations
 from radarsdf.budget.schedule import Schedule
+from radarsdf.field.widths import intensity_widths, parameters_of, sdf_widths, weights_of
 from torch import nn
+
+from ..settings import grouped
 
 BOTH = FitConfig(
     training={
@@ -22,15 +24,12 @@ BOTH = FitConfig(
         "intensity_batch_size": 500,
     }
 )
-NAMES = [f.name for f in dataclasses.fields(FitConfig)]
+COUNTS = {"returns": 1000, "cells": 3000, "rows": 2000}
 
 
 def work(config=BOTH, *, with_intensity=True, **changes):
-    settings = {k: v for k, v in changes.items() if k in NAMES}
-    counts = {"returns": 1000, "cells": 3000, "rows": 2000} | {
-        k: v for k, v in changes.items() if k not in NAMES
-    }
-    config = dataclasses.replace(config, **settings)
+    counts = COUNTS | {k: v for k, v in changes.items() if k in COUNTS}
+    config = config.override(**grouped(**{k: v for k, v in changes.items() if k not in COUNTS}))
     schedule = Schedule.of(
         config, surface_returns=counts["returns"], returns=counts["returns"], vertices=counts["rows"],
         with_intensity=with_intensity,
@@ -51,13 +50,16 @@ def test_multiplications_are_those_of_the_networks(scene, config):
         networks={"normals": False},
     )
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
-    encoding, *products = durations.widths(config)
-    assert encoding == radar_map.field.cells.dim + radar_map.field.fourier.dim
-    for network, product in zip(
-        (radar_map.field.sdf_network, radar_map.field.intensity_network), products, strict=True
+    field = radar_map.field
+    (encoding,) = {sum(part.shape[1] for part in field.encode(torch.zeros(1, 3)))}
+    assert sdf_widths(config)[0] == encoding
+    for network, widths in (
+        (field.sdf_network, sdf_widths(config)),
+        (field.intensity_network, intensity_widths(config)),
     ):
-        found = sum(layer.weight.numel() for layer in network.modules() if isinstance(layer, nn.Linear))
-        assert product == pytest.approx(found, rel=0.05)  # of inputs that few numbers make, all are counted
+        layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+        assert weights_of(widths) == sum(layer.weight.numel() for layer in layers)
+        assert parameters_of(widths) == sum(p.numel() for p in network.parameters())
 
 
 def test_what_makes_more_work():
@@ -79,10 +81,9 @@ def test_what_makes_more_work():
         assert work(**changes)["encoded number"] > base["encoded number"], changes
     assert base["moved row"] == 0 < work(row_updates=False)["moved row"] == 100 * 2000
     assert work(normals=True)["moved row"] > 0  # as Training does
-    assert (work(drop_ghosts=False)["ghost"], base["ghost"]) == (0, 1000)
-    quick = FitConfig.quick()
-    assert work(quick, with_intensity=False)["averaged return"] == 1000
-    assert work(quick, with_intensity=False)["iteration"] == 0
+    assert work(returns=5000)["return"] == 5 * base["return"]
+    assert work(cells=9000)["cell"] == 3 * base["cell"]
+    assert work(FitConfig.quick(), with_intensity=False)["iteration"] == 0
 
 
 def test_threads_share_what_can_be_shared_as_far_as_there_are_processors(monkeypatch):

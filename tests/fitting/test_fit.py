@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -67,9 +66,7 @@ def test_observed_is_near_the_returns_only(scene, radar_map):
 
 def test_same_seed_same_bits_other_seed_other_bits(scene):
     maps = [radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK) for _ in range(2)]
-    other = radarsdf.fit(
-        scene.points, scene.poses, scene.intensities, config=dataclasses.replace(QUICK, seed=1)
-    )
+    other = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK.override(seed=1))
     for name, value in maps[0].field.state_dict().items():
         assert torch.equal(value, maps[1].field.state_dict()[name])
     assert not torch.equal(maps[0].field.cells.features, other.field.cells.features)
@@ -78,7 +75,7 @@ def test_same_seed_same_bits_other_seed_other_bits(scene):
 def test_a_fit_leaves_the_global_random_state_and_threads_alone(scene):
     torch.manual_seed(3)
     state, threads = torch.get_rng_state(), torch.get_num_threads()
-    radarsdf.fit(scene.points, scene.poses, config=dataclasses.replace(QUICK, num_threads=1))
+    radarsdf.fit(scene.points, scene.poses, config=QUICK.override(num_threads=1))
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.get_num_threads() == threads
 
@@ -150,7 +147,7 @@ def test_the_more_often_samples_are_seen_the_more_is_hidden(monkeypatch):
 
     draw = Dropout.draw
     monkeypatch.setattr(Dropout, "draw", record)
-    samples = FitConfig().near_samples * sum(map(len, scene.points))
+    samples = FitConfig().sampling.near_samples * sum(map(len, scene.points))
     for passes in (1, 3, 27):
         shares.clear()
         config = QUICK.override(
@@ -195,11 +192,12 @@ def test_each_stage_of_the_schedule_begins_at_the_full_rate(scene):
         (200_000, {}, 586),  # one pass is more than enough
         (30_000, {}, 176),  # two passes are not enough, and still all that the data gives
         (2_000, {}, 150),  # without so many iterations there is no surface
-        (100_000, {"sdf_passes": 2.0}, 586),
-        (100_000, {"enough_sdf_iterations": 1}, 293),
-        (20_000, {"max_sdf_passes": 4.0}, 235),
-        (2_000, {"min_sdf_iterations": 40}, 40),
-        (20_000, {"sdf_iterations": 7}, 7),
+        (100_000, {"effort": 2.0}, 600),
+        (200_000, {"effort": 0.5}, 293),
+        (2_000, {"effort": 0.25}, 38),
+        (2_000, {"effort": 1e-9}, 1),
+        (20_000, {"training": {"sdf_iterations": 7}}, 7),
+        (20_000, {"training": {"sdf_iterations": 7}, "effort": 3.0}, 7),
     ],
 )
 def test_iterations_until_the_surface_is_finished_but_its_noise_not_learnt(returns, changes, expected):
@@ -273,22 +271,6 @@ class TestBadInput:
         with pytest.raises(ValueError, match="within a million cells"):
             radarsdf.fit(points, poses)
 
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
-            ("leaf_size_m", 0),
-            ("sigma_m", float("nan")),
-            ("num_levels", 99),
-            ("near_samples", 0),
-            ("free_from", 1.0),
-        ]
-        + [("encoding", "tree"), ("sdf_hidden", ()), ("batch_size", -1), ("max_range_m", 1.0)]
-        + [("seed", -1), ("seed", 2**60)],
-    )
-    def test_settings_that_make_no_sense(self, name, value):
-        with pytest.raises(ValueError, match=r"."):
-            FitConfig(**{name: value})
-
 
 def test_a_loss_that_stops_being_finite_stops_the_fit(scene):
     with pytest.raises(FloatingPointError, match="sdf loss is"):
@@ -301,23 +283,28 @@ def test_a_loss_that_stops_being_finite_stops_the_fit(scene):
         )
 
 
-def test_paper_configuration_is_the_published_one():
-    paper = FitConfig.paper()
-    assert (paper.leaf_size_m, paper.num_levels, paper.fourier_count) == (0.2, 3, 16)
-    assert (paper.near_samples, paper.free_samples, paper.batch_size) == (6, 6, 8192)
-    assert (paper.sdf_iterations, paper.intensity_iterations, paper.learning_rate) == (1000, 4000, 1e-3)
-    assert (paper.geometry_feature_dim, paper.normals, paper.log_range) == (15, True, False)
-    assert (paper.feature_dropout, paper.fourier_dropout, paper.cross_range_noise_rad) == (0, 0, 0)
-    assert (paper.joint, paper.intensity_in_free_space, paper.accumulate_frames) == (True, True, 5)
-    assert FitConfig.from_dict(paper.to_dict()) == paper
-    with pytest.raises(ValueError, match="unknown settings: colour"):
-        FitConfig.from_dict({"colour": 1})
+@pytest.mark.parametrize(
+    "training",
+    [
+        {},
+        {"joint": False},
+        {"intensity_iterations": 7},  # the joint beginning alone has more
+        {"sdf_iterations": 0},
+    ],
+)
+def test_a_complete_fit_has_done_all_its_iterations(scene, training):
+    config = QUICK.override(training={"intensity_iterations": 30}).override(training=training)
+    report = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config).report
+    assert report["iterations"] == {
+        "sdf": config.training.sdf_iterations, "intensity": config.training.intensity_iterations
+    }  # fmt: skip
+    assert report["iterations_done"] == report["iterations"]
 
 
 def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     is_ghost = np.concatenate(scene.points)[:, 2] > -0.5  # of the sensor frame: the wall, for once
     assert 0.1 < is_ghost.mean() < 0.9
-    monkeypatch.setattr("radarsdf.fitting.fit.find_ghosts", lambda *_: is_ghost)
+    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", lambda *_: is_ghost)
     drawn_from = []
     spread = RaySampler.spread
     monkeypatch.setattr(

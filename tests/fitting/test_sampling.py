@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
+from radarsdf._core import cell_keys
 from radarsdf.fitting.sampling import Dropout, RaySampler
 from radarsdf.returns.rays import prepare
 
 from ..conftest import pose
+from ..settings import grouped
 
 NUM_RAYS = 1000
 
@@ -26,12 +28,18 @@ def rays():
 
 
 def sampler(rays, batch_size=256, seed=0, **settings):
-    config = FitConfig(**settings)
+    config = FitConfig(**grouped(**settings))
     return RaySampler(rays, config, batch_size, torch.Generator().manual_seed(seed))
 
 
+def rows_of(points, samples):
+    """(B,) row of `points` that each sample's return is; no two returns are the same."""
+    rows = {point.tobytes(): row for row, point in enumerate(points)}
+    return torch.tensor([rows[point.tobytes()] for point in samples.of_ray[:, :3].numpy()])
+
+
 def sensors_of(rays, samples):
-    index = samples.rays.numpy()
+    index = rows_of(rays.points, samples).numpy()
     points = rays.points[index].astype(np.float64)
     return points, points - rays.directions[index].astype(np.float64) * rays.ranges_m[index, None]
 
@@ -47,10 +55,10 @@ def test_neighbours_come_together_and_all_have_their_turn(rays):
         torch.Generator().manual_seed(0),
         neighbours=5,
     )
-    place = np.argsort(draw._original.numpy())  # of each ray in Morton order
+    in_order = rays.points[np.argsort(cell_keys(rays.points, FitConfig().leaf_size_m), kind="stable")]
     seen = []
     while len(seen) * 32 < len(rays):
-        taken = np.sort(place[draw.batch()[0].rays[:32].numpy()])
+        taken = np.sort(rows_of(in_order, draw.batch()[0])[:32].numpy())
         assert (np.diff(taken) == 1).sum() >= 20  # of 31, where runs of five are cut at most twice
         seen.append(taken)
     assert len(np.unique(np.concatenate(seen))) == len(rays)
@@ -70,12 +78,12 @@ def test_labels_are_the_signed_distance_to_the_return(rays, kind):
 
 
 def test_ranges_of_the_samples(rays):
-    config = FitConfig(sampling={"near_band_cells": 0.25, "free_from": 0.4, "free_beyond_cells": 0.6})
+    config = FitConfig(sampling={"near_band_cells": 1.25, "free_from": 0.4, "free_beyond_cells": 3.0})
     draw = RaySampler(rays, config, 512, torch.Generator().manual_seed(0))
     near, free, lowest_share = [], [], []
     for _ in range(40):
         samples = draw.batch()[0]
-        range_m = torch.from_numpy(rays.ranges_m)[samples.rays][samples.num_near :]
+        range_m = torch.from_numpy(rays.ranges_m)[rows_of(rays.points, samples)][samples.num_near :]
         near.append(samples.sdf_m[: samples.num_near])
         from_sensor = range_m - samples.sdf_m[samples.num_near :]
         free.append((from_sensor - 0.4 * range_m) / (0.6 * range_m + 0.6))
@@ -100,7 +108,8 @@ def test_each_ray_is_seen_equally_often(rays, batch_size):
     batches = 4 * NUM_RAYS * 2 // batch_size
     for _ in range(batches):
         samples = draw.batch()[0]
-        for kind, part in enumerate((samples.rays[: samples.num_near], samples.rays[samples.num_near :])):
+        rows = rows_of(rays.points, samples)
+        for kind, part in enumerate((rows[: samples.num_near], rows[samples.num_near :])):
             np.add.at(seen[kind], part.numpy(), 1)
     assert seen.sum() == batches * batch_size
     # Whole passes, and the begun one.
@@ -115,13 +124,13 @@ def test_spread_sees_each_ray_equally_often(rays):
         samples = draw.spread(300)[0]
         assert samples.num_near == len(samples.points) == 300
         assert samples.sdf_m.abs().max() <= FitConfig().near_band_m
-        np.add.at(seen, samples.rays.numpy(), 1)
+        np.add.at(seen, rows_of(rays.points, samples).numpy(), 1)
     assert (seen == 3).all()
 
 
 def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
     samples = sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS)[0]
-    index = samples.rays.numpy()
+    index = rows_of(rays.points, samples).numpy()
     offset = samples.points.numpy() - rays.points[index]
     along = (offset * rays.directions[index]).sum(axis=1)
     across = offset - along[:, None] * rays.directions[index]
@@ -131,8 +140,7 @@ def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
 
 def test_passes_take_the_rays_in_different_orders(rays):
     draw = sampler(rays, NUM_RAYS, near_samples=1, free_samples=1)
-    first, second = draw.batch()[0].rays[: NUM_RAYS // 2], draw.batch()[0].rays[: NUM_RAYS // 2]
-    third = draw.batch()[0].rays[: NUM_RAYS // 2]
+    first, second, third = (rows_of(rays.points, draw.batch()[0])[: NUM_RAYS // 2] for _ in range(3))
     assert set(first.tolist()).isdisjoint(second.tolist())
     assert set(third.tolist()) not in (set(first.tolist()), set(second.tolist()))
 
@@ -146,9 +154,11 @@ def test_shares_of_near_and_free_samples(rays, near_samples, free_samples, num_n
     assert samples.num_near == num_near
     assert samples.points.shape == (240, 3)
     assert samples.points.dtype == samples.sdf_m.dtype == torch.float32
-    assert samples.rays.shape == samples.sdf_m.shape == (240,)
+    assert samples.of_ray.shape == (240, 7)
+    assert samples.sdf_m.shape == (240,)
+    rows = rows_of(rays.points, samples)
     # No kind is drawn from a corner of the scene: rays come in the order of space, and each kind has their spread.
-    for part in (samples.rays[:num_near], samples.rays[num_near:]):
+    for part in (rows[:num_near], rows[num_near:]):
         if len(part) >= 40:
             x = rays.points[part.numpy(), 0]
             assert np.ptp(x) > 0.6 * np.ptp(rays.points[:, 0])
@@ -156,14 +166,14 @@ def test_shares_of_near_and_free_samples(rays, near_samples, free_samples, num_n
 
 def test_the_rarer_kind_reaches_every_ray_in_the_long_run(rays):
     draw = sampler(rays, 240, near_samples=5, free_samples=1)
-    free = torch.cat([(s := draw.batch()[0]).rays[s.num_near :] for _ in range(400)])
+    free = torch.cat([rows_of(rays.points, s := draw.batch()[0])[s.num_near :] for _ in range(400)])
     assert len(torch.unique(free)) > 0.99 * NUM_RAYS
 
 
 def test_a_batch_larger_than_the_scene(rays):
     few = rays.select(slice(None, None, 250))
     samples = sampler(few, 100, near_samples=1, free_samples=1).batch()[0]
-    assert sorted(torch.bincount(samples.rays[:50], minlength=4).tolist()) == [12, 12, 13, 13]
+    assert sorted(torch.bincount(rows_of(few.points, samples)[:50], minlength=4).tolist()) == [12, 12, 13, 13]
     assert len(sampler(few, 1).batch()[0].points) == 1
 
 
@@ -174,7 +184,7 @@ def test_the_generator_decides_alone(rays):
     for kind in ("batch", "spread", "batch"):
         a, b, c = (DRAWS[kind](s) for s in (one, two, other))
         assert torch.equal(a.points, b.points)
-        assert torch.equal(a.rays, b.rays)
+        assert torch.equal(a.of_ray, b.of_ray)
         assert not torch.equal(a.points, c.points)
     assert torch.equal(torch.get_rng_state(), state)
 
@@ -193,7 +203,7 @@ def test_memory_does_not_grow_with_the_samples(rays):
 def test_neighbours_in_a_batch_are_neighbours_in_space(rays):
     dense = dataclasses.replace(rays, points=rays.points * np.float32(0.1))
     samples = sampler(dense, 512, near_samples=1, free_samples=1).spread(512)[0]
-    steps = np.linalg.norm(np.diff(dense.points[samples.rays.numpy()], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(dense.points[rows_of(dense.points, samples).numpy()], axis=0), axis=1)
     shuffled = np.linalg.norm(
         np.diff(dense.points[np.random.default_rng(0).permutation(NUM_RAYS)], axis=0), axis=1
     )
@@ -215,13 +225,15 @@ def test_parts_are_the_batch_each_with_its_share(rays, near_samples, free_sample
     # The same rays, each kind in the same order.
     for kind in (slice(None, whole.num_near), slice(whole.num_near, None)):
         kinds = [
-            part.rays[: part.num_near] if kind.start is None else part.rays[part.num_near :] for part in found
+            part.of_ray[: part.num_near] if kind.start is None else part.of_ray[part.num_near :]
+            for part in found
         ]
-        assert torch.equal(torch.cat(kinds), whole.rays[kind])
+        assert torch.equal(torch.cat(kinds), whole.of_ray[kind])
     for part in found:
-        assert torch.equal(part.ranges_m, torch.from_numpy(rays.ranges_m)[part.rays])
+        rows = rows_of(rays.points, part)
+        assert torch.equal(part.ranges_m, torch.from_numpy(rays.ranges_m)[rows])
         assert (part.sdf_m[: part.num_near].abs() <= FitConfig().near_band_m).all()
-        gap = part.points + part.sdf_m[:, None] * part.directions - torch.from_numpy(rays.points)[part.rays]
+        gap = part.points + part.sdf_m[:, None] * part.directions - torch.from_numpy(rays.points)[rows]
         assert gap.abs().max() < 2e-5
 
 
@@ -230,15 +242,16 @@ def test_parts_of_spread_samples(rays):
     found = sampler(rays).spread(101, 2)
     assert [part.num_near for part in found] == [50, 51]
     assert torch.equal(torch.cat([part.points for part in found]), whole.points)
-    assert torch.equal(torch.cat([part.rays for part in found]), whole.rays)
+    assert torch.equal(torch.cat([part.of_ray for part in found]), whole.of_ray)
 
 
 def test_what_is_known_of_a_ray_comes_with_its_samples(rays):
     unit = torch.linspace(0, 1, len(rays))
     draw = RaySampler(rays, FitConfig(), 256, torch.Generator().manual_seed(0), intensities=unit)
     for (samples,) in (draw.batch(), draw.spread(100)):
-        assert torch.equal(samples.intensities, unit[samples.rays])
-        assert torch.equal(samples.directions, torch.from_numpy(rays.directions)[samples.rays])
+        rows = rows_of(rays.points, samples)
+        assert torch.equal(samples.intensities, unit[rows])
+        assert torch.equal(samples.directions, torch.from_numpy(rays.directions)[rows])
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.3, 0.85])

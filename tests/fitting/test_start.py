@@ -16,6 +16,7 @@ from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 
 from ..conftest import ground_and_wall
+from ..settings import grouped
 
 
 def rays_down(heights, half_m=3.0, spacing_m=0.05):
@@ -29,9 +30,8 @@ def rays_down(heights, half_m=3.0, spacing_m=0.05):
 
 
 def fit(points, poses, **changes):
-    return radarsdf.fit(
-        points, poses, config=FitConfig.quick(**changes, returns={"drop_ghosts": False}), progress=False
-    )
+    config = FitConfig.quick(**grouped(drop_ghosts=False, **changes))
+    return radarsdf.fit(points, poses, config=config, progress=False)
 
 
 def inner_points(count=500):
@@ -57,8 +57,8 @@ def test_rays_count_behind_what_floats_before_their_ends():
     clutter = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.full(20, 0.9 - 300.0)])
     points = [np.concatenate([points[0], clutter])]
     x = np.column_stack([np.zeros((5, 2)), np.linspace(0.75, 0.85, 5)])
-    assert (fit(points, poses, truncation_m=1.2).sdf(x) > 0).all()
-    assert (fit(points, poses, truncation_m=0.4).sdf(x) < 0).any()
+    assert (fit(points, poses, truncation_cells=6.0).sdf(x) > 0).all()
+    assert (fit(points, poses, truncation_cells=2.0).sdf(x) < 0).any()
 
 
 def test_one_ray_of_a_cell_is_the_mean_of_its_rays():
@@ -131,10 +131,14 @@ def test_the_mesh_from_vertices_is_that_of_the_field(hidden):
 
 @pytest.mark.parametrize("hidden", [(2,), (5, 3), (4, 4, 4)])
 def test_the_network_starts_as_one_input(hidden):
-    torch.manual_seed(0)
-    network = SDFNetwork(6, FitConfig(networks={"sdf_hidden": hidden, "geometry_feature_dim": 2}))
+    config = FitConfig(
+        encoding={"num_levels": 1, "fourier_count": 0},
+        networks={"sdf_hidden": hidden, "geometry_feature_dim": 2},
+    )
+    network = SDFNetwork(config)
+    network.initialise(torch.Generator().manual_seed(0))
     network.start_as_input(4)
-    encoding = torch.randn(50, 6)
+    encoding = torch.randn(50, 8, generator=torch.Generator().manual_seed(1))
     logit, _ = network([encoding])
     torch.testing.assert_close(logit, encoding[:, 4])
     logit.sum().backward()
@@ -146,7 +150,9 @@ def test_only_an_octree_holds_an_average():
         FitConfig(training={"start": "average"})
     with pytest.raises(ValueError, match="start"):
         FitConfig(training={"start": "zero"})
-    with pytest.raises(ValueError, match="at least two"):
+    with pytest.raises(ValueError, match="at least 2"):
         FitConfig.quick(networks={"sdf_hidden": (1,)})
-    with pytest.raises(ValueError, match="truncation_m"):
-        FitConfig.quick(training={"truncation_cells": 0.3})
+    with pytest.raises(
+        ValueError, match=r"training\.truncation_cells must be at least sampling\.near_band_cells, 2\.0"
+    ):
+        FitConfig.quick(training={"truncation_cells": 1.5})

@@ -18,7 +18,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import Diverged, FitConfig, Interrupted, _core
-from radarsdf.fitting.gradients import Shard
+from radarsdf.fitting.core_gradients import CoreGradients
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.scans import Scans, write_scans
@@ -26,7 +26,7 @@ from radarsdf.io.scans import Scans, write_scans
 from ..conftest import ground_and_wall
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-LONG = {"sdf_iterations": 1_000_000, "batch_size": 512}
+LONG = {"training": {"sdf_iterations": 1_000_000, "batch_size": 512}}
 WITHIN_S = 5.0
 """Of what takes half a second on a quiet machine; the work interrupted would take longer on any."""
 
@@ -147,7 +147,7 @@ def test_ctrl_c_ends_a_mesh():
 import radarsdf
 from tests.conftest import ground_and_wall
 scene = ground_and_wall()
-config = radarsdf.FitConfig(sdf_iterations=5)
+config = radarsdf.FitConfig(training={"sdf_iterations": 5})
 radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
 print("ready", flush=True)
 try:
@@ -198,7 +198,7 @@ sys.exit(main())
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code, "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
-        + ["--quiet", "--set", "sdf_iterations=1000000", "--checkpoint", str(tmp_path / "state")],
+        + ["--quiet", "--set", "training={'sdf_iterations': 1000000}", "--checkpoint", str(tmp_path / "state")],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -288,18 +288,18 @@ def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypat
     eighth = 8 if stage == "sdf" else 10 + 8
 
     def failing(of_stage):
-        def gradients(shard, samples):
+        def gradients(backend, samples):
             nonlocal calls
             calls += 1
-            found = of_stage(shard, samples)
+            found = of_stage(backend, samples)
             if calls == eighth:
                 found.losses[name] *= math.inf
             return found
 
         return gradients
 
-    for method in ("geometry", "joint", "reflectance"):
-        monkeypatch.setattr(Shard, method, failing(getattr(Shard, method)))
+    for method in ("sdf", "joint", "intensity"):
+        monkeypatch.setattr(CoreGradients, method, failing(getattr(CoreGradients, method)))
     config = FitConfig(
         num_threads=1,
         training={"sdf_iterations": 10, "intensity_iterations": 20, "batch_size": 512, "joint": joint},

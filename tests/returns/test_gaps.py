@@ -95,8 +95,8 @@ def test_a_sparse_surface_has_fewer_holes():
     scene = ground_and_wall(scans=4, returns_per_scan=400)
     area = {}
     for cells in (0, 2):
-        config = FitConfig(min_support=0.0, num_threads=1, encoding={"bridge_cells": cells})
-        mesh = radarsdf.fit(scene.points, scene.poses, config=config, progress=False).mesh()
+        config = FitConfig(num_threads=1, encoding={"bridge_cells": cells})
+        mesh = radarsdf.fit(scene.points, scene.poses, config=config, progress=False).mesh(min_support=0)
         area[cells] = mesh.area
         off_m = np.minimum(np.abs(mesh.vertices[:, 2]), np.abs(mesh.vertices[:, 0] - 20))
         assert np.percentile(off_m, 95) < 0.2
@@ -104,7 +104,7 @@ def test_a_sparse_surface_has_fewer_holes():
 
 
 def test_the_published_configuration_bridges_nothing():
-    assert FitConfig.paper().bridge_cells == 0
+    assert FitConfig.paper().encoding.bridge_cells == 0
     rays = rays_to([(0, 0, 0), (2, 0, 0)])
     leaf_keys = leaf_keys_of(rays)
     assert bridged(leaf_keys, rays, LEAF_M, 0) is leaf_keys

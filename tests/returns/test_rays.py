@@ -44,7 +44,6 @@ def test_rays_lead_from_the_sensors_to_the_returns():
     )
     np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(rays.ranges_m, np.linalg.norm(np.concatenate(points), axis=1), rtol=1e-6)
-    np.testing.assert_array_equal(rays.scans, np.repeat(np.arange(7), [len(p) for p in points]))
     assert rays.intensities is None
     assert {rays.points.dtype, rays.directions.dtype, rays.ranges_m.dtype} == {np.dtype(np.float32)}
     assert len(rays) == sum(map(len, points))
@@ -60,7 +59,8 @@ def test_ranges_are_measured_from_the_sensor_and_take_the_intensities_along():
     rays = prepare(points, poses, intensities, min_range_m=2.5, max_range_m=60)
     # Both bounds belong to what is kept.
     assert rays.intensities.tolist() == [2, 3, 4, 6]
-    assert rays.scans.tolist() == [0, 0, 1, 1]
+    sensors = rays.points - rays.directions * rays.ranges_m[:, None] + rays.origin
+    np.testing.assert_allclose(sensors, poses[[0, 0, 1, 1], :3, 3], atol=1e-4)
     np.testing.assert_allclose(rays.ranges_m, [2.5, 7, 60, 5], rtol=1e-6)
 
 
@@ -71,11 +71,12 @@ def test_a_return_at_the_sensor_has_no_direction_and_is_dropped():
 
 def test_accumulated_scans_are_seen_from_the_middle_one():
     points, poses = scans(count=8)
-    rays = prepare(points, poses, accumulate_frames=5)
+    rays = prepare(points, poses, accumulate_scans=5)
     single = prepare(points, poses)
     # Scans 0 to 4 are seen from 2; of the last, incomplete group, 5 to 7, from 6.
     middle = np.array([2, 2, 2, 2, 2, 6, 6, 6])
-    sensors = poses[middle[rays.scans], :3, 3] - rays.origin
+    scan = np.repeat(np.arange(8), [len(p) for p in points])  # of each return
+    sensors = poses[middle[scan], :3, 3] - rays.origin
     back = rays.points.astype(float) - rays.directions.astype(float) * rays.ranges_m[:, None]
     np.testing.assert_allclose(back, sensors, atol=5e-5)
     np.testing.assert_array_equal(rays.points, single.points)
@@ -85,7 +86,7 @@ def test_accumulated_scans_are_seen_from_the_middle_one():
 def test_accumulation_does_not_change_who_is_too_near():
     points = [np.array([[1.0, 0, 0], [10, 0, 0]]), np.array([[1.0, 0, 0], [10, 0, 0]])]
     poses = np.stack([pose([0.0, 0, 0]), pose([50.0, 0, 0])])
-    rays = prepare(points, poses, min_range_m=2.5, accumulate_frames=2)
+    rays = prepare(points, poses, min_range_m=2.5, accumulate_scans=2)
     np.testing.assert_allclose(rays.points[:, 0] + rays.origin[0], [10, 60])
 
 
@@ -139,7 +140,7 @@ def test_select_takes_some_rays():
     rays = prepare(points, poses, values)
     parts = [rays.select(slice(first, None, 3)) for first in range(3)]
     assert sum(map(len, parts)) == len(rays)
-    for name in ("points", "directions", "ranges_m", "intensities", "scans"):
+    for name in ("points", "directions", "ranges_m", "intensities"):
         for first, part in enumerate(parts):
             np.testing.assert_array_equal(getattr(part, name), getattr(rays, name)[first::3])
     assert parts[1].directions.flags.c_contiguous

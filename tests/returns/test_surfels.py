@@ -110,7 +110,7 @@ def test_a_fit_drops_and_counts_them():
     assert with_ghosts.report["ghosts"] == 0
     assert without.report["ghosts"] > 0.9 * is_ghost.sum()
     assert without.report["returns_used"] + without.report["ghosts"] == len(is_ghost)
-    assert not FitConfig.paper().drop_ghosts
+    assert not FitConfig.paper().returns.drop_ghosts
     behind = [[19.0, y, 2.0] for y in np.linspace(-3, 3, 50)]
     assert without.observed(behind).sum() < with_ghosts.observed(behind).sum()
 
@@ -251,7 +251,6 @@ def test_returns_come_onto_the_planes_that_they_make():
     sensors = [r.points - r.directions * r.ranges_m[:, None] for r in (rays, moved)]
     np.testing.assert_allclose(*sensors, atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(moved.directions, axis=1), 1, atol=1e-6)
-    np.testing.assert_array_equal(moved.scans, rays.scans)
 
 
 def test_returns_that_make_no_plane_stay_where_they_are():
