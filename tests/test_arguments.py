@@ -124,7 +124,7 @@ def test_prepare(sizes, ranges, frames, origin, odd, data):
     if odd & 8:
         points, poses = data.draw(st.just(points) | THINGS), data.draw(arrays(len(sizes), 4, 4))
     keywords = {"min_range_m": ranges[0], "max_range_m": ranges[1]} if odd & 1 else {}
-    keywords |= {"accumulate_frames": frames} if odd & 2 else {}
+    keywords |= {"accumulate_scans": frames} if odd & 2 else {}
     keywords |= {"origin": origin} if odd & 4 else {}
     rays = answer(prepare, points, poses, intensities, **keywords)
     if rays is None:
@@ -132,7 +132,7 @@ def test_prepare(sizes, ranges, frames, origin, odd, data):
     count = len(rays)
     assert 0 < count <= sum(map(len, points))
     assert rays.points.shape == rays.directions.shape == (count, 3)
-    assert rays.ranges_m.shape == rays.scans.shape == (count,)
+    assert rays.ranges_m.shape == (count,)
     assert rays.origin.shape == (3,)
     for values in (rays.points, rays.directions, rays.ranges_m):
         assert values.dtype == np.float32
@@ -143,15 +143,29 @@ def test_prepare(sizes, ranges, frames, origin, odd, data):
         assert rays.intensities.min() < rays.intensities.max()
 
 
-@examples(200)
-@given(st.sampled_from(dataclasses.fields(FitConfig)), THINGS | st.lists(THINGS, max_size=3).map(tuple))
-def test_config(field, value):
+GROUPS = {
+    field.name: [own.name for own in dataclasses.fields(group)]
+    for field in dataclasses.fields(FitConfig)
+    if dataclasses.is_dataclass(group := getattr(FitConfig(), field.name))
+}
+
+
+@examples(300)
+@given(
+    st.sampled_from(
+        [(field.name, None) for field in dataclasses.fields(FitConfig)]
+        + [(group, name) for group, names in GROUPS.items() for name in names]
+    ),
+    THINGS | st.lists(THINGS, max_size=3).map(tuple),
+)
+def test_config(names, value):
+    group, name = names
     try:
-        config = FitConfig(**{field.name: value})
+        config = FitConfig(**{group: value if name is None else {name: value}})
     except ValueError:
         return
     assert FitConfig.from_dict(config.to_dict()) == config
-    if isinstance(value, float) and field.name != "max_range_m":
+    if isinstance(value, float):
         assert np.isfinite(value)
 
 

@@ -16,7 +16,14 @@ from radarsdf.map.isosurface import extract_cells, mesh_components, sparse_latti
 
 from .test_arguments import FLOATS, THINGS, answer, arrays, examples, mostly, pose
 
-TINY = FitConfig(num_threads=1, max_memory_bytes=10**9, training={"sdf_iterations": 1, "intensity_iterations": 1, "batch_size": 16, "intensity_batch_size": 16}, networks={"sdf_hidden": (4,), "intensity_hidden": (4,)}, encoding={"num_levels": 2, "fourier_count": 2}, returns={"min_range_m": 0.0})  # fmt: skip
+TINY = FitConfig(
+    num_threads=1,
+    max_memory_bytes=10**9,
+    returns={"min_range_m": 0.0},
+    encoding={"num_levels": 2, "fourier_count": 2},
+    networks={"sdf_hidden": (4,), "intensity_hidden": (4,)},
+    training={"sdf_iterations": 1, "intensity_iterations": 1, "batch_size": 16, "intensity_batch_size": 16},
+)
 
 
 @examples(60)

@@ -30,7 +30,7 @@ from tests.test_processes import QUICK, X
 torch.set_num_threads(2)
 scene = ground_and_wall()
 def fitted(threads=0):
-    config = type(QUICK)(**(QUICK.to_dict() | {"num_threads": threads}))
+    config = QUICK.override(num_threads=threads)
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
 radar_map = fitted()
 sdf, mesh, product = radar_map.sdf(X), radar_map.mesh(0.2), torch.ones(700, 700) @ torch.ones(700, 700)

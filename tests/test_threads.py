@@ -157,7 +157,7 @@ def test_zero_threads_are_as_many_as_torch_has():
 
 
 def fitted(scene, seed):
-    config = FitConfig(**(QUICK.to_dict() | {"seed": seed}))
+    config = QUICK.override(seed=seed)
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
 
 

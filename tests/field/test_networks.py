@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -14,18 +12,20 @@ from radarsdf._core import CellSet
 from radarsdf.field.field import Field
 from radarsdf.field.losses import intensity_loss, sdf_loss
 from radarsdf.field.networks import IntensityNetwork, SDFNetwork
+from radarsdf.field.widths import cells_width, fourier_width
 
 BARE = FitConfig(networks={"sdf_input": False, "view_direction": False, "log_range": False})
+SMALL = {"num_levels": 1, "fourier_count": 1}  # 8 and 6 numbers
 
 
-def inputs(config, count=20, encoding_dim=10):
+def inputs(config, count=20):
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape):
         return torch.randn(*shape, generator=generator)
 
     return {
-        "encoding": [normal(count, 1), normal(count, encoding_dim - 1)],
+        "encoding": [normal(count, cells_width(config)), normal(count, fourier_width(config))],
         "logit": normal(count),
         "geometry_feature": normal(count, config.networks.geometry_feature_dim),
         "normals": torch.nn.functional.normalize(normal(count, 3), dim=1)
@@ -37,13 +37,19 @@ def inputs(config, count=20, encoding_dim=10):
 
 
 def make_field(config, seed=0):
-    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     points = np.random.default_rng(seed).uniform(-1, 1, (2000, 3)).astype(np.float32)
     cells = CellSet(config.leaf_size_m)
     cells.insert(points)
     field = Field(cells.sorted_keys(), config, with_intensity=True)
-    field.cells.initialise(1.0)
+    field.initialise(generator)
+    torch.nn.init.normal_(field.cells.features, generator=generator)
     return field, torch.from_numpy(points[:200])
+
+
+def initialised(network):
+    network.initialise(torch.Generator().manual_seed(0))
+    return network
 
 
 def views(points):
@@ -53,19 +59,18 @@ def views(points):
 
 @pytest.mark.parametrize("geometry_feature_dim", [0, 15])
 def test_sdf_network(geometry_feature_dim):
-    network = SDFNetwork(
-        10, FitConfig(networks={"sdf_hidden": (7, 5), "geometry_feature_dim": geometry_feature_dim})
-    )
-    logit, feature = network([torch.randn(4, 4), torch.randn(4, 6)])
+    networks = {"sdf_hidden": (7, 5), "geometry_feature_dim": geometry_feature_dim}
+    network = initialised(SDFNetwork(FitConfig(encoding=SMALL, networks=networks)))
+    logit, feature = network([torch.randn(4, 8), torch.randn(4, 6)])
     assert logit.shape == (4,)
     assert feature.shape == (4, geometry_feature_dim)
     widths = [tuple(m.weight.shape) for m in network.layers if isinstance(m, torch.nn.Linear)]
-    assert widths == [(7, 10), (5, 7), (1 + geometry_feature_dim, 5)]
+    assert widths == [(7, 14), (5, 7), (1 + geometry_feature_dim, 5)]
 
 
 def test_the_logit_has_both_signs():
     # An activation behind the last layer would leave one side of the surface without a value.
-    logit, _ = SDFNetwork(10, FitConfig())([torch.randn(2000, 10) * 10])
+    logit, _ = initialised(SDFNetwork(FitConfig(encoding=SMALL)))([torch.randn(2000, 14) * 10])
     assert logit.min() < 0 < logit.max()
 
 
@@ -80,10 +85,9 @@ def test_the_logit_has_both_signs():
     ],
 )
 def test_the_intensity_network_sees_what_it_is_told_to(setting, arguments, width):
-    config = dataclasses.replace(BARE, **setting)
-    torch.manual_seed(0)
-    network = IntensityNetwork(10, config)
-    assert network.layers[0].in_features == 10 + width
+    config = BARE.override(encoding=SMALL, networks=setting)
+    network = initialised(IntensityNetwork(config))
+    assert network.layers[0].in_features == 14 + width
     given = inputs(config)
     before = network(**given)
     assert before.shape == (20,)
@@ -98,21 +102,21 @@ def test_the_intensity_network_sees_what_it_is_told_to(setting, arguments, width
 
 
 def test_range_enters_as_its_logarithm():
-    config = BARE.override(networks={"log_range": True, "intensity_hidden": (1,)})
-    network = IntensityNetwork(1, config)
+    config = BARE.override(encoding=SMALL, networks={"log_range": True, "intensity_hidden": (1,)})
+    network = initialised(IntensityNetwork(config))
     with torch.no_grad():  # the identity of log10(range / 10 m) + 5
         for layer in (network.layers[0], network.layers[2]):
             layer.weight.fill_(1)
             layer.bias.fill_(0)
-        network.layers[0].weight[0, 0] = 0
+        network.layers[0].weight[0, :14] = 0
         network.layers[0].bias.fill_(5)
-    given = inputs(config, 4, 1) | {"ranges_m": torch.tensor([1.0, 10.0, 100.0, 0.0])}
+    given = inputs(config, 4) | {"ranges_m": torch.tensor([1.0, 10.0, 100.0, 0.0])}
     np.testing.assert_allclose(network(**given).detach(), [4, 5, 6, 1], atol=1e-6)
 
 
 def intensity(field, points, *, frozen=True, encoding_factors=None):
     geometry = field.geometry(points, frozen=frozen)
-    return field.reflectance(geometry, *views(points), encoding_factors=encoding_factors)
+    return field.intensity(geometry, *views(points), encoding_factors=encoding_factors)
 
 
 def test_normals_are_the_normalised_gradient():
@@ -131,7 +135,8 @@ def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_fr
     field, points = make_field(BARE.override(networks={"sdf_input": True}))
     seen = []
     field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[:2]))
-    factors = [torch.ones(len(points), dim) for dim in (field.cells.dim, field.fourier.dim)]
+    widths = (cells_width(BARE), fourier_width(BARE))
+    factors = [torch.ones(len(points), width) for width in widths]
     for part in factors:
         part[:, ::2] = 0
         part[:, 1::2] = 3

@@ -15,8 +15,16 @@ from radarsdf.returns.rays import prepare
 from ..conftest import SEED, pose
 from ..conftest import ground_and_wall as any_ground_and_wall
 
-QUICK = FitConfig(num_threads=1, min_component_triangles=0, min_support=0.0, training={"sdf_iterations": 60, "intensity_iterations": 80, "batch_size": 512, "intensity_batch_size": 512}, returns={"min_range_m": 0.0})  # fmt: skip
-LENGTHS = [f.name for f in dataclasses.fields(FitConfig) if f.name.endswith("_m")]
+QUICK = FitConfig(
+    num_threads=1,
+    returns={"min_range_m": 0.0},
+    training={
+        "sdf_iterations": 60,
+        "intensity_iterations": 80,
+        "batch_size": 512,
+        "intensity_batch_size": 512,
+    },
+)
 
 
 def ground_and_wall(scans=3, returns_per_scan=800):
@@ -25,8 +33,10 @@ def ground_and_wall(scans=3, returns_per_scan=800):
 
 def scaled(config, factor):
     """The same fit in other units."""
-    lengths = {n: getattr(config, n) * factor for n in LENGTHS if getattr(config, n) is not None}
-    return dataclasses.replace(config, **lengths)
+    ranges = {
+        n: v * factor for n in ("min_range_m", "max_range_m") if (v := getattr(config.returns, n)) is not None
+    }
+    return config.override(leaf_size_m=config.leaf_size_m * factor, returns=ranges)
 
 
 def finite(radar_map, sensor):
@@ -39,7 +49,8 @@ def finite(radar_map, sensor):
     assert np.isfinite(radar_map.confidence(x)).all()
     if radar_map.has_intensity:
         assert np.isfinite(radar_map.intensity(x, sensor)).all()
-    mesh = radar_map.mesh(radar_map.config.leaf_size_m / 2, progress=False)
+    voxel_size = radar_map.config.leaf_size_m / 2
+    mesh = radar_map.mesh(voxel_size, min_support=0, min_component_triangles=0, progress=False)
     assert np.isfinite(mesh.vertices).all()
     return x, mesh
 

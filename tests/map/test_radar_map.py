@@ -216,7 +216,7 @@ def test_gradient_is_the_derivative_of_the_distance(sharp_map):
     x = near_surface(400)
     local = torch.from_numpy((x - sharp_map.origin).astype(np.float32)).double()
     field = Field(sharp_map.field.cells.table.leaf_keys(), sharp_map.config, with_intensity=True)
-    field.load_state_dict(sharp_map.field.state_dict())
+    field.load_state_dict(sharp_map.field.state_dict(), assign=True)
     field.double()  # so that differences over a tiny step are exact enough
     step = 1e-6
     with torch.no_grad():

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import pickle
@@ -19,15 +18,15 @@ from radarsdf.io import files
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-QUICK = FitConfig(
-    min_component_triangles=0, training={"sdf_iterations": 60, "intensity_iterations": 8, "batch_size": 1024}
-)
+from ..settings import grouped
+
+QUICK = FitConfig(training={"sdf_iterations": 60, "intensity_iterations": 8, "batch_size": 1024})
 SENSOR = np.array([0.5, 0.0, 1.5])
 
 
 def fitted(scene, *, with_intensity=True, **changes):
     intensities = scene.intensities if with_intensity else None
-    config = dataclasses.replace(QUICK, **changes)
+    config = QUICK.override(**grouped(**changes))
     return radarsdf.fit(scene.points, scene.poses, intensities, config=config, progress=False)
 
 
@@ -60,7 +59,7 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
     before = fitted(
         scene,
         with_intensity=with_intensity,
-        encoding=encoding,
+        kind=encoding,
         normals=True,
         geometry_feature_dim=4,
         sdf_hidden=(16,),
@@ -84,7 +83,7 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
         np.testing.assert_array_equal(*(m.vertex_attributes["intensity"] for m in meshes))
 
     assert after.config == before.config
-    assert isinstance(after.config.sdf_hidden, tuple)
+    assert isinstance(after.config.networks.sdf_hidden, tuple)
     np.testing.assert_array_equal(after.origin, before.origin)
     assert after.origin.dtype == np.float64
     assert after.intensity_scale == before.intensity_scale
@@ -231,12 +230,15 @@ def test_cells_that_cannot_be(saved, tmp_path, keys):
 
 DAMAGE = {
     "unknown setting": lambda d: d["config"].update(colour="red"),
+    "unknown setting of a group": lambda d: d["config"]["training"].update(colour="red"),
+    "a group a list": lambda d: d["config"].update(training=[1, 2]),
+    "a group null": lambda d: d["config"].update(training=None),
     "setting out of range": lambda d: d["config"].update(leaf_size_m=-0.2),
-    "setting of another type": lambda d: d["config"].update(batch_size="many"),
-    "fractional count": lambda d: d["config"].update(num_levels=2.5),
-    "number beyond floats": lambda d: d["config"].update(sigma_m=10**400),
-    "other levels": lambda d: d["config"].update(num_levels=5),
-    "other width": lambda d: d["config"].update(sdf_hidden=[33, 32]),
+    "setting of another type": lambda d: d["config"]["training"].update(batch_size="many"),
+    "fractional count": lambda d: d["config"]["encoding"].update(num_levels=2.5),
+    "number beyond floats": lambda d: d["config"]["training"].update(sigma_cells=10**400),
+    "other levels": lambda d: d["config"]["encoding"].update(num_levels=5),
+    "other width": lambda d: d["config"]["networks"].update(sdf_hidden=[33, 32]),
     "no config": lambda d: d.pop("config"),
     "config a list": lambda d: d.update(config=[1, 2]),
     "no report": lambda d: d.pop("report"),
