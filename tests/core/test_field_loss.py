@@ -13,23 +13,26 @@ import pytest
 import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.field import Field
-from radarsdf.field.losses import sdf_loss
-from radarsdf.fitting.gradients import Shard, _layers
+from radarsdf.fitting.autograd_gradients import AutogradGradients
+from radarsdf.fitting.core_gradients import CoreGradients, _layers
+from radarsdf.fitting.gradients import Share
 from radarsdf.fitting.sampling import RaySampler
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
 
+from ..settings import grouped
+
 CONFIGS = {
     "default": {},
-    "octree": {"encoding": "octree", "geometry_feature_dim": 3, "fourier_count": 0},
-    "features": {"geometry_feature_dim": 15, "num_levels": 2, "fourier_count": 4, "fourier_first": 2},
+    "octree": {"kind": "octree", "geometry_feature_dim": 3, "fourier_count": 0},
+    "features": {"geometry_feature_dim": 15, "num_levels": 2, "fourier_count": 4},
     "free space": {"intensity_in_free_space": True, "feature_dropout": 0.0, "fourier_dropout": 0.0},
     "one dropout": {"feature_dropout": 0.0, "sdf_loss_weight": 0.3},
     "blind": {"sdf_input": False, "view_direction": False, "log_range": False, "intensity_hidden": (5,)},
     "not all": {"sdf_input": False, "log_range": False, "sdf_hidden": (17, 16, 3)},
     "intensities alone": {"sdf_loss_weight": 0.0},
 }
-STAGES = ("geometry", "joint", "reflectance")
+STAGES = ("sdf", "joint", "intensity")
 
 
 @pytest.fixture(scope="module")
@@ -39,24 +42,36 @@ def rays():
     return prepare([scan], np.eye(4)[None], [generator.uniform(size=300)])
 
 
-def shard_and_samples(rays, changes, dtype, batch_size=400):
-    config = FitConfig(**changes)
+@dataclasses.dataclass
+class Batch:
+    """A field, and what a thread would have of a batch."""
+
+    field: Field
+    config: FitConfig
+    samples: object
+
+    def backend(self, kind, **training):
+        """Of the first of two threads, with 0.7 of the dropout."""
+        share = Share(2, 0.7, torch.Generator().manual_seed(5))
+        return kind(self.field, self.config.override(training=training), share)
+
+
+def make_batch(rays, dtype=torch.float32, batch_size=400, **changes):
+    config = FitConfig(**grouped(**changes))
     cells = _core.CellSet(config.leaf_size_m)
     for chunk in rays.along(np.linspace(-0.3, 0.3, 7)):
         cells.insert(chunk)
-    torch.manual_seed(0)
     field = Field(cells.sorted_keys(), config, with_intensity=True)
-    field.cells.initialise(0.3)
+    field.initialise(torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        field.cells.features.mul_(6)
     generator = torch.Generator().manual_seed(1)
     sampler = RaySampler(
         rays, config, batch_size, generator, intensities=torch.from_numpy(rays.intensities.copy())
     )
     (samples,) = sampler.batch()
     exact = {name: getattr(samples, name).to(dtype) for name in ("points", "sdf_m", "of_ray")}
-    samples = dataclasses.replace(samples, **exact)
-    field.to(dtype)
-    shard = Shard(field, config, 0.7, torch.Generator(), 2, moves_rows=False)
-    return field, config, shard, samples
+    return Batch(field.to(dtype), config, dataclasses.replace(samples, **exact))
 
 
 @pytest.fixture
@@ -68,48 +83,45 @@ def default_dtype(dtype):
     torch.set_default_dtype(before)
 
 
-def by_autograd(stage, field, config, shard, samples):
-    if stage != "geometry":
-        return shard._by_autograd(samples, frozen=stage == "reflectance")
-    loss = sdf_loss(field.logit(samples.points), samples.sdf_m, config.sigma_m) / 2
-    parameters = [*field.cells.parameters(), *field.sdf_network.parameters()]
-    found = torch.autograd.grad(loss, parameters)
-    return dataclasses.make_dataclass("Expected", ["losses", "by_parameters"])({"sdf": loss.item()}, found)
-
-
 @pytest.mark.usefixtures("instruction_set", "default_dtype")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize("changes", CONFIGS.values(), ids=CONFIGS)
 def test_same_as_autograd(rays, changes, stage, dtype):
-    field, config, shard, samples = shard_and_samples(rays, changes, dtype)
-    results = []
+    batch = make_batch(rays, dtype, **changes)
+    backends = [batch.backend(kind, row_updates=False) for kind in (CoreGradients, AutogradGradients)]
     with Workers(1):
-        for gradients in (getattr(shard, stage), lambda s: by_autograd(stage, field, config, shard, s)):
-            shard.restore({"generator": torch.Generator().manual_seed(5).get_state()})
-            results.append(gradients(samples))
-    found, expected = results
+        found, expected = (getattr(backend, stage)(batch.samples) for backend in backends)
     assert found.touched is None
+    assert expected.touched is None
+    weight = batch.config.training.sdf_loss_weight
     tolerance = 3e-5 if dtype == torch.float32 else 1e-12
     assert found.losses.keys() == expected.losses.keys()
     for name, loss in found.losses.items():
         assert loss == pytest.approx(expected.losses[name], rel=tolerance)
-        assert loss > 0.01 or (name, config.training.sdf_loss_weight) == ("sdf", 0)
+        assert loss > 0.01 or (name, weight) == ("sdf", 0)
     assert len(found.by_parameters) == len(expected.by_parameters)
     for a, b in zip(found.by_parameters, expected.by_parameters, strict=True):
-        assert b.abs().max() > 0 or (stage == "joint" and config.training.sdf_loss_weight == 0)
+        assert b.abs().max() > 0 or (stage == "joint" and weight == 0)
         torch.testing.assert_close(a, b, rtol=0, atol=tolerance * max(b.abs().max().item(), 1e-3))
 
 
-def test_the_touched_features_get_the_same_gradient(rays):
-    field, config, shard, samples = shard_and_samples(rays, {}, torch.float64)
+@pytest.mark.usefixtures("default_dtype")
+@pytest.mark.parametrize("dtype", [torch.float64])
+@pytest.mark.parametrize("stage", ["sdf", "joint"])
+@pytest.mark.parametrize("kind", [CoreGradients, AutogradGradients])
+def test_the_touched_features_get_the_same_gradient(rays, kind, stage, dtype):
+    batch = make_batch(rays, dtype)
+    samples = batch.samples
     with Workers(1):
-        dense = shard.geometry(samples)
-        rows = Shard(field, config, 0.7, torch.Generator(), 2, moves_rows=True).geometry(samples)
+        dense, rows = (
+            getattr(batch.backend(kind, row_updates=row_updates), stage)(samples)
+            for row_updates in (False, True)
+        )
         touched = rows.touched
         assert touched is not None
-        by_features = torch.zeros_like(field.cells.features)
-        field.cells.table.scatter(
+        by_features = torch.zeros_like(batch.field.cells.features)
+        batch.field.cells.table.scatter(
             touched.points.numpy(),
             touched.located.numpy(),
             None,
@@ -123,35 +135,39 @@ def test_the_touched_features_get_the_same_gradient(rays):
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_extreme_logits_and_no_samples(rays, stage):
-    field, _, shard, samples = shard_and_samples(rays, {}, torch.float32)
+    batch = make_batch(rays)
+    samples = batch.samples
     with torch.no_grad():
-        for parameter in field.sdf_network.parameters():
+        for parameter in batch.field.sdf_network.parameters():
             parameter.mul_(30)
+    backend = batch.backend(CoreGradients, row_updates=False)
     with Workers(1):
-        found = getattr(shard, stage)(samples)
+        found = getattr(backend, stage)(samples)
         assert all(np.isfinite(loss) for loss in found.losses.values())
         assert all(p.isfinite().all() for p in found.by_parameters)
         none = dataclasses.replace(
             samples, points=samples.points[:0], sdf_m=samples.sdf_m[:0], of_ray=samples.of_ray[:0], num_near=0
         )
-        found = getattr(shard, stage)(none)
+        found = getattr(backend, stage)(none)
     assert set(found.losses.values()) == {0.0}
     assert not any(p.any() for p in found.by_parameters)
 
 
 def test_not_a_number_is_passed_on(rays):
-    _, _, shard, samples = shard_and_samples(rays, {}, torch.float32)
+    batch = make_batch(rays)
+    samples, backend = batch.samples, batch.backend(CoreGradients)
     samples.sdf_m[3] = float("nan")
     with Workers(1):
-        assert np.isnan(shard.geometry(samples).losses["sdf"])
+        assert np.isnan(backend.sdf(samples).losses["sdf"])
         samples.sdf_m[3] = 0
         samples.of_ray[2, 7] = float("nan")
-        losses = shard.joint(samples).losses
+        losses = backend.joint(samples).losses
     assert np.isnan(losses["intensity"])
     assert np.isfinite(losses["sdf"])
 
 
-def core_arguments(field, config):
+def core_arguments(batch):
+    field = batch.field
     return {
         "table": field.cells.table,
         "features": field.cells.features.detach().numpy(),
@@ -159,7 +175,7 @@ def core_arguments(field, config):
         "sdf": _layers(field.sdf_network),
         "intensity": _layers(field.intensity_network),
         "sees": (True, True, True),
-        "sigma_m": config.sigma_m,
+        "sigma_m": batch.config.sigma_m,
         "intensity_in_free_space": False,
     }
 
@@ -185,8 +201,7 @@ def one_more_output(layers):
     ],
 )
 def test_the_core_refuses_networks_that_do_not_fit(rays, changes, message):
-    field, config, _, _ = shard_and_samples(rays, {}, torch.float32)
-    arguments = core_arguments(field, config)
+    arguments = core_arguments(make_batch(rays))
     _core.FieldLoss(**arguments)
     changes = {k: change(arguments[k]) if callable(change) else change for k, change in changes.items()}
     with pytest.raises(ValueError, match=message):
@@ -211,8 +226,9 @@ def test_the_core_refuses_networks_that_do_not_fit(rays, changes, message):
     ],
 )
 def test_the_core_refuses_batches_that_do_not_fit(rays, changes, message):
-    field, config, _, samples = shard_and_samples(rays, {}, torch.float32)
-    loss = _core.FieldLoss(**core_arguments(field, config))
+    made = make_batch(rays)
+    samples = made.samples
+    loss = _core.FieldLoss(**core_arguments(made))
     batch = {
         "points": samples.points.numpy(),
         "sdf_m": samples.sdf_m.numpy(),
@@ -240,8 +256,8 @@ def test_the_core_refuses_batches_that_do_not_fit(rays, changes, message):
 
 
 def test_the_core_refuses_other_types_and_a_missing_network(rays):
-    field, config, _, samples = shard_and_samples(rays, {}, torch.float32)
-    arguments = core_arguments(field, config)
+    batch = make_batch(rays)
+    samples, arguments = batch.samples, core_arguments(batch)
     outputs = [np.zeros((400, 3), np.int32), np.zeros((400, 24), np.float64)]
     points, sdf_m = (samples.points.numpy().astype(np.float64), samples.sdf_m.numpy().astype(np.float64))
     with pytest.raises(TypeError, match="dtype of the features"):
@@ -255,10 +271,10 @@ def test_the_core_refuses_other_types_and_a_missing_network(rays):
 
 
 def test_the_core_keeps_what_it_reads(rays):
-    field, config, _, samples = shard_and_samples(rays, {}, torch.float32)
-    arguments = core_arguments(field, config)
+    made = make_batch(rays)
+    samples, arguments = made.samples, core_arguments(made)
     arguments["table"] = _core.VertexTable(
-        field.cells.table.leaf_keys(), config.leaf_size_m, config.num_levels
+        made.field.cells.table.leaf_keys(), made.config.leaf_size_m, made.config.encoding.num_levels
     )
     for name in ("features", "sdf", "intensity"):
         arguments[name] = copy.deepcopy(arguments[name])
