@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What users hand over as arrays of numbers, checked in one place: a ValueError or TypeError that names it."""
+"""Checks of numbers and arrays from users. The errors name the argument."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 MAX_POSITION_M = 1e12
-"""Further out than the planets, yet squares and products of three such lengths are far from overflow."""
+"""Largest coordinate, m. Squares of it, and products of three, are far from overflow in float64."""
 
-_MAX_ROTATION_ERROR = 1e-3  # of R R^T - 1: float32 poses pass, a scaled or sheared one does not
+_MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; scaled or sheared ones do not
 
 
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
-    """`values` as an array of floats, of any shape, not copied where it is one already.
+    """`values` as an array of `dtype`, of any shape. It is not copied if it is one already.
 
     Raises
     ------
     TypeError
-        For anything but real numbers: of complex ones NumPy would drop a part, of text it would read numbers.
+        If `values` are not real numbers. NumPy would drop the imaginary part of complex numbers, and parse
+        text.
     ValueError
-        For rows of different lengths, or integers beyond float64.
+        If rows have different lengths, or an integer is too large for float64.
     """
     try:
         array = np.asarray(values)
@@ -38,7 +39,7 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
     if array.dtype.kind not in "biuf":
         msg = f"{name} must be real numbers, not {array.dtype}"
         raise TypeError(msg)
-    with np.errstate(over="ignore"):  # what is too large becomes infinite, which the callers refuse
+    with np.errstate(over="ignore"):  # a number that is too large becomes infinite; the callers refuse that
         return array.astype(dtype, copy=False)
 
 
@@ -55,13 +56,19 @@ def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
-    """`poses` as (F, 4, 4) float64, or a ValueError that names the first that is not a rigid transform."""
+    """`poses` as (F, 4, 4) float64 T_world_sensor, m.
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong, or a pose is not a rigid transform. The error names the first such pose.
+    """
     T_world_sensor = real_array(poses, "poses")
     if T_world_sensor.shape != (num_scans, 4, 4):
         msg = f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
         raise ValueError(msg)
     rotation = T_world_sensor[:, :3, :3]
-    with np.errstate(all="ignore"):  # of what is refused
+    with np.errstate(all="ignore"):  # poses that are not finite are refused below
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
         rigid = (
             (np.abs(T_world_sensor) <= MAX_POSITION_M).all(axis=(1, 2))
@@ -78,7 +85,7 @@ def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
 
 
 def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:
-    """`value` as an int of a range."""
+    """`value` as an int, `lowest` ≤ value ≤ `highest`."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         msg = f"{name} must be a whole number, not {value!r:.50}"
         raise TypeError(msg)
@@ -90,7 +97,7 @@ def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -
 
 
 def positive(value: Any, name: str) -> float:
-    """`value` as a positive, finite number."""
+    """`value` as a float, positive and finite."""
     array = real_array(value, name)
     if array.shape != () or not 0 < array < np.inf:
         msg = f"{name} must be positive and finite, not {value!r:.50}"
@@ -99,7 +106,7 @@ def positive(value: Any, name: str) -> float:
 
 
 def not_negative(value: Any, name: str) -> float:
-    """`value` as a finite number of at least zero."""
+    """`value` as a float, at least 0 and finite."""
     array = real_array(value, name)
     if array.shape != () or not 0 <= array < np.inf:
         msg = f"{name} must be at least 0 and finite, not {value!r:.50}"
@@ -108,7 +115,7 @@ def not_negative(value: Any, name: str) -> float:
 
 
 def number(value: Any, name: str) -> float:
-    """`value` as a float, infinity allowed."""
+    """`value` as a float. Infinity is allowed, NaN is not."""
     array = real_array(value, name)
     if array.shape != () or np.isnan(array):
         msg = f"{name} must be a number, not {value!r:.50}"

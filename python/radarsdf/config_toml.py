@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A configuration as a TOML file: one table for each group."""
+"""Settings as a TOML file, with a table for each group."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_WIDTH = 100
+_WIDTH = 100  # columns of a comment
 
 
 def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
@@ -34,13 +34,16 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:  # of TOML, or of UTF-8
+    except ValueError as error:  # invalid TOML or invalid UTF-8
         msg = f"{path} is not a TOML file: {error}"
         raise ValueError(msg) from error
 
 
 def to_toml(config: FitConfig) -> str:
-    """All settings, each after the comment that explains it. What is None stands in a comment, since TOML has no null."""
+    """All settings, each below a comment that explains it.
+
+    A setting that is None is written as a comment, because TOML has no null.
+    """
     groups = [
         field.name
         for field in dataclasses.fields(config)
@@ -60,7 +63,7 @@ def _settings(group: Any, leave_out: list[str] | None = None) -> list[str]:
             continue
         value = getattr(group, field.name)
         lines += _comment(_descriptions(group)[field.name])
-        # JSON's numbers, strings, booleans and lists are TOML's.
+        # TOML writes numbers, strings, booleans and lists as JSON does.
         lines.append(f"# {field.name} =" if value is None else f"{field.name} = {json.dumps(value)}")
     return lines
 

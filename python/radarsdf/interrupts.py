@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Ctrl-C, held back while something must not be torn."""
+"""Delays Ctrl-C while work must not be interrupted."""
 
 from __future__ import annotations
 
@@ -13,34 +13,39 @@ from types import FrameType
 
 @contextmanager
 def deferred_interrupts() -> Iterator[Callable[[], bool]]:
-    """Gives a function that says whether Ctrl-C was pressed, so that it tears nothing: a second one does not wait.
+    """Delays Ctrl-C in a ``with`` block. Gives a function that tells whether it was pressed.
 
-    Where someone else handles the signal, or the thread is not the main one, which alone receives it, all stays as it
-    is.
+    The caller stops at the next safe place. A second Ctrl-C interrupts at once. Nothing is changed in a
+    thread that is not the main one, since only that receives the signal, nor if the program has its own
+    handler for the signal.
     """
     pressed = False
-    usual = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or usual is not signal.default_int_handler:
+    handler_before = signal.getsignal(signal.SIGINT)
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or handler_before is not signal.default_int_handler
+    ):
         yield lambda: False
         return
 
     def remember(_number: int, _frame: FrameType | None) -> None:
         nonlocal pressed
         pressed = True
-        signal.signal(signal.SIGINT, usual)
+        signal.signal(signal.SIGINT, handler_before)
 
     signal.signal(signal.SIGINT, remember)
     try:
         yield lambda: pressed
     finally:
-        signal.signal(signal.SIGINT, usual)
+        signal.signal(signal.SIGINT, handler_before)
 
 
 @contextmanager
 def whole_import() -> Iterator[None]:
-    """For the import of a library that takes any exception within for a part that is missing: Ctrl-C comes after it.
+    """Delays Ctrl-C until an import is complete.
 
-    trimesh does so. It would go on without the part, and nobody would learn that Ctrl-C was pressed.
+    For libraries such as trimesh, which take any exception during an import for a missing optional module.
+    They would go on without the module, and Ctrl-C would have no effect.
     """
     with deferred_interrupts() as pressed:
         yield

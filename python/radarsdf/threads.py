@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Threads that each run whole pieces of work, with PyTorch's own threads off.
+"""Python threads for large pieces of work. PyTorch's own threads are off meanwhile.
 
-PyTorch splits every single operation over OpenMP's threads, which spin while they wait for each other. Beside another
-busy process, a fit of 1.8 s took 88 s, since a thread that should work waited for the time slice of one that spun.
-Pieces of work on Python's threads, which sleep when they wait, meet once an iteration instead of a hundred times, and
-share the processor fairly; on an idle machine they are no slower. The interpreter's lock costs little: PyTorch and the
-compiled core release it.
+PyTorch splits every operation over OpenMP threads, which spin while they wait for each other. Beside another
+busy process, a fit of 1.8 s took 88 s: threads that had work waited for the time slices of threads that only
+spun. Python threads sleep while they wait. They synchronise once in an iteration instead of a hundred times.
+On an idle machine they are no slower. The interpreter's lock costs little, because PyTorch and the compiled
+core release it.
 """
 
 from __future__ import annotations
@@ -30,41 +30,46 @@ _Result = TypeVar("_Result")
 _lock = threading.Lock()
 _users = 0
 _threads_before = 0
-_blocks = threading.local()  # .depth: blocks that this thread is in
+_blocks = threading.local()  # .depth: number of `with Workers` blocks that this thread is in
 
 
 def _use_one_thread() -> None:
-    torch.get_num_threads()  # a thread's first call of anything else would undo the next line
+    torch.get_num_threads()  # initialises PyTorch in this thread, which would otherwise undo the next line
     torch.set_num_threads(1)
 
 
-def _begin_anew() -> None:
-    """In a forked child there is only the thread that forked, and OpenMP waits for its others for ever.
+def _reset_after_fork() -> None:
+    """Makes a forked child use one thread.
 
-    A lock that another thread held would never be released. The compiled core sees to its own number of threads.
+    The child has only the thread that forked. OpenMP would wait for ever for the others, and a lock that
+    another thread held would never be released. The compiled core limits its own number of threads.
     """
-    global _lock, _users, _blocks  # noqa: PLW0603 - the child begins anew
+    global _lock, _users, _blocks  # noqa: PLW0603 - this state belongs to the process
     _lock = threading.Lock()
     _users, _blocks = 0, threading.local()
     torch.set_num_threads(1)
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_begin_anew)
+    os.register_at_fork(after_in_child=_reset_after_fork)
 
 
 def resolve_num_threads(num_threads: int) -> int:
-    """`num_threads`, or where it is 0 as many as PyTorch would use."""
+    """`num_threads`, or if it is 0 as many as PyTorch uses.
+
+    Inside a block of :class:`Workers`, PyTorch uses one. Then it is the number from before the block.
+    """
     with _lock:
         return num_threads or (_threads_before if _users else torch.get_num_threads())
 
 
 class Workers:
-    """`num_threads` threads for the time of a ``with`` block.
+    """A pool of `num_threads` threads for a ``with`` block. 0: as many as PyTorch uses.
 
-    PyTorch's number of threads is each thread's own, and a new thread begins with what was set last anywhere. So every
-    thread's outermost block sets 1 and restores, and a thread that meets PyTorch first while another is in a block
-    takes over the number from before that block.
+    PyTorch keeps its number of threads for each thread. A new thread starts with the number that any thread
+    set last. So the outermost block of each thread sets 1 and restores the number afterwards. It restores the
+    number from before the first block that is still open, because a thread that first used PyTorch since then
+    has read 1.
     """
 
     def __init__(self, num_threads: int = 0) -> None:
@@ -72,7 +77,7 @@ class Workers:
         self._pool: ThreadPoolExecutor | None = None
 
     def __enter__(self) -> Self:
-        global _users, _threads_before  # noqa: PLW0603 - there is one PyTorch
+        global _users, _threads_before  # noqa: PLW0603 - PyTorch's setting is global too
         with _lock:
             depth = getattr(_blocks, "depth", 0)
             if _users == 0:
@@ -92,7 +97,7 @@ class Workers:
         assert self._pool is not None
         try:
             self._pool.shutdown(cancel_futures=True)
-        finally:  # a second Ctrl-C does not wait for the threads
+        finally:  # also if a second Ctrl-C interrupts the wait for the threads
             with _lock:
                 _users -= 1
                 _blocks.depth -= 1
@@ -100,14 +105,20 @@ class Workers:
                     torch.set_num_threads(_blocks.threads_before)
 
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
-        """Like the built-in, in order, the items on different threads. Grad mode is each thread's own."""
+        """Like the built-in ``map``, with the items on different threads and the results in their order.
+
+        PyTorch's grad mode is not passed on: `function` starts with gradients on in the threads of the pool.
+        If only one thread is used, or there is only one item, it runs in the calling thread, with the grad
+        mode of that.
+        """
         assert self._pool is not None
         if self.num_threads == 1 or len(items) <= 1:
             return map(function, items)
         if len(items) > self.num_threads:
             return self._pool.map(function, items)
-        # One for each: this thread takes the first, rather than wait and be woken, which an iteration would feel.
+        # Every item gets a thread. The calling thread computes the first one itself: to sleep and be woken
+        # would take a noticeable part of an iteration.
         others = self._pool.map(function, items[1:])
-        with torch.enable_grad():  # as in a new thread
+        with torch.enable_grad():  # as in the threads of the pool
             first = function(items[0])
         return itertools.chain([first], others)
