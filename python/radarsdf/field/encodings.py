@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Encodings of positions and directions as modules: what the networks see instead of coordinates."""
+"""Encodings of positions and directions, the inputs of the networks, as PyTorch modules."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from torch import Tensor, nn
 from radarsdf._core import FEATURE_DIM, Encoding, VertexTable
 from radarsdf.field import kernels
 
-_FEATURE_STD = 0.05
+_FEATURE_STD = 0.05  # standard deviation of the features at the start (3QFP)
 
 
 class VertexFeatures(nn.Module):
-    """Learnable vectors of 8 floats at the vertices of the occupied cells.
+    """A learnable feature, 8 floats, at each vertex of the occupied cells, interpolated inside the cells.
 
     Parameters
     ----------
     leaf_keys : ndarray
         (C,) uint64, Morton keys of the occupied leaf cells, ascending (``CellSet.sorted_keys``).
     leaf_size_m : float
-        Edge of a cell of the finest level, m.
+        Edge of a leaf cell, which is a cell of the finest level, m.
     num_levels : int
-        Each level's cells are twice as large as those of the level before.
+        Levels of cells. The cells of each level are twice as large as those of the level before.
     num_threads : int
-        For building the table; 0: as many as OpenMP uses.
+        Threads that build the table of vertices. 0: as many as OpenMP uses.
     """
 
     encoding: Encoding
@@ -43,7 +43,7 @@ class VertexFeatures(nn.Module):
 
     @property
     def interpolated_dim(self) -> int:
-        """Numbers that are interpolated for a point."""
+        """Interpolated numbers of a point: 8 for each level."""
         return FEATURE_DIM * self.table.num_levels
 
     def initialise(self, generator: torch.Generator) -> None:
@@ -51,12 +51,12 @@ class VertexFeatures(nn.Module):
         nn.init.normal_(self.features, std=_FEATURE_STD, generator=generator)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Encoding (N, any) of points (N, 3), local frame, m."""
+        """Encoding (N, width) of points (N, 3), local frame, m."""
         return self.combine(kernels.interpolate(self.features, points, self.table))
 
     @abstractmethod
     def combine(self, interpolated: Tensor) -> Tensor:
-        """From what is interpolated, (N, `interpolated_dim`), to the encoding."""
+        """The encoding (N, width) from the interpolated features (N, `interpolated_dim`)."""
 
     def occupied(self, points: Tensor) -> Tensor:
         """Whether each point (N, 3), local frame, m, lies in an occupied leaf cell: (N,) bool."""
@@ -64,7 +64,10 @@ class VertexFeatures(nn.Module):
 
 
 class TriQuadtree(VertexFeatures):
-    """Quadtrees on the planes xy, xz, yz: planes summed, levels concatenated, (N, 8 · num_levels) (3QFP, ICRA 2024)."""
+    """Features on quadtrees in the planes xy, xz and yz (3QFP, ICRA 2024).
+
+    The encoding has the sum over the planes, side by side for all levels: (N, 8 · num_levels).
+    """
 
     encoding = Encoding.TRI_QUADTREE
 
@@ -73,7 +76,10 @@ class TriQuadtree(VertexFeatures):
 
 
 class Octree(VertexFeatures):
-    """Features at the corners of cells in space, trilinear, levels summed, (N, 8) (SHINE-Mapping, ICRA 2023)."""
+    """Features at the corners of an octree's cells, interpolated trilinearly (SHINE-Mapping, ICRA 2023).
+
+    The encoding is the sum over the levels: (N, 8).
+    """
 
     encoding = Encoding.OCTREE
 
@@ -97,7 +103,8 @@ class Fourier(nn.Module):
 
 
 class SphericalHarmonics(nn.Module):
-    """Real spherical harmonics of degree 0 to 3 ("degree 4" of the paper): unit vectors (N, 3) to (N, 16)."""
+    """Real spherical harmonics of degree 0 to 3 of unit vectors (N, 3): (N, 16). 3QFPI calls this "degree
+    4"."""
 
     def forward(self, directions: Tensor) -> Tensor:
         return kernels.spherical_harmonics(directions)

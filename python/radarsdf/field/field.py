@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The learnt field: encodings and networks together, in the local frame and in scaled intensities."""
+"""The learnt field: encodings and networks together. Positions are local; intensities are scaled to [0,
+1]."""
 
 from __future__ import annotations
 
@@ -20,37 +21,37 @@ from radarsdf.field.networks import IntensityNetwork, SDFNetwork
 
 @dataclass(frozen=True)
 class Geometry:
-    """What the SDF network sees and says of N points."""
+    """Inputs and outputs of the SDF network at N points."""
 
     encoding: tuple[Tensor, ...]
-    """Of the cells and, where there are frequencies, of Fourier: (N, any) each."""
+    """Inputs, (N, width) each: the encoding by the cells, then the Fourier encoding if there is one."""
     logit: Tensor
     """(N,) signed distance / sigma, positive in free space."""
     feature: Tensor
-    """(N, G), handed on to the intensity network."""
+    """(N, geometry_feature_dim), an input of the intensity network."""
     normals: Tensor | None
-    """(N, 3) unit vectors towards free space, where the intensity network asks for them."""
+    """(N, 3) unit vectors towards free space. None if the intensity network does not use them."""
 
     def first(self, count: int) -> Geometry:
-        """Of the first `count` points alone."""
+        """The part for the first `count` points."""
         normals = None if self.normals is None else self.normals[:count]
         encoding = tuple(part[:count] for part in self.encoding)
         return Geometry(encoding, self.logit[:count], self.feature[:count], normals)
 
 
 class Field(nn.Module):
-    """Signed distance and, where there are intensities, reflectance at points of the local frame.
+    """Signed distance, and if there are intensities also intensity, at points of the local frame.
 
     Parameters
     ----------
     leaf_keys : ndarray
-        (C,) uint64, occupied leaf cells (``CellSet.sorted_keys``).
+        (C,) uint64, Morton keys of the occupied leaf cells, ascending (``CellSet.sorted_keys``).
     config : FitConfig
-        Shapes and scales.
+        Its encoding, its networks and its lengths are used.
     with_intensity : bool
-        Whether there is an intensity network at all.
+        Whether the field has an intensity network.
     num_threads : int
-        For building the table of cells; 0: as many as OpenMP uses.
+        Threads that build the table of vertices. 0: as many as OpenMP uses.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class Field(nn.Module):
         self.intensity_network = IntensityNetwork(config) if with_intensity else None
 
     def initialise(self, generator: torch.Generator, *, features: bool = True) -> None:
-        """Draws the weights of the networks, then the features, which stay zero where `features` is False (3QFP)."""
+        """Draws the weights of the networks, then the features (3QFP). `features` False: they stay zero."""
         self.sdf_network.initialise(generator)
         if self.intensity_network is not None:
             self.intensity_network.initialise(generator)
@@ -73,7 +74,11 @@ class Field(nn.Module):
             self.cells.initialise(generator)
 
     def encode(self, points: Tensor, interpolated: Tensor | None = None) -> tuple[Tensor, ...]:
-        """(N, 3) local, m, to (N, any) each. `interpolated`: what the cells' features give there, where it is known."""
+        """The inputs of the SDF network, (N, width) each, at points (N, 3), local frame, m.
+
+        `interpolated`: the features of the cells at the points, (N, interpolated_dim), if they are known
+        already.
+        """
         cells = self.cells(points) if interpolated is None else self.cells.combine(interpolated)
         return (cells, self.fourier(points)) if self.fourier.num_frequencies else (cells,)
 
@@ -82,18 +87,18 @@ class Field(nn.Module):
         return self.sdf_network(self.encode(points, interpolated))[0]  # type: ignore[no-any-return]
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """(N,) m, positive in free space."""
+        """Signed distance (N,), m, positive in free space, at points (N, 3), local frame, m."""
         return self.logit(points) * self.sigma_m
 
     def geometry(
         self, points: Tensor, *, frozen: bool = True, interpolated: Tensor | None = None
     ) -> Geometry:
-        """What the intensity network may see of points (N, 3), local, m.
+        """The inputs of the intensity network at points (N, 3), local frame, m.
 
         `frozen`: no gradient reaches features and SDF network. `interpolated`: see :meth:`encode`.
         """
         wants_normals = self.intensity_network is not None and self.intensity_network.normals
-        # The normal is itself a gradient: where it is wanted, its own graph is needed for a moment.
+        # A normal is the gradient of the logit, so it needs an autograd graph even if the field is frozen.
         with torch.set_grad_enabled((torch.is_grad_enabled() and not frozen) or wants_normals):
             if wants_normals:
                 points = points.detach().requires_grad_()
@@ -116,10 +121,16 @@ class Field(nn.Module):
         *,
         encoding_factors: Sequence[Tensor] | None = None,
     ) -> Tensor:
-        """Scaled intensity (N,) where the geometry is that of the same points.
+        """Scaled intensity (N,).
 
-        Directions and ranges are those of :class:`~radarsdf.field.networks.IntensityNetwork`. What that sees of the encoding is
-        multiplied by `encoding_factors`, (N, any) each: dropout.
+        Parameters
+        ----------
+        geometry : Geometry
+            The result of :meth:`geometry` at the N points.
+        directions, ranges_m : Tensor
+            As for :class:`~radarsdf.field.networks.IntensityNetwork`.
+        encoding_factors : sequence of Tensor, optional
+            Dropout: what each part of the encoding is multiplied by, of the same shapes.
         """
         assert self.intensity_network is not None
         encoding = geometry.encoding

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: MIT
 """Autograd functions over the compiled core.
 
-Each is a :class:`torch.autograd.Function` rather than a ``torch.library`` operator: measured at 16, 1024 and 8192
-points, forward and backward through an operator cost 10 to 17 µs more a call (30 against 40 to 47 µs at 16 points),
-and an operator could not take the vertex table as an argument without a global registry of handles.
+They are :class:`torch.autograd.Function`, not ``torch.library`` operators. Measured at 16, 1024 and 8192
+points, forward and backward of an operator take 10 to 17 µs more (at 16 points 40 to 47 instead of 30 µs).
+And an operator could only get the vertex table through a global registry.
 
-Tensors cross to the core as NumPy views of the same memory. Results are the same bits for any number of threads.
+The core gets tensors as NumPy views of the same memory. Results have the same bits with any number of
+threads.
 """
 
 from __future__ import annotations
@@ -31,39 +32,40 @@ _CACHE_LINE = 64  # bytes
 
 @dataclass(frozen=True)
 class AdamMemory:
-    """What :func:`adam_step` keeps between steps, for every row."""
+    """What :func:`adam_step` remembers of each row of features between steps."""
 
     moments: Tensor
-    """(num_rows, 16): mean and mean square of each row's gradients."""
+    """(num_rows, 16): mean (8) and mean square (8) of the row's gradients."""
     marks: Tensor
-    """(num_rows, 2) int32: the step in which a row last moved, or 0, and a 0 that only means something within a step."""
+    """(num_rows, 2) int32: the last step that changed the row, 0 for none; then a mark that the core uses
+    during a step, and that is 0 between steps."""
 
 
 def view(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """What the core takes: a NumPy view in C order."""
+    """A NumPy view in C order, as the core takes it. A tensor in another order is copied."""
     return tensor.detach().contiguous().numpy()
 
 
 def rows_view(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """Like :func:`view`, but leaves a block of columns of a larger matrix where it is."""
+    """Like :func:`view`, but does not copy a block of columns of a larger matrix."""
     tensor = tensor.detach()
     return (tensor if tensor.stride(1) == 1 and tensor.stride(0) > 0 else tensor.contiguous()).numpy()
 
 
 def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Zeros for what is then read and written all over.
+    """Zeros of this shape in huge memory pages, for random access.
 
-    NumPy asks for huge pages (from 4 MB on), PyTorch does not: with small ones, a step of Adam on a map of a million rows
-    takes half as long again.
+    NumPy asks for huge pages from 4 MB on, PyTorch does not. With small pages, a step of Adam on a map of a
+    million rows takes 1.5 times as long.
     """
     like = torch.empty(0, dtype=dtype, device="cpu").numpy()
     numbers = np.zeros(math.prod(shape) + _CACHE_LINE, like.dtype)
-    first = -numbers.ctypes.data % _CACHE_LINE // numbers.itemsize  # or rows would lie across two lines
+    first = -numbers.ctypes.data % _CACHE_LINE // numbers.itemsize  # else a row would lie in two lines
     return torch.from_numpy(numbers[first : first + math.prod(shape)].reshape(shape))
 
 
 def threads() -> int:
-    """How many the core is to use: as many as PyTorch would."""
+    """Threads that the core uses in a call: as many as PyTorch in the calling thread."""
     return torch.get_num_threads()
 
 
@@ -85,7 +87,10 @@ def _interpolate(
 def scatter(
     table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
 ) -> Tensor:
-    """Gradient (num_rows, 8) by the features, of (interpolated . out_grad); along `directions`, of its derivative."""
+    """Gradient of the sum of interpolated · out_grad with respect to the features, (num_rows, 8).
+
+    With `directions` (N, 3), the interpolated features are replaced by their derivatives along these.
+    """
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
     table.scatter(
         view(points),
@@ -119,8 +124,9 @@ def _coordinate_gradient(
     return points_grad
 
 
-# With y = W(x) F (interpolate), the core's other two sums are W(x)^T g (scatter) and d(y . g)/dx (coordinate_gradient).
-# Given a direction v in place of nothing, W becomes dW/dx . v in all three, and that closes them under differentiation.
+# The core computes y = W(x) F (interpolate), W(x)^T g (scatter) and d(y . g)/dx (coordinate_gradient). With a
+# direction v, all three use dW/dx . v instead of W. Their derivatives are again such sums, so these are
+# enough to differentiate twice.
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
@@ -162,7 +168,7 @@ class _InterpolateBackward(torch.autograd.Function):
         ctx.table = table
         ctx.set_materialize_grads(
             False
-        )  # an unused gradient is None, not a matrix of zeros to be interpolated
+        )  # an unused gradient is then None: no time is spent on interpolating zeros
         return (
             scatter(table, points, located, None, out_grad) if needs_features else None,
             _coordinate_gradient(table, features, points, located, None, out_grad) if needs_points else None,
@@ -207,7 +213,7 @@ class _Fourier(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, out_grad: Tensor) -> tuple[Tensor, None, None, None]:
-        # Differentiable torch operations on the saved output, so that autograd can differentiate them again.
+        # PyTorch operations on the saved output, so that autograd can differentiate them again.
         (out,) = ctx.saved_tensors
         half_width_m, first, count = ctx.frequencies
         scale = torch.tensor(
@@ -219,7 +225,8 @@ class _Fourier(torch.autograd.Function):
 
 
 def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
-    """Features at points, bilinear on each plane of each level (method: tri-quadtree encoding of 3QFP).
+    """Features at points: for a tri-quadtree bilinear on each plane, then summed (3QFP); for an octree
+    trilinear.
 
     Parameters
     ----------
@@ -228,19 +235,20 @@ def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
     points : Tensor
         (N, 3), the dtype of `features`, local frame, m.
     table : VertexTable
-        Which rows belong to which cell.
+        The rows of `features` at the vertices of each cell.
 
     Returns
     -------
     Tensor
-        (N, 8 · num_levels), finest level first; zero at the levels where the point's cell is not occupied.
-        Differentiable twice, by features and points. The gradient by points is that inside the cell.
+        (N, 8 · num_levels), finest level first. Zero at a level at which the point is in no occupied cell. It
+        can be differentiated twice, with respect to features and points. The gradient at points is the one
+        inside their cell.
     """
     return _Interpolate.apply(features, points, table)  # type: ignore[no-any-return, no-untyped-call]
 
 
 def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor, Tensor]:
-    """:func:`interpolate` without a gradient, and the cells (N, num_levels) int32 of :func:`locate`."""
+    """:func:`interpolate` without gradients, and the result of :func:`locate`, (N, num_levels) int32."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
     table.encode(view(features), view(points), located.numpy(), out.numpy(), threads())
@@ -258,20 +266,21 @@ def adam_step(
     learning_rate: float,
     epsilon: float,
 ) -> Callable[[], None]:
-    """One step of Adam on the rows that batches touch, in place; the others stay as they are.
+    """A step of Adam, in place, on the rows of features that batches touch. Other rows do not change.
 
     Parameters
     ----------
     table : VertexTable
-        Of the features.
+        The rows of `features` at the vertices of each cell.
     batches : sequence of (points, located, gradient)
-        (N, 3), (N, num_levels) int32 and (N, 8 · num_levels): where, and the loss's gradient by the interpolated features.
+        Points (N, 3), local frame, m; their cells (N, num_levels) int32, from :func:`locate`; and the
+        gradient of the loss with respect to the interpolated features (N, 8 · num_levels).
     features : Tensor
         (num_rows, 8).
     memory : AdamMemory
-        What the step remembers of earlier ones.
+        State of Adam from the steps before.
     decays : Tensor
-        (more than `step`, 2): both betas to the powers 0, 1, …
+        (more than `step`, 2): both betas of Adam to the powers 0, 1, …
     step : int
         Number of this step, from 1 on.
     learning_rate, epsilon : float
@@ -280,7 +289,8 @@ def adam_step(
     Returns
     -------
     callable
-        That does what of the step no other call of it has begun: threads share it by all calling it.
+        Does the step. Several threads may call it at once; each does a part, and together they do the whole
+        step.
     """
     return functools.partial(
         table.adam_step,
@@ -297,21 +307,25 @@ def adam_step(
 
 
 def locate(points: Tensor, table: VertexTable) -> Tensor:
-    """Occupied cell that holds each point (N, 3), local frame, m: (N, num_levels) int32, finest first, -1 where none."""
+    """Row of the occupied cell that holds each point (N, 3), local frame, m, at each level.
+
+    (N, num_levels) int32, finest level first. -1: the point is in no occupied cell.
+    """
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
     table.locate(view(points), located.numpy(), threads())
     return located
 
 
 def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequencies: int) -> Tensor:
-    """Sines, then cosines, of 2^k·π·points / half_width_m for k = first_frequency, …: (N, 6 · num_frequencies)."""
+    """Sines, then cosines, of 2^k·π·points / half_width_m for k = first_frequency, …: (N, 6 ·
+    num_frequencies)."""
     return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-any-return, no-untyped-call]
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    """Real spherical harmonics of degree 0 to 3 of unit vectors (N, 3): (N, 16). Directions are data: no gradient."""
+    """Real spherical harmonics of degree 0 to 3 of unit vectors (N, 3): (N, 16). Not differentiable."""
     if directions.requires_grad:
-        msg = "spherical_harmonics has no gradient by the directions"
+        msg = "spherical_harmonics has no gradient with respect to the directions"
         raise NotImplementedError(msg)
     out = directions.new_empty((directions.shape[0], NUM_SPHERICAL_HARMONICS))
     _spherical_harmonics(view(directions), out.numpy(), threads())

@@ -10,12 +10,14 @@ from torch.nn import functional
 
 
 def sdf_loss(logit: Tensor, sdf_m: Tensor, sigma_m: float) -> Tensor:
-    """Binary cross-entropy of sigmoid(logit) and sigmoid(sdf / sigma): near the surface counts most (SHINE-Mapping).
+    """Binary cross-entropy of sigmoid(logit) against sigmoid(sdf / sigma) (SHINE-Mapping).
+
+    The sigmoid gives errors near the surface the most weight.
 
     Parameters
     ----------
     logit : Tensor
-        (B,) output of the SDF network, distance / sigma, positive in free space.
+        (B,) output of the SDF network: signed distance / sigma, positive in free space.
     sdf_m : Tensor
         (B,) label, m, positive in free space.
     sigma_m : float
@@ -25,5 +27,5 @@ def sdf_loss(logit: Tensor, sdf_m: Tensor, sigma_m: float) -> Tensor:
 
 
 def intensity_loss(predicted: Tensor, label: Tensor) -> Tensor:
-    """Mean absolute error of scaled intensities (B,): less drawn by outliers than squares (3QFPI)."""
+    """Mean absolute error of scaled intensities (B,). Outliers count less than in a squared error (3QFPI)."""
     return functional.l1_loss(predicted, label)

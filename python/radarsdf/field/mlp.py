@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Networks of linear layers as an autograd function over the compiled core."""
+"""Multi-layer perceptrons as an autograd function over the compiled core."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ from radarsdf.field.kernels import rows_view, threads, view
 
 
 def mlp(inputs: Sequence[Tensor], layers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """Linear layers with ReLU between them, a few rows at a time through all of them.
+    """Linear layers with ReLU between them.
 
-    PyTorch's operations one after the other take half as long again, and each of their dozen calls waits for the
-    interpreter's lock, so that two threads train little faster than one.
+    The core takes a few rows at a time through all layers. PyTorch, which takes all rows through one layer
+    after the other, needs 1.5 times as long. It also makes a dozen calls, each of which waits for the
+    interpreter's lock, so two threads would train hardly faster than one.
 
     Parameters
     ----------
     inputs : sequence of Tensor
-        (N, any) each: side by side, they are what the first layer sees.
+        (N, width) each. Side by side they are the input of the first layer.
     layers : sequence of (weight, bias)
         (outputs, inputs) and (outputs,) of each layer, like those of ``torch.nn.Linear``.
 
     Returns
     -------
     Tensor
-        (N, outputs of the last layer). Differentiable as often as PyTorch's own. A row's bits depend on no other row;
-        gradients are the same bits for any number of threads.
+        (N, outputs of the last layer). It can be differentiated any number of times. The bits of a row do not
+        depend on the other rows. Gradients have the same bits with any number of threads.
     """
     return _MLP.apply(len(layers), *(t for layer in layers for t in layer), *inputs)  # type: ignore[no-any-return, no-untyped-call]
 
 
 class _MLP(torch.autograd.Function):
-    # Tensors are weight and bias of each layer, then the inputs.
+    # `tensors` are weight and bias of each layer, then the inputs.
     @staticmethod
     def forward(ctx: Any, num_layers: int, *tensors: Tensor) -> Tensor:
         inputs = tensors[2 * num_layers :]
@@ -55,14 +56,14 @@ class _MLP(torch.autograd.Function):
     def backward(ctx: Any, out_grad: Tensor) -> tuple[Tensor | None, ...]:
         tensors: tuple[Tensor, ...] = ctx.saved_tensors
         wanted: tuple[bool, ...] = ctx.needs_input_grad[1:]
-        if torch.is_grad_enabled():  # the gradient will itself be differentiated
+        if torch.is_grad_enabled():  # the gradient may be differentiated again, which the core cannot do
             chosen = [t for t, w in zip(tensors, wanted, strict=True) if w]
             found = iter(
                 torch.autograd.grad(_plain(ctx.num_layers, tensors), chosen, out_grad, create_graph=True)
             )
             return None, *(next(found) if w else None for w in wanted)
         split = 2 * ctx.num_layers
-        by_layers = any(wanted[:split])  # of all layers or of none: together they cost hardly more than one
+        by_layers = any(wanted[:split])  # the core computes all of them: that takes little longer than one
         grads = [
             torch.empty_like(t, memory_format=torch.contiguous_format)
             if w or (by_layers and i < split)
@@ -84,13 +85,13 @@ class _MLP(torch.autograd.Function):
 
 
 def _views(num_layers: int, tensors: Sequence[Tensor]) -> tuple[list[Any], list[Any], list[Any]]:
-    """Inputs, weights and biases for the core."""
+    """Inputs, weights and biases as the core takes them."""
     layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
     return [rows_view(x) for x in inputs], [view(w) for w in layers[::2]], [view(b) for b in layers[1::2]]
 
 
 def _plain(num_layers: int, tensors: Sequence[Tensor]) -> Tensor:
-    """The same in PyTorch's own operations."""
+    """The same network in PyTorch operations, which autograd can differentiate any number of times."""
     x = torch.cat(list(tensors[2 * num_layers :]), 1)
     for i in range(num_layers):
         x = functional.linear(x if i == 0 else torch.relu(x), tensors[2 * i], tensors[2 * i + 1])

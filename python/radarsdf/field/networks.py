@@ -18,7 +18,7 @@ from radarsdf.field.widths import intensity_widths, sdf_widths
 
 
 class Network(nn.Module):
-    """Linear layers with ReLU between them. They take no memory until they are initialised or loaded."""
+    """Linear layers with ReLU between them. They have no memory until they are initialised or loaded."""
 
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class Network(nn.Module):
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:
-        """Draws weights and biases as ``torch.nn.Linear`` does, from a generator of our own."""
+        """Draws weights and biases like ``torch.nn.Linear``, but from `generator`."""
         for layer in self._linear():
             # Not to_empty(), which imports SymPy: a second.
             layer.weight, layer.bias = (
@@ -46,20 +46,25 @@ class Network(nn.Module):
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def _run(self, inputs: Sequence[Tensor]) -> Tensor:
-        """The layers on `inputs` side by side."""
+        """Output of the layers for `inputs`, (N, width) each, side by side."""
         layers = [(layer.weight, layer.bias) for layer in self._linear()]
         return mlp([x for x in inputs if x.shape[1] > 0], layers)
 
 
 class SDFNetwork(Network):
-    """Encoding of a point to distance / sigma (positive in free space) and, where asked for, a geometry feature."""
+    """From the encoding of a point to signed distance / sigma, positive in free space, and a geometry
+    feature."""
 
     def __init__(self, config: FitConfig) -> None:
         super().__init__(sdf_widths(config))
 
     @torch.no_grad()
     def start_as_input(self, index: int) -> None:
-        """Makes the logit one number of the encoding, which two units of each hidden layer carry past the ReLUs."""
+        """Sets the weights so that the logit equals column `index` of the encoding.
+
+        Two units of each hidden layer hold the positive and the negative part x of it: x = relu(x) -
+        relu(-x).
+        """
         first, *hidden, last = self._linear()
         for layer in (first, *hidden):
             layer.weight[:2] = 0
@@ -72,16 +77,18 @@ class SDFNetwork(Network):
         last.weight[0, 0], last.weight[0, 1] = 1, -1
 
     def forward(self, encoding: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Encodings (N, any), side by side, to the logit (N,) and the geometry feature (N, geometry_feature_dim)."""
+        """Logit (N,) and geometry feature (N, geometry_feature_dim) of encodings (N, width), side by side."""
         out = self._run(encoding)
-        # A column of several costs its gradient a matrix of zeros: where there is but one, it is the matrix.
+        # The gradient of out[:, 0] is a matrix filled up with zeros. squeeze avoids it if there is only one
+        # column.
         return out.squeeze(1) if out.shape[1] == 1 else out[:, 0], out[:, 1:]
 
 
 class IntensityNetwork(Network):
-    """How strongly a point answers a sensor, scaled to about [0, 1].
+    """Intensity of the return that a sensor gets from a point, scaled to about [0, 1].
 
-    The radar equation, P ∝ σ / r⁴, needs the range as well as the direction: in dB its logarithm enters linearly.
+    By the radar equation, P ∝ σ / r⁴, it depends on the range as well as on the direction. In dB it is linear
+    in log r, so log r is the input.
     """
 
     def __init__(self, config: FitConfig) -> None:
@@ -107,9 +114,9 @@ class IntensityNetwork(Network):
         Parameters
         ----------
         encoding, logit, geometry_feature : Tensor
-            (N, any) each, (N,) and (N, G): input and outputs of the SDF network.
+            (N, width) each, (N,) and (N, geometry_feature_dim): inputs and outputs of the SDF network.
         normals : Tensor or None
-            (N, 3) unit normals, towards free space; needed where the configuration asks for them.
+            (N, 3) unit normals, towards free space. Needed if ``config.networks.normals``.
         directions, ranges_m : Tensor
             (N, 3) unit vectors from the sensor to the points, world axes, and the distances (N,), m.
         """
