@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From returns to a map: sampling, gradients, optimiser, the training loop, checkpoints."""
+"""From returns to a map: sampling, gradients, optimisers, the training loop and checkpoints."""

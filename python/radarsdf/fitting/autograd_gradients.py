@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Losses and gradients by PyTorch's autograd: the plain definition, which the core is tested against."""
+"""Losses and gradients by PyTorch's autograd: the reference that the compiled core is tested against."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from radarsdf.fitting.sampling import Samples
 
 
 class AutogradGradients(GradientBackend):
-    """The losses as the field defines them, differentiated by PyTorch."""
+    """Losses of the field, differentiated by PyTorch."""
 
     def sdf(self, samples: Samples) -> Gradients:
         touched = self._touched(samples)
@@ -37,7 +37,12 @@ class AutogradGradients(GradientBackend):
         return self._gradients({"intensity": self._intensity_loss(geometry, samples)}, None, frozen=True)
 
     def _touched(self, samples: Samples) -> Touched | None:
-        """Where only touched features move: what the samples take of them, in the place of its gradient."""
+        """If only touched features move: the samples with their interpolated features in place of the
+        gradient.
+
+        These are the leaves that autograd differentiates with respect to. :meth:`_gradients` puts in the
+        gradient.
+        """
         if not self._moves_rows:
             return None
         cells = self._field.cells
@@ -50,7 +55,7 @@ class AutogradGradients(GradientBackend):
     def _intensity_loss(self, geometry: Geometry, samples: Samples) -> Tensor:
         count = self._num_seen(samples)
         labels = samples.intensities[:count].clone()
-        labels[samples.num_near :] = 0  # no return is expected from free space (3QFPI)
+        labels[samples.num_near :] = 0  # free space returns nothing (3QFPI)
         predicted = self._field.intensity(
             geometry.first(count),
             samples.directions[:count],

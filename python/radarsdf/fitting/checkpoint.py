@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The state of a fit in a file, from which it goes on to the bits that it would have come to without a stop."""
+"""The state of a fit in a file. A fit that goes on from it ends with the same bits as one without a stop."""
 
 from __future__ import annotations
 
@@ -25,32 +25,35 @@ if TYPE_CHECKING:
     from radarsdf.fitting.training import Training
 
 FORMAT = "radarsdf.checkpoint"
-_EVERY_S = 30.0
-_SHARE = 0.02  # of the time, at most, goes into writing
-_NOT_OF_THE_TRAINING = ("num_threads", "max_memory_bytes")
+_EVERY_S = 30.0  # seconds between two files, at least
+_SHARE = 0.02  # largest share of the time that is spent on writing
+_SETTINGS_NOT_COMPARED = ("num_threads", "max_memory_bytes")  # another number of threads shows in the tensors
 
 
 class Checkpoint:
-    """A file that the training writes its state to, every half minute or, where that takes long, less often.
+    """A file that the training writes its state to, every half minute or less often if writing takes long.
 
     Parameters
     ----------
     path : path-like
-        Written whole or not at all. If it exists, it must be a checkpoint of the same fit.
-    rays, config
-        What is fitted, and how: the file holds a digest of the first and a copy of the second.
+        An existing file must be a checkpoint of the same fit. It is replaced only once the new one is
+        complete.
+    rays : Rays
+        All returns of the fit. The file holds a digest of them.
+    config : FitConfig
+        Settings of the fit. The file holds a copy.
 
     Raises
     ------
     ValueError
-        If the file is no checkpoint, or one of other scans, another configuration or another version.
+        If the file is not a checkpoint, or one of other scans, another configuration or another version.
     OSError
-        If it cannot be read, or its folder does not exist.
+        If the file cannot be read, or its folder does not exist.
     """
 
     def __init__(self, path: str | PathLike[str], rays: Rays, config: FitConfig) -> None:
         self._path = Path(path)
-        settings = {k: v for k, v in config.to_dict().items() if k not in _NOT_OF_THE_TRAINING}
+        settings = {k: v for k, v in config.to_dict().items() if k not in _SETTINGS_NOT_COMPARED}
         self._identity: dict[str, Any] = json.loads(
             json.dumps({"version": _core.__version__, "scans": _digest(rays), "config": settings})
         )
@@ -63,11 +66,11 @@ class Checkpoint:
             raise FileNotFoundError(msg)
 
     def due(self) -> bool:
-        """Whether it is time to write."""
+        """Whether it is time to write the next file."""
         return time.monotonic() >= self._next_s
 
     def write(self, state: dict[str, Tensor]) -> None:
-        """Replaces the file. If that fails, a warning says so: to go on without is better than to stop."""
+        """Replaces the file. If that fails, there is only a warning, because the fit can go on without it."""
         started_s = time.monotonic()
         metadata = {"format": FORMAT, "identity": json.dumps(self._identity)}
         try:
@@ -78,12 +81,12 @@ class Checkpoint:
         self._next_s = now_s + max(_EVERY_S, (now_s - started_s) / _SHARE)
 
     def resume(self, training: Training) -> None:
-        """Brings a training to where the file says it was; does nothing if there is no file.
+        """Sets a training to the state in the file. Does nothing if there is no file.
 
         Raises
         ------
         ValueError
-            If the file is damaged, or was begun with another number of threads.
+            If the file is damaged, or from a fit with another number of threads.
         """
         if not self._path.exists():
             return
@@ -96,7 +99,9 @@ class Checkpoint:
                     raise ValueError(msg)
                 for name, tensor in expected.items():
                     shape = tuple(file.get_slice(name).get_shape())
-                    if shape != tuple(tensor.shape):  # before it is read: it could be of any size
+                    if shape != tuple(
+                        tensor.shape
+                    ):  # checked before the tensor is read, since a damaged one can have any size
                         msg = f"{name} has shape {shape} instead of {tuple(tensor.shape)}"
                         raise ValueError(msg)
                 state = {name: file.get_tensor(name).clone() for name in expected}
@@ -107,7 +112,7 @@ class Checkpoint:
             training.restore(state)
         except OSError:
             raise
-        except Exception as error:  # of which kind depends on where a damaged file breaks off
+        except Exception as error:  # damaged files raise exceptions of many kinds
             msg = f"{self._path} is not a whole checkpoint of this fit: {error}"
             raise ValueError(msg) from error
 
@@ -143,7 +148,7 @@ class Checkpoint:
 
 
 def _digest(rays: Rays) -> str:
-    """Of all that the training sees of the scans."""
+    """Digest of all arrays of the scans that the training uses."""
     digest = hashlib.blake2b(digest_size=16)
     for array in (rays.origin, rays.points, rays.directions, rays.ranges_m, rays.intensities):
         digest.update(b"-" if array is None else array.data if array.flags.c_contiguous else array.tobytes())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Losses and gradients by one call of the compiled core."""
+"""Losses and gradients by a call of the compiled core."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from radarsdf.fitting.sampling import Samples
 
 
 class CoreGradients(GradientBackend):
-    """The core's ``FieldLoss``, which checks the field's arrays once and reads them anew in each call.
+    """Losses and gradients by the core's ``FieldLoss``.
 
-    It does not know normals: they are gradients themselves.
+    It checks the field's arrays once and reads their present values in each call. It has no normals: they are
+    gradients, and it does not differentiate twice.
     """
 
     def __init__(self, field: Field, config: FitConfig, share: Share) -> None:
@@ -69,7 +70,7 @@ class CoreGradients(GradientBackend):
         return Gradients({"intensity": loss / parts}, list(self._by_intensity), None)
 
     def _batch(self, samples: Samples) -> dict[str, Any]:
-        """What the core's losses of intensities take of samples."""
+        """The arguments of the core's joint and intensity losses that come from samples."""
         dropouts = self._draw_dropouts(self._num_seen(samples))
         return {
             "points": samples.points.numpy(),
@@ -80,7 +81,7 @@ class CoreGradients(GradientBackend):
         }
 
     def _untouched(self, samples: Samples) -> Touched:
-        """Arrays for the core to fill."""
+        """Samples with arrays that the core fills."""
         cells, count = self._field.cells, len(samples.points)
         located = torch.empty((count, cells.table.num_levels), dtype=torch.int32, device="cpu")
         return Touched(samples.points, located, samples.points.new_empty((count, cells.interpolated_dim)))
@@ -88,7 +89,7 @@ class CoreGradients(GradientBackend):
     def _with_features(
         self, losses: dict[str, float], touched: Touched, by_networks: list[Tensor]
     ) -> Gradients:
-        """With the gradient by all features, unless only the touched ones move."""
+        """Adds the gradient by features: of the touched ones if only these move, otherwise of all."""
         if self._moves_rows:
             return Gradients(losses, list(by_networks), touched)
         table = self._field.cells.table
@@ -97,6 +98,6 @@ class CoreGradients(GradientBackend):
 
 
 def _layers(network: nn.Module) -> tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]:
-    """Weights and biases of a network's layers, where they are in memory."""
+    """Weights and biases of a network's layers, as views of their memory."""
     values = [kernels.view(parameter) for parameter in network.parameters()]
     return values[::2], values[1::2]

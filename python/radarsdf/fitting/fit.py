@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From scans with poses to a map: what a fit does, in order."""
+"""From scans with poses to a map: the steps of a fit, in order."""
 
 from __future__ import annotations
 
@@ -38,43 +38,46 @@ def fit(
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
 ) -> RadarMap:
-    """Fits a signed distance field, and with intensities a reflectance field, to radar returns.
+    """Fits a signed distance field, and with intensities a reflectance map, to radar returns.
 
     Parameters
     ----------
     points : sequence of F arrays
         (N_i, 3) each: the returns of one scan, sensor frame, m.
     poses : array_like
-        (F, 4, 4) T_world_sensor, one for each scan.
+        (F, 4, 4) T_world_sensor, m, one for each scan.
     intensities : sequence of F arrays, optional
-        (N_i,) each, in the sensor's own units. Without them nothing of the reflectance side is built or run.
+        (N_i,) each, sensor units. Without them the map has no intensity network.
     config : FitConfig, optional
-        Every choice of the fit; ``FitConfig.paper()`` is the published configuration.
+        Settings of the fit. ``FitConfig.paper()`` has the published ones.
     progress : bool, optional
-        Whether to show a progress bar; by default only on a terminal.
+        Whether to show a progress bar. By default only on a terminal.
     checkpoint : path-like, optional
-        File that the state of the training is written to every half minute, and when it is interrupted or done. If the
-        file exists, a fit of the same scans, configuration and number of threads goes on from it, and ends with the
-        same bits as one without a stop. It stays when the fit is done, to be removed once the map is saved.
+        File for the state of the training. It is written every half minute, and when the training is
+        interrupted or done. If it exists, a fit of the same scans with the same configuration and number of
+        threads goes on from it, and ends with the same bits as one without a stop. It is not removed when the
+        fit is done.
 
     Returns
     -------
     RadarMap
-        With the times and counts of the fit in its ``report``. The same input, seed and number of threads give the
-        same bits; another number of threads sees the same samples, and rounds differently or, with intensities, has another
-        dropout.
+        Its ``report`` has the times and counts of the fit. The same input, seed and number of threads give
+        the same bits. With another number of threads the samples are the same, but the rounding differs, and
+        with intensities also the dropout.
 
     Raises
     ------
     ValueError
-        For scans or poses that cannot be what they should be, see :func:`radarsdf.returns.rays.prepare`, and for a
-        `checkpoint` that is damaged or belongs to another fit.
+        If scans or poses are invalid (see :func:`radarsdf.returns.rays.prepare`), a return is too far away,
+        or the `checkpoint` is damaged or from another fit.
     MemoryError
-        If the estimate of :func:`radarsdf.estimate` exceeds ``config.max_memory_bytes``, or what the system has.
+        If the memory by :func:`radarsdf.estimate` exceeds ``config.max_memory_bytes``, or what the system has
+        left.
     Interrupted
-        A KeyboardInterrupt, for Ctrl-C: with the map so far as its ``radar_map``.
+        A KeyboardInterrupt, after Ctrl-C. Its ``radar_map`` is the map so far.
     Diverged
-        A FloatingPointError, if a loss or parameter stops being finite: with the last good map as its ``radar_map``.
+        A FloatingPointError, if a loss or a parameter is not finite. Its ``radar_map`` is the last finite
+        map.
 
     Examples
     --------
@@ -107,7 +110,8 @@ def fit(
             training = Training(field, surface.rays, rays, scale, config, workers)
             if saved is not None:
                 saved.resume(training)
-            # Whole from here on, and better with every iteration: what there is when the training ends too early.
+            # The map is made before the training, which changes its field: Interrupted and Diverged can hand
+            # it over.
             radar_map = RadarMap(
                 MapContents(
                     field=field,
@@ -143,48 +147,49 @@ def fit(
 
 
 def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, num_threads: int) -> Field:
-    """The field over cells where a surface can lie, and over those that bridge the gaps between them."""
+    """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
     leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
     return Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
 
 
 def _check_extent(rays: Rays, config: FitConfig) -> None:
-    """A single outlier must not be met in the middle of the work, nor by an error that does not say what it is."""
+    """Refuses returns that are too far away for a cell's key, before the work begins and with a clear
+    error."""
     limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m
     reach_m = max(config.near_band_m, config.truncation_m if config.training.start == "average" else 0.0)
     if np.abs(rays.points).max() + reach_m > limit_m:
         distance_m = np.abs(rays.points).max(axis=1) + reach_m
         outside = int((distance_m > limit_m).sum())
         msg = (
-            f"{outside} of {len(rays)} returns are not within a million cells of {config.leaf_size_m} m of the sensors' mean "
-            f"position, the furthest {distance_m.max():.3g} m away: drop them (max_range_m), use larger cells, or split "
-            "scans so far apart"
+            f"{outside} of {len(rays)} returns are not within a million cells of {config.leaf_size_m} m of the mean sensor "
+            f"position, the farthest {distance_m.max():.3g} m away: drop them (max_range_m), use larger cells, or fit "
+            "distant scans separately"
         )
         raise ValueError(msg)
 
 
 def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None) -> list[str]:
-    """What the scene did not need, in words."""
+    """Parts of the method that this fit did not run, in words."""
     skipped = []
     if scale is None:
-        skipped.append("the reflectance network: there are no intensities")
+        skipped.append("the intensity network: there are no intensities")
     else:
         unused = [
             ("normals", config.networks.normals),
             ("geometry feature", config.networks.geometry_feature_dim > 0),
         ]
         skipped += [
-            f"the {name}, which the intensity network does not ask for" for name, used in unused if not used
+            f"the {name}, which the intensity network does not use" for name, used in unused if not used
         ]
     if training.passes < 1 and config.training.sdf_iterations is None:
-        skipped.append(f"{1 - training.passes:.0%} of the samples of a pass: the others said as much")
+        skipped.append(f"{1 - training.passes:.0%} of the samples: the others were enough")
     if training.moves_rows and training.iterations["sdf"] > 0:
-        skipped.append("in each iteration, the features that its batch did not touch")
+        skipped.append("in each iteration, updates of features that its samples did not use")
     return skipped
 
 
 class _Clock:
-    """Wall seconds between laps."""
+    """Wall-clock seconds of each step."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()

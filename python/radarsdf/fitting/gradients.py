@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Losses of a batch and their gradients: what both back ends answer, and what they share.
+"""The interface of the two back ends that compute losses and gradients, and their common code.
 
-:mod:`radarsdf.fitting.autograd_gradients` is the reference: the losses as :class:`~radarsdf.field.field.Field` and
-:mod:`~radarsdf.field.losses` define them, differentiated by PyTorch. :mod:`radarsdf.fitting.core_gradients` asks the
-compiled core, in one call. Tests hold the two equal up to rounding.
+:mod:`radarsdf.fitting.autograd_gradients` is the reference. It differentiates the losses of
+:class:`~radarsdf.field.field.Field` and :mod:`~radarsdf.field.losses` by PyTorch.
+:mod:`radarsdf.fitting.core_gradients` calls the compiled core once. Tests check that the two are equal up to
+rounding.
 """
 
 from __future__ import annotations
@@ -23,44 +24,48 @@ from radarsdf.fitting.sampling import Dropout, Samples
 
 @dataclass(frozen=True)
 class Touched:
-    """What a batch took from the features of cells, and the loss's gradient by that."""
+    """The samples of a batch, and the gradient of the loss with respect to their interpolated features.
+
+    The features of cells that hold a sample are called touched.
+    """
 
     points: Tensor
-    """(N, 3), local frame, m."""
+    """(N, 3) samples, local frame, m."""
     located: Tensor
-    """(N, num_levels) int32, the cells that hold them."""
+    """(N, num_levels) int32, rows of the cells that hold them."""
     gradient: Tensor
-    """(N, 8 · num_levels), by the interpolated features."""
+    """(N, 8 · num_levels), with respect to the interpolated features."""
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """Of one thread's share of a batch. The next batch overwrites its arrays."""
+    """Losses and gradients of one thread's share of a batch. The next batch overwrites the arrays."""
 
     losses: dict[str, float]
-    """What each loss, "sdf" and "intensity", adds to that of the whole batch."""
+    """The part of each loss, "sdf" and "intensity", that this share adds to the loss of the whole batch."""
     by_parameters: list[Tensor]
-    """By features, where all of them move, SDF network and intensity network, as far as they learn."""
+    """Gradients of those parameters that are trained: all features (unless `touched` is given), SDF network,
+    intensity network."""
     touched: Touched | None
-    """Where only the touched features move."""
+    """If only the touched features move: the gradient for these."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """What one thread's back end knows beside the field."""
+    """How the back end of one thread takes part in a batch."""
 
     parts: int
-    """Threads that share a batch."""
+    """Number of threads that share a batch."""
     dropout_scale: float
-    """Share of the configured dropout."""
+    """Factor on the dropout of the configuration."""
     generator: torch.Generator
-    """For dropout."""
+    """Random numbers of this thread's dropout."""
 
 
 class GradientBackend(ABC):
     """Losses and gradients of one thread's share of each batch.
 
-    The parameters of `field` stay where they are in memory.
+    The parameters of `field` must keep their memory: a back end may hold views of them.
     """
 
     def __init__(self, field: Field, config: FitConfig, share: Share) -> None:
@@ -71,31 +76,31 @@ class GradientBackend(ABC):
 
     @abstractmethod
     def sdf(self, samples: Samples) -> Gradients:
-        """Of the SDF's loss alone, by features and SDF network."""
+        """Gradients of the sdf loss with respect to features and SDF network."""
 
     @abstractmethod
     def joint(self, samples: Samples) -> Gradients:
-        """Of both losses, by all parameters."""
+        """Gradients of the sum of both losses with respect to all parameters."""
 
     @abstractmethod
     def intensity(self, samples: Samples) -> Gradients:
-        """Of the intensity's loss, by the intensity network: features and SDF network are frozen."""
+        """Gradients of the intensity loss with respect to the intensity network. The others are frozen."""
 
     def state(self) -> dict[str, Tensor]:
-        """What its dropout depends on."""
+        """The state of the random numbers of dropout."""
         return {"generator": self._share.generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on as the back end that gave `state`."""
+        """Restores what :meth:`state` gave."""
         self._share.generator.set_state(state["generator"])
 
     def _num_seen(self, samples: Samples) -> int:
-        """How many samples the intensity network sees."""
+        """Number of samples, the first ones, that the intensity network sees."""
         in_free_space = self._config.training.intensity_in_free_space
         return len(samples.points) if in_free_space else samples.num_near
 
     def _draw_dropouts(self, count: int) -> list[Dropout]:
-        """Of the intensity network's view of so many encoded samples. The SDF network sees all."""
+        """Dropout of each part of the encoding of `count` samples, for the intensity network alone."""
         networks, scale = self._config.networks, self._share.dropout_scale
         shares = [scale * networks.feature_dropout, scale * networks.fourier_dropout]
         if not any(shares):

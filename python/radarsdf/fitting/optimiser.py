@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Adam (Kingma and Ba, ICLR 2015): for networks on PyTorch's kernel, for features on the rows that a batch touches."""
+"""Adam (Kingma and Ba, ICLR 2015): for networks by PyTorch, for features on the rows that a batch touches."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ _Result = TypeVar("_Result")
 
 
 class Adam:
-    """Same bits as ``torch.optim.Adam(fused=True)``.
+    """Adam with the same bits as ``torch.optim.Adam(fused=True)``.
 
-    Making one of those imports PyTorch's compiler and SymPy, 800 modules in a second: as long as a small fit takes.
+    That class imports PyTorch's compiler and SymPy. These 800 modules take a second, as long as a small fit.
 
     Attributes
     ----------
     parameters : list of Tensor
-        What is optimised.
+        The tensors that are optimised.
     learning_rate : float
-        Of the next step; `full_rate` is the one at the start.
+        Learning rate of the next step.
+    full_rate : float
+        Learning rate at the start.
     """
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
@@ -42,19 +44,19 @@ class Adam:
         self._step = torch.zeros(())
 
     def state(self) -> dict[str, Tensor]:
-        """What the next steps depend on beside the parameters. Not copies."""
+        """All that the next steps depend on, except the parameters. The tensors are not copied."""
         lists = {"mean": self._means, "square": self._squares}
         state = {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
         return state | {"step": self._step}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on as the optimiser of the same parameters that gave `state`."""
+        """Restores what :meth:`state` of an optimiser of the same parameters gave."""
         for name, value in self.state().items():
             value.copy_(state[name])
 
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor]) -> None:
-        """Move the parameters by their gradients, in the same order."""
+        """Changes the parameters by `gradients`, which are in the same order."""
         self._step.add_(1)
         torch._fused_adam_(  # the kernel has no public name
             self.parameters,
@@ -74,16 +76,19 @@ class Adam:
 
 
 class RowAdam:
-    """Adam for the features of cells: a step costs the rows that its batch touches, not the map.
+    """Adam for the features of cells. A step takes time for the rows that its batch touches, not for the
+    whole map.
 
-    An untouched row's mean and mean square fade as they would with gradients of zero, but it does not move: dense Adam
-    would carry on in the direction of its last gradient for some thirty times the learning rate. Measured, that is no
-    loss (see BENCHMARK.md).
+    The mean and mean square of an untouched row decay as with a gradient of zero, but the row does not
+    change. Adam would go on to move it along its last gradient, by up to thirty times the learning rate.
+    Measured: the surface is as good without that (``docs/levers.md``).
 
     Attributes
     ----------
     learning_rate : float
-        Of the next step; `full_rate` is the one at the start.
+        Learning rate of the next step.
+    full_rate : float
+        Learning rate at the start.
     """
 
     def __init__(self, cells: VertexFeatures, learning_rate: float) -> None:
@@ -99,22 +104,28 @@ class RowAdam:
 
     @property
     def features(self) -> Tensor:
-        """What is optimised, (num_rows, 8)."""
+        """(num_rows, 8), the tensor that is optimised."""
         return self._cells.features
 
     def state(self) -> dict[str, Tensor]:
-        """What the next steps depend on beside the features. Not copies."""
+        """All that the next steps depend on, except the features. The tensors are not copied."""
         memory = self._memory
         count = torch.tensor(self.step_count)
         return {"moments": memory.moments, "last_step": memory.marks[:, :1], "step_count": count}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on as the optimiser of the same features that gave `state`."""
+        """Restores what :meth:`state` of an optimiser of the same features gave.
+
+        Raises
+        ------
+        ValueError
+            If a row changed later than the last step.
+        """
         count, last_step = int(state["step_count"]), state["last_step"]
         if count < 0 or (
             last_step.numel() and not 0 <= int(last_step.min()) <= int(last_step.max()) <= count
         ):
-            msg = f"a row cannot have moved after step {count}"  # the core trusts it
+            msg = f"a row cannot have moved after step {count}"  # the core does not check it
             raise ValueError(msg)
         self._memory.moments.copy_(state["moments"])
         self._memory.marks[:, :1].copy_(last_step)
@@ -127,15 +138,15 @@ class RowAdam:
         workers: Workers,
         meanwhile: Callable[[], _Result],
     ) -> _Result:
-        """Move the rows that batches touched.
+        """Changes the rows that batches touched. Returns the result of `meanwhile`.
 
-        The calling thread first does `meanwhile`, whose result it returns, and then its share of what the others left.
+        The calling thread runs `meanwhile` first, and then helps the other threads with the rows.
         """
         self.step_count += 1
         if self.step_count >= len(self._decays):
             powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64)[:, None]
             decays = torch.tensor([_BETAS], dtype=torch.float64) ** powers
-            # Denormal numbers would be slow, and are nothing beside a gradient.
+            # Denormal numbers would be slow, and make no difference beside a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         move = kernels.adam_step(
             self._cells.table,

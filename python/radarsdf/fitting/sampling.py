@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Samples along rays with their labels, drawn as they are needed."""
+"""Samples on rays with their labels, drawn when they are needed."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from radarsdf.returns.rays import Rays
 
 @dataclass(frozen=True)
 class Samples:
-    """A batch of points on rays. The near-surface ones come first."""
+    """A batch of points on rays. Those near the surface come first."""
 
     points: Tensor
     """(B, 3) float32, local frame, m."""
     sdf_m: Tensor
-    """(B,) distance along the ray to the return, positive in front of it."""
+    """(B,) label: distance along the ray to the return, m, positive in front of it."""
     num_near: int
-    """The first `num_near` are near the surface, the others in free space."""
+    """The first `num_near` samples are near the surface, the others in free space."""
     of_ray: Tensor
-    """(B, 7 or 8): return (3), direction (3), range and, where there are any, scaled intensity of each sample's ray."""
+    """(B, 7 or 8) for the ray of each sample: return (3), local frame, m; direction (3); range, m; and scaled
+    intensity if there are intensities."""
 
     @property
     def directions(self) -> Tensor:
@@ -36,24 +37,37 @@ class Samples:
 
     @property
     def ranges_m(self) -> Tensor:
-        """(B,) from the sensor to the return."""
+        """(B,) distances from the sensor to the return, m."""
         return self.of_ray[:, RAY_RANGE]
 
     @property
     def intensities(self) -> Tensor:
-        """(B,) of the returns, scaled."""
+        """(B,) scaled intensities of the returns."""
         return self.of_ray[:, RAY_INTENSITY]
 
 
 class RaySampler:
-    """Draws batches from rays: memory grows with the returns, not with the samples.
+    """Draws batches of samples from rays. The memory grows with the returns, not with the samples.
 
-    Rays are taken in random order without replacement, so that after one pass each has been seen equally often; the
-    positions along the rays are random. A batch takes one near-surface and one free-space sample from each of its rays
-    rather than all twelve from a twelfth as many: the gradient sees more of the scene. Within a batch, rays go in
-    Morton order of their returns, so that neighbours share cache lines. `neighbours` rays that follow each other in that
-    order are taken together: in large batches of a large map, no two others would be near. `intensities` (N,) are those of
-    the rays, scaled.
+    Rays are taken in random order without replacement, so all are used equally often. The positions on the
+    rays are random. A batch has one sample near the surface and one in free space on each of its rays,
+    instead of all twelve on a twelfth of the rays: so its gradient covers more of the scene.
+
+    Parameters
+    ----------
+    rays : Rays
+        N rays.
+    config : FitConfig
+        Its sampling and its lengths are used.
+    batch_size : int
+        Samples in a batch.
+    generator : torch.Generator
+        Random numbers. The caller saves and restores its state.
+    neighbours : int
+        So many rays that follow each other in Morton order of their returns are always taken together. In a
+        large map, the rays of a batch would otherwise be far apart, and share no cache lines.
+    intensities : Tensor, optional
+        (N,) scaled intensities of the rays.
     """
 
     def __init__(
@@ -69,14 +83,15 @@ class RaySampler:
         self._neighbours = neighbours
         self._generator = generator
         order = np.argsort(cell_keys(np.ascontiguousarray(rays.points), config.leaf_size_m, 1), kind="stable")
-        # One gather a batch fetches all there is to know of a ray: 32 bytes, half a cache line.
+        # All numbers of a ray in one row of 32 bytes, half a cache line: a batch reads them by one
+        # index_select.
         columns = [torch.from_numpy(a) for a in (rays.points, rays.directions, rays.ranges_m[:, None])]
         if intensities is not None:
             columns.append(intensities[:, None])
         self._rays = torch.cat(columns, 1)[torch.from_numpy(order)]
         self._order = np.zeros(0, np.int64)
         self._order_from = torch.zeros_like(generator.get_state())
-        """The generator's state that `_order` was drawn from."""
+        """State of the generator before `_order` was drawn."""
         self._next = 0
         near_share = config.sampling.near_samples / (
             config.sampling.near_samples + config.sampling.free_samples
@@ -86,15 +101,15 @@ class RaySampler:
         self._layouts: dict[int, _Layout] = {}
 
     def state(self) -> dict[str, Tensor]:
-        """Where in which order of the rays it is; the generator is its owner's."""
+        """The order of the rays, as a state of the generator, and the position in it."""
         drawn = len(self._order) > 0
         return {"order_from": self._order_from, "next": torch.tensor(self._next if drawn else -1)}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on as the sampler of the same rays that gave `state`; leaves the generator in another state."""
+        """Restores what :meth:`state` of a sampler of the same rays gave. Changes the generator's state."""
         following = int(state["next"])
         if not -1 <= following <= len(self._rays):
-            msg = f"a sampler of {len(self._rays)} rays is at none of them"
+            msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"
             raise ValueError(msg)
         if following >= 0:
             self._generator.set_state(state["order_from"])
@@ -109,7 +124,11 @@ class RaySampler:
         self._next = 0
 
     def _take(self, count: int) -> Tensor:
-        """The next `count` rays of the random order, sorted; a new order begins where one ends."""
+        """Rows of the next `count` rays of the random order, ascending, which is Morton order of their
+        returns.
+
+        After the last ray, a new order is drawn.
+        """
         parts = []
         while count > 0:
             if self._next >= len(self._order):
@@ -124,21 +143,25 @@ class RaySampler:
         return torch.rand(count, generator=self._generator)
 
     def spread(self, count: int, parts: int = 1) -> list[Samples]:
-        """`count` samples round returns, in parts: within `near_band_m` along the beam, and across it as angular noise is."""
+        """`count` samples near the surface, in `parts` for the threads.
+
+        They are uniform within `near_band_m` along the beam, and have the sensor's angular noise across it.
+        """
         config = self._config
         places = self._take(count)
         sdf_m = (2 * self._uniform(count) - 1) * config.near_band_m
         ray = self._rays.index_select(0, places)
         points = _returns(ray) - sdf_m[:, None] * _directions(ray)
         if config.sampling.cross_range_noise_rad > 0:
-            # Isotropic: what it adds along the beam is lost in the width of the band.
+            # Noise in all directions is simpler. Along the beam it is small beside the width of the band.
             noise = torch.randn(points.shape, generator=self._generator)
             points += noise * (config.sampling.cross_range_noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
         return self._split(points, sdf_m, ray, near, near)
 
     def batch(self, parts: int = 1) -> list[Samples]:
-        """`batch_size` samples, near the surface and in free space, in parts that each have their share of both."""
+        """`batch_size` samples, in `parts` for the threads. Each part has its share of near and free
+        samples."""
         if parts not in self._layouts:
             self._layouts[parts] = _Layout.of(self._num_near, self._num_free, parts, self._config)
         layout = self._layouts[parts]
@@ -148,7 +171,7 @@ class RaySampler:
         start_m, length_m = (
             torch.addcmul(constant, of_range, range_m) for constant, of_range in (layout.start, layout.length)
         )
-        # Drawn for the batch, and then dealt out: the number of parts changes no sample.
+        # Random numbers are drawn for the whole batch and then divided, so samples do not depend on `parts`.
         sdf_m = torch.addcmul(start_m, length_m, self._uniform(len(places)).index_select(0, layout.order))
         points = torch.addcmul(_returns(ray), sdf_m[:, None], _directions(ray), value=-1)
         return self._split(points, sdf_m, ray, layout.sizes, layout.near)
@@ -178,26 +201,30 @@ def _directions(rays: Tensor) -> Tensor:
 
 
 def share(count: int, part: int, parts: int) -> int:
-    """`count` things over `parts`: how many the `part`-th gets."""
+    """How many of `count` things the `part`-th of `parts` gets."""
     return count * (part + 1) // parts - count * part // parts
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Which samples a batch has: part by part, the near ones of each first."""
+    """The order of the B samples of a batch: part by part, with the near samples of each part first.
+
+    A sample is drawn uniformly from a segment of its ray.
+    """
 
     index: Tensor
-    """(B,) int64, of each sample's ray among those that were taken."""
+    """(B,) int64, row of each sample's ray among the rays that were taken."""
     order: Tensor
-    """(B,) int64, of each sample among the near and then the free ones of the whole batch."""
+    """(B,) int64, row of each sample if all near samples of the batch came first, then all free ones."""
     start: tuple[Tensor, Tensor]
-    """(B,) each: c and d of the end nearest to the return, c + d · range, as a distance in front of it, m."""
+    """(B,) each: c and d. The segment starts c + d · range in front of the return, m; behind it if
+    negative."""
     length: tuple[Tensor, Tensor]
-    """The same, from there to the other end."""
+    """(B,) each: c and d. The segment has the length c + d · range, m, towards the sensor."""
     sizes: list[int]
-    """Of the parts."""
+    """Number of samples in each part."""
     near: list[int]
-    """Near samples of the parts."""
+    """Number of near samples in each part."""
 
     @classmethod
     def of(cls, num_near: int, num_free: int, parts: int, config: FitConfig) -> _Layout:
@@ -206,9 +233,10 @@ class _Layout:
         sizes = [size for part in zip(*shares, strict=True) for size in part]  # near, free, near, free, ...
         kinds = torch.tensor([0, 1] * parts).repeat_interleave(torch.tensor(sizes))
         order = kinds.argsort(stable=True).argsort()
-        # Where one kind is rarer, every so many-th ray has one of it: each kind still covers the whole scene.
+        # Fewer samples of one kind are spread evenly over the rays, so that they cover the whole scene too.
         index = torch.cat([torch.arange(n) * taken // max(n, 1) for n in (num_near, num_free)])[order]
-        # Near samples within the band; free ones uniform in [free_from · range, range + free_beyond] from the sensor.
+        # From the sensor: near samples in range ± near_band, free ones in [free_from · range, range +
+        # free_beyond].
         band_m, before = config.near_band_m, 1 - config.sampling.free_from
         ends = torch.tensor(
             [[-band_m, 0, 2 * band_m, 0], [-config.free_beyond_m, 0, config.free_beyond_m, before]]
@@ -220,20 +248,21 @@ class _Layout:
 
 @dataclass(frozen=True)
 class Dropout:
-    """Which numbers of a matrix stay.
+    """Which numbers of a matrix are kept.
 
-    Not torch's own dropout, which draws from the global generator: the same seed would not give the same bits.
+    PyTorch's dropout draws from the global generator, so the same seed would not give the same bits.
     """
 
     bytes: Tensor
-    """(rows, columns) uint8, drawn for each number."""
+    """(rows, columns) uint8, a random byte for each number of the matrix."""
     keep: int
-    """What is below it stays."""
+    """Numbers whose byte is below this are kept. From 0 to 256."""
 
     @classmethod
     def draw(cls, rows: int, columns: int, dropout: float, generator: torch.Generator) -> Dropout:
-        """For a matrix of which each number is left out with the probability `dropout`."""
-        # Eight bytes from every number drawn: drawing one for each would take a tenth of an iteration.
+        """Draws a dropout of a matrix (rows, columns). Each number is dropped with the probability
+        `dropout`."""
+        # Each random int64 gives eight bytes. To draw bytes one by one would take a tenth of an iteration.
         words = torch.empty(-(-rows * columns // 8), dtype=torch.int64).random_(
             -(2**63), None, generator=generator
         )
@@ -241,5 +270,5 @@ class Dropout:
 
     @property
     def factors(self) -> Tensor:
-        """(rows, columns) of mean one: zero, or what makes up for the zeros."""
-        return (self.bytes <= self.keep - 1) * (256 / self.keep)  # not < keep: 256 is no byte
+        """(rows, columns): 0 for dropped numbers, 256 / keep for the others, so that the mean is 1."""
+        return (self.bytes <= self.keep - 1) * (256 / self.keep)  # not < keep: 256 does not fit into a byte

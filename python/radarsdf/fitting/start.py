@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a training starts from: noise, or the average of what the rays say."""
+"""The field before the training: random, or an average of the rays' signed distances."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from radarsdf.returns.surfels import Surfels
 
 
 class Start(ABC):
-    """A start decides which cells are open, what the field is at first, and what supports its cells."""
+    """Decides which leaf cells the map has, what the field is before the training, and the support of the
+    cells."""
 
     def __init__(self, surface: SurfaceReturns, config: FitConfig, num_threads: int) -> None:
         self._surface = surface
@@ -31,19 +32,19 @@ class Start(ABC):
 
     @abstractmethod
     def leaf_keys(self) -> NDArray[np.uint64]:
-        """Leaf cells in which a surface can lie: Morton keys, ascending."""
+        """(C,) uint64, Morton keys of the leaf cells in which a surface can lie, ascending."""
 
     @abstractmethod
     def initialise(self, field: Field, generator: torch.Generator) -> None:
-        """Makes the field what training starts from."""
+        """Sets the parameters of the field."""
 
     @abstractmethod
     def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
-        """(C,) returns in and round each leaf cell."""
+        """(C,) uint16, support of the leaf cells: number of returns in each and the 26 cells round it."""
 
 
 class FromNoise(Start):
-    """Networks and features are drawn at random (3QFP)."""
+    """Random networks and features (3QFP)."""
 
     def leaf_keys(self) -> NDArray[np.uint64]:
         return near_leaf_keys(self._surface.rays, self._config, self._num_threads)
@@ -57,14 +58,15 @@ class FromNoise(Start):
 
 
 class FromAverage(Start):
-    """The field is the average of the rays' truncated signed distances (Curless and Levoy, 1996). It needs no training."""
+    """The average of the rays' truncated signed distances (Curless and Levoy, 1996). It needs no training."""
 
     def leaf_keys(self) -> NDArray[np.uint64]:
         config = self._config
         return self._means.leaf_keys(config.leaf_size_m, config.near_band_m, self._num_threads)
 
     def initialise(self, field: Field, generator: torch.Generator) -> None:
-        # Where nothing is learnt, the average is all that the features hold.
+        # Only the first number of each feature holds the average. The other seven are random if they are
+        # used, else 0.
         learns = self._config.training.sdf_iterations != 0 or field.intensity_network is not None
         field.initialise(generator, features=learns)
         surfels = self._surface.surfels
@@ -82,14 +84,14 @@ class FromAverage(Start):
 
 
 STARTS: dict[str, type[Start]] = {"noise": FromNoise, "average": FromAverage}
-"""By the names of ``config.training.start``."""
+"""The starts by their names in ``config.training.start``."""
 
 
 def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
-    """Leaf cells that a near-surface sample can fall into: Morton keys, ascending.
+    """(C,) uint64, Morton keys of the leaf cells that a sample near the surface can fall into, ascending.
 
-    The line of samples round each return is walked in steps of half a cell instead of being left to chance, so that
-    the map does not depend on the seed.
+    Points every half cell along the near band of each ray find the cells. Random samples would make the map's
+    cells depend on the seed.
     """
     steps = math.ceil(2 * config.near_band_m / (config.leaf_size_m / 2))
     cells = CellSet(config.leaf_size_m)
@@ -99,11 +101,11 @@ def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[n
 
 
 def average_rays(field: Field, rays: MeanRays, surfels: Surfels, config: FitConfig, num_threads: int) -> None:
-    """Makes the field the average over rays, interpolated between the vertices of an octree's leaf cells.
+    """Sets the field to the average over rays, interpolated between the vertices of an octree's leaf cells.
 
-    A ray counts at the vertices of the cells that it goes through, up to `truncation_m` before and behind its end. It
-    counts with the distance to the plane through the returns round its end; where there is no plane, with the distance to
-    the plane across the ray.
+    A ray counts at the vertices of the cells that it crosses, up to `truncation_m` before and behind its
+    return. Its value there is the vertex's distance to a plane through its return: parallel to the surfel
+    there, or, if there is none, perpendicular to the ray.
     """
     plane = surfels.flat_plane_of(surfels.cells.cell_of_ray[rays.first])
     normals = np.where(

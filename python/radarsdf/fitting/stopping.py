@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How a fit ends before its time, and what it hands back then."""
+"""Exceptions of a fit that ends early. They carry the map so far."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class Interrupted(KeyboardInterrupt):
     Attributes
     ----------
     radar_map : RadarMap or None
-        What was learnt so far, a map like any other; None if the training had not begun. In its ``report``,
-        ``iterations_done`` falls short of ``iterations``.
+        The map so far, which can be used like any other. None if the training had not begun. In its
+        ``report``, ``iterations_done`` is less than ``iterations``.
     """
 
     def __init__(self, radar_map: RadarMap | None = None) -> None:
@@ -23,12 +23,12 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Diverged(FloatingPointError):
-    """A loss or a parameter stopped being finite; the message says which, in which stage and iteration.
+    """A loss or a parameter is not finite. The message names it, the stage and the iteration.
 
     Attributes
     ----------
     radar_map : RadarMap or None
-        The last state found to be finite throughout, at most a hundred iterations older.
+        The last state that was checked and finite, at most 100 iterations before.
     """
 
     radar_map: RadarMap | None = None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the surface is learnt from: the returns without those that are false, moved onto the planes that they make."""
+"""The returns that the sdf stage uses: without ghosts, and moved onto surfels."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from radarsdf.returns.surfels import Surfels
 
 @dataclass(frozen=True)
 class SurfaceReturns:
-    """Returns of surfaces."""
+    """The returns that the sdf stage uses, and what the average as a start needs."""
 
     rays: Rays
-    """Without ghosts; the returns lie on planes where they make one."""
+    """Rays without ghosts. Returns are moved onto the flat surfel of their cell if there is one."""
     surfels: Surfels | None
-    """The planes through all returns. None: nothing asks for them."""
+    """Surfels of all returns. None if the configuration needs none."""
     means: MeanRays | None
-    """The mean ray of each leaf cell, without ghosts. None: the training does not start from an average."""
+    """Mean rays of the leaf cells, without ghosts. None if the training does not start from an average."""
 
     @classmethod
     def of(cls, rays: Rays, config: FitConfig, num_threads: int) -> SurfaceReturns:
-        """What of `rays` the surface is learnt from."""
+        """Cleans `rays` as ``config.returns`` says."""
         averages = config.training.start == "average"
-        # An average that is not trained on has distances to planes in any case.
+        # Without an sdf stage, only the average uses the surface, and it takes distances to surfels anyway.
         onto_planes = config.returns.onto_planes and config.training.sdf_iterations != 0
         means = MeanRays.of(rays, config.leaf_size_m, num_threads) if averages else None
         if not (config.returns.drop_ghosts or onto_planes or averages):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The training loop: batches over threads, and the schedule of the two networks."""
+"""The training loop: the stages sdf and intensity, with batches split over threads."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ from radarsdf.interrupts import deferred_interrupts
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
-_GENERATORS = MAX_THREADS + 1  # of random numbers in a fit: one for the draws, one for each thread's dropout
-_KEEP_EVERY = (
-    100  # iterations: to look through all parameters, and copy them, in each would cost a tenth of it
-)
+_GENERATORS = (
+    MAX_THREADS + 1
+)  # random generators of a fit: one for samples, one for the dropout of each thread
+_CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
 
 
 class _Draws:
-    """Samples for each thread, drawn by one: dozens of small operations on every thread would wait for each other."""
+    """Draws the samples of all threads in one thread: in several, its small operations would wait for each
+    other."""
 
     def __init__(
         self,
@@ -59,11 +60,12 @@ class _Draws:
             return RaySampler(rays, config, schedule.batch_size, self._generator, schedule.neighbours, unit)
 
         self._surface = sampler(surface)
-        # A ghost has an intensity, though no surface: the sensor will see it again.
+        # Ghosts are not part of the surface, but the sensor will see them again, so their intensities are
+        # learnt.
         self._returns = self._surface if returns is surface or scale is None else sampler(returns)
 
     def state(self) -> dict[str, Tensor]:
-        """What the next batches depend on."""
+        """All that the next batches depend on."""
         samplers = self._samplers()
         state = {f"{name}.{k}": v for name, sampler in samplers.items() for k, v in sampler.state().items()}
         return state | {"generator": self._generator.get_state()}
@@ -71,16 +73,18 @@ class _Draws:
     def restore(self, state: dict[str, Tensor]) -> None:
         for name, sampler in self._samplers().items():
             sampler.restore(_part(state, name))
-        self._generator.set_state(state["generator"])  # last: the samplers draw their orders again
+        self._generator.set_state(state["generator"])  # last, because the samplers change it
 
     def _samplers(self) -> dict[str, RaySampler]:
         samplers = {"surface": self._surface}
         return samplers if self._returns is self._surface else samplers | {"returns": self._returns}
 
     def of_surface(self) -> list[Samples]:
+        """A batch of the sdf stage, in a part for each thread."""
         return self._surface.batch(self._parts)
 
     def of_returns(self) -> list[Samples]:
+        """A batch of the intensity stage, in a part for each thread."""
         if self._config.training.intensity_in_free_space:
             return self._returns.batch(self._parts)
         return self._returns.spread(self._config.training.intensity_batch_size, self._parts)
@@ -88,39 +92,43 @@ class _Draws:
 
 @dataclass(frozen=True)
 class _Pauses:
-    """What is asked after each iteration."""
+    """What is updated or asked between iterations."""
 
     bar: Any
+    """Progress bar of tqdm."""
     interrupted: Callable[[], bool]
+    """Tells whether Ctrl-C was pressed."""
     checkpoint: Checkpoint | None
 
 
 @dataclass(frozen=True)
 class _Stage:
-    """A part of the schedule."""
+    """A stage of the training."""
 
     name: str
     """ "sdf" or "intensity"."""
     iterations: int
-    """How many it has."""
+    """Number of iterations of this stage."""
     iterations_before: int
-    """Of the same name, done by an earlier stage."""
+    """Joint iterations of the sdf stage that count as iterations of this stage too."""
     counts: tuple[str, ...]
-    """Whose iterations it does: both in a joint beginning."""
+    """The stages that an iteration counts for. Joint iterations count for both."""
     adams: list[Adam]
-    """Of the parameters that learn, in the order of their gradients."""
+    """Optimisers of the parameters that are trained, in the order of their gradients."""
     rows: RowAdam | None
-    """Of the features, where only the touched ones move."""
+    """Optimiser of the features if only the touched ones move."""
     draw: Callable[[], list[Samples]]
-    """A batch, in a part for each thread."""
+    """Draws a batch, in a part for each thread."""
     gradients_of: Callable[[tuple[GradientBackend, Samples]], Gradients]
+    """Computes losses and gradients of a part."""
 
 
 class Training:
-    """The schedule: the SDF first, alone or with the intensity, then the intensity on the frozen SDF.
+    """Trains `field` in place: the sdf stage on `surface`, with joint iterations or without, then the
+    intensity stage on all `returns`. Without a `scale` there are no intensities.
 
-    Every batch is split over the threads; their gradients are added in the order of the threads, so the same number of
-    threads gives the same bits; another number of threads rounds differently and has another dropout.
+    Each batch is split over the threads. Their gradients are added in the order of the threads, so the same
+    number of threads gives the same bits. With another number, the rounding and the dropout differ.
     """
 
     def __init__(
@@ -145,7 +153,7 @@ class Training:
         self.iterations = schedule.iterations
         self.passes = schedule.passes
         parts = min(workers.num_threads, schedule.batch_size, config.training.intensity_batch_size)
-        self._draws: _Draws | None = None  # where nothing is trained, the returns need not be put in order
+        self._draws: _Draws | None = None  # not made without iterations, because it sorts the returns
         self._backends: list[GradientBackend] = []
         if any(self.iterations.values()):
             self._draws = _Draws(surface, returns, scale, config, schedule, parts)
@@ -166,11 +174,12 @@ class Training:
 
     @property
     def moves_rows(self) -> bool:
-        """Whether an iteration moves the touched features alone."""
+        """Whether an iteration changes only the features that its samples touch."""
         return self._rows is not None
 
     def state(self) -> dict[str, Tensor]:
-        """All that the rest of the training depends on, between two iterations. Not copies."""
+        """All that the rest of the training depends on, between two iterations. The tensors are not
+        copied."""
         losses = [self.losses.get(name, 0.0) for name in self.iterations_done]
         state = {
             "done": torch.tensor(list(self.iterations_done.values())),
@@ -188,7 +197,8 @@ class Training:
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on where another training of the same rays and configuration was when it gave `state`."""
+        """Restores what :meth:`state` of a training of the same rays and configuration gave. A ValueError if
+        it is impossible."""
         done = dict(zip(self.iterations_done, state["done"].tolist(), strict=True))
         if not all(0 <= done[name] <= self.iterations[name] for name in done):
             msg = f"{done} iterations of {self.iterations}"
@@ -208,14 +218,15 @@ class Training:
             backend.restore(_part(state, f"backend.{i}"))
 
     def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
-        """All iterations that are left.
+        """Runs all iterations that are left.
 
         Raises
         ------
         Diverged
-            With the parameters as they last were when all were finite.
+            If a loss or a parameter is not finite. The field then has the last parameters that were checked
+            and finite.
         KeyboardInterrupt
-            For Ctrl-C, between two iterations.
+            After Ctrl-C, between two iterations.
         """
         field = self._field
         stages = self._stages()
@@ -237,11 +248,11 @@ class Training:
                 self._run_stage(stage, pauses)
             if checkpoint is not None:
                 checkpoint.write(self.state())
-            if interrupted():  # by now all is done, but whoever pressed it wants to stop more than this
+            if interrupted():  # the training is done, but the program that called the fit should stop too
                 raise KeyboardInterrupt
 
     def _stages(self) -> list[_Stage]:
-        """The SDF, alone or joint with the intensity; then the intensity alone, on frozen features and SDF network."""
+        """The sdf stage, then the intensity stage, as far as they have iterations."""
         stages: list[_Stage] = []
         if self._draws is None:
             return stages
@@ -277,7 +288,7 @@ class Training:
         return stages
 
     def _done(self, stage: _Stage) -> int:
-        """Iterations of a stage that are done."""
+        """Iterations of this stage that are done, without joint ones of an earlier stage."""
         return max(0, self.iterations_done[stage.name] - stage.iterations_before)
 
     def _run_stage(self, stage: _Stage, pauses: _Pauses) -> None:
@@ -294,7 +305,8 @@ class Training:
 
         ahead: list[Samples] | None = None
         for i in range(self._done(stage), iterations):
-            # From the full rate on in each stage, also for an Adam that has been through another.
+            # Each stage starts at the full learning rate, also for an optimiser that an earlier stage has
+            # used.
             cosine = 0.5 * (1 + math.cos(math.pi * i / iterations))
             share = cosine if self._config.training.cosine_schedule else 1.0
             work = list(zip(self._backends, ahead or stage.draw(), strict=True))
@@ -304,8 +316,9 @@ class Training:
                 give_up(f"the {_bad_losses(found)} loss is {loss}")
             stop = pauses.interrupted()
             write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
-            look = stop or write or i % _KEEP_EVERY == _KEEP_EVERY - 1 or i == iterations - 1
-            # No draw before the state is looked at: it would be that after the next one.
+            look = stop or write or i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
+            # No samples are drawn ahead before the state is written: it would contain the draw after the
+            # next.
             rest = functools.partial(_move_networks, found, stage.adams, share, None if look else stage.draw)
             if rows is None:
                 ahead = rest()
@@ -322,7 +335,7 @@ class Training:
                 self.iterations_done[name] = min(before + i + 1, self.iterations[name])
             pauses.bar.update()
             if look:
-                # The sum is finite only if all are; that it overflows by itself is as bad.
+                # A sum is finite only if all numbers are. A sum that overflows is no better.
                 if not all(math.isfinite(float(p.detach().sum())) for p in changing):
                     give_up("a parameter is not finite")
                 for parameter, value in zip(changing, good, strict=True):
@@ -334,8 +347,8 @@ class Training:
 
 
 def _backends(field: Field, config: FitConfig, schedule: Schedule, parts: int) -> list[GradientBackend]:
-    """One for each thread."""
-    # Normals are gradients themselves, which the core does not know.
+    """A back end for each thread."""
+    # Normals are gradients, and the core's loss does not differentiate twice.
     normals = field.intensity_network is not None and config.networks.normals
     kind = AutogradGradients if normals or config.training.gradients == "autograd" else CoreGradients
     seeds = range(config.seed * _GENERATORS + 1, config.seed * _GENERATORS + 1 + parts)
@@ -362,7 +375,7 @@ def _intensity_gradients(work: _Work) -> Gradients:
 
 
 def _bad_losses(found: Sequence[Gradients]) -> str:
-    """Which of them are not finite."""
+    """Names of the losses that are not finite."""
     bad = {name for part in found for name, value in part.losses.items() if not math.isfinite(value)}
     return " and ".join(sorted(bad))
 
@@ -370,7 +383,7 @@ def _bad_losses(found: Sequence[Gradients]) -> str:
 def _move_networks(
     found: Sequence[Gradients], adams: Sequence[Adam], share: float, draw: Callable[[], list[Samples]] | None
 ) -> list[Samples] | None:
-    """What of an iteration one thread does while the others move features: it draws the next samples, too."""
+    """Adds the gradients of all threads, changes the networks and draws the next samples by `draw`."""
     for part in found[1:]:
         torch._foreach_add_(found[0].by_parameters, part.by_parameters)
     total = iter(found[0].by_parameters)
@@ -381,5 +394,5 @@ def _move_networks(
 
 
 def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
-    """Those of a state whose names begin with `name` and a dot, without these."""
+    """The entries of `state` whose names begin with `name` and a dot, named without that."""
     return {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")}
