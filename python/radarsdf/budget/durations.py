@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How long a fit takes: how much there is of each kind of work, and what that took where it was measured."""
+"""Estimate of the time of a fit: the amount of each kind of work, and the time measured for each."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from radarsdf.budget.schedule import Schedule
 from radarsdf.config import FitConfig
 from radarsdf.field.widths import intensity_widths, sdf_widths, weights_of
 
-# `python -m bench.stress durations` measures fits and prints these anew. Seconds of one thread of the machine of
-# BENCHMARK.md. What they say of twenty fits is 0.58 to 1.25 times their processor time.
+# Seconds on one thread, measured on the machine that BENCHMARK.md names: `python -m bench.stress durations`
+# measures fits and prints them. The estimates of twenty fits were 0.58 to 1.25 times their processor time.
 SECONDS = {
     "return": 3.1e-06,
     "cell": 4.1e-07,
@@ -20,40 +20,45 @@ SECONDS = {
     "encoded number": 3.2e-9,
     "multiplication": 2.7e-11,
 }
-_SHARED = ("encoded number", "multiplication")  # by all threads; the other kinds of work are done by one
+_SHARED = ("encoded number", "multiplication")  # done by all threads; one thread does the other kinds
 
 
 def work_of(
     config: FitConfig, schedule: Schedule, *, returns: int, cells: int, rows: int, with_intensity: bool
 ) -> dict[str, float]:
-    """How often a fit does each of the things that :data:`SECONDS` has, all threads together."""
+    """Amount of each kind of work in :data:`SECONDS` for a fit, all threads together.
+
+    `returns`, `cells`, `rows`: numbers of returns, leaf cells and rows of features.
+    """
     sampling, training, normals = config.sampling, config.training, config.networks.normals
     iterations = schedule.sdf_iterations
     joint = iterations if with_intensity and training.joint else 0
     later = max(0, schedule.intensity_iterations - joint)
     near_share = sampling.near_samples / (sampling.near_samples + sampling.free_samples)
     of_both = schedule.batch_size * (1 if training.intensity_in_free_space else near_share)
-    # Forward and backward is three times forward alone, a normal is a backward pass, and its own gradient two more.
-    passes, of_frozen = (9, 3) if normals and with_intensity else (3, 1)
-    ways = passes * iterations * schedule.batch_size + of_frozen * later * training.intensity_batch_size
+    # Units: a forward pass of a sample. Forward and backward take 3. Normals take a backward pass of their
+    # own, and their gradient two more: 9 in all, or 3 if the field is frozen.
+    passes, frozen_passes = (9, 3) if normals and with_intensity else (3, 1)
+    evaluations = passes * iterations * schedule.batch_size
+    evaluations += frozen_passes * later * training.intensity_batch_size
     sdf, intensity = weights_of(sdf_widths(config)), weights_of(intensity_widths(config))
-    multiplied = sdf * ways + intensity * 3 * (joint * of_both + later * training.intensity_batch_size)
+    multiplied = sdf * evaluations + intensity * 3 * (joint * of_both + later * training.intensity_batch_size)
     return {
         "return": float(returns),
         "cell": float(cells),
         "moved row": float(rows * iterations * (not config.moves_rows(with_intensity))),
         "iteration": float(iterations + later),
-        "encoded number": float(sdf_widths(config)[0] * ways),
+        "encoded number": float(sdf_widths(config)[0] * evaluations),
         "multiplication": float(multiplied),
     }
 
 
 def processors() -> int:
-    """Processors that this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def shared(work: dict[str, float], threads: int) -> dict[str, float]:
-    """The same work where so many threads share what can be shared, as far as there are processors for them."""
+    """The amounts of `work` for one of so many threads. More threads than processors do not help."""
     threads = min(threads, processors())
     return {kind: amount / (threads if kind in _SHARED else 1) for kind, amount in work.items()}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a fit or a mesh will take, before it begins: an estimate, and an error where there is not so much memory."""
+"""Estimates of the memory and time of a fit or a mesh, and errors if the memory is not enough."""
 
 from __future__ import annotations
 
@@ -20,40 +20,42 @@ from radarsdf.field.widths import fourier_width, intensity_widths, parameters_of
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import resolve_num_threads
 
-# Measured: peaks of fits of 1e4 to 3e6 returns of a street, over what the process had before; `bench.stress memory`
-# repeats it, and a test holds it. Bytes.
-_ALWAYS = 55e6  # code that is loaded on the way, stacks and arenas of the threads
+# Bytes. Measured as peaks of fits of 1e4 to 3e6 returns of a street, over the memory of the process before
+# the fit; `python -m bench.stress memory` repeats it, and a test checks it.
+_ALWAYS = 55e6  # code that the fit loads, stacks and arenas of the threads
 _PER_RETURN = 30.0
 _PER_INTENSITY = 20.0
-_PER_RETURN_AGAIN = 110.0  # where the intensities are learnt from other returns than the surface
-_PER_RETURN_CHECKED = 200.0  # passing, in float64, before there is anything else
+_PER_RETURN_AGAIN = 110.0  # if the intensity stage uses other returns than the sdf stage
+_PER_RETURN_CHECKED = 200.0  # scans in float64, freed before the training
 _PER_CELL = 215.0
-_PER_OCTREE_ROW = 110.0  # passing, while they are numbered
-_COPIES = 4  # of each parameter: itself, two moments, the last good one; where all rows move, a gradient for each thread
-_PER_ROW = 8.0  # where only the touched rows do
+_PER_OCTREE_ROW = 110.0  # freed when the rows are numbered
+_COPIES = 4  # of each parameter: value, two moments of Adam, last finite value. If all rows move, also its gradients
+_PER_ROW = 8.0  # if only the touched rows move: marks of Adam
 _PER_VOXEL = 220.0
 
-_SAMPLE = 50_000  # returns whose cells are counted
-_COLUMN = 16  # leaf cells: edge of the pieces of space that are in the sample as a whole
+_SAMPLE = 50_000  # returns, about, whose cells are counted
+_COLUMN = 16  # leaf cells: edge of the columns of space, of which some are sampled
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a fit will take."""
+    """Memory and time that a fit will take."""
 
     peak_memory_bytes: int
-    """Over what the process has before; within a factor of 1.5 on scans like those it was measured on."""
+    """Peak above the memory that the process has before. Within a factor of 1.5 on scans like those of the
+    measurement."""
     seconds: float
-    """On a quiet machine like the one it was measured on within a factor of 2; of others only the number of processors is
-    known."""
+    """Wall-clock time. Within a factor of 2 on the quiet machine of the measurement. Of another machine, only
+    the number of processors is taken into account."""
     returns: int
-    """Within the ranges."""
+    """Number of returns between `min_range_m` and `max_range_m`."""
     leaf_cells: int
-    """Estimated, with the ghosts and without those that bridge gaps: of sparse scans, up to a third more."""
+    """Number of leaf cells, with those of ghosts and without those that bridge gaps. A fit of sparse scans
+    has up to a third more."""
     vertices: int
-    """Rows of features, estimated likewise."""
+    """Number of vertices, which is the number of rows of features. Estimated like the leaf cells."""
     iterations: dict[str, int]
-    """Of the stages `sdf` and `intensity`."""
+    """Iterations of the stages `sdf` and `intensity`. Joint iterations count for both."""
 
     def __str__(self) -> str:
         return (
@@ -70,9 +72,23 @@ def estimate(
     *,
     config: FitConfig | None = None,
 ) -> Estimate:
-    """What :func:`radarsdf.fit` of the same arguments will take, in a small part of that.
+    """Estimates the memory and time of :func:`radarsdf.fit` with the same arguments, in a small part of that
+    time.
 
-    Parameters and errors are those of :func:`radarsdf.fit`.
+    Parameters
+    ----------
+    points, poses, intensities, config
+        As for :func:`radarsdf.fit`.
+
+    Returns
+    -------
+    Estimate
+        Memory in bytes, time in s, and the size of the map.
+
+    Raises
+    ------
+    ValueError
+        If scans or poses are invalid, see :func:`radarsdf.returns.rays.prepare`.
 
     Examples
     --------
@@ -87,7 +103,7 @@ def estimate(
 
 
 def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
-    """:func:`estimate` for returns that are prepared."""
+    """:func:`estimate` for scans that are already rays."""
     count, threads = len(rays), resolve_num_threads(config.num_threads)
     cells, rows = _count_cells(rays, config)
     schedule = _schedule(rays, rows, config)
@@ -133,9 +149,11 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
 
 
 def check_fit(rays: Rays, config: FitConfig) -> None:
-    """Raises a MemoryError where a fit would take more than there is."""
+    """Raises a MemoryError if the estimated memory of a fit exceeds `max_memory_bytes`, or what the system
+    has left."""
     available = available_bytes() if config.max_memory_bytes is None else config.max_memory_bytes
-    # No line of samples meets more cells, and no cell has more corners: where this is little, there is nothing to count.
+    # Upper bounds: cells that the near band of a ray can cross, and rows of features of a cell. If a fit of
+    # so many is small enough, the cells need not be counted, which takes time.
     cells = len(rays) * (3 * math.ceil(2 * config.near_band_m / config.leaf_size_m) + 3)
     corners = 12 if config.encoding.kind == "tri-quadtree" else 8
     if (
@@ -147,14 +165,14 @@ def check_fit(rays: Rays, config: FitConfig) -> None:
     if expected.peak_memory_bytes > available:
         msg = (
             f"the fit would take about {expected.peak_memory_bytes / 1e9:.2f} GB for {expected.leaf_cells} leaf cells "
-            f"and {expected.returns} returns, of {available / 1e9:.2f}: use larger cells (leaf_size_m), leave out what "
-            "is far (max_range_m), or set max_memory_bytes if you know better"
+            f"and {expected.returns} returns, of {available / 1e9:.2f}: use larger cells (leaf_size_m), drop far "
+            "returns (max_range_m), or set max_memory_bytes if the estimate is too high"
         )
         raise MemoryError(msg)
 
 
 def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> None:
-    """Raises a MemoryError where so many voxels would take more than there is."""
+    """Raises a MemoryError if so many voxels of `voxel_size`, m, need more memory than there is."""
     available = available_bytes() if max_memory_bytes is None else max_memory_bytes
     if available is not None and voxels * _PER_VOXEL > available:
         msg = (
@@ -165,7 +183,12 @@ def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> 
 
 
 def available_bytes(root: Path = Path("/")) -> int | None:
-    """What this process may still take: what the system has, and its control group. None where nobody says."""
+    """Memory that this process can still get, bytes: the least of what the system and its control groups have
+    left.
+
+    None if it cannot be found out, as on systems other than Linux. `root` is the root of the file system, for
+    tests.
+    """
     found = []
     try:
         lines = (root / "proc/meminfo").read_text().splitlines()
@@ -186,21 +209,24 @@ def available_bytes(root: Path = Path("/")) -> int | None:
         try:
             left = int((folder / limit).read_text()) - int((folder / usage).read_text())
             stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
-        except (OSError, ValueError):  # no such group, or "max"
+        except (OSError, ValueError):  # there is no such group, or its limit is "max"
             continue
-        found.append(max(0, left + int(stat.get("inactive_file", 0))))  # which the system gives up
+        found.append(
+            max(0, left + int(stat.get("inactive_file", 0)))
+        )  # cached files, which the system can drop
     return min(found) if found else None
 
 
 def _sample_bytes(config: FitConfig) -> float:
-    """Of a sample in a batch: what its gradient needs of its way through the encoding and the networks."""
+    """Bytes that a sample of a batch takes in encodings, hidden layers and their gradients."""
     encoding = config.encoding.num_levels * FEATURE_DIM + fourier_width(config)
     numbers = 2 * encoding + sum(config.networks.sdf_hidden) + sum(config.networks.intensity_hidden)
-    return 4.0 * numbers * (3 if config.networks.normals else 1)  # of normals, the gradient of a gradient
+    return 4.0 * numbers * (3 if config.networks.normals else 1)  # normals need gradients of gradients
 
 
 def _count_cells(rays: Rays, config: FitConfig) -> tuple[int, int]:
-    """Leaf cells and rows of features, from those pieces of space that a hash puts into a sample."""
+    """Numbers of leaf cells and rows of features, estimated from the columns of space that a hash puts into a
+    sample."""
     all_axes = (0, 1, 2)
     planes = [(0, 1), (0, 2), (1, 2)] if config.encoding.kind == "tri-quadtree" else [all_axes]
     cells = round(sum(_distinct(rays, config, all_axes, [0], corners=False)))
@@ -214,7 +240,7 @@ def _count_cells(rays: Rays, config: FitConfig) -> tuple[int, int]:
 def _distinct(
     rays: Rays, config: FitConfig, axes: tuple[int, ...], levels: list[int], *, corners: bool
 ) -> list[float]:
-    """Occupied cells of each level, or corners of them, by these of their coordinates alone."""
+    """Number of occupied cells of each level, or of their corners, that differ in the coordinates `axes`."""
     share = min(1.0, _SAMPLE / len(rays))
     band = np.array([-config.near_band_m, 0.0, config.near_band_m])
     chosen = np.zeros(len(rays), bool)
@@ -230,7 +256,8 @@ def _distinct(
         if corners:
             steps_to = np.stack(np.meshgrid(*[[0, 1]] * len(axes), indexing="ij"), -1).reshape(-1, len(axes))
             found = _unique_rows((found[:, None, :] + steps_to).reshape(-1, len(axes)))
-        # Each by its own place: a return's cells, and a cell's corners, may lie in a column that is not in the sample.
+        # Count by the column of each cell or corner itself. Those of a return in the sample may be in another
+        # column.
         counts.append(len(found) if share == 1 else int(_in_sample(found << level, share).sum()) / share)
     return counts
 
@@ -245,13 +272,14 @@ def _lattice(
     columns = list(axes)
     start, direction = rays.points[used][:, columns], rays.directions[used][:, columns]
     points = start[:, None, :] + offsets[None, :, None].astype(np.float32) * direction[:, None, :]
-    limit = float(2**40)  # what is further out has no cells, as the fit will say
+    limit = float(2**40)  # far beyond the cells' keys; the fit refuses such points
     lattice: NDArray[np.int64] = np.floor((points / leaf_size_m).clip(-limit, limit)).astype(np.int64)
     return lattice.reshape(-1, len(axes))
 
 
 def _in_sample(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
-    """Whether a hash of its column puts a cell into the sample."""
+    """(N,) whether a hash of its column puts each cell (N, axes) into the sample, which has this share of all
+    columns."""
     hashed = np.zeros(len(lattice), np.uint64)
     for coordinate in (lattice // _COLUMN).T:
         hashed = (hashed ^ coordinate.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
@@ -260,7 +288,7 @@ def _in_sample(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
 
 
 def _unique_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Different rows; much faster than NumPy's, which compares them as bytes."""
+    """The different rows. np.unique is much slower, because it compares rows as bytes."""
     ordered = rows[np.lexsort(rows.T)]
     new = np.ones(len(ordered), bool)
     new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
