@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Which lattice cells hold returns, and sums over the returns of each cell."""
+"""The cells that hold returns, and sums over the returns of each cell."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from radarsdf._core import CellBlocks, CellSet, cell_keys, sum_moments
 from radarsdf.returns.rays import Rays
 
 MAX_CELLS_FROM_ORIGIN = 1_000_000
-"""Along each axis. A cell's key has 21 bits for each axis."""
+"""Farthest cell along each axis. A Morton key has 21 bits for each axis."""
 
 
 @dataclass(frozen=True)
@@ -23,20 +23,21 @@ class ReturnCells:
     keys: NDArray[np.uint64]
     """(C,) Morton keys of the cells, ascending."""
     blocks: CellBlocks
-    """Finds a cell's row from its key."""
+    """Finds the row of a cell from its key."""
     cell_of_ray: NDArray[np.int32]
     """(N,) row of each return's cell."""
     moments: NDArray[np.float64]
-    """(C, 13) sums over the returns of each cell: 1, x, y, z, xx, xy, xz, yy, yz, zz, and the ray's direction."""
+    """(C, 13) sums over the returns of each cell: of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m²,
+    and of the direction (3) of the ray."""
 
     @classmethod
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> ReturnCells:
-        """Cells of this size, m, that hold returns of `rays`."""
+        """The cells of this size, m, that hold returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
         points = np.ascontiguousarray(rays.points)
         occupied = CellSet(cell_size_m)
         occupied.insert(points, num_threads)
         keys = occupied.sorted_keys(num_threads)
-        del occupied  # it may be as large as all that follows
+        del occupied  # frees memory: it can be as large as everything below
         blocks = CellBlocks(keys)
         rows = blocks.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
         directions = np.ascontiguousarray(rays.directions)

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Cells without a return that a surface crosses all the same: what a sparse sensor left out between two returns."""
+"""Bridges gaps: adds cells without returns that lie between cells with returns, as sparse sensors leave
+them."""
 
 from __future__ import annotations
 
@@ -13,30 +14,38 @@ from radarsdf._core import CellBlocks, cell_keys
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.support import support_of_points
 
-# Measured on simulated and real scans; see "What the levers of the surface are worth" in BENCHMARK.md.
-_MIN_SUPPORT = 0.5  # of the median: returns of less are too often false to say where a surface goes on
-_MAX_SUPPORT = (
-    9.0  # returns in 27 cells, of which a surface crosses nine: one a cell, and a hole is hardly chance
-)
+# Measured on simulated and real scans; see docs/levers.md.
+# Share of the median support. Returns with less are too often false to tell where a surface goes on.
+_MIN_SUPPORT = 0.5
+# Mean support of the two ends of a bridge, at most. A surface crosses about nine of the 27 cells. With one
+# return in each of these or more, an empty cell is most likely a real gap.
+_MAX_SUPPORT = 9.0
 
 
 def bridged(
     leaf_keys: NDArray[np.uint64], rays: Rays, leaf_size_m: float, max_cells: int, num_threads: int = 0
 ) -> NDArray[np.uint64]:
-    """`leaf_keys` and, ascending among them, the cells between two that hold returns, in one of 13 directions.
+    """Adds the leaf cells that bridge a gap: those on the line between two cells with returns.
+
+    Lines run along the axes and the diagonals of the cells, in 13 directions.
 
     Parameters
     ----------
     leaf_keys : ndarray
-        (C,) Morton keys of the cells that near-surface samples fall into, ascending.
+        (C,) uint64 Morton keys of the leaf cells near the surface, ascending.
     rays : Rays
         The returns.
     leaf_size_m : float
-        Edge of the cells, m.
+        Edge of a leaf cell, m.
     max_cells : int
-        So many cells in a row are bridged at most.
+        Largest number of cells between the two.
     num_threads : int
         0: as many as OpenMP uses.
+
+    Returns
+    -------
+    ndarray
+        (C',) uint64 Morton keys of `leaf_keys` and the new cells, ascending.
     """
     if max_cells == 0:
         return leaf_keys
@@ -47,9 +56,11 @@ def bridged(
     rows = np.minimum(np.searchsorted(leaf_keys, keys), len(leaf_keys) - 1)
     returns = np.where(leaf_keys[rows] == keys, support[rows], 0).astype(np.float64)
     least = max(1.0, _MIN_SUPPORT * median)
-    used = (returns >= least) & (returns + least < 2 * _MAX_SUPPORT)  # more finds no partner
+    used = (returns >= least) & (
+        returns + least < 2 * _MAX_SUPPORT
+    )  # with more, the mean with any other end is too high
     keys, first, returns = keys[used], first[used], returns[used]
-    cells = np.floor(points[first] * np.float32(1 / leaf_size_m))  # as the core does it, to the bit
+    cells = np.floor(points[first] * np.float32(1 / leaf_size_m))  # the same bits as in the core
     ends = CellBlocks(keys)
 
     def keys_at(cells: NDArray[np.float32]) -> NDArray[np.uint64]:
@@ -58,7 +69,7 @@ def bridged(
     found = [leaf_keys]
     for direction in itertools.product((-1, 0, 1), repeat=3):
         if direction <= (0, 0, 0):
-            continue  # the same pairs from their other ends
+            continue  # the opposite direction finds the same pairs
         step = np.array(direction, np.float32)
         for distance in range(2, max_cells + 2):
             row = ends.rows(keys_at(cells + distance * step), num_threads)
@@ -66,6 +77,6 @@ def bridged(
             pair = pair[returns[pair] + returns[row[pair]] < 2 * _MAX_SUPPORT]
             found += [keys_at(cells[pair] + between * step) for between in range(1, distance)]
     keys = np.concatenate(found)
-    keys.sort()  # np.unique would build a hash table, ten times slower
+    keys.sort()  # np.unique takes ten times as long: it builds a hash table
     different: NDArray[np.uint64] = keys[np.concatenate([[True], keys[1:] != keys[:-1]])]
     return different

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Ghosts: returns behind a surface that their own rays passed through.
+"""Finds ghosts: returns behind a surface that their rays crossed.
 
-A radar sees an object by way of a mirror, such as a metal wall, and places it straight on, behind the mirror. Such returns
-agree with each other from every position. So neither their number nor the rays that other returns sent betray them.
+A mirror, such as a metal wall, reflects the radar's beam to an object. The radar places the object behind the
+mirror, in the direction of the beam. From all sensor positions, these returns are at the same place. So
+neither the number of returns there nor the rays of other returns show that they are false.
 """
 
 from __future__ import annotations
@@ -18,33 +19,37 @@ from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import NEIGHBOUR_WEIGHT, Surfels
 
 # Measured on simulated and real scans; see docs/levers.md.
-_NOISE_RETURNS_OF_MEANS = 20_000  # tell the noise to 2 %, which is enough where time counts
-_MARGIN = 0.25  # surfel cells. This, and the next, behind a surface: a noisy return of the surface itself is no ghost.
-_SIGMAS = 2.0
-_MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there. A hedge lets most of them through.
-_MIN_SHARE = 0.5  # of the returns round it: ghosts are among ghosts, a noisy return is not
+_NOISE_RETURNS_OF_MEANS = 20_000  # returns. They give the noise to 2 %, which is enough for a quick fit
+# A ghost is farther behind the surface than these two together, since noise puts returns of the surface
+# itself behind it.
+_MARGIN = 0.25  # cells of surfels
+_SIGMAS = 2.0  # standard deviations of the noise
+_MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there. A hedge lets most rays through.
+_MIN_SHARE = (
+    0.5  # of the returns round a ghost that are behind a surface too. Round a noisy return there are few.
+)
 
 
 def find_ghosts(
     surfels: Surfels, rays: Rays, means: MeanRays | None = None, num_threads: int = 0
 ) -> NDArray[np.bool_]:
-    """Which returns are ghosts.
+    """Finds the returns that are ghosts.
 
     Parameters
     ----------
     surfels : Surfels
-        The planes through the returns of `rays`.
+        Surfels of the returns of `rays`.
     rays : Rays
         N rays.
     means : MeanRays, optional
-        For less work: only the first ray of each of these cells is followed, and stands for all returns of the cell.
+        Makes it faster: only the first ray of each of these cells is followed, for all returns of the cell.
     num_threads : int
         0: as many as OpenMP uses.
 
     Returns
     -------
     ndarray
-        (N,) bool.
+        (N,) bool, True for ghosts.
     """
     cells, all_cell_of_ray = surfels.cells, surfels.cells.cell_of_ray
     if means is None:
@@ -59,7 +64,8 @@ def find_ghosts(
     table = table.astype(np.float32)
 
     def crossed(planes: NDArray[np.int64], rays: Rays) -> NDArray[np.int32]:
-        """Row among `planes` of the first plane that each ray crosses from its front; -1 where there is none."""
+        """(N,) row in `planes` of the first plane that each ray crosses from its front. -1: it crosses
+        none."""
         surfel_map = SurfelMap(cells.keys[surfels.cell_of_plane[planes]], table[planes], surfels.cell_size_m)
         return surfel_map.first_crossings(
             np.ascontiguousarray(rays.points),
@@ -84,7 +90,7 @@ def find_ghosts(
     support = surfels.support[flat_cells]
     passed_round = cells.blocks.sum_round(cells.keys[flat_cells], passed, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
     opaque = support / (support + passed_round) > _MIN_OPACITY
-    # Few rays cross a surface at all, and fewer one that is not opaque. Only those may yet cross another.
+    # A ray through a surface that is not opaque may cross an opaque one behind it. There are few such rays.
     behind = first >= 0
     through = np.flatnonzero(behind)[~opaque[first[behind]]]
     behind[through] = crossed(flat[opaque], rays.select(through)) >= 0

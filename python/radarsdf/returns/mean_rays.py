@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One ray for each cell that holds returns: their mean."""
+"""The mean ray of the returns in each cell."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ from radarsdf._core import CellSet
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import Rays
 
-_MIN_LENGTH = 1e-3  # of the sum of directions: shorter ones cancel each other
+_MIN_LENGTH = 1e-3  # of the sum of unit directions. A shorter sum has no meaningful direction
 
 
 @dataclass(frozen=True)
 class MeanRays:
-    """The mean ray of each cell. Measured: an average over them is as good as one over all rays, 2 to 3 times as many."""
+    """The mean ray of each cell.
+
+    Measured: as a start of the training, the average over mean rays is as good as over all rays, of which
+    there are two to three times as many.
+    """
 
     keys: NDArray[np.uint64]
     """(M,) Morton keys of the cells, ascending."""
@@ -27,24 +31,24 @@ class MeanRays:
     points: NDArray[np.float32]
     """(M, 3) mean of the returns in each cell, local, m."""
     directions: NDArray[np.float32]
-    """(M, 3) mean direction of their rays, unit."""
+    """(M, 3) mean direction of their rays, unit vectors."""
     counts: NDArray[np.float32]
     """(M,) number of returns in each cell."""
 
     @classmethod
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> MeanRays:
-        """The mean rays of cells of this size, m."""
+        """The mean rays of cells of this size, m. `num_threads` 0: as many as OpenMP uses."""
         cells = ReturnCells.of(rays, cell_size_m, num_threads)
         rows, moments = cells.cell_of_ray, cells.moments
         first = np.zeros(len(cells.keys), np.int64)
         first[rows[::-1]] = np.arange(
             len(rows) - 1, -1, -1
-        )  # of several rows, NumPy keeps the one written last
+        )  # backwards: NumPy assigns in order, so the first return of a cell is written last and stays
         lengths = np.linalg.norm(moments[:, 10:], axis=1)[:, None]
         directions = np.where(
             lengths > _MIN_LENGTH,
             moments[:, 10:] / np.maximum(lengths, _MIN_LENGTH),
-            rays.directions[first],  # of rays that cancel each other, the first
+            rays.directions[first],  # without a mean direction, that of the first ray
         )
         return cls(
             keys=cells.keys,
@@ -61,7 +65,8 @@ class MeanRays:
         )
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
-        """Leaf cells that the rays go through within `reach_m` of their ends: Morton keys, ascending."""
+        """(C,) uint64, Morton keys of the leaf cells that the rays cross within `reach_m` of their returns,
+        ascending."""
         cells = CellSet(leaf_size_m)
         cells.insert_rays(self.points, self.directions, reach_m, num_threads)
         return cells.sorted_keys(num_threads)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The sensor's noise, estimated from the returns."""
+"""Estimates the noise of the sensor from its returns."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from numpy.typing import NDArray
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
-_MAX_FLATNESS = 0.1  # of a plane that tells the noise
-_MAX_RETURNS = 1_000_000  # more do not tell the noise better
-_MIN_RETURNS = 100  # fewer tell nothing: a stated guess is used
-_SIGMAS2 = 6.0  # a squared residual above so many variances is an outlier
-_TRUNCATION = 1.05  # makes up for the part of a normal distribution that is cut off there
+_MAX_FLATNESS = 0.1  # smallest variance over the middle one of the surfels that are used
+_MAX_RETURNS = 1_000_000  # more do not make the estimate better
+_MIN_RETURNS = 100  # with fewer, the result is the guess that the estimate starts from
+_SIGMAS2 = 6.0  # variances. A larger squared residual is an outlier
+_TRUNCATION = (
+    1.05  # factor on the variance of a normal distribution without these outliers that gives the whole one
+)
 
 
 @dataclass(frozen=True)
 class BeamNoise:
-    """Standard deviations of a return's position."""
+    """Standard deviations of the noise of a return."""
 
     range_m: float
     """Along the beam, m."""
@@ -35,21 +37,21 @@ def beam_noise(
     cell_of_ray: NDArray[np.int32],
     max_returns: int = _MAX_RETURNS,
 ) -> BeamNoise:
-    """Noise of the sensor, from the distances of returns to the planes that they make.
+    """Estimates the noise of the sensor from the distances of returns to their surfels.
 
-    At an angle of incidence θ, the variance across the plane is (σ_range · cos θ)² + (σ_angle · range · sin θ)². The two
-    deviations are fitted to the squared distances by weighted least squares.
+    At an angle of incidence θ, the variance across the plane is (σ_range · cos θ)² + (σ_angle · range · sin
+    θ)². The two deviations are fitted to the squared distances by weighted least squares.
 
     Parameters
     ----------
     surfels : Surfels
-        The planes.
+        Surfels of the returns.
     rays : Rays
         N rays.
     cell_of_ray : ndarray
         (N,) row of the surfel cell of each return.
     max_returns : int
-        No more returns than this are looked at.
+        About so many returns are used at most.
     """
     plane_of_cell = surfels.plane_of_cell(np.flatnonzero(surfels.is_flat(_MAX_FLATNESS)))
     plane = plane_of_cell[cell_of_ray]
@@ -65,7 +67,7 @@ def beam_noise(
     cosine2 = np.einsum("ni,ni->n", rays.directions[used_rays], normals) ** 2
     least = [(0.025 * surfels.cell_size_m) ** 2, 1e-6]
     parts = np.stack([cosine2, range_m**2 * (1 - cosine2)], 1)
-    for _ in range(10):  # each round weighs by the variances of the round before
+    for _ in range(10):  # the weights are the variances of the round before
         variance = parts @ sigma2
         used = residual2 < _SIGMAS2 * variance
         kept = parts[used]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How many returns lie in and round each leaf cell."""
+"""Support: the number of returns in and round each leaf cell."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from radarsdf._core import CellBlocks, cell_keys
 def support_of_points(
     points: NDArray[np.float32], leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_threads: int = 0
 ) -> NDArray[np.uint16]:
-    """Number of returns in each leaf cell and the 26 cells round it.
+    """Support of leaf cells: the number of returns in each and in the 26 cells round it.
 
     Parameters
     ----------
@@ -41,9 +41,21 @@ def support_of_cells(
     leaf_keys: NDArray[np.uint64],
     num_threads: int = 0,
 ) -> NDArray[np.uint16]:
-    """:func:`support_of_points` where returns are given as cells: their `keys` (M,) and the returns in each, `counts` (M,).
+    """:func:`support_of_points` for returns that are already counted in cells.
 
-    Without `counts`, each key stands for one return.
+    Parameters
+    ----------
+    keys : ndarray
+        (M,) uint64 Morton keys of cells with returns.
+    counts : ndarray or None
+        (M,) float32 number of returns in each of them. None: one for each key.
+    leaf_keys, num_threads
+        As for :func:`support_of_points`.
+
+    Returns
+    -------
+    ndarray
+        (C,) uint16. A count above 65535 is stored as 65535.
     """
     cells = CellBlocks(leaf_keys)
     rows = cells.rows(keys, num_threads)

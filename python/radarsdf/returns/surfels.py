@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Surfels: planes through the returns of neighbouring cells."""
+"""Surfels: planes through the returns of a cell and the cells round it."""
 
 from __future__ import annotations
 
@@ -15,42 +15,43 @@ from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import Rays
 
 # Measured on simulated and real scans; see docs/levers.md.
-LEAVES_PER_SURFEL = 2  # leaf cells along an edge of a surfel's cell: 0.4 m
-NEIGHBOUR_WEIGHT = 0.7  # of a cell that shares a face. An edge counts its square, a corner its cube.
-MAX_FLATNESS = 0.5  # smallest variance over the middle one. More is not a plane.
-_MIN_RETURNS = 12.0  # weighted, in the 27 cells of a plane
+LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m with leaf cells of 0.2 m
+NEIGHBOUR_WEIGHT = (
+    0.7  # of a cell that shares a face. One that shares an edge has its square, a corner its cube.
+)
+MAX_FLATNESS = 0.5  # smallest variance over the middle one. A surfel with more is not flat.
+_MIN_RETURNS = 12.0  # weighted returns in the 27 cells of a surfel
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Cells twice as large as leaf cells, and the planes through their returns.
-
-    A cell has a plane if it and the 26 cells round it hold enough returns.
-    """
+    """Cells twice as large as leaf cells, and the surfels of those that have enough returns in and round
+    them."""
 
     cell_size_m: float
     """Edge of a cell, m."""
     cells: ReturnCells
-    """The occupied cells."""
+    """The cells that hold returns."""
     support: NDArray[np.float64]
-    """(C,) returns in a cell and the 26 round it, weighted: far cells count less."""
+    """(C,) weighted number of returns in a cell and the 26 cells round it. Neighbours have less weight."""
     cell_of_plane: NDArray[np.int64]
-    """(P,) row of each plane's cell, ascending."""
+    """(P,) row of the cell of each surfel, ascending."""
     centres: NDArray[np.float64]
-    """(P, 3) local, m."""
+    """(P, 3) weighted mean of the returns, local, m."""
     normals: NDArray[np.float64]
-    """(P, 3) unit vectors, towards the sensors."""
+    """(P, 3) unit vectors towards the sensors."""
     variances: NDArray[np.float64]
-    """(P, 3) variances of the returns along the principal axes, ascending, m². The first is across the plane."""
+    """(P, 3) variances of the returns along the principal axes, ascending, m². The first is across the
+    plane."""
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
-        """Planes through the returns of `rays`."""
+        """Surfels of the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
         cell_size_m = LEAVES_PER_SURFEL * leaf_size_m
         cells = ReturnCells.of(rays, cell_size_m, num_threads)
         counts = cells.moments[:, :1].copy()
         support = cells.blocks.sum_round(cells.keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
-        # Many cells have hardly a return. Planes for all of them would be most of the work and of the memory.
+        # Most cells have few returns. Surfels for all of them would take most of the time and the memory.
         cell_of_plane = np.flatnonzero(support >= _MIN_RETURNS)
         moments = cells.blocks.sum_round(
             cells.keys[cell_of_plane], cells.moments, NEIGHBOUR_WEIGHT, num_threads
@@ -73,29 +74,31 @@ class Surfels:
             normals=normals,
             variances=np.maximum(
                 variances, (0.0025 * cell_size_m) ** 2
-            ),  # float32 coordinates resolve no less
+            ),  # the resolution of float32 coordinates
         )
 
     def is_flat(self, max_flatness: float = MAX_FLATNESS) -> NDArray[np.bool_]:
-        """(P,) whether each plane is thin beside its extent."""
+        """(P,) bool, whether each surfel is thin compared with its extent."""
         flat: NDArray[np.bool_] = self.variances[:, 0] < max_flatness * self.variances[:, 1]
         return flat
 
     def plane_of_cell(self, planes: NDArray[np.int64]) -> NDArray[np.int32]:
-        """(C,) row of each cell's plane, where it is one of `planes`; otherwise -1."""
+        """(C,) row of the surfel of each cell. -1: it has none, or none of `planes`, which are rows of
+        surfels."""
         plane_of_cell = np.full(len(self.cells.keys), -1, np.int32)
         plane_of_cell[self.cell_of_plane[planes]] = planes
         return plane_of_cell
 
     def flat_plane_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Row of the plane of each cell (N,); -1 where there is none, or none that is flat."""
+        """(N,) row of the surfel of each of the `cells` (N,), rows of cells. -1: it has none that is flat."""
         return self.plane_of_cell(np.flatnonzero(self.is_flat()))[cells]
 
     def onto_planes(self, rays: Rays, chunk: int = 1 << 17) -> Rays:
-        """The rays, with their returns moved onto the plane of their cell where that is flat.
+        """The rays with each return moved onto the surfel of its cell, if there is a flat one.
 
-        A return moves along the plane's normal. Dozens of returns know the plane far better than one return knows its
-        own distance from it. Along the plane nothing changes.
+        The return moves along the normal, by its distance from the plane. A plane through dozens of returns
+        has much less noise than one return. Along the plane, the return keeps its position. `chunk`: returns
+        that are moved at a time.
         """
         plane = self.flat_plane_of(self.cells.cell_of_ray)
         points, directions, ranges_m = rays.points.copy(), rays.directions.copy(), rays.ranges_m.copy()
