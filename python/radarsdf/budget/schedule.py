@@ -19,9 +19,8 @@ _ENOUGH_SDF_ITERATIONS = 300
 # F-score on oculii(seed=1, frames=40), 13 passes 1.4 on a tenth of oculii.
 _MOST_SDF_PASSES = 2.0
 _MOST_SAMPLES_PER_VERTEX = 32.0  # measured: wall has 100 in one pass, and is as good after 20
-_MOST_SDF_ITERATIONS = (
-    5000  # beyond this, batches grow: one of the usual size touches little of so large a map
-)
+# Beyond this, batches grow: one of the usual size touches little of so large a map.
+_MOST_SDF_ITERATIONS = 5000
 
 # The training of the intensity network makes one pass over the samples near the surface, within these limits.
 _LEAST_INTENSITY_ITERATIONS = 1200  # with fewer, it has not converged on a small scene

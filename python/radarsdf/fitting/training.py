@@ -30,9 +30,8 @@ from radarsdf.interrupts import deferred_interrupts
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
-_GENERATORS = (
-    MAX_THREADS + 1
-)  # random generators of a fit: one for samples, one for the dropout of each thread
+# Random generators of a fit: one for samples, one for the dropout of each thread.
+_GENERATORS = MAX_THREADS + 1
 _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
 
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# From indigo through magenta and orange to yellow. The lightness grows from 0.32 to 0.93 in OKLab, in equal steps.
+# From indigo through magenta and orange to yellow. The lightness grows from 0.32 to 0.93 in OKLab, in equal
+# steps.
 _ANCHORS = np.array(
     [
         [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
@@ -23,8 +24,8 @@ def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.u
     Parameters
     ----------
     values : (N,) array_like
-        Scalars. Values outside the limits have the colour of the nearer limit. NaN is grey, such as the intensity of a
-        vertex that was not observed.
+        Scalars. Values outside the limits have the colour of the nearer limit. NaN is grey, such as the
+        intensity of a vertex that was not observed.
     low, high : float
         Limits, low ≤ high. If they are equal, all values have the middle colour.
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a map consists of: what its file stores, its queries read and its mesh is extracted from."""
+"""The parts of a map, which its file, its queries and its mesh have in common."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class MapContents:
     field: Field
     """The learnt field, in the local frame."""
     origin: NDArray[np.float64]
-    """(3,) world coordinates of the local frame's zero, m."""
+    """(3,) origin of the local frame in world coordinates, m."""
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
     config: FitConfig
-    """What it was fitted with."""
+    """Settings of the fit."""
     support: NDArray[np.uint16]
-    """(C,) returns in and round each leaf cell, in the order of the cells' keys."""
+    """(C,) number of returns in each leaf cell and the 26 round it, in the order of the cells' keys."""
     report: dict[str, Any]
-    """Counts, losses and seconds of the fit, and under `skipped` what the scene did not need."""
+    """Counts, losses and seconds of the fit. `skipped`: parts of the method that it did not run."""

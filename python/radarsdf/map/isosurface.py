@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Triangle meshes of the level sets of sampled fields.
+"""Triangle meshes of the level sets of sampled fields, by marching cubes.
 
-All functions here give results that do not depend on the number of threads. Lattice corners, wherever eight of
-them make a cell, come in C order: corner ``4 * dx + 2 * dy + dz`` lies ``(dx, dy, dz)`` above the lower one.
+A cell here is a cube of eight neighbouring samples: a voxel of marching cubes. Its corners are in C order:
+corner ``4 * dx + 2 * dy + dz`` is at ``(dx, dy, dz)`` from the lower one. Results do not depend on the number
+of threads.
 """
 
 from __future__ import annotations
@@ -32,18 +33,17 @@ def marching_cubes(
 ) -> Mesh:
     """Triangulate the surface on which a volume crosses a level.
 
-    A sample is positive if and only if it is greater than `level`, and the triangles' normals point to the positive
-    side. The mesh is closed and manifold except where the cells in use end: at the border of the volume, of the
-    mask and of NaN samples. No triangle has zero area, even where samples equal the level, since vertices keep 0.1 %
-    of an edge's length away from the samples; provided that float64 resolves such a length at the vertices' positions,
-    that is to about 10^12 times `spacing` from the world's origin. Further out, vertices may coincide.
+    A sample is positive if it is greater than `level`. The normals of the triangles point to the positive
+    side. The mesh is closed and manifold except where the cells in use end: at the border of the volume or of
+    the mask, and at NaN samples. No triangle has zero area, because vertices stay 0.1 % of an edge's length
+    away from samples, even from samples that equal the level. Beyond about 10^12 times `spacing` from the
+    world's origin, float64 does not resolve this length, and vertices may coincide.
 
     Parameters
     ----------
     volume : array_like, shape (nx, ny, nz)
-        Samples; any is allowed to be infinite, which counts as a sign. float32 and float64 are used as they are,
-        float16, booleans and integers are converted to the smaller of the two that holds all their values (float64
-        for 64-bit integers too, rounded).
+        Samples. An infinite one counts by its sign. Other types than float32 and float64 are converted to the
+        smaller of these that holds all values of the type; 64-bit integers are rounded to float64.
     level : float
         Value of the field on the surface.
     spacing : array_like, shape (3,)
@@ -51,10 +51,10 @@ def marching_cubes(
     origin : array_like, shape (3,)
         Position of sample (0, 0, 0), in world units.
     mask : array_like of bool, shape (nx, ny, nz), optional
-        True where a sample may be used. A cell is triangulated if all eight of its samples may be used and none is
-        NaN. Default: all may be used.
+        True where a sample may be used. A cell is triangulated if all its eight samples may be used and none
+        is NaN. Default: all may be used.
     num_threads : int
-        0 for as many as OpenMP would use.
+        0: as many as OpenMP uses.
 
     Returns
     -------
@@ -68,7 +68,8 @@ def marching_cubes(
     TypeError
         If `volume` is not real or `mask` is not boolean.
     ValueError
-        If a shape does not fit, `spacing`, `origin` or `level` is out of range, or int32 cannot number the vertices.
+        If a shape does not fit, `spacing`, `origin` or `level` is out of range, or there are too many
+        vertices for int32.
 
     Examples
     --------
@@ -107,19 +108,19 @@ def extract_cells(
     origin: ArrayLike = (0.0, 0.0, 0.0),
     num_threads: int = 0,
 ) -> Mesh:
-    """Triangulate the level set inside some cells of a lattice.
+    """Triangulate the surface on which a field crosses a level, in some cells of a lattice.
 
-    The mesh is the one of `marching_cubes` on a volume with these cells in use, up to the order of its vertices and
-    faces. Time and memory are proportional to the numbers of cells and corners.
+    The mesh is that of `marching_cubes` on a volume in which these cells are in use, with vertices and faces
+    in another order. Time and memory are proportional to the numbers of cells and corners.
 
     Parameters
     ----------
     corners : array_like of int32, shape (K, 3)
-        Lattice coordinates, each at most once.
+        Lattice coordinates. None may occur twice.
     values : array_like, shape (K,)
-        The field at the corners; types as for `marching_cubes`. Cells with a NaN corner are left out.
+        The field at the corners, with types as for `marching_cubes`. Cells with a NaN corner are left out.
     cells : array_like of int32, shape (M, 8)
-        Rows of `corners` in C order, each cell at most once; as `sparse_lattice` gives them.
+        Rows of `corners` for each cell, in C order, as `sparse_lattice` gives them. No cell may occur twice.
     level, spacing, origin, num_threads
         As for `marching_cubes`; `origin` is the position of lattice point (0, 0, 0).
 
@@ -159,21 +160,21 @@ def extract_cells(
 def sparse_lattice(
     cells: ArrayLike, *, num_threads: int = 0
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Collect a set of lattice cells and the corners they share.
+    """Remove repeated cells of a lattice, and number the corners that the cells share.
 
     Parameters
     ----------
     cells : array_like of int32, shape (M, 3)
-        Lattice coordinates of the cells' lower corners, in any order, any number of times.
+        Lattice coordinates of the lower corners of the cells, in any order. Cells may be repeated.
     num_threads : int
-        0 for as many as OpenMP would use.
+        0: as many as OpenMP uses.
 
     Returns
     -------
     unique_cells : ndarray of int32, shape (M', 3)
         The different rows of `cells`, sorted by x, then y, then z.
     corners : ndarray of int32, shape (K, 3)
-        Lattice coordinates of all their corners, each once, sorted likewise.
+        Lattice coordinates of all their corners, without repetitions, sorted likewise.
     cell_corners : ndarray of int32, shape (M', 8)
         Rows of `corners` for each cell, in C order.
 
@@ -182,7 +183,7 @@ def sparse_lattice(
     TypeError
         If `cells` are not integers.
     ValueError
-        If the shape does not fit, or the cells are so far apart that 63 bits cannot number their bounding box.
+        If the shape does not fit, or the bounding box of the cells has more than 2^63 cells.
 
     Examples
     --------
@@ -196,7 +197,7 @@ def sparse_lattice(
 
 
 def mesh_components(faces: ArrayLike, num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Label the connected components of a mesh; faces are connected where they share a vertex.
+    """Label the connected components of a mesh. Faces are connected if they share a vertex.
 
     Parameters
     ----------
@@ -233,7 +234,7 @@ def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[n
     if array.dtype.kind not in "biuf":
         msg = f"{name} must be real numbers, not {array.dtype}"
         raise TypeError(msg)
-    # float32 where it holds every value of the type: it is half of the memory to read
+    # float32 if it holds every value of the type, since it is half the memory to read
     if np.can_cast(array.dtype, np.float32, "safe"):
         return np.ascontiguousarray(array, dtype=np.float32)
     return np.ascontiguousarray(real_array(array, name))
@@ -266,7 +267,7 @@ def _as_placement(
         raise ValueError(msg)
     with np.errstate(over="ignore"):
         if not np.isfinite(np.abs(start) + step * extent).all():
-            msg = f"spacing {spacing!r} puts the lattice's end beyond float64"
+            msg = f"spacing {spacing!r} puts the end of the lattice beyond float64"
             raise ValueError(msg)
     return step.tolist(), start.tolist()
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From a map to triangles, and what their vertices carry."""
+"""Extracts the mesh of a map, with confidence and intensity at its vertices."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ with whole_import():
     import trimesh
 
 
-# Measured: see docs/levers.md.
+# Shares of the median support. Measured: see docs/levers.md.
 _MIN_SUPPORT = 0.12
 _MIN_SUPPORT_OF_AVERAGE = 0.15
 
@@ -75,7 +75,7 @@ def extract_mesh(
 
 
 def _is_average(config: FitConfig) -> bool:
-    """Whether the surface is an average of the rays that was not trained on."""
+    """Whether the surface is the average of the rays, without training."""
     return config.training.start == "average" and config.training.sdf_iterations == 0
 
 
@@ -86,7 +86,8 @@ def _local(contents: MapContents, world: NDArray[np.float64]) -> torch.Tensor:
 def _add_intensity(
     mesh: trimesh.Trimesh, contents: MapContents, sensor_position: NDArray[np.float64]
 ) -> None:
-    """Gives the vertices the intensity that a sensor at this position (3,), world, m, would see, and its colour."""
+    """Gives the vertices the intensities predicted for a sensor at `sensor_position`, (3,), world, m, and
+    colours."""
     vertices = np.array(mesh.vertices, np.float64)
     sensors = np.broadcast_to(sensor_position, vertices.shape).copy()
     intensity = queries.intensity(contents, _local(contents, vertices), _local(contents, sensors)).numpy()
@@ -99,7 +100,7 @@ def _add_intensity(
 
 def _check_viewpoint(contents: MapContents, viewpoint: ArrayLike) -> NDArray[np.float64]:
     if contents.intensity_scale is None:
-        msg = "a viewpoint needs a map with intensities, and this one was fitted without"
+        msg = "a viewpoint needs a map with intensities; this one was fitted without"
         raise ValueError(msg)
     sensor_position = real_array(viewpoint, "viewpoint")
     if sensor_position.shape != (3,) or not np.isfinite(sensor_position).all():
@@ -111,7 +112,7 @@ def _check_viewpoint(contents: MapContents, viewpoint: ArrayLike) -> NDArray[np.
 def _check_box(box: ArrayLike) -> NDArray[np.float64]:
     corners = real_array(box, "box")
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
-        msg = "box must be a lower and a higher corner, (2, 3)"
+        msg = "box must be a lower and an upper corner, (2, 3)"
         raise ValueError(msg)
     return corners
 
@@ -119,7 +120,10 @@ def _check_box(box: ArrayLike) -> NDArray[np.float64]:
 def _without_small_components(
     num_vertices: int, faces: NDArray[np.int32], min_triangles: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
-    """Which vertices (V,) the large components use, and their faces in the numbers of these vertices."""
+    """Drops components of fewer triangles than `min_triangles`.
+
+    Returns which vertices are kept, (V,) bool, and the faces (F, 3) as rows of the kept vertices.
+    """
     labels, sizes = mesh_components(faces, num_vertices)
     faces = faces[sizes[labels] >= min_triangles] if len(faces) else faces
     used = np.zeros(num_vertices, bool)

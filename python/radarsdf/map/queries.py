@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a map answers at points of its local frame, (N, 3) float32 tensors, m."""
+"""Queries of a map at points (N, 3) float32, local frame, m."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from radarsdf.map.contents import MapContents
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import Workers, resolve_num_threads
 
-_HALF_SUPPORT = 10.0  # so many returns round a point give a confidence of one half
-_CHUNK = 1 << 13  # points evaluated at a time: hidden layers stay in the second-level cache
-_MIN_RANGE_M = 1e-6  # a point at the sensor itself has no direction
+_HALF_SUPPORT = 10.0  # returns round a point that give a confidence of one half
+_CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
+_MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
 
 
 def to_local(contents: MapContents, world: Tensor) -> Tensor:
@@ -29,7 +29,7 @@ def to_local(contents: MapContents, world: Tensor) -> Tensor:
 def signed_distance(
     contents: MapContents, points: Tensor, *, description: str = "", progress: bool | None = False
 ) -> Tensor:
-    """(N,) m, positive in free space."""
+    """(N,) signed distance, m, positive in free space."""
     return evaluate(contents.field.signed_distance, points, description=description, progress=progress)
 
 
@@ -51,10 +51,12 @@ def occupied(contents: MapContents, points: Tensor) -> Tensor:
 
 
 def confidence(contents: MapContents, points: Tensor) -> Tensor:
-    """(N,) n / (n + 10) for n returns in the 27 leaf cells round each point."""
-    # Trilinear between the centres of cells: a vertex on the face of two cells belongs to both.
+    """(N,) n / (n + 10) for the support n at each point: the returns in the 27 leaf cells round it,
+    interpolated."""
+    # Interpolated trilinearly between the centres of cells, because a vertex of a mesh may be on the face of
+    # two cells.
     table = contents.field.cells.table
-    # A point too far away for a key is in no cell.
+    # Points that are too far away for a key are moved to the limit, where there are no cells.
     limit_m = MAX_CELLS_FROM_ORIGIN * table.leaf_size_m
     near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
     cells = CellBlocks(table.leaf_keys())
@@ -65,7 +67,7 @@ def confidence(contents: MapContents, points: Tensor) -> Tensor:
 
 
 def confidence_of_median(contents: MapContents, share: float) -> float:
-    """The confidence of `share` of the median support."""
+    """The confidence of a support of `share` times the median over the leaf cells that have any."""
     observed = contents.support[contents.support > 0]
     if len(observed) == 0:
         return 0.0
@@ -74,7 +76,10 @@ def confidence_of_median(contents: MapContents, share: float) -> float:
 
 
 def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
-    """(N,) intensity, sensor units, of the returns from points to sensors at positions (N, 3), local, m."""
+    """(N,) intensity, sensor units, of the return that each sensor gets from its point.
+
+    `sensors` (N, 3): sensor positions, local frame, m.
+    """
     scale, field = contents.intensity_scale, contents.field
     assert scale is not None
 
@@ -94,7 +99,10 @@ def evaluate(
     description: str = "",
     progress: bool | None = False,
 ) -> Tensor:
-    """function(points) without gradients, in chunks on all threads, with a progress bar where asked for."""
+    """function(points) without gradients, in chunks, on as many threads as PyTorch uses.
+
+    `progress`: whether to show a progress bar with this `description`. None: only on a terminal.
+    """
 
     def without_gradients(chunk: Tensor) -> Tensor:
         with torch.no_grad():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The map that a fit gives: signed distance, gradient, intensity, mesh, and its file."""
+"""The map that a fit returns: signed distance, gradient, intensity, mesh and file."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ if TYPE_CHECKING:
 
 
 class RadarMap:
-    """A fitted map. Made by :func:`radarsdf.fit` or :func:`radarsdf.load`.
+    """A fitted map, made by :func:`radarsdf.fit` or :func:`radarsdf.load`.
 
-    Queries take world coordinates, m, as NumPy arrays or CPU tensors, and answer in kind and in the same precision.
-    Positions are brought to the map's local frame in float64 before they become float32, so UTM coordinates are fine.
-    Queries may run in many threads at once, and maps be pickled, for workers in other processes.
+    Queries take world coordinates, m, as NumPy arrays or CPU tensors. Results are of the same kind: float64
+    for float64 coordinates and lists, otherwise float32. Coordinates are converted to the local frame in
+    float64, so large ones such as UTM lose no precision. Several threads may query a map at once. A map can
+    be pickled for other processes.
     """
 
     def __init__(self, contents: MapContents) -> None:
@@ -44,12 +45,12 @@ class RadarMap:
 
     @property
     def origin(self) -> NDArray[np.float64]:
-        """(3,) float64, world coordinates of the local frame's zero, m."""
+        """(3,) float64, origin of the local frame in world coordinates, m."""
         return self._contents.origin
 
     @property
     def config(self) -> FitConfig:
-        """What the map was fitted with."""
+        """Settings of the fit."""
         return self._contents.config
 
     @property
@@ -59,12 +60,13 @@ class RadarMap:
 
     @property
     def report(self) -> dict[str, Any]:
-        """Counts, losses and seconds of the fit, and under `skipped` what the scene did not need."""
+        """Counts, losses and seconds of the fit. `skipped`: parts of the method that it did not run."""
         return self._contents.report
 
     @property
     def support(self) -> NDArray[np.uint16]:
-        """(C,) uint16, returns in and round each leaf cell, in the order of the cells' keys."""
+        """(C,) uint16, number of returns in each leaf cell and the 26 round it, in the order of the cells'
+        keys."""
         return self._contents.support
 
     @property
@@ -74,12 +76,12 @@ class RadarMap:
 
     @property
     def nbytes(self) -> int:
-        """Size of features and network weights, bytes: what the paper calls the map's size."""
+        """Size of features and networks, bytes. 3QFP calls this the size of the map."""
         return sum(p.numel() * p.element_size() for p in self.field.parameters())
 
     @property
     def field(self) -> Field:
-        """The learnt field in the local frame, for those who build on it."""
+        """The learnt field, a PyTorch module in the local frame."""
         return self._contents.field
 
     @overload
@@ -97,9 +99,9 @@ class RadarMap:
         Returns
         -------
         (N,) array or tensor
-            m, positive in free space. Meaningful near the surface (a few sigma); see :meth:`observed`. Zero on the
-            surface; beside it the distance along the sensor's rays, which where they graze it is longer than the
-            shortest.
+            Signed distance, m, positive in free space and zero on the surface. It is meaningful near the
+            surface, within a few `sigma_m`; see :meth:`observed`. It is learnt along the sensor's rays. So it
+            is longer than the shortest distance where rays meet the surface at a flat angle.
 
         Raises
         ------
@@ -116,7 +118,8 @@ class RadarMap:
     def gradient(self, x: Any) -> Any:
         """Gradient of :meth:`sdf` at x (N, 3), world, m: (N, 3), towards free space.
 
-        Of about unit length where rays met the surface head on, longer where they grazed it.
+        Its length is about 1 where rays met the surface at a right angle, and more where they met it at a
+        flat angle.
         """
         points, answer = self._local(x)
         return answer(queries.gradient(self._contents, points))
@@ -126,9 +129,9 @@ class RadarMap:
     @overload
     def observed(self, x: ArrayLike) -> NDArray[np.bool_]: ...
     def observed(self, x: Any) -> Any:
-        """Whether the data supports a surface at x (N, 3), world, m: (N,) bool.
+        """Whether x (N, 3), world, m, is in a leaf cell of the map: (N,) bool.
 
-        It does in the leaf cells round a return, and in those of a small gap between two.
+        These are the cells near returns, and those that bridge a small gap between two of them.
         """
         points, answer = self._local(x)
         return answer(queries.occupied(self._contents, points))
@@ -138,7 +141,7 @@ class RadarMap:
     @overload
     def confidence(self, x: ArrayLike) -> NDArray[Any]: ...
     def confidence(self, x: Any) -> Any:
-        """How well the data supports a surface at points.
+        """Confidence in a surface at points, from the number of returns round them.
 
         Parameters
         ----------
@@ -148,9 +151,9 @@ class RadarMap:
         Returns
         -------
         (N,) array or tensor
-            n / (n + 10) for n returns in the 27 leaf cells round the point, interpolated, without those that the fit
-            dropped as ghosts: 0 where there are none, 0.5 at ten, towards 1 with more. It orders places by how far off
-            the surface is likely to be; it is no probability.
+            n / (n + 10) for the support n: the returns in the 27 leaf cells round the point, interpolated
+            between cells, without ghosts that the fit dropped. 0 without returns, 0.5 with ten. Where it is
+            higher, the surface is likely to be more accurate. It is not a probability.
         """
         points, answer = self._local(x)
         return answer(queries.confidence(self._contents, points))
@@ -160,7 +163,7 @@ class RadarMap:
     @overload
     def intensity(self, x: ArrayLike, sensor_positions: ArrayLike) -> NDArray[Any]: ...
     def intensity(self, x: Any, sensor_positions: Any) -> Any:
-        """Predicted intensity of the returns that sensors would get from points.
+        """Predicts the intensity of the return that a sensor gets from each point.
 
         Parameters
         ----------
@@ -172,7 +175,7 @@ class RadarMap:
         Returns
         -------
         (N,) array or tensor
-            In the units of the intensities that the map was fitted to.
+            Intensity, sensor units, as given to the fit.
 
         Raises
         ------
@@ -197,43 +200,45 @@ class RadarMap:
         min_component_triangles: int = 30,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
-        """The surface as triangles: marching cubes on the zero level, only where the map is occupied.
+        """Extracts the surface as triangles, by marching cubes in the leaf cells of the map.
 
         Parameters
         ----------
         voxel_size : float
-            Edge of the marching cubes' cells, m.
+            Edge of a voxel, m.
         box : (2, 3) array_like, optional
-            Lower and upper corner, world, m. Only voxels whose centres lie inside are meshed.
+            Lower and upper corner, world, m. Only voxels with their centre inside are meshed.
         viewpoint : (3,) array_like, optional
-            Sensor position, world, m. The vertices then carry the intensity predicted for it, in sensor units, as
-            ``mesh.vertex_attributes["intensity"]``, and colours from dark (low) to bright (high).
+            Sensor position, world, m. The vertices then carry the intensity predicted for it, in sensor
+            units, as ``mesh.vertex_attributes["intensity"]``, and colours from dark (low) to bright (high).
         min_confidence : float
-            In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out, before small components are.
+            In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out.
         min_support : float, optional
-            Triangles with a vertex that fewer returns support than this share of the map's median are left out (3QFP: 0). A
-            share, since what is much for a sparse sensor is little for a dense one. Default: 0.12, and 0.15 for a surface
-            that is an average.
+            Triangles with a vertex of less support are left out, as a share of the median support of the map,
+            because sensors differ in their number of returns (3QFP: 0). Default: 0.12, or 0.15 for an average
+            without training.
         min_component_triangles : int
-            Components of fewer triangles are left out (3QFP: 300, which on sparse scans costs ten points of completion).
+            Components of fewer triangles are then left out (3QFP: 300, which on sparse scans costs ten points
+            of completion).
         progress : bool, optional
             Whether to show a progress bar. By default only on a terminal.
 
         Returns
         -------
         trimesh.Trimesh
-            World frame, m. Triangles, and so vertex normals, face free space. Empty where there is no surface. The
-            vertices carry :meth:`confidence` as ``mesh.vertex_attributes["confidence"]``. ``mesh.metadata`` counts the leaf
-            cells, and those that were searched because the surface could lie in them.
+            World frame, m. Triangles and vertex normals face free space. The mesh is empty if there is no
+            surface. The vertices have their :meth:`confidence` as ``mesh.vertex_attributes["confidence"]``.
+            In ``mesh.metadata``, `leaf_cells` is the number of leaf cells, and `leaf_cells_searched` of those
+            in which the surface can be.
 
         Raises
         ------
         ValueError
-            For a voxel size, box, viewpoint or confidence out of range, or a viewpoint for a map without intensities.
+            If an argument is out of range, or there is a viewpoint but the map has no intensities.
         MemoryError
-            If so many voxels take more than ``config.max_memory_bytes``, or than the system has.
+            If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
-        from radarsdf.map.meshing import extract_mesh  # noqa: PLC0415 - trimesh, which only a mesh needs, is slow to import
+        from radarsdf.map.meshing import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
 
         return extract_mesh(
             self._contents,
@@ -247,16 +252,21 @@ class RadarMap:
         )
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes the whole map to one safetensors file; :func:`radarsdf.load` reads it back to the same answers."""
+        """Writes the map to a safetensors file. :func:`radarsdf.load` reads it, with the same bits in all
+        results.
+
+        An old file is replaced only once the new one is complete. An OSError says why it cannot be written.
+        """
         storage.save_contents(self._contents, path)
 
     def _local(self, x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
-        """`x` in the local frame as float32 (N, 3), and what gives an answer the kind and precision of `x`.
+        """`x` as (N, 3) float32 in the local frame, and a function that gives results the kind and precision
+        of `x`.
 
-        A single position (3,) is repeated `rows` times where those are given.
+        With `rows`, a single position (3,) is repeated so many times.
         """
         is_tensor = isinstance(x, Tensor)
-        # Writable, or PyTorch warns: a read-only array is copied.
+        # Read-only arrays are copied, because PyTorch warns of them.
         world = (
             x.detach()
             if is_tensor
@@ -292,7 +302,7 @@ def load(path: str | PathLike[str]) -> RadarMap:
     Returns
     -------
     RadarMap
-        Gives the same bits as the map that was saved.
+        Its results have the same bits as those of the map that was saved.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One safetensors file with everything that a map is: cells, features, weights, origin, units, configuration."""
+"""Writes and reads a map as one safetensors file, and as a pickle."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ _UNITS = "positions and distances in m, world frame; signed distance positive in
 
 
 def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
-    """Writes a map to one file. An old file at `path` is replaced only once the new one is whole.
+    """Writes a map to one file. An old file at `path` is replaced only once the new one is complete.
 
-    A process that is killed meanwhile may leave a hidden file beside it, ``.NAME.`` and 16 hexadecimal digits.
+    If the process is killed meanwhile, a hidden file ``.NAME.`` with 16 hexadecimal digits may stay beside
+    it.
     """
     tensors, description = parts_of(contents)
     metadata = {
@@ -43,7 +44,7 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
 
 
 def to_pickle(contents: MapContents) -> tuple[bytes, dict[str, Any]]:
-    """What a pickle of a map holds. Bytes, so that no module of PyTorch's is in it."""
+    """The contents of a map's pickle: tensors as bytes, so that it does not contain classes of PyTorch."""
     tensors, description = parts_of(contents)
     return to_bytes(tensors), description
 
@@ -54,12 +55,12 @@ def from_pickle(data: bytes, description: dict[str, Any]) -> MapContents:
 
 
 def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """All numbers of a map, and a description of JSON's types."""
+    """All tensors of a map, and a description that JSON can store."""
     tensors: dict[str, Tensor] = {
         f"field.{name}": value for name, value in contents.field.state_dict().items()
     }
     tensors["origin"] = torch.from_numpy(contents.origin)
-    # Morton keys use 63 bits, so the cast to the signed integers that every reader knows is lossless.
+    # Morton keys have 63 bits, so they fit into int64, which all readers of safetensors have.
     tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
     tensors["support"] = torch.from_numpy(contents.support)
     scale = contents.intensity_scale
@@ -72,32 +73,32 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def load_contents(path: str | PathLike[str]) -> MapContents:
-    """Reads a map's file. Nothing in the file is executed.
+    """Reads the file of a map. Nothing in the file is executed.
 
     Raises
     ------
     ValueError
-        If the file is not a radarsdf map, is damaged, or comes from a newer version.
+        If the file is not a radarsdf map, is damaged, or is of another version of the format.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     check_regular_file(path)
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             _check_format(metadata, path)
-            # Copies, since these are views of the file, which may change or go.
+            # Copied, because the tensors are views of the file, which may be changed or removed.
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a mapping
         return _build(tensors, json.loads(metadata["description"]))
     except (OSError, _OtherFileError):
         raise
-    except Exception as error:  # of which kind depends on where a damaged file breaks off
+    except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} is not a whole radarsdf map: {error}"
         raise ValueError(msg) from error
 
 
 class _OtherFileError(ValueError):
-    """The file may be whole, but is of another program or version."""
+    """The file is of another program, or of another version of the format."""
 
 
 def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
@@ -118,21 +119,21 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         raise ValueError(msg)
     leaf_keys = tensors.pop("leaf_keys")
     if leaf_keys.ndim != 1 or leaf_keys.dtype != torch.int64:
-        msg = "leaf_keys is not a list of cells"
+        msg = "leaf_keys is not one key for each leaf cell"
         raise ValueError(msg)
     support = tensors.pop("support")
     if support.shape != leaf_keys.shape or support.dtype != torch.uint16:
-        msg = "support is not a number of returns for each cell"
+        msg = "support is not one count for each leaf cell"
         raise ValueError(msg)
     scale = None
     if description["intensity_scale"] is not None:
         low, high = description["intensity_scale"]
         scale = IntensityScale(float(low), float(high))
         if not -math.inf < scale.low < scale.high < math.inf:
-            msg = f"the intensity scale is {low} to {high}"
+            msg = f"the intensity scale must be finite and ascending, not {low} to {high}"
             raise ValueError(msg)
-    # The description could ask for more than any machine has. Of as many layers as there are tensors, at most, and
-    # without memory, the field only says what shapes these must have.
+    # A damaged description could ask for networks of any size. So the number of layers is limited, and the
+    # field is made without memory: it only serves to check the shapes of the tensors.
     if len(config.networks.sdf_hidden + config.networks.intensity_hidden) > len(tensors):
         msg = "there are fewer tensors than layers"
         raise ValueError(msg)
@@ -143,7 +144,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         if tensor.dtype != torch.float32 or not tensor.isfinite().all():
             msg = f"{name} holds something other than finite float32 numbers"
             raise ValueError(msg)
-    field.load_state_dict(state, assign=True)  # a RuntimeError for wrong names or shapes
+    field.load_state_dict(state, assign=True)  # raises a RuntimeError for wrong names or shapes
     field.requires_grad_(False)
     return MapContents(
         field=field,

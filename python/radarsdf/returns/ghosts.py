@@ -25,9 +25,8 @@ _NOISE_RETURNS_OF_MEANS = 20_000  # returns. They give the noise to 2 %, which i
 _MARGIN = 0.25  # cells of surfels
 _SIGMAS = 2.0  # standard deviations of the noise
 _MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there. A hedge lets most rays through.
-_MIN_SHARE = (
-    0.5  # of the returns round a ghost that are behind a surface too. Round a noisy return there are few.
-)
+# Share of the returns round a ghost that are behind a surface too. Round a noisy return it is lower.
+_MIN_SHARE = 0.5
 
 
 def find_ghosts(

@@ -16,9 +16,8 @@ _MAX_FLATNESS = 0.1  # smallest variance over the middle one of the surfels that
 _MAX_RETURNS = 1_000_000  # more do not make the estimate better
 _MIN_RETURNS = 100  # with fewer, the result is the guess that the estimate starts from
 _SIGMAS2 = 6.0  # variances. A larger squared residual is an outlier
-_TRUNCATION = (
-    1.05  # factor on the variance of a normal distribution without these outliers that gives the whole one
-)
+# The variance of a normal distribution is so many times its variance without these outliers.
+_TRUNCATION = 1.05
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,8 @@ from radarsdf.returns.rays import Rays
 
 # Measured on simulated and real scans; see docs/levers.md.
 LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m with leaf cells of 0.2 m
-NEIGHBOUR_WEIGHT = (
-    0.7  # of a cell that shares a face. One that shares an edge has its square, a corner its cube.
-)
+# Weight of a cell that shares a face. One that shares an edge has its square, a corner its cube.
+NEIGHBOUR_WEIGHT = 0.7
 MAX_FLATNESS = 0.5  # smallest variance over the middle one. A surfel with more is not flat.
 _MIN_RETURNS = 12.0  # weighted returns in the 27 cells of a surfel
 
