@@ -134,7 +134,7 @@ class NetworksConfig:
     """Widths of the hidden layers of the intensity network (3QFPI: 64, 64). Measured: the third gives 1 to 3
     % less error."""
     geometry_feature_dim: Annotated[int, Field(ge=0, le=_MAX_WIDTH)] = 0
-    """Numbers that the SDF network passes to the intensity network (3QFPI: 15; no gain in its own ablation)."""
+    """Numbers that the SDF network passes to the intensity network (3QFPI: 15; its ablation shows no gain)."""
     normals: bool = False
     """Whether the intensity network sees the surface normal (3QFPI: yes; its own ablation shows no gain)."""
     sdf_input: bool = True

@@ -29,7 +29,7 @@ _PER_RETURN_AGAIN = 110.0  # if the intensity stage uses other returns than the 
 _PER_RETURN_CHECKED = 200.0  # scans in float64, freed before the training
 _PER_CELL = 215.0
 _PER_OCTREE_ROW = 110.0  # freed when the rows are numbered
-_COPIES = 4  # of each parameter: value, two moments of Adam, last finite value. If all rows move, also its gradients
+_COPIES = 4  # of each parameter: value, two moments of Adam, last finite value. Gradients are added below
 _PER_ROW = 8.0  # if only the touched rows move: marks of Adam
 _PER_VOXEL = 220.0
 
@@ -72,8 +72,7 @@ def estimate(
     *,
     config: FitConfig | None = None,
 ) -> Estimate:
-    """Estimates the memory and time of :func:`radarsdf.fit` with the same arguments, in a small part of that
-    time.
+    """Estimates memory and time of :func:`radarsdf.fit` with the same arguments, much faster than a fit.
 
     Parameters
     ----------
@@ -149,8 +148,7 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
 
 
 def check_fit(rays: Rays, config: FitConfig) -> None:
-    """Raises a MemoryError if the estimated memory of a fit exceeds `max_memory_bytes`, or what the system
-    has left."""
+    """Raises a MemoryError if a fit needs more than `max_memory_bytes`, or than the system has left."""
     available = available_bytes() if config.max_memory_bytes is None else config.max_memory_bytes
     # Upper bounds: cells that the near band of a ray can cross, and rows of features of a cell. If a fit of
     # so many is small enough, the cells need not be counted, which takes time.
@@ -183,8 +181,7 @@ def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> 
 
 
 def available_bytes(root: Path = Path("/")) -> int | None:
-    """Memory that this process can still get, bytes: the least of what the system and its control groups have
-    left.
+    """Memory that this process can still get, bytes: the least of what system and control groups have left.
 
     None if it cannot be found out, as on systems other than Linux. `root` is the root of the file system, for
     tests.
@@ -225,8 +222,7 @@ def _sample_bytes(config: FitConfig) -> float:
 
 
 def _count_cells(rays: Rays, config: FitConfig) -> tuple[int, int]:
-    """Numbers of leaf cells and rows of features, estimated from the columns of space that a hash puts into a
-    sample."""
+    """Numbers of leaf cells and rows of features, estimated from a sample of columns of space."""
     all_axes = (0, 1, 2)
     planes = [(0, 1), (0, 2), (1, 2)] if config.encoding.kind == "tri-quadtree" else [all_axes]
     cells = round(sum(_distinct(rays, config, all_axes, [0], corners=False)))
@@ -278,8 +274,7 @@ def _lattice(
 
 
 def _in_sample(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
-    """(N,) whether a hash of its column puts each cell (N, axes) into the sample, which has this share of all
-    columns."""
+    """(N,) whether each cell (N, axes) is in the sample. A hash selects this share of all columns."""
     hashed = np.zeros(len(lattice), np.uint64)
     for coordinate in (lattice // _COLUMN).T:
         hashed = (hashed ^ coordinate.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)

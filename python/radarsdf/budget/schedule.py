@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from radarsdf.config import FitConfig
 
-# The sdf stage makes one pass over the samples, within these limits. With fewer, the surface of a small scene
-# is unfinished. This limit wins over _MOST_SDF_PASSES and _MOST_SAMPLES_PER_VERTEX.
-_LEAST_SDF_ITERATIONS = 150
+# The sdf stage makes one pass over the samples, within these limits. If they contradict each other, the least
+# number of iterations wins over the most passes and the most samples.
+_LEAST_SDF_ITERATIONS = 150  # with fewer, the surface of a small scene is unfinished
 # With fewer, the networks have not converged. Measured: 0.8 points of F-score on hugin(seed=1, frames=30),
 # 0.3 on a real scene.
 _ENOUGH_SDF_ITERATIONS = 300
@@ -52,8 +52,7 @@ class Schedule:
     def of(
         cls, config: FitConfig, *, surface_returns: int, returns: int, vertices: int, with_intensity: bool
     ) -> Schedule:
-        """The schedule for `surface_returns` returns without ghosts, `returns` with them, and a map of
-        `vertices`."""
+        """The schedule for `surface_returns` returns without ghosts, `returns` with them."""
         sampling, training = config.sampling, config.training
         samples = surface_returns * (sampling.near_samples + sampling.free_samples)
         batch_size, sdf_iterations = training.batch_size, training.sdf_iterations

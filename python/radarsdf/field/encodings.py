@@ -103,8 +103,7 @@ class Fourier(nn.Module):
 
 
 class SphericalHarmonics(nn.Module):
-    """Real spherical harmonics of degree 0 to 3 of unit vectors (N, 3): (N, 16). 3QFPI calls this "degree
-    4"."""
+    """Real spherical harmonics of degree 0 to 3 ("degree 4" in 3QFPI) of unit vectors (N, 3): (N, 16)."""
 
     def forward(self, directions: Tensor) -> Tensor:
         return kernels.spherical_harmonics(directions)

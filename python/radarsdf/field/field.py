@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The learnt field: encodings and networks together. Positions are local; intensities are scaled to [0,
-1]."""
+"""The learnt field: encodings and networks. Positions are local, intensities scaled to [0, 1]."""
 
 from __future__ import annotations
 

@@ -225,8 +225,7 @@ class _Fourier(torch.autograd.Function):
 
 
 def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
-    """Features at points: for a tri-quadtree bilinear on each plane, then summed (3QFP); for an octree
-    trilinear.
+    """Features at points: bilinear in each plane of a tri-quadtree, then summed (3QFP); trilinear in an octree.
 
     Parameters
     ----------
@@ -317,8 +316,10 @@ def locate(points: Tensor, table: VertexTable) -> Tensor:
 
 
 def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequencies: int) -> Tensor:
-    """Sines, then cosines, of 2^k·π·points / half_width_m for k = first_frequency, …: (N, 6 ·
-    num_frequencies)."""
+    """Sines, then cosines, of 2^k·π·points / half_width_m from k = first_frequency on.
+
+    (N, 6 · num_frequencies).
+    """
     return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-any-return, no-untyped-call]
 
 

@@ -52,8 +52,7 @@ class Network(nn.Module):
 
 
 class SDFNetwork(Network):
-    """From the encoding of a point to signed distance / sigma, positive in free space, and a geometry
-    feature."""
+    """From the encoding of a point to signed distance / sigma, positive in free space, and a feature."""
 
     def __init__(self, config: FitConfig) -> None:
         super().__init__(sdf_widths(config))

@@ -37,8 +37,7 @@ class AutogradGradients(GradientBackend):
         return self._gradients({"intensity": self._intensity_loss(geometry, samples)}, None, frozen=True)
 
     def _touched(self, samples: Samples) -> Touched | None:
-        """If only touched features move: the samples with their interpolated features in place of the
-        gradient.
+        """If only touched features move: the samples, with interpolated features in place of the gradient.
 
         These are the leaves that autograd differentiates with respect to. :meth:`_gradients` puts in the
         gradient.

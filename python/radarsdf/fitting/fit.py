@@ -153,8 +153,7 @@ def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, nu
 
 
 def _check_extent(rays: Rays, config: FitConfig) -> None:
-    """Refuses returns that are too far away for a cell's key, before the work begins and with a clear
-    error."""
+    """Refuses returns too far away for a cell's key. Checked first, so that the error is early and clear."""
     limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m
     reach_m = max(config.near_band_m, config.truncation_m if config.training.start == "average" else 0.0)
     if np.abs(rays.points).max() + reach_m > limit_m:

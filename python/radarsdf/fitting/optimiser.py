@@ -76,8 +76,7 @@ class Adam:
 
 
 class RowAdam:
-    """Adam for the features of cells. A step takes time for the rows that its batch touches, not for the
-    whole map.
+    """Adam for the features of cells. A step takes time for the touched rows, not for the whole map.
 
     The mean and mean square of an untouched row decay as with a gradient of zero, but the row does not
     change. Adam would go on to move it along its last gradient, by up to thirty times the learning rate.

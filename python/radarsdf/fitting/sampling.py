@@ -124,8 +124,7 @@ class RaySampler:
         self._next = 0
 
     def _take(self, count: int) -> Tensor:
-        """Rows of the next `count` rays of the random order, ascending, which is Morton order of their
-        returns.
+        """Rows of the next `count` rays of the random order, ascending: in Morton order of their returns.
 
         After the last ray, a new order is drawn.
         """
@@ -160,8 +159,7 @@ class RaySampler:
         return self._split(points, sdf_m, ray, near, near)
 
     def batch(self, parts: int = 1) -> list[Samples]:
-        """`batch_size` samples, in `parts` for the threads. Each part has its share of near and free
-        samples."""
+        """`batch_size` samples, in `parts` for the threads, each with its share of near and free samples."""
         if parts not in self._layouts:
             self._layouts[parts] = _Layout.of(self._num_near, self._num_free, parts, self._config)
         layout = self._layouts[parts]
@@ -260,8 +258,7 @@ class Dropout:
 
     @classmethod
     def draw(cls, rows: int, columns: int, dropout: float, generator: torch.Generator) -> Dropout:
-        """Draws a dropout of a matrix (rows, columns). Each number is dropped with the probability
-        `dropout`."""
+        """Draws a dropout of a matrix (rows, columns). `dropout`: probability that a number is dropped."""
         # Each random int64 gives eight bytes. To draw bytes one by one would take a tenth of an iteration.
         words = torch.empty(-(-rows * columns // 8), dtype=torch.int64).random_(
             -(2**63), None, generator=generator

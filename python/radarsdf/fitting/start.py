@@ -22,8 +22,7 @@ from radarsdf.returns.surfels import Surfels
 
 
 class Start(ABC):
-    """Decides which leaf cells the map has, what the field is before the training, and the support of the
-    cells."""
+    """Decides which leaf cells the map has, what the field is at first, and the support of the cells."""
 
     def __init__(self, surface: SurfaceReturns, config: FitConfig, num_threads: int) -> None:
         self._surface = surface

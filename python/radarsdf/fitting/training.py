@@ -36,8 +36,7 @@ _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would
 
 
 class _Draws:
-    """Draws the samples of all threads in one thread: in several, its small operations would wait for each
-    other."""
+    """Draws the samples of all threads in one: in several, small operations would wait for each other."""
 
     def __init__(
         self,
@@ -123,11 +122,11 @@ class _Stage:
 
 
 class Training:
-    """Trains `field` in place: the sdf stage on `surface`, with joint iterations or without, then the
-    intensity stage on all `returns`. Without a `scale` there are no intensities.
+    """Trains `field` in place: the sdf stage on `surface`, then the intensity stage on all `returns`.
 
-    Each batch is split over the threads. Their gradients are added in the order of the threads, so the same
-    number of threads gives the same bits. With another number, the rounding and the dropout differ.
+    Without a `scale` there are no intensities. Each batch is split over the threads. Their gradients are
+    added in the order of the threads, so the same number of threads gives the same bits. With another number,
+    the rounding and the dropout differ.
     """
 
     def __init__(
@@ -177,8 +176,7 @@ class Training:
         return self._rows is not None
 
     def state(self) -> dict[str, Tensor]:
-        """All that the rest of the training depends on, between two iterations. The tensors are not
-        copied."""
+        """All that the rest of the training depends on, between two iterations. Tensors are not copied."""
         losses = [self.losses.get(name, 0.0) for name in self.iterations_done]
         state = {
             "done": torch.tensor(list(self.iterations_done.values())),
@@ -196,8 +194,7 @@ class Training:
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of a training of the same rays and configuration gave. A ValueError if
-        it is impossible."""
+        """Restores what :meth:`state` of the same fit gave. Raises a ValueError if it is impossible."""
         done = dict(zip(self.iterations_done, state["done"].tolist(), strict=True))
         if not all(0 <= done[name] <= self.iterations[name] for name in done):
             msg = f"{done} iterations of {self.iterations}"

@@ -86,8 +86,7 @@ def _local(contents: MapContents, world: NDArray[np.float64]) -> torch.Tensor:
 def _add_intensity(
     mesh: trimesh.Trimesh, contents: MapContents, sensor_position: NDArray[np.float64]
 ) -> None:
-    """Gives the vertices the intensities predicted for a sensor at `sensor_position`, (3,), world, m, and
-    colours."""
+    """Gives the vertices intensities predicted for `sensor_position`, (3,), world, m, and colours."""
     vertices = np.array(mesh.vertices, np.float64)
     sensors = np.broadcast_to(sensor_position, vertices.shape).copy()
     intensity = queries.intensity(contents, _local(contents, vertices), _local(contents, sensors)).numpy()

@@ -51,8 +51,7 @@ def occupied(contents: MapContents, points: Tensor) -> Tensor:
 
 
 def confidence(contents: MapContents, points: Tensor) -> Tensor:
-    """(N,) n / (n + 10) for the support n at each point: the returns in the 27 leaf cells round it,
-    interpolated."""
+    """(N,) n / (n + 10) for the interpolated number n of returns in the 27 leaf cells round each point."""
     # Interpolated trilinearly between the centres of cells, because a vertex of a mesh may be on the face of
     # two cells.
     table = contents.field.cells.table

@@ -65,8 +65,7 @@ class RadarMap:
 
     @property
     def support(self) -> NDArray[np.uint16]:
-        """(C,) uint16, number of returns in each leaf cell and the 26 round it, in the order of the cells'
-        keys."""
+        """(C,) uint16, returns in each leaf cell and the 26 round it, in the order of the cells' keys."""
         return self._contents.support
 
     @property
@@ -252,16 +251,14 @@ class RadarMap:
         )
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes the map to a safetensors file. :func:`radarsdf.load` reads it, with the same bits in all
-        results.
+        """Writes the map to a safetensors file. After :func:`radarsdf.load`, all results have the same bits.
 
         An old file is replaced only once the new one is complete. An OSError says why it cannot be written.
         """
         storage.save_contents(self._contents, path)
 
     def _local(self, x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
-        """`x` as (N, 3) float32 in the local frame, and a function that gives results the kind and precision
-        of `x`.
+        """`x` as (N, 3) float32, local frame, and a function that gives results the kind and precision of `x`.
 
         With `rows`, a single position (3,) is repeated so many times.
         """

@@ -104,8 +104,7 @@ def _is_grid(config: FitConfig) -> bool:
 def _grid(
     contents: MapContents, progress: bool | None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-    """If :func:`_is_grid`: vertices (V, 3) of the leaf cells, rows of them (C, 8) for each cell, and their
-    distances (V,), m.
+    """If :func:`_is_grid`: vertices (V, 3), rows of them for each leaf cell (C, 8), and distances (V,), m.
 
     This needs no interpolation, which makes it fast.
     """
@@ -131,8 +130,7 @@ def _crossed(contents: MapContents, cells: NDArray[np.int32]) -> NDArray[np.int3
 
 
 def _per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
-    """Number of voxels along the edge of a leaf cell, and whether they divide it, so that each is in one
-    cell."""
+    """Voxels along the edge of a leaf cell, and whether they divide it, so that each is in one cell."""
     parts = max(1, math.ceil(min(leaf_size_m / voxel_size, _MAX_VOXELS) - 1e-9))
     return parts, math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
 
@@ -214,7 +212,6 @@ def _corner_distances(
 
 
 def _parts(count: int, numbers: int = 8) -> Iterator[slice]:
-    """Slices of [0, count), where each item has `numbers` numbers. Ctrl-C has to wait for one slice at
-    most."""
+    """Slices of [0, count), for `numbers` numbers each. Ctrl-C has to wait for at most one slice."""
     step = max(1, _PART // numbers)
     return (slice(first, min(first + step, count)) for first in range(0, count, step))

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Bridges gaps: adds cells without returns that lie between cells with returns, as sparse sensors leave
-them."""
+"""Bridges gaps: adds the empty cells that a sparse sensor leaves between cells with returns."""
 
 from __future__ import annotations
 

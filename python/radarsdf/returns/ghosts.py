@@ -63,8 +63,7 @@ def find_ghosts(
     table = table.astype(np.float32)
 
     def crossed(planes: NDArray[np.int64], rays: Rays) -> NDArray[np.int32]:
-        """(N,) row in `planes` of the first plane that each ray crosses from its front. -1: it crosses
-        none."""
+        """(N,) row in `planes` of the first plane that each ray crosses from its front, or -1."""
         surfel_map = SurfelMap(cells.keys[surfels.cell_of_plane[planes]], table[planes], surfels.cell_size_m)
         return surfel_map.first_crossings(
             np.ascontiguousarray(rays.points),

@@ -65,8 +65,7 @@ class MeanRays:
         )
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
-        """(C,) uint64, Morton keys of the leaf cells that the rays cross within `reach_m` of their returns,
-        ascending."""
+        """(C,) uint64, ascending Morton keys of the leaf cells that rays cross within `reach_m` of their returns."""
         cells = CellSet(leaf_size_m)
         cells.insert_rays(self.points, self.directions, reach_m, num_threads)
         return cells.sorted_keys(num_threads)

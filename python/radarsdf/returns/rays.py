@@ -66,10 +66,9 @@ class Rays:
         return points, points - self.directions.astype(np.float64) * self.ranges_m[:, None]
 
     def along(self, offsets_m: ArrayLike, chunk: int = 1 << 20) -> Iterator[NDArray[np.float32]]:
-        """Points at fixed offsets from the return along each ray, in chunks (M, 3) of about `chunk` points,
-        local, m.
+        """Points at fixed offsets from the return along each ray, in chunks (M, 3), local, m.
 
-        Positive offsets are behind the return.
+        Positive offsets are behind the return. A chunk has about `chunk` points.
         """
         offsets = np.asarray(offsets_m, np.float32)
         rays_per_chunk = max(1, chunk // len(offsets))

@@ -24,8 +24,7 @@ _MIN_RETURNS = 12.0  # weighted returns in the 27 cells of a surfel
 
 @dataclass(frozen=True)
 class Surfels:
-    """Cells twice as large as leaf cells, and the surfels of those that have enough returns in and round
-    them."""
+    """Cells twice as large as leaf cells, and surfels of those with enough returns in and round them."""
 
     cell_size_m: float
     """Edge of a cell, m."""
@@ -82,8 +81,7 @@ class Surfels:
         return flat
 
     def plane_of_cell(self, planes: NDArray[np.int64]) -> NDArray[np.int32]:
-        """(C,) row of the surfel of each cell. -1: it has none, or none of `planes`, which are rows of
-        surfels."""
+        """(C,) row of the surfel of each cell, -1 if it is none of the rows `planes`."""
         plane_of_cell = np.full(len(self.cells.keys), -1, np.int32)
         plane_of_cell[self.cell_of_plane[planes]] = planes
         return plane_of_cell
