@@ -49,7 +49,9 @@ class AutogradGradients(GradientBackend):
         return Touched(samples.points, located, interpolated.requires_grad_())
 
     def _sdf_loss(self, logit: Tensor, samples: Samples) -> Tensor:
-        return sdf_loss(logit, samples.sdf_m, self._field.sigma_m) / self._share.parts
+        if len(logit) == 0:  # whose mean is not a number
+            return logit.sum()
+        return sdf_loss(logit, samples.sdf_m, self._field.sigma_m) * samples.share
 
     def _intensity_loss(self, geometry: Geometry, samples: Samples) -> Tensor:
         count = self._num_seen(samples)
@@ -61,7 +63,9 @@ class AutogradGradients(GradientBackend):
             samples.ranges_m[:count] - samples.sdf_m[:count],
             encoding_factors=[dropout.factors for dropout in self._draw_dropouts(count)] or None,
         )
-        return intensity_loss(predicted, labels) / self._share.parts
+        if count == 0:
+            return predicted.sum()
+        return intensity_loss(predicted, labels) * self._seen_share(samples)
 
     def _gradients(
         self, losses: dict[str, Tensor], touched: Touched | None, *, frozen: bool = False

@@ -42,32 +42,32 @@ class CoreGradients(GradientBackend):
         self._by_intensity = [torch.from_numpy(gradient) for gradient in self._loss.intensity_gradients]
 
     def sdf(self, samples: Samples) -> Gradients:
-        touched, parts = self._untouched(samples), self._share.parts
+        touched, share = self._untouched(samples), samples.share
         loss = self._loss.sdf(
             points=samples.points.numpy(),
             sdf_m=samples.sdf_m.numpy(),
-            weight=1 / parts,
+            weight=share,
             located=touched.located.numpy(),
             interpolated_grad=touched.gradient.numpy(),
         )
-        return self._with_features({"sdf": loss / parts}, touched, self._by_sdf)
+        return self._with_features({"sdf": loss * share}, touched, self._by_sdf)
 
     def joint(self, samples: Samples) -> Gradients:
-        touched, parts = self._untouched(samples), self._share.parts
-        sdf_weight = self._config.training.sdf_loss_weight
+        touched, seen_share = self._untouched(samples), self._seen_share(samples)
+        sdf_weight = self._config.training.sdf_loss_weight * samples.share
         sdf, intensity = self._loss.joint(
             **self._batch(samples),
-            weights=(sdf_weight / parts, 1 / parts),
+            weights=(sdf_weight, seen_share),
             located=touched.located.numpy(),
             interpolated_grad=touched.gradient.numpy(),
         )
-        losses = {"sdf": sdf_weight * sdf / parts, "intensity": intensity / parts}
+        losses = {"sdf": sdf_weight * sdf, "intensity": intensity * seen_share}
         return self._with_features(losses, touched, self._by_sdf + self._by_intensity)
 
     def intensity(self, samples: Samples) -> Gradients:
-        parts = self._share.parts
-        loss = self._loss.intensity(**self._batch(samples), weight=1 / parts)
-        return Gradients({"intensity": loss / parts}, list(self._by_intensity), None)
+        share = self._seen_share(samples)
+        loss = self._loss.intensity(**self._batch(samples), weight=share)
+        return Gradients({"intensity": loss * share}, list(self._by_intensity), None)
 
     def _batch(self, samples: Samples) -> dict[str, Any]:
         """The arguments of the core's joint and intensity losses that come from samples."""

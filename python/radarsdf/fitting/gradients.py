@@ -54,8 +54,6 @@ class Gradients:
 class Share:
     """How the back end of one thread takes part in a batch."""
 
-    parts: int
-    """Number of threads that share a batch."""
     dropout_scale: float
     """Factor on the dropout of the configuration."""
     generator: torch.Generator
@@ -98,6 +96,10 @@ class GradientBackend(ABC):
         """Number of samples, the first ones, that the intensity network sees."""
         in_free_space = self._config.training.intensity_in_free_space
         return len(samples.points) if in_free_space else samples.num_near
+
+    def _seen_share(self, samples: Samples) -> float:
+        """What the mean over them counts in that of the whole batch."""
+        return samples.share if self._config.training.intensity_in_free_space else samples.near_share
 
     def _draw_dropouts(self, count: int) -> list[Dropout]:
         """Dropout of each part of the encoding of `count` samples, for the intensity network alone."""

@@ -29,6 +29,10 @@ class Samples:
     of_ray: Tensor
     """(B, 7 or 8) for the ray of each sample: return (3), local frame, m; direction (3); range, m; and scaled
     intensity if there are intensities."""
+    share: float = 1.0
+    """Of a part of a batch: what its mean counts in the mean of the whole batch. 0 where it has no samples."""
+    near_share: float = 1.0
+    """The same of the samples near the surface."""
 
     @property
     def directions(self) -> Tensor:
@@ -185,8 +189,11 @@ class RaySampler:
         if len(sizes) == 1:
             return [Samples(points, sdf_m, near[0], ray)]
         columns = [torch.split_with_sizes(column, sizes) for column in (points, sdf_m, ray)]
+        # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
+        shares = ([count / sum(counts) for count in counts] for counts in (sizes, near))
         return [
-            Samples(x, sdf, num_near, of_ray) for x, sdf, of_ray, num_near in zip(*columns, near, strict=True)
+            Samples(x, sdf, num_near, of_ray, *shares_of_part)
+            for x, sdf, of_ray, num_near, *shares_of_part in zip(*columns, near, *shares, strict=True)
         ]
 
 

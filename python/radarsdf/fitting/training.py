@@ -349,7 +349,7 @@ def _backends(field: Field, config: FitConfig, schedule: Schedule, parts: int) -
     kind = AutogradGradients if normals or config.training.gradients == "autograd" else CoreGradients
     seeds = range(config.seed * _GENERATORS + 1, config.seed * _GENERATORS + 1 + parts)
     generators = [torch.Generator("cpu").manual_seed(seed) for seed in seeds]
-    return [kind(field, config, Share(parts, schedule.dropout_scale, generator)) for generator in generators]
+    return [kind(field, config, Share(schedule.dropout_scale, generator)) for generator in generators]
 
 
 _Work = tuple[GradientBackend, Samples]
