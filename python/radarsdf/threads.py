@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
+from torch.nn import functional
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -31,6 +32,9 @@ _lock = threading.Lock()
 _users = 0
 _threads_before = 0
 _blocks = threading.local()  # .depth: number of `with Workers` blocks that this thread is in
+_vector_library_started = False
+_TRANSCENDENTAL = ("cos", "exp", "log", "log10", "log1p", "log2", "pow", "sigmoid", "sin", "tanh")
+_AT_ONCE = 1024  # numbers: enough for vectors, too few for PyTorch to share them among threads
 
 
 def _use_one_thread() -> None:
@@ -52,6 +56,32 @@ def _reset_after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_reset_after_fork)
+
+
+def start_vector_library() -> None:
+    """Call PyTorch's transcendental functions once in this process, by one thread alone.
+
+    The libraries behind them look for the processor's instructions in the first call. Where several threads make it at
+    once, some get other last bits than in all later calls: the same fit would differ about once in fifty processes.
+    """
+    if not _vector_library_started:
+        with _lock:
+            _start_vector_library()
+
+
+def _start_vector_library() -> None:
+    """The same for who holds the lock."""
+    global _vector_library_started  # noqa: PLW0603 - there is one PyTorch
+    if _vector_library_started:
+        return
+    with torch.no_grad():
+        for dtype in (torch.float32, torch.float64):
+            numbers = torch.full((_AT_ONCE,), 0.5, dtype=dtype, device="cpu")
+            for name in _TRANSCENDENTAL:
+                getattr(torch, name)(*[numbers] * (2 if name == "pow" else 1))
+            functional.binary_cross_entropy_with_logits(numbers, numbers)
+            torch.randn(_AT_ONCE, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
+    _vector_library_started = True
 
 
 def resolve_num_threads(num_threads: int) -> int:
@@ -79,6 +109,7 @@ class Workers:
     def __enter__(self) -> Self:
         global _users, _threads_before  # noqa: PLW0603 - PyTorch's setting is global too
         with _lock:
+            _start_vector_library()
             depth = getattr(_blocks, "depth", 0)
             if _users == 0:
                 _threads_before = torch.get_num_threads()

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from radarsdf._core import CellBlocks
 from radarsdf.map.contents import MapContents
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
-from radarsdf.threads import Workers, resolve_num_threads
+from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
 _HALF_SUPPORT = 10.0  # returns round a point that give a confidence of one half
 _CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
@@ -109,6 +109,7 @@ def evaluate(
 
     chunks = torch.split(points, _CHUNK) if len(points) > _CHUNK else (points,)
     if len(chunks) == 1:
+        start_vector_library()  # the first queries may come from several threads at once
         return without_gradients(points)
     with Workers() as workers:
         results = workers.map(without_gradients, chunks)
