@@ -76,8 +76,8 @@ void scatter_to_copies(const std::int32_t* rows, const float* weights, const flo
   }
 }
 
-// Each thread has all points, but only some planes. Planes share no rows, so there is one gradient without copies, as in
-// csrc/encodings.cpp.
+// Each thread has all points, but only some planes. Planes share no rows, so there is one gradient without copies, as
+// in csrc/field/encodings.cpp.
 void scatter_by_planes(const std::int32_t* rows, const float* weights, const float* out_grad, std::int64_t count,
                        float* gradient, int threads) {
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)

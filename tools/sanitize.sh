@@ -18,10 +18,7 @@ rm -rf $folder/python
 cp -r python $folder/python
 rm -f $folder/python/radarsdf/_core*.so
 ln -s "$PWD/$folder"/csrc/bindings/_core*.so $folder/python/radarsdf/
-tests=(tests/test_kernels.py tests/test_kernel_rounding.py tests/test_encodings.py tests/test_marching_cubes.py
-  tests/test_marching_cubes_extremes.py tests/test_mesh_components.py tests/test_sparse_lattice.py
-  tests/test_cell_sums.py tests/test_surface_crossings.py tests/test_optimiser.py tests/test_mlp.py
-  tests/test_ray_average.py tests/test_shards.py)
+tests=(tests/core tests/field/test_encodings.py tests/fitting/test_optimiser.py)
 # Python itself leaks by design, and libraries beside ours define the same symbols.
 LD_PRELOAD="$(g++ -print-file-name=libasan.so) $(g++ -print-file-name=libubsan.so)" \
   ASAN_OPTIONS=detect_leaks=0:detect_odr_violation=0 UBSAN_OPTIONS=print_stacktrace=1 \
