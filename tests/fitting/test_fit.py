@@ -301,6 +301,18 @@ def test_a_complete_fit_has_done_all_its_iterations(scene, training):
     assert report["iterations_done"] == report["iterations"]
 
 
+def test_effort_is_that_of_the_fit(scene):
+    """Of 150 and 1200 iterations, the first of which are of both networks."""
+    config = FitConfig(effort=0.02, training={"batch_size": 1024, "intensity_batch_size": 512})
+    report = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config).report
+    whole = radarsdf.estimate(
+        scene.points, scene.poses, scene.intensities, config=config.override(effort=1.0)
+    ).iterations
+    done = report["iterations_done"]
+    assert done["sdf"] == pytest.approx(0.02 * whole["sdf"], abs=1)
+    assert done["sdf"] < done["intensity"] < 0.05 * whole["intensity"]
+
+
 def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     is_ghost = np.concatenate(scene.points)[:, 2] > -0.5  # of the sensor frame: the wall, for once
     assert 0.1 < is_ghost.mean() < 0.9

@@ -1,0 +1,423 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Settings are checked where they are made, say in one line what is wrong, and survive files."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import inspect
+import json
+import math
+import pickle
+import sys
+
+import numpy as np
+import pytest
+from radarsdf import FitConfig, _core
+from radarsdf import config as module
+
+GROUPS = ("returns", "encoding", "networks", "sampling", "training")
+TINY = sys.float_info.min
+LARGE = 1e300
+MAX_COUNT, MAX_SAMPLES, MAX_WIDTH = 2**31 - 1, 2**24, 4096
+
+# Of each setting, the least and the greatest value that pass, and what is refused below and above: None, where any larger
+# finite number passes.
+WHOLE = {
+    "seed": (0, 2**48, -1, 2**48 + 1),
+    "num_threads": (0, 1024, -1, 1025),
+    "max_memory_bytes": (1, 2**63 - 1, 0, 2**63),
+    "returns.accumulate_scans": (1, MAX_COUNT, 0, MAX_COUNT + 1),
+    "encoding.num_levels": (1, 12, 0, 13),
+    "encoding.bridge_cells": (0, 8, -1, 9),
+    "encoding.fourier_count": (0, 24, -1, 25),
+    "networks.geometry_feature_dim": (0, MAX_WIDTH, -1, MAX_WIDTH + 1),
+    "sampling.near_samples": (1, MAX_SAMPLES, 0, MAX_SAMPLES + 1),
+    "sampling.free_samples": (0, MAX_SAMPLES, -1, MAX_SAMPLES + 1),
+    "training.batch_size": (1, MAX_SAMPLES, 0, MAX_SAMPLES + 1),
+    "training.intensity_batch_size": (1, MAX_SAMPLES, 0, MAX_SAMPLES + 1),
+    "training.sdf_iterations": (0, MAX_COUNT, -3, MAX_COUNT + 1),
+    "training.intensity_iterations": (1, MAX_COUNT, 0, MAX_COUNT + 1),
+}
+REAL = {
+    "leaf_size_m": (TINY, LARGE, 0.0, None),
+    "effort": (TINY, 1000.0, 0.0, 1000.1),
+    "returns.min_range_m": (0.0, LARGE, -0.1, None),
+    "returns.max_range_m": (2.6, LARGE, 2.5, None),  # of which the default's least range is the limit
+    "encoding.fourier_half_width_cells": (TINY, LARGE, 0.0, None),
+    "networks.feature_dropout": (0.0, 0.95, -0.01, 0.96),
+    "networks.fourier_dropout": (0.0, 0.95, -0.01, 0.96),
+    "sampling.near_band_cells": (TINY, LARGE, 0.0, None),
+    "sampling.free_from": (0.0, 0.999, -0.01, 1.0),
+    "sampling.free_beyond_cells": (0.0, LARGE, -0.1, None),
+    "sampling.cross_range_noise_rad": (0.0, LARGE, -0.1, None),
+    "training.truncation_cells": (TINY, LARGE, 0.0, None),
+    "training.sigma_cells": (TINY, LARGE, 0.0, None),
+    "training.sdf_loss_weight": (0.0, LARGE, -0.1, None),
+    "training.learning_rate": (TINY, LARGE, 0.0, None),
+    "training.intensity_learning_rate": (TINY, LARGE, 0.0, None),
+}
+TRUTH = [
+    "returns.drop_ghosts",
+    "returns.onto_planes",
+    "networks.normals",
+    "networks.sdf_input",
+    "networks.view_direction",
+    "networks.log_range",
+    "training.intensity_in_free_space",
+    "training.joint",
+    "training.cosine_schedule",
+    "training.row_updates",
+]
+WORDS = {
+    "encoding.kind": ["tri-quadtree", "octree"],
+    "training.start": ["noise"],  # an average needs more: see below
+    "training.gradients": ["core", "autograd"],
+}
+WIDTHS = ["networks.sdf_hidden", "networks.intensity_hidden"]
+NONE = ["max_memory_bytes", "returns.max_range_m", "training.sdf_iterations", "training.intensity_iterations"]
+
+
+def nested(name, value):
+    """A setting such as "training.joint" as arguments of FitConfig."""
+    group, dot, own = name.partition(".")
+    return {group: {own: value}} if dot else {group: value}
+
+
+def get(config, name):
+    for part in name.split("."):
+        config = getattr(config, part)
+    return config
+
+
+def refused(name, value, says=r"."):
+    """By the constructor, by override and from a file alike, in one line that begins with the setting's name."""
+    base = FitConfig()
+    for make in (FitConfig, base.override, lambda **values: FitConfig.from_dict(values)):
+        with pytest.raises(ValueError, match=says) as caught:
+            make(**nested(name, value))
+        message = str(caught.value)
+        assert message.startswith(f"{name} must"), message
+        assert "\n" not in message
+        assert len(message) < 200
+
+
+def names():
+    found = [field.name for field in dataclasses.fields(FitConfig) if field.name not in GROUPS]
+    for group in GROUPS:
+        found += [f"{group}.{field.name}" for field in dataclasses.fields(getattr(FitConfig(), group))]
+    return found
+
+
+def test_every_setting_is_in_one_of_these_tests():
+    assert sorted([*WHOLE, *REAL, *TRUTH, *WORDS, *WIDTHS]) == sorted(names())
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "greatest", "below", "above"), [(n, *v) for n, v in (WHOLE | REAL).items()]
+)
+def test_ranges(name, least, greatest, below, above):
+    for value in (least, greatest):
+        assert get(FitConfig(**nested(name, value)), name) == value
+    refused(name, below, says=f"not {below}")
+    if above is not None:
+        refused(name, above, says=f"not {above}")
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_numbers_are_finite(name):
+    for value in (math.nan, math.inf, -math.inf):
+        refused(name, value)
+
+
+@pytest.mark.parametrize("name", names())
+def test_types(name):
+    wrong = [b"1", [1.5], {}, (), object(), 1j]
+    if name in WHOLE:
+        wrong += [True, 1.0, "1", np.float64(1)]
+    elif name in REAL:
+        wrong += [True, "0.5"]
+    elif name in TRUTH:
+        wrong += [1, 0, "yes", 1.0]
+    elif name in WORDS:
+        wrong += ["", "OCTREE", 1, True]
+    if name not in NONE:
+        wrong.append(None)
+    else:
+        assert get(FitConfig(**nested(name, None)), name) is None
+    for value in wrong:
+        refused(name, value)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_whole_numbers_are_numbers(name):
+    value = math.ceil(REAL[name][0])
+    assert get(FitConfig(**nested(name, value)), name) == value
+
+
+@pytest.mark.parametrize("name", TRUTH)
+def test_both_of_what_is_true_or_false(name):
+    for value in (True, False):
+        assert get(FitConfig(**nested(name, value)), name) is value
+
+
+@pytest.mark.parametrize("name", WORDS)
+def test_words(name):
+    for value in WORDS[name]:
+        assert get(FitConfig(**nested(name, value)), name) == value
+    refused(name, "zero", says="not 'zero'")
+
+
+@pytest.mark.parametrize("name", WIDTHS)
+def test_widths(name):
+    for value in ((1,), (MAX_WIDTH,) * 32, [3, 4]):
+        found = get(FitConfig(**nested(name, value)), name)
+        assert found == tuple(value)
+        assert isinstance(found, tuple)
+    for value in (
+        (),
+        (0,),
+        (MAX_WIDTH + 1,),
+        (8,) * 33,
+        (8, 10**9),
+        (True,),
+        (1.0,),
+        ("8",),
+        "88",
+        8,
+        {8: 8},
+        ((8,),),
+    ):
+        refused(name, value)
+
+
+def test_limits_are_those_of_the_core():
+    assert module.MAX_LEVELS == _core.MAX_LEVELS
+    assert module.MAX_FREQUENCIES == _core.MAX_FREQUENCIES
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"training": {"sdf_iterations": -3}},
+            "training.sdf_iterations must be greater than or equal to 0, not -3",
+        ),
+        ({"leaf_size_m": 0}, "leaf_size_m must be greater than 0, not 0"),
+        ({"training": {"bar": 1}}, "unknown setting training.bar"),
+        ({"bar": 1}, "unknown setting bar"),
+        ({"sdf_iterations": 1}, "unknown setting sdf_iterations"),
+        ({"returns": {"max_range_m": 1.0}}, "returns.max_range_m must exceed min_range_m, 2.5, not 1.0"),
+        (
+            {"training": {"start": "average"}},
+            "training.start 'average' needs encoding.kind 'octree' and networks.sdf_hidden of at least 2",
+        ),
+    ],
+)
+def test_messages(values, message):
+    for make in (FitConfig, FitConfig().override, lambda **settings: FitConfig.from_dict(settings)):
+        with pytest.raises(ValueError, match=r".") as caught:
+            make(**values)
+        assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_groups_are_groups(group):
+    other = FitConfig().sampling if group != "sampling" else FitConfig().training
+    for value in (None, 1, "a", [], other, FitConfig()):
+        with pytest.raises(ValueError, match=group):
+            FitConfig(**{group: value})
+    assert FitConfig(**{group: {}}) == FitConfig()
+    assert FitConfig(**{group: getattr(FitConfig(), group)}) == FitConfig()
+
+
+def test_settings_are_given_by_name():
+    with pytest.raises(TypeError):
+        FitConfig(0.2)
+    assert {p.kind for p in inspect.signature(FitConfig).parameters.values()} == {
+        inspect.Parameter.KEYWORD_ONLY
+    }
+
+
+def test_an_average_is_held_by_an_octree():
+    quick = FitConfig.quick()
+    for changes in (
+        {"encoding": {"kind": "tri-quadtree"}},
+        {"networks": {"sdf_hidden": (1,)}},
+        {"training": {"truncation_cells": 1.9}},
+        {"sampling": {"near_band_cells": 3.1}},
+    ):
+        with pytest.raises(ValueError, match=r"^training\.(start|truncation_cells)"):
+            quick.override(**changes)
+    assert quick.override(training={"truncation_cells": 2.0}).truncation_m == 0.4
+
+
+def test_override_changes_what_it_names_alone():
+    base = FitConfig.paper(seed=3, training={"sdf_iterations": 200}, networks={"normals": False})
+    changed = base.override(leaf_size_m=0.3, training={"batch_size": 77}, sampling={"near_samples": 2})
+    differing = {name for name in names() if get(base, name) != get(changed, name)}
+    assert differing == {"leaf_size_m", "training.batch_size", "sampling.near_samples"}
+    assert (changed.seed, changed.training.sdf_iterations, changed.networks.normals) == (3, 200, False)
+    assert base.training.batch_size == 8192
+    assert base.override() == base
+    # A group as a whole replaces the whole.
+    assert base.override(training=FitConfig().training).training == FitConfig().training
+    # None is a value.
+    assert base.override(training={"sdf_iterations": None}).training.sdf_iterations is None
+
+
+def test_override_checks_settings_together():
+    near = FitConfig(returns={"max_range_m": 3.0})
+    with pytest.raises(ValueError, match="must exceed"):
+        near.override(returns={"min_range_m": 3.0})
+    assert near.override(returns={"min_range_m": 3.0, "max_range_m": None}).returns.min_range_m == 3.0
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        FitConfig(),
+        FitConfig.quick(),
+        FitConfig.paper(),
+        FitConfig(
+            seed=9, max_memory_bytes=10**12, returns={"max_range_m": 99.5}, networks={"sdf_hidden": [3, 4]}
+        ),
+    ],
+    ids=["default", "quick", "paper", "changed"],
+)
+def test_there_and_back(config):
+    values = config.to_dict()
+    assert FitConfig.from_dict(values) == config
+    assert FitConfig.from_dict(json.loads(json.dumps(values))) == config  # JSON has no tuples
+    values["training"]["batch_size"] = 1
+    assert config.training.batch_size != 1  # a copy
+    for other in (pickle.loads(pickle.dumps(config)), copy.deepcopy(config), dataclasses.replace(config)):
+        assert other == config
+        assert hash(other) == hash(config)
+
+
+def test_from_dict_fills_what_is_missing():
+    assert FitConfig.from_dict({}) == FitConfig()
+    found = FitConfig.from_dict({"seed": 2, "training": {"joint": False}})
+    assert found == FitConfig(seed=2, training={"joint": False})
+
+
+def test_configurations_are_values():
+    one, same, other = FitConfig(), FitConfig(seed=0), FitConfig(training={"joint": False})
+    assert one == same
+    assert one != other
+    assert {one: 1, other: 2}[same] == 1
+    for thing, name in ((one, "seed"), (one.training, "joint"), (one, "training")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(thing, name, 1)
+
+
+def test_lengths_go_with_the_cells():
+    lengths = ("near_band_m", "free_beyond_m", "sigma_m", "truncation_m", "fourier_half_width_m")
+    assert [getattr(FitConfig(), name) for name in lengths] == [0.3, 0.8, 0.15, 0.6, 409.6]
+    assert [getattr(FitConfig(leaf_size_m=0.4), name) for name in lengths] == [0.6, 1.6, 0.3, 1.2, 819.2]
+    config = FitConfig(leaf_size_m=0.5, sampling={"near_band_cells": 3.0, "free_beyond_cells": 0.0})
+    assert (config.near_band_m, config.free_beyond_m) == (1.5, 0.0)
+    for name in lengths:
+        with pytest.raises(ValueError, match=f"unknown setting {name}"):
+            FitConfig(**{name: 0.5})
+
+
+PUBLISHED = {
+    "leaf_size_m": 0.2,
+    "effort": 1.0,
+    "seed": 0,
+    "num_threads": 0,
+    "max_memory_bytes": None,
+    "returns": {
+        "min_range_m": 2.5,
+        "max_range_m": None,
+        "accumulate_scans": 5,
+        "drop_ghosts": False,
+        "onto_planes": False,
+    },
+    "encoding": {
+        "kind": "tri-quadtree",
+        "num_levels": 3,
+        "bridge_cells": 0,
+        "fourier_count": 16,
+        "fourier_half_width_cells": 2048.0,
+    },
+    "networks": {
+        "sdf_hidden": (32, 32),
+        "intensity_hidden": (64, 64),
+        "geometry_feature_dim": 15,
+        "normals": True,
+        "sdf_input": True,
+        "view_direction": True,
+        "log_range": False,
+        "feature_dropout": 0.0,
+        "fourier_dropout": 0.0,
+    },
+    "sampling": {
+        "near_samples": 6,
+        "free_samples": 6,
+        "near_band_cells": 1.5,
+        "free_from": 0.3,
+        "free_beyond_cells": 4.0,
+        "cross_range_noise_rad": 0.0,
+    },
+    "training": {
+        "start": "noise",
+        "truncation_cells": 3.0,
+        "sigma_cells": 0.1375,
+        "sdf_loss_weight": 1.0,
+        "intensity_in_free_space": True,
+        "joint": True,
+        "batch_size": 8192,
+        "intensity_batch_size": 8192,
+        "sdf_iterations": 1000,
+        "intensity_iterations": 4000,
+        "learning_rate": 1e-3,
+        "intensity_learning_rate": 1e-3,
+        "cosine_schedule": False,
+        "row_updates": False,
+        "gradients": "core",
+    },
+}
+
+
+def test_paper_is_the_published_configuration():
+    paper = FitConfig.paper()
+    assert paper.to_dict() == PUBLISHED
+    lengths = (paper.near_band_m, paper.free_beyond_m, paper.sigma_m, paper.fourier_half_width_m)
+    assert lengths == (0.3, 0.8, 0.0275, 409.6)
+
+
+def test_quick_averages_and_trains_no_surface():
+    quick = FitConfig.quick(seed=4)
+    assert (quick.training.start, quick.training.sdf_iterations, quick.encoding.kind) == (
+        "average",
+        0,
+        "octree",
+    )
+    assert (quick.near_band_m, quick.truncation_m, quick.seed) == (0.4, 0.6, 4)
+
+
+def test_what_is_told_to_prepare():
+    config = FitConfig(returns={"min_range_m": 1.0, "max_range_m": 50.0, "accumulate_scans": 3})
+    assert config.returns.preparation == {"min_range_m": 1.0, "max_range_m": 50.0, "accumulate_scans": 3}
+
+
+def test_rows_move_unless_normals_are_learnt_with_the_geometry():
+    assert FitConfig().moves_rows(with_intensity=True)
+    assert not FitConfig(training={"row_updates": False}).moves_rows(with_intensity=False)
+    normals = FitConfig(networks={"normals": True})
+    assert normals.moves_rows(with_intensity=False)
+    assert not normals.moves_rows(with_intensity=True)
+    assert normals.override(training={"joint": False}).moves_rows(with_intensity=True)
+
+
+def test_every_setting_says_what_it_is():
+    source = inspect.getsource(module)
+    for name in names():
+        own = name.split(".")[-1]
+        assert f"\n    {own}: " in source
+        after = source.split(f"\n    {own}: ")[1].split("\n", 1)[1]
+        assert after.startswith('    """'), name
