@@ -44,7 +44,7 @@ inline void check_lattice(const Lattice& lattice, double level) {
   if (!std::isfinite(level)) throw std::invalid_argument("level must be finite");
 }
 
-inline Mesh allocate_mesh(std::int64_t num_vertices, std::int64_t num_faces) {
+inline Mesh allocate_mesh(std::int64_t num_vertices, std::int64_t num_faces, bool with_edges) {
   if (num_vertices > std::numeric_limits<std::int32_t>::max()) {
     throw std::invalid_argument("the mesh has more vertices than int32 faces can number: extract it in parts");
   }
@@ -53,6 +53,7 @@ inline Mesh allocate_mesh(std::int64_t num_vertices, std::int64_t num_faces) {
   mesh.num_faces = num_faces;
   mesh.vertices = large_array<double>(3 * num_vertices);
   mesh.faces = large_array<std::int32_t>(3 * num_faces);
+  if (with_edges) mesh.edges = large_array<std::int64_t>(num_vertices);
   return mesh;
 }
 

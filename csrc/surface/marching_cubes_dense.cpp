@@ -124,11 +124,11 @@ class SlabWriter {
   // slab above it.
   void write(int64_t begin, int64_t end) {
     number_vertices(begin, lower_.get());
-    write_vertices(begin);
+    write_plane(begin);
     for (int64_t i = begin; i < end; ++i) {
       number_vertices(i + 1, upper_.get());
       write_triangles(i);
-      if (i + 1 < end || i + 2 == signs_.shape[0]) write_vertices(i + 1);
+      if (i + 1 < end || i + 2 == signs_.shape[0]) write_plane(i + 1);
       std::swap(lower_, upper_);
     }
   }
@@ -160,6 +160,20 @@ class SlabWriter {
   }
 
   // Of the plane numbered last.
+  void write_plane(int64_t i) {
+    write_vertices(i);
+    if (mesh_.edges) write_edges(i);
+  }
+
+  void write_edges(int64_t i) {
+    int64_t* out = mesh_.edges.get() + offsets_[static_cast<size_t>(i)].vertices;
+    for (int64_t j = 0; j < signs_.shape[1]; ++j) {
+      const int64_t row = 3 * (i * strides_[0] + j * strides_[1]);
+      const int64_t end = first_edge_[static_cast<size_t>(j) + 1];
+      for (int64_t e = first_edge_[static_cast<size_t>(j)]; e < end; ++e) *out++ = row + edges_[static_cast<size_t>(e)];
+    }
+  }
+
   void write_vertices(int64_t i) {
     double* vertex = mesh_.vertices.get() + 3 * offsets_[static_cast<size_t>(i)].vertices;
     for (int64_t j = 0; j < signs_.shape[1]; ++j) {
@@ -214,10 +228,10 @@ class SlabWriter {
 
 template <typename T>
 Mesh marching_cubes_dense(const T* volume, const std::array<int64_t, 3>& shape, const bool* mask,
-                          const Lattice& lattice, double level, int num_threads) {
+                          const Lattice& lattice, double level, int num_threads, bool with_edges) {
   check_lattice(lattice, level);
   const auto [nx, ny, nz] = shape;
-  if (nx < 2 || ny < 2 || nz < 2) return allocate_mesh(0, 0);  // samples without a cell
+  if (nx < 2 || ny < 2 || nz < 2) return allocate_mesh(0, 0, with_edges);  // samples without a cell
   if (nz > std::numeric_limits<int32_t>::max() / 3) throw std::invalid_argument("the volume's rows are too long");
   const VolumeSigns signs = read_signs(volume, shape, mask, level, num_threads);
 
@@ -227,7 +241,7 @@ Mesh marching_cubes_dense(const T* volume, const std::array<int64_t, 3>& shape, 
     offsets[i].vertices += offsets[i - 1].vertices;
     offsets[i].faces += offsets[i - 1].faces;
   }
-  Mesh mesh = allocate_mesh(offsets.back().vertices, offsets.back().faces);
+  Mesh mesh = allocate_mesh(offsets.back().vertices, offsets.back().faces, with_edges);
 
   // More runs than threads even out the load; each numbers the first plane of its successor again, so not many more.
   const int64_t num_slabs = nx - 1;
@@ -241,8 +255,8 @@ Mesh marching_cubes_dense(const T* volume, const std::array<int64_t, 3>& shape, 
 }
 
 template Mesh marching_cubes_dense(const float*, const std::array<int64_t, 3>&, const bool*, const Lattice&, double,
-                                   int);
+                                   int, bool);
 template Mesh marching_cubes_dense(const double*, const std::array<int64_t, 3>&, const bool*, const Lattice&, double,
-                                   int);
+                                   int, bool);
 
 }  // namespace radarsdf

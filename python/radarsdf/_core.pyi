@@ -32,7 +32,11 @@ __all__: list[str] = [
     "fourier",
     "instruction_set",
     "marching_cubes_dense",
+    "marching_cubes_dense_backward",
+    "marching_cubes_dense_with_edges",
     "marching_cubes_sparse",
+    "marching_cubes_sparse_backward",
+    "marching_cubes_sparse_with_edges",
     "mesh_components",
     "mlp",
     "mlp_backward",
@@ -669,6 +673,60 @@ def marching_cubes_dense(
     num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
 ) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.int32]]: ...
 @typing.overload
+def marching_cubes_dense_backward(
+    volume: numpy.typing.NDArray[numpy.float32],
+    edges: numpy.typing.NDArray[numpy.int64],
+    vertices_grad: numpy.typing.NDArray[numpy.float64],
+    spacing: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    level: typing.SupportsFloat | typing.SupportsIndex,
+    volume_grad: numpy.typing.NDArray[numpy.float32],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> None: ...
+@typing.overload
+def marching_cubes_dense_backward(
+    volume: numpy.typing.NDArray[numpy.float64],
+    edges: numpy.typing.NDArray[numpy.int64],
+    vertices_grad: numpy.typing.NDArray[numpy.float64],
+    spacing: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    level: typing.SupportsFloat | typing.SupportsIndex,
+    volume_grad: numpy.typing.NDArray[numpy.float64],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> None: ...
+@typing.overload
+def marching_cubes_dense_with_edges(
+    volume: numpy.typing.NDArray[numpy.float32],
+    mask: numpy.typing.NDArray[numpy.bool] | None,
+    spacing: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    origin: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    level: typing.SupportsFloat | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> tuple[
+    numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int64]
+]: ...
+@typing.overload
+def marching_cubes_dense_with_edges(
+    volume: numpy.typing.NDArray[numpy.float64],
+    mask: numpy.typing.NDArray[numpy.bool] | None,
+    spacing: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    origin: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    level: typing.SupportsFloat | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> tuple[
+    numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int64]
+]: ...
+@typing.overload
 def marching_cubes_sparse(
     corners: numpy.typing.NDArray[numpy.int32],
     values: numpy.typing.NDArray[numpy.float32],
@@ -696,6 +754,70 @@ def marching_cubes_sparse(
     level: typing.SupportsFloat | typing.SupportsIndex,
     num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
 ) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.int32]]: ...
+@typing.overload
+def marching_cubes_sparse_backward(
+    values: numpy.typing.NDArray[numpy.float32],
+    edges: numpy.typing.NDArray[numpy.int64],
+    uppers: numpy.typing.NDArray[numpy.int32],
+    vertices_grad: numpy.typing.NDArray[numpy.float64],
+    spacing: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    level: typing.SupportsFloat | typing.SupportsIndex,
+    values_grad: numpy.typing.NDArray[numpy.float32],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> None: ...
+@typing.overload
+def marching_cubes_sparse_backward(
+    values: numpy.typing.NDArray[numpy.float64],
+    edges: numpy.typing.NDArray[numpy.int64],
+    uppers: numpy.typing.NDArray[numpy.int32],
+    vertices_grad: numpy.typing.NDArray[numpy.float64],
+    spacing: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    level: typing.SupportsFloat | typing.SupportsIndex,
+    values_grad: numpy.typing.NDArray[numpy.float64],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> None: ...
+@typing.overload
+def marching_cubes_sparse_with_edges(
+    corners: numpy.typing.NDArray[numpy.int32],
+    values: numpy.typing.NDArray[numpy.float32],
+    cells: numpy.typing.NDArray[numpy.int32],
+    spacing: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    origin: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    level: typing.SupportsFloat | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> tuple[
+    numpy.typing.NDArray[numpy.float64],
+    numpy.typing.NDArray[numpy.int32],
+    numpy.typing.NDArray[numpy.int64],
+    numpy.typing.NDArray[numpy.int32],
+]: ...
+@typing.overload
+def marching_cubes_sparse_with_edges(
+    corners: numpy.typing.NDArray[numpy.int32],
+    values: numpy.typing.NDArray[numpy.float64],
+    cells: numpy.typing.NDArray[numpy.int32],
+    spacing: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    origin: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    level: typing.SupportsFloat | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> tuple[
+    numpy.typing.NDArray[numpy.float64],
+    numpy.typing.NDArray[numpy.int32],
+    numpy.typing.NDArray[numpy.int64],
+    numpy.typing.NDArray[numpy.int32],
+]: ...
 def mesh_components(
     faces: numpy.typing.NDArray[numpy.int32], num_vertices: typing.SupportsInt | typing.SupportsIndex
 ) -> tuple[numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int64]]: ...

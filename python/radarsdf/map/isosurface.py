@@ -9,28 +9,55 @@ of threads.
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.checks import real_array
+from radarsdf.map import differentiable_isosurface
 
 Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
+TensorMesh: TypeAlias = tuple[Tensor, Tensor]
 
 __all__ = ["extract_cells", "marching_cubes", "mesh_components", "sparse_lattice"]
 
 
+@overload
+def marching_cubes(
+    volume: Tensor,
+    level: float = 0.0,
+    *,
+    spacing: ArrayLike = ...,
+    origin: ArrayLike = ...,
+    mask: ArrayLike | None = None,
+    num_threads: int = 0,
+) -> TensorMesh: ...
+
+
+@overload
 def marching_cubes(
     volume: ArrayLike,
+    level: float = 0.0,
+    *,
+    spacing: ArrayLike = ...,
+    origin: ArrayLike = ...,
+    mask: ArrayLike | None = None,
+    num_threads: int = 0,
+) -> Mesh: ...
+
+
+def marching_cubes(
+    volume: ArrayLike | Tensor,
     level: float = 0.0,
     *,
     spacing: ArrayLike = (1.0, 1.0, 1.0),
     origin: ArrayLike = (0.0, 0.0, 0.0),
     mask: ArrayLike | None = None,
     num_threads: int = 0,
-) -> Mesh:
+) -> Mesh | TensorMesh:
     """Triangulate the surface on which a volume crosses a level.
 
     A sample is positive if it is greater than `level`. The normals of the triangles point to the positive
@@ -39,11 +66,17 @@ def marching_cubes(
     away from samples, even from samples that equal the level. Beyond about 10^12 times `spacing` from the
     world's origin, float64 does not resolve this length, and vertices may coincide.
 
+    For a tensor, the vertices can be differentiated by the samples. A vertex moves along its edge with the two
+    samples at the edge's ends. Its gradient is zero where it is kept away from a sample, and where a sample is
+    infinite. The gradient does not know that a sample could change its sign. For a gradient by the level,
+    subtract the level from the samples.
+
     Parameters
     ----------
-    volume : array_like, shape (nx, ny, nz)
+    volume : array_like or Tensor, shape (nx, ny, nz)
         Samples. An infinite one counts by its sign. Other types than float32 and float64 are converted to the
-        smaller of these that holds all values of the type; 64-bit integers are rounded to float64.
+        smaller of these that holds all values of the type; 64-bit integers are rounded to float64, and bfloat16
+        of a tensor becomes float32.
     level : float
         Value of the field on the surface.
     spacing : array_like, shape (3,)
@@ -59,9 +92,11 @@ def marching_cubes(
     Returns
     -------
     vertices : ndarray of float64, shape (V, 3)
-        Positions in world units: index * `spacing` + `origin`.
+        Positions in world units: index * `spacing` + `origin`. A Tensor if `volume` is one; it can be differentiated
+        once, and the gradient has the same bits for any number of threads.
     faces : ndarray of int32, shape (F, 3)
-        Rows of `vertices`, counter-clockwise seen from the positive side.
+        Rows of `vertices`, counter-clockwise seen from the positive side. A Tensor, without gradient, if `volume` is
+        one.
 
     Raises
     ------
@@ -80,44 +115,83 @@ def marching_cubes(
     >>> vertices, faces = marching_cubes(np.sqrt(x**2 + y**2 + z**2), 0.5, spacing=[0.05] * 3, origin=[-1] * 3)
     >>> bool(np.allclose(np.linalg.norm(vertices, axis=1), 0.5, atol=1e-3))
     True
+
+    Its samples as a tensor, trained until the surface is on average 0.6 from the origin:
+
+    >>> import torch
+    >>> samples = torch.tensor(np.sqrt(x**2 + y**2 + z**2) - 0.52, requires_grad=True)
+    >>> optimiser = torch.optim.Adam([samples], lr=0.005)
+    >>> for _ in range(40):
+    ...     vertices, faces = marching_cubes(samples, spacing=[0.05] * 3, origin=[-1] * 3)
+    ...     radius = vertices.norm(dim=1).mean()
+    ...     optimiser.zero_grad()
+    ...     (radius - 0.6).square().backward()
+    ...     optimiser.step()
+    >>> bool(abs(radius - 0.6) < 0.005)
+    True
     """
-    samples = _as_samples(volume, "volume")
-    if samples.ndim != 3:
-        msg = f"volume must have three axes, not {samples.ndim}"
+    samples = volume if isinstance(volume, Tensor) else _as_samples(volume, "volume")
+    shape = tuple(samples.shape)
+    if len(shape) != 3:
+        msg = f"volume must have three axes, not {len(shape)}"
         raise ValueError(msg)
-    if mask is not None:
-        mask = np.asarray(mask)
-        if mask.dtype != np.bool_:
-            msg = f"mask must be boolean, not {mask.dtype}"
-            raise TypeError(msg)
-        if mask.shape != samples.shape:
-            msg = f"mask must have the shape of volume, {samples.shape}, not {mask.shape}"
-            raise ValueError(msg)
-        mask = np.ascontiguousarray(mask)
-    placement = _as_placement(spacing, origin, samples.shape)
-    return _core.marching_cubes_dense(samples, mask, *placement, _as_level(level), num_threads)
+    usable = None if mask is None else _as_mask(mask, shape)
+    placement = _as_placement(spacing, origin, shape)
+    if isinstance(samples, Tensor):
+        samples = differentiable_isosurface.as_samples(samples, "volume")
+        return differentiable_isosurface.volume_mesh(
+            samples, usable, *placement, _as_level(level), num_threads
+        )
+    return _core.marching_cubes_dense(samples, usable, *placement, _as_level(level), num_threads)
 
 
+@overload
+def extract_cells(
+    corners: ArrayLike,
+    values: Tensor,
+    cells: ArrayLike,
+    level: float = 0.0,
+    *,
+    spacing: ArrayLike = ...,
+    origin: ArrayLike = ...,
+    num_threads: int = 0,
+) -> TensorMesh: ...
+
+
+@overload
 def extract_cells(
     corners: ArrayLike,
     values: ArrayLike,
     cells: ArrayLike,
     level: float = 0.0,
     *,
+    spacing: ArrayLike = ...,
+    origin: ArrayLike = ...,
+    num_threads: int = 0,
+) -> Mesh: ...
+
+
+def extract_cells(
+    corners: ArrayLike,
+    values: ArrayLike | Tensor,
+    cells: ArrayLike,
+    level: float = 0.0,
+    *,
     spacing: ArrayLike = (1.0, 1.0, 1.0),
     origin: ArrayLike = (0.0, 0.0, 0.0),
     num_threads: int = 0,
-) -> Mesh:
+) -> Mesh | TensorMesh:
     """Triangulate the surface on which a field crosses a level, in some cells of a lattice.
 
     The mesh is that of `marching_cubes` on a volume in which these cells are in use, with vertices and faces
-    in another order. Time and memory are proportional to the numbers of cells and corners.
+    in another order. Time and memory are proportional to the numbers of cells and corners. The vertices of a
+    tensor's mesh can be differentiated by `values`, as for `marching_cubes`.
 
     Parameters
     ----------
     corners : array_like of int32, shape (K, 3)
         Lattice coordinates. None may occur twice.
-    values : array_like, shape (K,)
+    values : array_like or Tensor, shape (K,)
         The field at the corners, with types as for `marching_cubes`. Cells with a NaN corner are left out.
     cells : array_like of int32, shape (M, 8)
         Rows of `corners` for each cell, in C order, as `sparse_lattice` gives them. No cell may occur twice.
@@ -127,9 +201,10 @@ def extract_cells(
     Returns
     -------
     vertices : ndarray of float64, shape (V, 3)
-        Positions in world units.
+        Positions in world units. A Tensor if `values` are one.
     faces : ndarray of int32, shape (F, 3)
-        Rows of `vertices`, counter-clockwise seen from the positive side.
+        Rows of `vertices`, counter-clockwise seen from the positive side. A Tensor, without gradient, if `values` are
+        one.
 
     Raises
     ------
@@ -147,14 +222,16 @@ def extract_cells(
     """
     corners = _as_int32(corners, "corners")
     furthest = max(-float(corners.min(initial=0)), float(corners.max(initial=0))) + 1
-    return _core.marching_cubes_sparse(
-        corners,
-        _as_samples(values, "values"),
+    rest = (
         _as_int32(cells, "cells"),
         *_as_placement(spacing, origin, (furthest,) * 3),
         _as_level(level),
         num_threads,
     )
+    if isinstance(values, Tensor):
+        samples = differentiable_isosurface.as_samples(values, "values")
+        return differentiable_isosurface.cells_mesh(corners, samples, *rest)
+    return _core.marching_cubes_sparse(corners, _as_samples(values, "values"), *rest)
 
 
 def sparse_lattice(
@@ -238,6 +315,17 @@ def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[n
     if np.can_cast(array.dtype, np.float32, "safe"):
         return np.ascontiguousarray(array, dtype=np.float32)
     return np.ascontiguousarray(real_array(array, name))
+
+
+def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    array = np.asarray(mask)
+    if array.dtype != np.bool_:
+        msg = f"mask must be boolean, not {array.dtype}"
+        raise TypeError(msg)
+    if array.shape != shape:
+        msg = f"mask must have the shape of volume, {shape}, not {array.shape}"
+        raise ValueError(msg)
+    return np.ascontiguousarray(array)
 
 
 def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
