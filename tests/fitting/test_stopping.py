@@ -94,7 +94,7 @@ def test_ctrl_c_while_training_hands_back_the_map(threads):
 def test_ctrl_c_before_the_training_has_no_map():
     code = """
 import numpy as np
-import radarsdf
+import radarsdf.fitting.fit
 rng = np.random.default_rng(0)
 points = rng.normal(size=(3_000_000, 3))
 points *= 300 / np.linalg.norm(points, axis=1, keepdims=True)
