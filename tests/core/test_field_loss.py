@@ -51,8 +51,8 @@ class Batch:
     samples: object
 
     def backend(self, kind, **training):
-        """Of the first of two threads, with 0.7 of the dropout."""
-        share = Share(2, 0.7, torch.Generator().manual_seed(5))
+        """Of one of two threads, with 0.7 of the dropout."""
+        share = Share(0.7, torch.Generator().manual_seed(5))
         return kind(self.field, self.config.override(training=training), share)
 
 
@@ -71,7 +71,7 @@ def make_batch(rays, dtype=torch.float32, batch_size=400, **changes):
     )
     (samples,) = sampler.batch()
     exact = {name: getattr(samples, name).to(dtype) for name in ("points", "sdf_m", "of_ray")}
-    return Batch(field.to(dtype), config, dataclasses.replace(samples, **exact))
+    return Batch(field.to(dtype), config, dataclasses.replace(samples, share=0.5, near_share=0.4, **exact))
 
 
 @pytest.fixture
@@ -241,9 +241,9 @@ def test_the_core_refuses_batches_that_do_not_fit(rays, changes, message):
         "interpolated_grad": np.zeros((400, 24), np.float32),
     }
     calls = {
-        loss.geometry: {"points": batch["points"], "sdf_m": batch["sdf_m"], "weight": 1.0} | outputs,
+        loss.sdf: {"points": batch["points"], "sdf_m": batch["sdf_m"], "weight": 1.0} | outputs,
         loss.joint: batch | outputs | {"weights": (1.0, 1.0)},
-        loss.reflectance: batch | {"weight": 1.0},
+        loss.intensity: batch | {"weight": 1.0},
     }
     refused = 0
     for call, arguments in calls.items():
@@ -261,13 +261,13 @@ def test_the_core_refuses_other_types_and_a_missing_network(rays):
     outputs = [np.zeros((400, 3), np.int32), np.zeros((400, 24), np.float64)]
     points, sdf_m = (samples.points.numpy().astype(np.float64), samples.sdf_m.numpy().astype(np.float64))
     with pytest.raises(TypeError, match="dtype of the features"):
-        _core.FieldLoss(**arguments).geometry(points, sdf_m, 1.0, *outputs)
+        _core.FieldLoss(**arguments).sdf(points, sdf_m, 1.0, *outputs)
     with pytest.raises(TypeError):
         _core.FieldLoss(**(arguments | {"features": np.zeros((3, 8), np.int32)}))
     loss = _core.FieldLoss(**(arguments | {"intensity": None}))
     assert loss.intensity_gradients == []
     with pytest.raises(ValueError, match="no intensity network"):
-        loss.reflectance(samples.points.numpy(), samples.sdf_m.numpy(), samples.of_ray.numpy(), 200, [], 1.0)
+        loss.intensity(samples.points.numpy(), samples.sdf_m.numpy(), samples.of_ray.numpy(), 200, [], 1.0)
 
 
 def test_the_core_keeps_what_it_reads(rays):
@@ -280,11 +280,11 @@ def test_the_core_keeps_what_it_reads(rays):
         arguments[name] = copy.deepcopy(arguments[name])
     loss = _core.FieldLoss(**arguments)
     batch = (samples.points.numpy(), samples.sdf_m.numpy(), samples.of_ray.numpy(), 200, [], 1.0)
-    before = loss.reflectance(*batch)
+    before = loss.intensity(*batch)
     gradients = loss.intensity_gradients
     arguments.clear()
     gc.collect()
-    assert loss.reflectance(*batch) == before
+    assert loss.intensity(*batch) == before
     del loss
     gc.collect()
     assert all(np.isfinite(gradient).all() for gradient in gradients)
