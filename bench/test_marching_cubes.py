@@ -64,6 +64,27 @@ def test_dense(benchmark, field, threads):
     check_mesh(vertices, faces, field)
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("part", ["forward", "backward"])
+def test_dense_gradient(benchmark, field, part, threads):
+    """Of a tensor that requires a gradient: the mesh with the vertices' edges; the gradient by the samples."""
+    benchmark.group = f"{part} of {field_group(field)}"
+    samples = torch.from_numpy(field[0]).requires_grad_()
+    vertices, faces = marching_cubes(samples, num_threads=threads)
+    check_mesh(vertices.detach().numpy(), faces.numpy(), field)
+    if part == "forward":
+        benchmark(marching_cubes, samples, num_threads=threads)
+        return
+    weights = torch.ones_like(vertices)
+    (grad,) = benchmark(torch.autograd.grad, vertices, samples, weights, retain_graph=True)
+    # The samples beside the surface have a gradient, unless their vertices are kept away from them or cancel out.
+    beside = np.zeros(field[0].shape, bool)
+    for axis in range(3):
+        cut = np.diff(field[0] > 0, axis=axis)
+        beside |= np.insert(cut, 0, False, axis) | np.insert(cut, cut.shape[axis], False, axis)
+    assert 0.9 * beside.sum() < (grad != 0).sum() <= beside.sum()
+
+
 def test_dense_masked(benchmark, field):
     benchmark.group = field_group(field)
     mask = np.ones(field[0].shape, dtype=bool)
@@ -238,6 +259,18 @@ def test_map_vtk_flying_edges(benchmark, map_lattice, backend, threads):
     benchmark.group = map_group(map_lattice)
     mesh = benchmark(FlyingEdges(map_lattice.volume, backend, threads).run)
     check_map(*FlyingEdges.arrays(mesh), map_lattice.crossed_edges(of_cells=False))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_sparse_gradient(benchmark, shell, threads):
+    benchmark.group = "gradient of the extraction from a shell"
+    _, corners, cells = sparse_lattice(shell)
+    values = torch.from_numpy((np.linalg.norm(corners, axis=1) - 200.0).astype(np.float32)).requires_grad_()
+    vertices, _ = extract_cells(corners, values, cells, num_threads=threads)
+    # The distance grows by one along the way outwards, so a surface lowered by d moves outwards by d.
+    outwards = vertices.detach() / vertices.detach().norm(dim=1, keepdim=True)
+    (grad,) = benchmark(torch.autograd.grad, vertices, values, outwards, retain_graph=True)
+    assert float(grad.sum(dtype=torch.float64)) == pytest.approx(-len(vertices), rel=0.01)
 
 
 def check_map(vertices, faces, crossed_edges):

@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The derivatives of marching cubes' vertices by the samples. Two samples pull at a vertex, and up to six vertices at a
-// sample. Here each sample collects its own sum, in an order that the mesh gives: no two threads write to one sample,
-// and the bits do not depend on the number of threads.
+// The derivatives of marching cubes' vertices by the samples. A vertex depends on two samples, and up to six vertices
+// depend on a sample. Each sample collects its own sum, in the order of the vertices: no two threads write to one
+// sample, and the bits do not depend on the number of threads.
 #include <algorithm>
 #include <array>
 #include <atomic>
@@ -48,8 +48,8 @@ inline EdgeGradient edge_gradient(double a, double b, double level, double grad)
 
 }  // namespace
 
-// The vertices of a plane pull at the samples of this plane and, on edges along x, of the next one. So a plane of
-// samples collects from its own vertices and from those of the plane before.
+// The edges of a plane's vertices end in this plane or, along x, in the next one. So a plane of samples collects from
+// its own vertices and from those of the plane before.
 template <typename T>
 void marching_cubes_dense_backward(const T* volume, const std::array<int64_t, 3>& shape, const int64_t* edges,
                                    const double* vertices_grad, int64_t num_vertices,
@@ -112,7 +112,8 @@ void marching_cubes_sparse_backward(const T* values, int64_t num_corners, const 
     });
   };
 
-  // No two vertices write to one place, unless corners were given twice: that is found below. Atomics make it defined.
+  // No two vertices write to one place, unless a corner was given twice, which is found below: the atomics make that
+  // well defined.
   const auto vertex_below = large_array<std::atomic<int32_t>>(3 * num_corners);
   for_each_block(3 * num_corners, [&](size_t, int64_t begin, int64_t end) {
     for (int64_t e = begin; e < end; ++e) {
@@ -152,7 +153,7 @@ void marching_cubes_sparse_backward(const T* values, int64_t num_corners, const 
     }
   });
   if (std::accumulate(found.begin(), found.end(), int64_t{0}) != num_vertices) {
-    throw std::invalid_argument("corners must be given once each for a gradient: two edges end at one");
+    throw std::invalid_argument("a corner occurs twice: two edges along one axis end there");
   }
 }
 

@@ -190,6 +190,70 @@ TEST_CASE("sparse marching cubes draws what the dense one does") {
   for (const int threads : test::kThreads) CHECK(same(mesh, sparse(threads)));
 }
 
+TEST_CASE("derivatives of the vertices are those of differences, for any number of threads") {
+  constexpr std::int64_t size = 7;
+  const std::array<std::int64_t, 3> shape{size, size, size};
+  const radarsdf::Lattice lattice{{0.5, 2, 0.1}, {-3, 100, 0.25}};
+  auto volume = test::normal_numbers<double>(size * size * size, 1, 4);
+  for (double& sample : volume) sample += sample > 0 ? 0.2 : -0.2;
+  for (std::size_t i = 0; i < volume.size(); i += 20) volume[i] *= 1e-5;  // vertices are kept away from some
+  volume[100] = std::nan("");
+  volume[111] = std::numeric_limits<double>::infinity();
+
+  // The same cells one by one: all corners, in the order of the samples.
+  std::vector<std::int32_t> cells;
+  for (std::int32_t i = 0; i + 1 < size; ++i) {
+    for (std::int32_t j = 0; j + 1 < size; ++j) {
+      for (std::int32_t k = 0; k + 1 < size; ++k) cells.insert(cells.end(), {i, j, k});
+    }
+  }
+  const auto corners = radarsdf::sparse_lattice(cells.data(), static_cast<std::int64_t>(cells.size()) / 3, 1);
+  REQUIRE(corners.num_corners == size * size * size);
+  const auto mesh_of = [&](bool dense) {
+    if (dense) return radarsdf::marching_cubes_dense(volume.data(), shape, nullptr, lattice, 0, 1, true);
+    return radarsdf::marching_cubes_sparse(corners.corners.get(), volume.data(), corners.num_corners,
+                                           corners.cell_corners.get(), corners.num_cells, lattice, 0, 1, true);
+  };
+  for (const bool dense : {true, false}) {
+    const Mesh mesh = mesh_of(dense);
+    REQUIRE(mesh.num_vertices > 300);
+    const auto weights = test::normal_numbers<double>(static_cast<std::size_t>(3 * mesh.num_vertices), 1, 5);
+    const auto derivative = [&](int threads) {
+      std::vector<double> grad(volume.size(), 7);
+      if (dense) {
+        radarsdf::marching_cubes_dense_backward(volume.data(), shape, mesh.edges.get(), weights.data(),
+                                                mesh.num_vertices, lattice.spacing, 0, grad.data(), threads);
+      } else {
+        radarsdf::marching_cubes_sparse_backward(volume.data(), corners.num_corners, mesh.edges.get(),
+                                                 mesh.uppers.get(), weights.data(), mesh.num_vertices, lattice.spacing,
+                                                 0, grad.data(), threads);
+      }
+      return grad;
+    };
+    const std::vector<double> grad = derivative(1);
+    for (const int threads : test::kThreads) CHECK(derivative(threads) == grad);
+    const auto moved = [&](std::size_t i, double step) {
+      const double kept = volume[i];
+      volume[i] += step;
+      const Mesh other = mesh_of(dense);
+      volume[i] = kept;
+      REQUIRE(other.num_vertices == mesh.num_vertices);
+      double sum = 0;  // of what moved alone: the origin is far from some vertices
+      for (std::size_t v = 0; v < weights.size(); ++v) sum += weights[v] * (other.vertices[v] - mesh.vertices[v]);
+      return sum;
+    };
+    constexpr double step = 1e-7;
+    std::int64_t not_zero = 0;
+    for (std::size_t i = 0; i < volume.size(); ++i) {
+      REQUIRE(grad[i] == doctest::Approx((moved(i, step) - moved(i, -step)) / (2 * step)).epsilon(1e-3));
+      not_zero += grad[i] != 0;
+    }
+    CHECK(not_zero > 200);
+    CHECK(grad[100] == 0);
+    CHECK(grad[111] == 0);
+  }
+}
+
 TEST_CASE("a mask and NaN leave out the cells that they touch") {
   auto volume = spheres({{0, 0, 0, 1.2}});
   const auto mask = std::make_unique<bool[]>(volume.size());
@@ -263,4 +327,11 @@ TEST_CASE("lattices and cells that make no sense are refused") {
                   std::invalid_argument);
   const std::int32_t corners[3] = {}, cells[8] = {0, 0, 0, 0, 0, 0, 0, 1};
   CHECK_THROWS_AS(radarsdf::marching_cubes_sparse(corners, volume, 1, cells, 1, {}, 0, 1), std::invalid_argument);
+  const std::int64_t edge[1] = {8 * 3};  // of a ninth sample
+  const std::int32_t upper[1] = {0};
+  double grad[8];
+  CHECK_THROWS_AS(radarsdf::marching_cubes_dense_backward(volume, {2, 2, 2}, edge, volume, 1, {1, 1, 1}, 0, grad, 1),
+                  std::invalid_argument);
+  CHECK_THROWS_AS(radarsdf::marching_cubes_sparse_backward(volume, 8, edge, upper, volume, 1, {1, 1, 1}, 0, grad, 1),
+                  std::invalid_argument);
 }

@@ -21,7 +21,7 @@ FUNCTIONS = ("dense", "sparse")
 
 
 def off_the_level(seed, shape=(4, 5, 6)):
-    """Samples between 0.2 and 1 from 0, of either sign: an edge's vertex is far from both ends and hardly curved."""
+    """Samples of either sign, between 0.2 and 1 from 0, so that all vertices are far from the samples."""
     rng = np.random.default_rng(seed)
     return rng.uniform(0.2, 1, shape) * rng.choice([-1.0, 1.0], shape)
 
@@ -46,7 +46,7 @@ def gradient(function, volume, weights=None, dtype=None, **keywords):
 
 
 def check_gradient(function, volume, **keywords):
-    """Against differences, for each sample and each coordinate of each vertex. Returns the vertices' number."""
+    """Compare with differences: each vertex coordinate by each sample. Return the number of vertices."""
     samples = torch.tensor(volume, dtype=torch.float64, requires_grad=True)
     keywords = {**PLACEMENT, "num_threads": 1, **keywords}
     assert torch.autograd.gradcheck(
@@ -124,7 +124,7 @@ def test_extreme_samples_have_finite_gradients(function):
     assert (
         gradient(function, volume) == 0
     ).all()  # their differences overflow, the vertices are kept at one end
-    # Differences so small that their inverse overflows: where the vertex has no gradient, neither has the sample.
+    # Differences so small that their inverse overflows. A gradient of zero stays zero.
     small = torch.tensor(np.where(sphere(9) > 0, 1e-320, -1e-320), requires_grad=True)
     vertices, _ = mesh_of(function, small)
     (0 * vertices).sum().backward()

@@ -2,11 +2,9 @@
 # SPDX-License-Identifier: MIT
 """Marching cubes on tensors, as autograd functions over the compiled core.
 
-A vertex lies on the edge between two samples of different signs, where a straight line between them meets the level.
-Its gradient is the one by these two samples: it moves along the edge, while both keep their signs. A vertex that is kept
-away from a sample, or that lies beside an infinite one, does not move.
-
-The mesh's triangles have no gradient: they change where a sample changes its sign, and not otherwise.
+A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of the way.
+It moves along this edge when a or b changes, and depends on no other sample. Triangles have no gradient: they
+change only where a sample changes its sign.
 """
 
 from __future__ import annotations
@@ -44,9 +42,12 @@ def volume_mesh(
     level: float,
     num_threads: int,
 ) -> tuple[Tensor, Tensor]:
-    """Vertices and faces of a volume; the arguments are checked, as `marching_cubes` hands them to the core."""
+    """Vertices and faces of a volume, of arguments that `marching_cubes` has checked."""
     if volume.requires_grad and torch.is_grad_enabled():
-        return _OfVolume.apply(volume, mask, spacing, origin, level, num_threads)  # type: ignore[no-untyped-call,no-any-return]
+        mesh: tuple[Tensor, Tensor] = _OfVolume.apply(  # type: ignore[no-untyped-call]
+            volume, mask, spacing, origin, level, num_threads
+        )
+        return mesh
     return _tensors(
         *_core.marching_cubes_dense(volume.detach().numpy(), mask, spacing, origin, level, num_threads)
     )
@@ -61,9 +62,12 @@ def cells_mesh(
     level: float,
     num_threads: int,
 ) -> tuple[Tensor, Tensor]:
-    """Vertices and faces of some cells; the arguments are checked, as `extract_cells` hands them to the core."""
+    """Vertices and faces of some cells, of arguments that `extract_cells` has checked."""
     if values.requires_grad and torch.is_grad_enabled():
-        return _OfCells.apply(values, corners, cells, spacing, origin, level, num_threads)  # type: ignore[no-untyped-call,no-any-return]
+        mesh: tuple[Tensor, Tensor] = _OfCells.apply(  # type: ignore[no-untyped-call]
+            values, corners, cells, spacing, origin, level, num_threads
+        )
+        return mesh
     return _tensors(
         *_core.marching_cubes_sparse(
             corners, values.detach().numpy(), cells, spacing, origin, level, num_threads

@@ -92,11 +92,10 @@ def marching_cubes(
     Returns
     -------
     vertices : ndarray of float64, shape (V, 3)
-        Positions in world units: index * `spacing` + `origin`. A Tensor if `volume` is one; it can be differentiated
-        once, and the gradient has the same bits for any number of threads.
+        Positions in world units: index * `spacing` + `origin`. A Tensor if `volume` is one, which can be
+        differentiated once.
     faces : ndarray of int32, shape (F, 3)
-        Rows of `vertices`, counter-clockwise seen from the positive side. A Tensor, without gradient, if `volume` is
-        one.
+        Rows of `vertices`, counter-clockwise seen from the positive side. A Tensor if `volume` is one.
 
     Raises
     ------
@@ -116,13 +115,14 @@ def marching_cubes(
     >>> bool(np.allclose(np.linalg.norm(vertices, axis=1), 0.5, atol=1e-3))
     True
 
-    Its samples as a tensor, trained until the surface is on average 0.6 from the origin:
+    The samples of a sphere of radius 0.52, trained until the surface is on average 0.6 from the origin:
 
     >>> import torch
-    >>> samples = torch.tensor(np.sqrt(x**2 + y**2 + z**2) - 0.52, requires_grad=True)
+    >>> points = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, 21)] * 3, indexing="ij"))
+    >>> samples = (points.norm(dim=0) - 0.52).requires_grad_()
     >>> optimiser = torch.optim.Adam([samples], lr=0.005)
     >>> for _ in range(40):
-    ...     vertices, faces = marching_cubes(samples, spacing=[0.05] * 3, origin=[-1] * 3)
+    ...     vertices, faces = marching_cubes(samples, spacing=[0.1] * 3, origin=[-1] * 3)
     ...     radius = vertices.norm(dim=1).mean()
     ...     optimiser.zero_grad()
     ...     (radius - 0.6).square().backward()
@@ -203,8 +203,7 @@ def extract_cells(
     vertices : ndarray of float64, shape (V, 3)
         Positions in world units. A Tensor if `values` are one.
     faces : ndarray of int32, shape (F, 3)
-        Rows of `vertices`, counter-clockwise seen from the positive side. A Tensor, without gradient, if `values` are
-        one.
+        Rows of `vertices`, counter-clockwise seen from the positive side. A Tensor if `values` are one.
 
     Raises
     ------
