@@ -12,29 +12,33 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import FEATURE_DIM
+from radarsdf._core import FEATURE_DIM, CellSet
 from radarsdf.budget.durations import SECONDS, shared, work_of
+from radarsdf.budget.extent import check_extent
 from radarsdf.budget.schedule import Schedule
 from radarsdf.config import FitConfig
 from radarsdf.field.widths import fourier_width, intensity_widths, parameters_of, sdf_widths
+from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import resolve_num_threads
 
 # Bytes. Measured as peaks of fits of 1e4 to 3e6 returns of a street, over the memory of the process before
 # the fit; `python -m bench.stress memory` repeats it, and a test checks it.
-_ALWAYS = 55e6  # code that the fit loads, stacks and arenas of the threads
+_ALWAYS = 35e6  # code that the fit loads, stacks and arenas of the threads
 _PER_RETURN = 30.0
 _PER_INTENSITY = 20.0
 _PER_RETURN_AGAIN = 110.0  # if the intensity stage uses other returns than the sdf stage
 _PER_RETURN_CHECKED = 200.0  # scans in float64, freed before the training
 _PER_CELL = 215.0
-_PER_OCTREE_ROW = 110.0  # freed when the rows are numbered
-_COPIES = 4  # of each parameter: value, two moments of Adam, last finite value. Gradients are added below
+_PER_OCTREE_ROW = 30.0  # freed when the rows are numbered
+_COPIES = 4  # of each parameter that learns: value, two moments of Adam, last finite value
 _PER_ROW = 8.0  # if only the touched rows move: marks of Adam
 _PER_VOXEL = 220.0
 
 _SAMPLE = 50_000  # returns, about, whose cells are counted
 _COLUMN = 16  # leaf cells: edge of the columns of space, of which some are sampled
+_MOST_STEPS = 1000  # half cells walked along a ray. A longer way is walked in longer steps.
+_MOST_POINTS = 1_600_000  # walked in all. Where the ways are long, fewer returns are sampled.
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,9 @@ def estimate(
     True
     """
     config = FitConfig() if config is None else config
-    return estimate_rays(prepare(points, poses, intensities, **config.returns.preparation), config)
+    rays = prepare(points, poses, intensities, **config.returns.preparation)
+    check_extent(rays, config)
+    return estimate_rays(rays, config)
 
 
 def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
@@ -128,23 +134,37 @@ def _schedule(rays: Rays, rows: int, config: FitConfig) -> Schedule:
 
 def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
     count, with_intensity = len(rays), rays.intensities is not None
-    parameters = rows * FEATURE_DIM + parameters_of(sdf_widths(config))
-    if with_intensity:
-        parameters += parameters_of(intensity_widths(config))
+    schedule, moves_rows = _schedule(rays, rows, config), config.moves_rows(with_intensity)
     memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL
-    moves_rows = config.moves_rows(with_intensity)
-    gradients = 0 if moves_rows else resolve_num_threads(config.num_threads)
-    memory += 4 * parameters * (_COPIES + gradients) + moves_rows * rows * _PER_ROW
-    batch_size = max(
-        _schedule(rays, rows, config).batch_size, with_intensity * config.training.intensity_batch_size
+    memory += 4 * rows * FEATURE_DIM * _copies(config, schedule, with_intensity=with_intensity)
+    networks = parameters_of(sdf_widths(config))
+    if with_intensity:
+        networks += parameters_of(intensity_widths(config))
+    memory += 4 * networks * (_COPIES + resolve_num_threads(config.num_threads))
+    learns_features = schedule.sdf_iterations > 0
+    memory += moves_rows * learns_features * rows * _PER_ROW
+    samples = max(
+        learns_features * schedule.batch_size,
+        (schedule.intensity_iterations > 0) * config.training.intensity_batch_size,
     )
-    memory += batch_size * _sample_bytes(config)
+    memory += samples * _sample_bytes(config)
     if with_intensity:
         memory += count * (_PER_INTENSITY + config.returns.drop_ghosts * _PER_RETURN_AGAIN)
     passing = count * _PER_RETURN_CHECKED
     if config.encoding.kind == "octree":
         passing = max(passing, _ALWAYS + cells * _PER_CELL + rows * _PER_OCTREE_ROW)
     return int(max(memory, passing))
+
+
+def _copies(config: FitConfig, schedule: Schedule, *, with_intensity: bool) -> int:
+    """How many numbers there are for each of the features, at the peak."""
+    if config.moves_rows(with_intensity):  # pages of zeros take no memory until a step writes to them
+        return _COPIES if schedule.sdf_iterations else 1
+    if not schedule.sdf_iterations:
+        return 3  # itself and two moments
+    # Each thread has a gradient of all rows. Through normals the loss sees them twice: two gradients, and their sum.
+    gradients = 3 if with_intensity and config.networks.normals else 1
+    return _COPIES + gradients * resolve_num_threads(config.num_threads)
 
 
 def check_fit(rays: Rays, config: FitConfig) -> None:
@@ -237,16 +257,23 @@ def _distinct(
     rays: Rays, config: FitConfig, axes: tuple[int, ...], levels: list[int], *, corners: bool
 ) -> list[float]:
     """Number of occupied cells of each level, or of their corners, that differ in the coordinates `axes`."""
+    band_m, leaf_size_m = config.near_band_m, config.leaf_size_m
+    wanted = max(1, math.ceil(4 * band_m / leaf_size_m))  # steps of half a cell, as a fit walks them
+    steps = min(wanted, _MOST_STEPS)
+    looks = 2 * math.ceil(steps / (2 * _COLUMN)) + 1  # at least one in each column that a ray passes
     share = min(1.0, _SAMPLE / len(rays))
-    band = np.array([-config.near_band_m, 0.0, config.near_band_m])
+    if share * len(rays) * steps > _MOST_POINTS:  # a ray is in the sample if one of its columns is
+        share *= _MOST_POINTS / (len(rays) * share * steps * looks)
     chosen = np.zeros(len(rays), bool)
-    for offset in band if share < 1 else ():
-        lattice = _lattice(rays, slice(None), np.array([offset]), axes, config.leaf_size_m)
-        chosen |= _in_sample(lattice, share)
-    used = np.flatnonzero(chosen) if share < 1 else slice(None)
-    steps = int(np.ceil(4 * config.near_band_m / config.leaf_size_m).clip(1, 64))
-    lattice = _lattice(rays, used, np.linspace(band[0], band[2], steps + 1), axes, config.leaf_size_m)
-    counts = []
+    for offset in np.linspace(-band_m, band_m, looks) if share < 1 else ():
+        chosen |= _in_sample(_lattice(rays, float(offset), axes, leaf_size_m), share)
+    used = rays.select(chosen) if share < 1 else rays
+    cells = CellSet(leaf_size_m)
+    for points in used.along(np.linspace(-band_m, band_m, steps + 1)) if len(used) else ():
+        points[:, [axis for axis in range(3) if axis not in axes]] = 0
+        cells.insert(points, config.num_threads)
+    lattice = lattice_of(cells.sorted_keys(config.num_threads))[:, list(axes)]
+    counts: list[float] = []
     for level in levels:
         found = _unique_rows(lattice >> level)
         if corners:
@@ -255,22 +282,16 @@ def _distinct(
         # Count by the column of each cell or corner itself. Those of a return in the sample may be in another
         # column.
         counts.append(len(found) if share == 1 else int(_in_sample(found << level, share).sum()) / share)
-    return counts
+    # Steps that are too long miss cells: as if there were so many times more.
+    return [count * wanted / steps for count in counts]
 
 
-def _lattice(
-    rays: Rays,
-    used: slice | NDArray[np.int64],
-    offsets: NDArray[np.float64],
-    axes: tuple[int, ...],
-    leaf_size_m: float,
-) -> NDArray[np.int64]:
+def _lattice(rays: Rays, offset_m: float, axes: tuple[int, ...], leaf_size_m: float) -> NDArray[np.int64]:
+    """Cells (N, any) of the points at this offset along the rays, by these of their coordinates alone."""
     columns = list(axes)
-    start, direction = rays.points[used][:, columns], rays.directions[used][:, columns]
-    points = start[:, None, :] + offsets[None, :, None].astype(np.float32) * direction[:, None, :]
-    limit = float(2**40)  # far beyond the cells' keys; the fit refuses such points
-    lattice: NDArray[np.int64] = np.floor((points / leaf_size_m).clip(-limit, limit)).astype(np.int64)
-    return lattice.reshape(-1, len(axes))
+    points = rays.points[:, columns] + np.float32(offset_m) * rays.directions[:, columns]
+    lattice: NDArray[np.int64] = np.floor(points / leaf_size_m).astype(np.int64)
+    return lattice
 
 
 def _in_sample(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.budget.estimate import check_fit
+from radarsdf.budget.extent import check_extent
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
@@ -23,7 +24,6 @@ from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import Workers
@@ -93,7 +93,7 @@ def fit(
     radar_map = None
     try:
         rays = prepare(points, poses, intensities, **config.returns.preparation)
-        _check_extent(rays, config)
+        check_extent(rays, config)
         check_fit(rays, config)
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
         clock.lap("prepare_s")
@@ -150,21 +150,6 @@ def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, nu
     """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
     leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
     return Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
-
-
-def _check_extent(rays: Rays, config: FitConfig) -> None:
-    """Refuses returns too far away for a cell's key. Checked first, so that the error is early and clear."""
-    limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m
-    reach_m = max(config.near_band_m, config.truncation_m if config.training.start == "average" else 0.0)
-    if np.abs(rays.points).max() + reach_m > limit_m:
-        distance_m = np.abs(rays.points).max(axis=1) + reach_m
-        outside = int((distance_m > limit_m).sum())
-        msg = (
-            f"{outside} of {len(rays)} returns are not within a million cells of {config.leaf_size_m} m of the mean sensor "
-            f"position, the farthest {distance_m.max():.3g} m away: drop them (max_range_m), use larger cells, or fit "
-            "distant scans separately"
-        )
-        raise ValueError(msg)
 
 
 def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None) -> list[str]:

@@ -15,6 +15,26 @@ from radarsdf.returns.rays import Rays
 MAX_CELLS_FROM_ORIGIN = 1_000_000
 """Farthest cell along each axis. A Morton key has 21 bits for each axis."""
 
+_AXIS_BITS = 21  # of a key, interleaved with those of the other axes
+_COMPACTED = (
+    (2, 0x10C30C30C30C30C3),
+    (4, 0x100F00F00F00F00F),
+    (8, 0x001F0000FF0000FF),
+    (16, 0x001F00000000FFFF),
+    (32, 0x1FFFFF),
+)  # how far to shift, and which bits to keep then
+
+
+def lattice_of(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Lattice coordinates (N, 3) of the cells with these Morton keys (N,)."""
+    coordinates = np.empty((len(keys), 3), np.int64)
+    for axis in range(3):
+        bits = keys >> np.uint64(axis) & np.uint64(0x1249249249249249)
+        for shift, kept in _COMPACTED:
+            bits = (bits | bits >> np.uint64(shift)) & np.uint64(kept)
+        coordinates[:, axis] = bits.astype(np.int64) - (1 << (_AXIS_BITS - 1))
+    return coordinates
+
 
 @dataclass(frozen=True)
 class ReturnCells:
