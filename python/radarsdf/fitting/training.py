@@ -179,8 +179,8 @@ class Training:
         """All that the rest of the training depends on, between two iterations. Tensors are not copied."""
         losses = [self.losses.get(name, 0.0) for name in self.iterations_done]
         state = {
-            "done": torch.tensor(list(self.iterations_done.values())),
-            "losses": torch.tensor(losses, dtype=torch.float64),
+            "done": torch.tensor(list(self.iterations_done.values()), dtype=torch.int64, device="cpu"),
+            "losses": torch.tensor(losses, dtype=torch.float64, device="cpu"),
         }
         state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
         for name, adam in self._adams.items():
@@ -325,6 +325,7 @@ class Training:
                     self._workers,
                     meanwhile=rest,
                 )
+            del found, rest  # gradients of all features are as large as these: not two for each thread
             self.losses[stage.name] = loss
             for name in stage.counts:
                 before = stage.iterations_before if name == stage.name else 0
