@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +21,20 @@ class Scene:
     points: list
     poses: np.ndarray
     intensities: list
+
+
+def recorded_scans(name):
+    """The file of a recorded drive; without it the test is skipped, for its licence keeps it out of the repository.
+
+    It is looked for in the folder that RADARSDF_DATA names, else in shared/data of a folder above this one.
+    """
+    above = [folder / "shared" / "data" for folder in Path(__file__).resolve().parents]
+    named = os.environ.get("RADARSDF_DATA")
+    for folder in above if named is None else [Path(named)]:
+        if (path := folder / "astyx" / f"{name}.npz").exists():
+            return path
+    where = "in shared/data of a folder above" if named is None else "where RADARSDF_DATA says"
+    return pytest.skip(f"no astyx/{name}.npz {where}")
 
 
 def pose(position, yaw_rad=0.0):

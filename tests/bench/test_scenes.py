@@ -4,9 +4,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -16,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from bench.paper.scenes import load_scene
 
-DATA = os.environ.get("RADARSDF_DATA")
+from ..conftest import recorded_scans
 
 
 @pytest.fixture(scope="module")
@@ -110,12 +107,9 @@ def test_damaged_file(tmp_path):
         load_scene(str(path))
 
 
-@pytest.mark.skipif(DATA is None, reason="RADARSDF_DATA does not name a folder with astyx/*.npz")
 @pytest.mark.parametrize(("name", "frames"), [("r0144_0167", 24), ("r0133_0142", 10)])
 def test_recorded_file(name, frames):
-    path = Path(DATA or "") / "astyx" / f"{name}.npz"
-    if not path.exists():
-        pytest.skip(f"{path} is not there")
+    path = recorded_scans(name)
     scene = load_scene(str(path))
     arrays = np.load(path)
     assert (len(scene), scene.holdout_every, scene.max_range_m) == (frames, 5, 60.0)
