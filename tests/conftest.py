@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,6 +66,14 @@ def ground_and_wall(scans=6, returns_per_scan=1500, noise_m=0.02, offset=(0.0, 0
         poses.append(T_world_sensor)
         intensities.append((100 - 40 * np.log10(ranges) + rng.normal(0, 0.5, len(ranges))).astype(np.float32))
     return Scene(points, np.stack(poses), intensities)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c():
+    """A shell starts its background jobs deaf to Ctrl-C, and so would be the tests of it and their processes."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")
