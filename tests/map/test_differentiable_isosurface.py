@@ -113,6 +113,10 @@ def test_vertices_beside_infinite_samples_have_no_gradient(function):
     assert (grad[infinite] == 0).all()
     assert np.isfinite(grad).all()
     assert (grad[~infinite] != 0).sum() > 20
+    # Not even an infinite gradient of the vertices reaches them, which times 0 would be NaN.
+    vertices, _ = mesh_of(function, samples)
+    (grad_of_inf,) = torch.autograd.grad(vertices, samples, torch.full_like(vertices, torch.inf))
+    assert (grad_of_inf.numpy()[infinite] == 0).all()
     # As if the infinite ones were so large that their derivative is nothing.
     large = gradient(function, np.where(infinite, np.sign(volume) * 1e300, volume), torch.ones(()))
     np.testing.assert_allclose(grad, large, rtol=1e-12, atol=1e-290)
