@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from os import PathLike
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,6 +113,11 @@ def fit(
                 saved.resume(training)
             # The map is made before the training, which changes its field: Interrupted and Diverged can hand
             # it over.
+            counts = {
+                "returns": sum(len(np.asarray(scan)) for scan in points),
+                "returns_used": len(surface.rays),
+                "ghosts": len(rays) - len(surface.rays),
+            }
             radar_map = RadarMap(
                 MapContents(
                     field=field,
@@ -119,17 +125,7 @@ def fit(
                     intensity_scale=scale,
                     config=config,
                     support=support,
-                    report={
-                        "returns": sum(len(np.asarray(scan)) for scan in points),
-                        "returns_used": len(surface.rays),
-                        "ghosts": len(rays) - len(surface.rays),
-                        "leaf_cells": len(support),
-                        "vertices": field.cells.table.num_rows,
-                        "iterations": training.iterations,
-                        "iterations_done": training.iterations_done,
-                        "losses": training.losses,
-                        "skipped": _skipped(config, training, scale),
-                    },
+                    report=counts | _report(config, field, training, scale),
                 )
             )
             training.run(progress, saved)
@@ -150,6 +146,20 @@ def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, nu
     """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
     leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
     return Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
+
+
+def _report(
+    config: FitConfig, field: Field, training: Training, scale: IntensityScale | None
+) -> dict[str, Any]:
+    """What the map's report says of cells and training. The training goes on to fill what counts it."""
+    return {
+        "leaf_cells": len(field.cells.table.leaf_keys()),
+        "vertices": field.cells.table.num_rows,
+        "iterations": training.iterations,
+        "iterations_done": training.iterations_done,
+        "losses": training.losses,
+        "skipped": _skipped(config, training, scale),
+    }
 
 
 def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None) -> list[str]:
