@@ -11,14 +11,12 @@ scene, only `leaf_size_m` has to change.
 from __future__ import annotations
 
 import dataclasses
-import functools
-import re
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
-from pydantic.dataclasses import dataclass
-from typing_extensions import dataclass_transform
+from pydantic import BeforeValidator, Field
+
+from radarsdf.settings import settings
 
 MAX_LEVELS = 12  # levels of cells that the compiled core allows; a test compares the two numbers
 MAX_FREQUENCIES = 24  # Fourier frequencies that the compiled core allows; likewise
@@ -38,41 +36,9 @@ _Widths = Annotated[
     tuple[Annotated[int, Field(ge=1, le=_MAX_WIDTH)], ...],
     Field(min_length=1, max_length=MAX_LAYERS, strict=False),  # TOML and JSON have lists, not tuples
 ]
-_Class = TypeVar("_Class", bound=type)
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True)
-def _settings(cls: _Class) -> _Class:
-    """Makes a frozen dataclass that checks its values. A ValueError of one line names the wrong one."""
-    rules = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-    checked = dataclass(frozen=True, kw_only=True, config=rules)(cls)
-    construct: Callable[..., None] = checked.__init__
-    group = cls.__name__.removesuffix("Config").lower()
-    prefix = "" if group == "fit" else f"{group}."
-
-    @functools.wraps(construct)
-    def with_short_errors(self: Any, **values: Any) -> None:
-        try:
-            construct(self, **values)
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            name = prefix + ".".join(part for part in first["loc"] if isinstance(part, str))
-            if (
-                first["type"] == "value_error"
-            ):  # raised by our own checks or by a group: its message is complete
-                msg = first["msg"].removeprefix("Value error, ")
-            elif first["type"] == "unexpected_keyword_argument":
-                msg = f"unknown setting {name}"
-            else:
-                must = re.sub(r"^\w+ should", "must", first["msg"])
-                msg = f"{name} {must}, not {first['input']!r:.50}"
-            raise ValueError(msg) from None
-
-    setattr(checked, "__init__", with_short_errors)  # noqa: B010 - mypy refuses a plain assignment
-    return cast(_Class, checked)
-
-
-@_settings
+@settings
 class ReturnsConfig:
     """Which returns are used, and how they are cleaned."""
 
@@ -104,7 +70,7 @@ class ReturnsConfig:
             raise ValueError(msg)
 
 
-@_settings
+@settings
 class EncodingConfig:
     """How a position is encoded for the networks."""
 
@@ -124,7 +90,7 @@ class EncodingConfig:
     """Half of the longest Fourier wavelength, in leaf cells (3QFP: 409.6 m)."""
 
 
-@_settings
+@settings
 class NetworksConfig:
     """The two networks and their inputs."""
 
@@ -153,7 +119,7 @@ class NetworksConfig:
     """The same for the Fourier encoding (3QFPI: 0)."""
 
 
-@_settings
+@settings
 class SamplingConfig:
     """Where on the rays the training samples are."""
 
@@ -173,7 +139,7 @@ class SamplingConfig:
     displaces returns: standard deviation, rad (3QFPI: 0)."""
 
 
-@_settings
+@settings
 class TrainingConfig:
     """Losses, schedule and optimiser."""
 
@@ -230,7 +196,7 @@ def _from_mapping(group: Any) -> Callable[[Any], Any]:
     return lambda value: group(**value) if isinstance(value, Mapping) else value
 
 
-@_settings
+@settings
 class FitConfig:
     """The settings of a fit. The defaults are the best ones measured; :meth:`paper` is 3QFPI as published.
 

@@ -1,0 +1,45 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Dataclasses whose values are checked, by pydantic, with errors of one line."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+from pydantic import ConfigDict, ValidationError
+from pydantic.dataclasses import dataclass
+from typing_extensions import dataclass_transform
+
+_Class = TypeVar("_Class", bound=type)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def settings(cls: _Class) -> _Class:
+    """Makes a frozen dataclass that checks its values. A ValueError of one line names the wrong one."""
+    rules = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    checked = dataclass(frozen=True, kw_only=True, config=rules)(cls)
+    construct: Callable[..., None] = checked.__init__
+    group = cls.__name__.removesuffix("Config").lower()
+    prefix = "" if group == "fit" else f"{group}."
+
+    @functools.wraps(construct)
+    def with_short_errors(self: Any, **values: Any) -> None:
+        try:
+            construct(self, **values)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            name = prefix + ".".join(part for part in first["loc"] if isinstance(part, str))
+            if first["type"] == "value_error":  # of a check of ours or of a group: its message is complete
+                msg = first["msg"].removeprefix("Value error, ")
+            elif first["type"] == "unexpected_keyword_argument":
+                msg = f"unknown setting {name}"
+            else:
+                must = re.sub(r"^\w+ should", "must", first["msg"])
+                msg = f"{name} {must}, not {first['input']!r:.50}"
+            raise ValueError(msg) from None
+
+    setattr(checked, "__init__", with_short_errors)  # noqa: B010 - mypy refuses a plain assignment
+    return cast(_Class, checked)
