@@ -16,7 +16,7 @@ import sys
 
 REPEATS = 3
 FIT = """
-import time, radarsdf
+import time, radarsdf, radarsdf.fitting.fit
 scans = radarsdf.simulate.hugin(frames=30)
 started = time.perf_counter()
 radarsdf.fit(scans.points, scans.poses, scans.intensities, progress=False)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import radarsdf
+import radarsdf.fitting.fit  # else the first fit would import it, in what is measured
 from radarsdf import FitConfig, RadarMap
 
 from bench.memory import memory_bytes

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-import radarsdf.map.meshing  # else the first mesh would import it and trimesh, in the measured time
+import radarsdf.fitting.fit  # else the first fit and the first mesh would import these, in the measured time
+import radarsdf.map.meshing
 
 from .child import Made, ScanArrays
 

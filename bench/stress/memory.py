@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import radarsdf
+import radarsdf.fitting.fit  # else the first fit would import it, in what is measured
 from radarsdf import Estimate, FitConfig
 
 from bench.growth.street import street

@@ -45,7 +45,7 @@ def test_the_published_mesh_leaves_out_what_was_published():
 
 def test_the_mesh_s_arguments_arrive(scans):
     done = reconstruct(OURS.with_changes(mesh={"min_component_triangles": 10**9}), scans.points, scans.poses)
-    assert done.why_not == "it made no triangles"
+    assert done.why_not == "the mesh has no triangles"
 
 
 def test_far_from_the_origin_the_same_mesh_comes_out_there(scans):
