@@ -26,6 +26,7 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
     ValueError
         If rows have different lengths, or an integer is too large for float64.
     """
+    refuse_masked(values, name)
     try:
         array = np.asarray(values)
         if array.dtype.kind == "O":  # numbers of other types, or integers of many digits
@@ -41,6 +42,14 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
         raise TypeError(msg)
     with np.errstate(over="ignore"):  # a number that is too large becomes infinite; the callers refuse that
         return array.astype(dtype, copy=False)
+
+
+def refuse_masked(values: Any, name: str) -> None:
+    """Raises a ValueError where values are masked: NumPy would take what is under the mask for a value."""
+    parts = values if isinstance(values, (list, tuple)) else [values]
+    if any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts):
+        msg = f"{name} has masked values: leave them out"
+        raise ValueError(msg)
 
 
 def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf._core import cell_keys
-from radarsdf.checks import positions, positive, real_array, whole_number
+from radarsdf.checks import MAX_POSITION_M, positions, positive, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def surface_metrics(
         threshold_m=threshold_m,
         outlier_m=outlier_m,
         truncation_m=truncation_m,
-        box=None if box is None else np.asarray(box, dtype=np.float64).tolist(),
+        box=None if box is None else real_array(box, "box").tolist(),
     )
 
 
@@ -241,7 +241,7 @@ def gamma_from_moments(angles_rad: ArrayLike) -> tuple[float | None, float | Non
     Maximum likelihood is not used: it needs the mean logarithm of the angles, which one angle of zero makes undefined,
     and on flat walls rounding errors of 1e-8 rad would decide the shape.
     """
-    angles = np.asarray(angles_rad, dtype=np.float64)
+    angles = real_array(angles_rad, "angles_rad")
     if angles.size == 0:
         return None, None, None
     mean, variance = float(angles.mean()), float(angles.var())
@@ -256,6 +256,9 @@ def _check_box(box: ArrayLike) -> _Points:
     corners = real_array(box, "box")
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         msg = "box must be (2, 3): a lower corner and an upper one above it"
+        raise ValueError(msg)
+    if not (np.abs(corners) <= MAX_POSITION_M).all():
+        msg = f"box must be finite, and within {MAX_POSITION_M:g} m"
         raise ValueError(msg)
     return corners
 

@@ -217,7 +217,9 @@ class _Fourier(torch.autograd.Function):
         (out,) = ctx.saved_tensors
         half_width_m, first, count = ctx.frequencies
         scale = torch.tensor(
-            [math.pi * 2**k / half_width_m for k in range(first, first + count)], dtype=out.dtype
+            [math.pi * 2**k / half_width_m for k in range(first, first + count)],
+            dtype=out.dtype,
+            device="cpu",
         )
         sine, cosine = out.view(-1, 2, count, 3).unbind(1)
         sine_grad, cosine_grad = out_grad.reshape(-1, 2, count, 3).unbind(1)

@@ -61,7 +61,7 @@ class AutogradGradients(GradientBackend):
             geometry.first(count),
             samples.directions[:count],
             samples.ranges_m[:count] - samples.sdf_m[:count],
-            encoding_factors=[dropout.factors for dropout in self._draw_dropouts(count)] or None,
+            encoding_factors=[drawn.factors_of(labels.dtype) for drawn in self._draw_dropouts(count)] or None,
         )
         if count == 0:
             return predicted.sum()

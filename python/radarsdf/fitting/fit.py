@@ -93,18 +93,23 @@ def fit(
     clock = _Clock()
     radar_map = None
     try:
+        points = list(points)  # which may be a generator
         rays = prepare(points, poses, intensities, **config.returns.preparation)
         check_extent(rays, config)
         check_fit(rays, config)
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
         clock.lap("prepare_s")
-        with Workers(config.num_threads) as workers:
+        # A map that is made in inference mode could not give gradients later.
+        with torch.inference_mode(mode=False), Workers(config.num_threads) as workers:
             surface = SurfaceReturns.of(rays, config, workers.num_threads)
             clock.lap("ghosts_s")
             start = STARTS[config.training.start](surface, config, workers.num_threads)
             field = _open_cells(start.leaf_keys(), surface.rays, config, workers.num_threads)
             clock.lap("occupied_cells_s")
             start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
+            if not all(parameter.isfinite().all() for parameter in field.parameters()):
+                msg = "what the training starts from is not finite: training.sigma_cells may be too small"
+                raise Diverged(msg)
             support = start.support(field.cells.table.leaf_keys())
             clock.lap("start_s")
             scale = IntensityScale.of(rays.intensities)

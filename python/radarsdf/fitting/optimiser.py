@@ -41,7 +41,7 @@ class Adam:
         self.full_rate = self.learning_rate = learning_rate
         self._means = [torch.zeros_like(p) for p in self.parameters]
         self._squares = [torch.zeros_like(p) for p in self.parameters]
-        self._step = torch.zeros(())
+        self._step = torch.zeros((), dtype=torch.float32, device="cpu")
 
     def state(self) -> dict[str, Tensor]:
         """All that the next steps depend on, except the parameters. The tensors are not copied."""
@@ -99,7 +99,7 @@ class RowAdam:
             moments=kernels.large_zeros(rows, 2 * FEATURE_DIM, dtype=dtype),
             marks=kernels.large_zeros(rows, 2, dtype=torch.int32),
         )
-        self._decays = torch.zeros(0, 2, dtype=dtype)
+        self._decays = torch.zeros(0, 2, dtype=dtype, device="cpu")
 
     @property
     def features(self) -> Tensor:
@@ -109,7 +109,7 @@ class RowAdam:
     def state(self) -> dict[str, Tensor]:
         """All that the next steps depend on, except the features. The tensors are not copied."""
         memory = self._memory
-        count = torch.tensor(self.step_count)
+        count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
         return {"moments": memory.moments, "last_step": memory.marks[:, :1], "step_count": count}
 
     def restore(self, state: dict[str, Tensor]) -> None:

@@ -107,7 +107,10 @@ class RaySampler:
     def state(self) -> dict[str, Tensor]:
         """The order of the rays, as a state of the generator, and the position in it."""
         drawn = len(self._order) > 0
-        return {"order_from": self._order_from, "next": torch.tensor(self._next if drawn else -1)}
+        return {
+            "order_from": self._order_from,
+            "next": torch.tensor(self._next if drawn else -1, dtype=torch.int64, device="cpu"),
+        }
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restores what :meth:`state` of a sampler of the same rays gave. Changes the generator's state."""
@@ -122,7 +125,8 @@ class RaySampler:
 
     def _draw_order(self) -> None:
         self._order_from = self._generator.get_state()
-        runs = torch.randperm(-(-len(self._rays) // self._neighbours), generator=self._generator).numpy()
+        count = -(-len(self._rays) // self._neighbours)
+        runs = torch.randperm(count, generator=self._generator, device="cpu").numpy()
         order = (runs[:, None] * self._neighbours + np.arange(self._neighbours)).ravel()
         self._order = order[order < len(self._rays)]
         self._next = 0
@@ -143,7 +147,7 @@ class RaySampler:
         return torch.from_numpy(np.sort(np.concatenate(parts)))
 
     def _uniform(self, count: int) -> Tensor:
-        return torch.rand(count, generator=self._generator)
+        return torch.rand(count, generator=self._generator, dtype=torch.float32, device="cpu")
 
     def spread(self, count: int, parts: int = 1) -> list[Samples]:
         """`count` samples near the surface, in `parts` for the threads.
@@ -236,7 +240,7 @@ class _Layout:
         taken = max(num_near, num_free)
         shares = [[share(n, part, parts) for part in range(parts)] for n in (num_near, num_free)]
         sizes = [size for part in zip(*shares, strict=True) for size in part]  # near, free, near, free, ...
-        kinds = torch.tensor([0, 1] * parts).repeat_interleave(torch.tensor(sizes))
+        kinds = torch.from_numpy(np.repeat(np.tile([0, 1], parts), sizes))
         order = kinds.argsort(stable=True).argsort()
         # Fewer samples of one kind are spread evenly over the rays, so that they cover the whole scene too.
         index = torch.cat([torch.arange(n) * taken // max(n, 1) for n in (num_near, num_free)])[order]
@@ -244,7 +248,9 @@ class _Layout:
         # free_beyond].
         band_m, before = config.near_band_m, 1 - config.sampling.free_from
         ends = torch.tensor(
-            [[-band_m, 0, 2 * band_m, 0], [-config.free_beyond_m, 0, config.free_beyond_m, before]]
+            [[-band_m, 0, 2 * band_m, 0], [-config.free_beyond_m, 0, config.free_beyond_m, before]],
+            dtype=torch.float32,
+            device="cpu",
         )[kinds]
         start, of_range, length, length_of_range = ends.T.contiguous()
         sums = [sum(part) for part in zip(*shares, strict=True)]

@@ -27,6 +27,7 @@ from radarsdf.fitting.optimiser import Adam, RowAdam
 from radarsdf.fitting.sampling import RaySampler, Samples
 from radarsdf.fitting.stopping import Diverged
 from radarsdf.interrupts import deferred_interrupts
+from radarsdf.progress import hides_bar
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
@@ -232,7 +233,7 @@ class Training:
                 initial=sum(self._done(stage) for stage in stages),
                 desc="fit",
                 unit="it",
-                disable=None if progress is None else not progress,
+                disable=hides_bar(progress),
             ) as bar,
             deferred_interrupts() as interrupted,
         ):

@@ -102,8 +102,8 @@ def _check_viewpoint(contents: MapContents, viewpoint: ArrayLike) -> NDArray[np.
         msg = "a viewpoint needs a map with intensities; this one was fitted without"
         raise ValueError(msg)
     sensor_position = real_array(viewpoint, "viewpoint")
-    if sensor_position.shape != (3,) or not np.isfinite(sensor_position).all():
-        msg = "viewpoint must be one position (3,)"
+    if sensor_position.shape != (3,) or not (np.abs(sensor_position) <= MAX_POSITION_M).all():
+        msg = f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m"
         raise ValueError(msg)
     return sensor_position
 
@@ -112,6 +112,9 @@ def _check_box(box: ArrayLike) -> NDArray[np.float64]:
     corners = real_array(box, "box")
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         msg = "box must be a lower and an upper corner, (2, 3)"
+        raise ValueError(msg)
+    if not (np.abs(corners) <= MAX_POSITION_M).all():
+        msg = f"box must be finite, and within {MAX_POSITION_M:g} m"
         raise ValueError(msg)
     return corners
 

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from radarsdf._core import CellBlocks
 from radarsdf.map.contents import MapContents
+from radarsdf.progress import hides_bar
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
@@ -21,6 +22,7 @@ _CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in th
 _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
 
 
+@torch.inference_mode(mode=False)  # gradients, of which normals are made, need ordinary tensors
 def to_local(contents: MapContents, world: Tensor) -> Tensor:
     """World positions (N, 3), m, in the local frame, float32. The origin is subtracted in float64."""
     return (world.double() - torch.from_numpy(contents.origin)).float()
@@ -74,6 +76,7 @@ def confidence_of_median(contents: MapContents, share: float) -> float:
     return returns / (returns + _HALF_SUPPORT)
 
 
+@torch.inference_mode(mode=False)
 def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
     """(N,) intensity, sensor units, of the return that each sensor gets from its point.
 
@@ -91,6 +94,7 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
     return evaluate(of_chunk, torch.cat([points, sensors], 1))
 
 
+@torch.inference_mode(mode=False)
 def evaluate(
     function: Callable[[Tensor], Tensor],
     points: Tensor,
@@ -113,8 +117,9 @@ def evaluate(
         return without_gradients(points)
     with Workers() as workers:
         results = workers.map(without_gradients, chunks)
-        disable = None if progress is None else not progress
-        return torch.cat(list(tqdm(results, description, len(chunks), unit="chunk", disable=disable)))
+        return torch.cat(
+            list(tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress)))
+        )
 
 
 def _confidence_of(returns: Tensor) -> Tensor:

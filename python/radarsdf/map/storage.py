@@ -34,6 +34,10 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     it.
     """
     tensors, description = parts_of(contents)
+    for name, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            msg = f"{name} of the map holds something other than finite numbers: it is not saved"
+            raise ValueError(msg)
     metadata = {
         "format": FORMAT,
         "format_version": str(FORMAT_VERSION),
@@ -49,6 +53,7 @@ def to_pickle(contents: MapContents) -> tuple[bytes, dict[str, Any]]:
     return to_bytes(tensors), description
 
 
+@torch.inference_mode(mode=False)
 def from_pickle(data: bytes, description: dict[str, Any]) -> MapContents:
     """The inverse of :func:`to_pickle`."""
     return _build(from_bytes(data), description)
@@ -72,6 +77,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
 
 
+@torch.inference_mode(mode=False)  # or the map could not give gradients
 def load_contents(path: str | PathLike[str]) -> MapContents:
     """Reads the file of a map. Nothing in the file is executed.
 

@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What users set in PyTorch for themselves changes no bit of ours."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
+
+
+@contextlib.contextmanager
+def float64():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@contextlib.contextmanager
+def default_device():
+    torch.set_default_device("meta")
+    try:
+        yield
+    finally:
+        torch.set_default_device(None)
+
+
+@contextlib.contextmanager
+def deterministic():
+    torch.use_deterministic_algorithms(True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+SETTINGS = {
+    "float64": float64,
+    "default device": default_device,
+    "device context": lambda: torch.device("meta"),
+    "inference mode": torch.inference_mode,
+    "no gradients": torch.no_grad,
+    "deterministic": deterministic,
+}
+TRAINING = {"sdf_iterations": 4, "intensity_iterations": 8, "batch_size": 256, "intensity_batch_size": 128}
+CONFIGS = {
+    "core": {},
+    "autograd": {"training": {"gradients": "autograd"}},
+    "normals": {"networks": {"normals": True}},
+    "all rows": {"training": {"row_updates": False}},
+    "octree": {"encoding": {"kind": "octree"}},
+}
+
+
+def answers(scene, path, changes):
+    """All that a map says, as bytes."""
+    found = {}
+    config = FitConfig(num_threads=2, training=TRAINING).override(**changes)
+    for name, intensities in {"geometry": None, "both": scene.intensities}.items():
+        fitted = radarsdf.fit(scene.points, scene.poses, intensities, config=config, progress=False)
+        fitted.save(path)
+        for radar_map in (fitted, radarsdf.load(path)):
+            x = scene.points[0][:50].astype(np.float64) @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
+            given = [radar_map.sdf(x), radar_map.gradient(x), radar_map.confidence(x), radar_map.observed(x)]
+            given += [
+                radar_map.sdf(torch.from_numpy(x)).numpy(),
+                radar_map.gradient(torch.from_numpy(x)).numpy(),
+            ]
+            if intensities is not None:
+                given.append(radar_map.intensity(x, scene.poses[0, :3, 3]))
+            mesh = radar_map.mesh(0.2, min_component_triangles=0, progress=False)
+            given += [np.asarray(mesh.vertices), np.asarray(mesh.faces)]
+            numbers = [p.detach().numpy() for p in radar_map.field.parameters()]
+            found.setdefault(name, []).append([a.tobytes() for a in (*given, *numbers)])
+    return found
+
+
+@pytest.fixture(scope="module")
+def usual(scene, tmp_path_factory):
+    path = tmp_path_factory.mktemp("maps") / "map.safetensors"
+    return {name: answers(scene, path, changes) for name, changes in CONFIGS.items()}
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_the_same_bits(scene, tmp_path, usual, setting, config):
+    with SETTINGS[setting]():
+        found = answers(scene, tmp_path / "map.safetensors", CONFIGS[config])
+    assert found == usual[config]
