@@ -45,19 +45,19 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.scans import read_scans
 
     radar_map = radarsdf.load(options.what) if options.what.suffix == ".safetensors" else None
-    if options.holdout and (radar_map is None or options.truth.suffix != ".npz"):
+    if options.holdout is not None and (radar_map is None or options.truth.suffix != ".npz"):
         msg = "--holdout needs a map and scans"
         raise ValueError(msg)
     scans = read_scans(options.truth) if options.truth.suffix == ".npz" else None
     ground_truth = scans.ground_truth if scans else read_points(options.truth)
-    if ground_truth is None and not options.holdout:
+    if ground_truth is None and options.holdout is None:
         msg = f"{options.truth} has no lidar_points; --holdout N evaluates intensities"
         raise ValueError(msg)
     if ground_truth is not None:
         mesh = radar_map.mesh() if radar_map else read_mesh(options.what)
         metrics = surface_metrics(mesh, ground_truth, box=box_of(options), samples=options.samples)
         print(format_metrics(metrics))
-    if options.holdout and radar_map is not None and scans is not None:
+    if options.holdout is not None and radar_map is not None and scans is not None:
         train, test = holdout(len(scans.points), options.holdout)
         print_intensity_errors(radar_map, scans.select(test), scans.select(train))
 
@@ -84,11 +84,12 @@ def read_points(path: Path) -> NDArray[np.float64]:
     """
     import numpy as np
 
+    from radarsdf.checks import real_array
     from radarsdf.interrupts import whole_import
 
     with _refusing_damage(path):
         if path.suffix == ".npy":
-            return np.asarray(np.load(path, allow_pickle=False), np.float64)
+            return real_array(np.load(path, allow_pickle=False), "points")
         if path.suffix in (".xyz", ".txt", ".csv"):
             delimiter = "," if path.suffix == ".csv" else None
             return np.loadtxt(path, delimiter=delimiter, ndmin=2)[:, :3]
@@ -99,7 +100,7 @@ def read_points(path: Path) -> NDArray[np.float64]:
     if vertices is None:  # a scene of several geometries
         msg = f"{path} is not one cloud or mesh"
         raise ValueError(msg)
-    return np.asarray(vertices, np.float64)
+    return real_array(vertices, "vertices")
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:

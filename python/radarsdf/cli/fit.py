@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> None:
 
     check_outputs([options.out, options.checkpoint], [options.scans])
     scans = read_scans(options.scans)
-    if options.holdout:
+    if options.holdout is not None:
         from radarsdf.evaluation import holdout
 
         scans = scans.select(holdout(len(scans.points), options.holdout)[0])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.checks import MAX_POSITION_M, positive, real_array, whole_number
+from radarsdf.checks import MAX_POSITION_M, positive, real_array, refuse_masked, whole_number
 from radarsdf.threads import resolve_num_threads
 
 INTENSITY_PROTOCOL = "radarsdf-intensity-1"
@@ -105,6 +105,7 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
     if isinstance(frames, (int, np.integer)):
         numbers = np.arange(whole_number(frames, "frames", 0, _MAX_FRAMES))
     else:
+        refuse_masked(frames, "frames")
         numbers = np.unique(np.asarray(frames))
     if numbers.ndim != 1 or not (numbers.size == 0 or np.issubdtype(numbers.dtype, np.integer)):
         msg = "frames must be a number of scans or integer frame numbers"

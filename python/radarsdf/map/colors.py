@@ -42,7 +42,7 @@ def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.u
     if not (np.isfinite([low, high]).all() and low <= high):
         msg = f"limits must be finite and ascending, not {low} and {high}"
         raise ValueError(msg)
-    v = np.asarray(values, dtype=np.float64)
+    v = real_array(values, "values")
     where = np.clip((v - low) / (high - low), 0.0, 1.0) if high > low else np.where(np.isnan(v), np.nan, 0.5)
     known = ~np.isnan(where)
     positions = np.linspace(0.0, 1.0, len(_ANCHORS))

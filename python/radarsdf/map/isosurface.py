@@ -306,6 +306,7 @@ def mesh_components(faces: ArrayLike, num_vertices: int) -> tuple[NDArray[np.int
 
 
 def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[np.float64]:
+    refuse_masked(values, name)
     array = np.asarray(values)
     if array.dtype.kind not in "biuf":
         msg = f"{name} must be real numbers, not {array.dtype}"
@@ -328,6 +329,7 @@ def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def _as_int32(values: ArrayLike, name: str) -> NDArray[np.int32]:
+    refuse_masked(values, name)
     array = np.asarray(values)
     if array.size == 0 and array.dtype.kind == "f":  # what an empty list becomes
         array = array.astype(np.int32)

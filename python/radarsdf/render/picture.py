@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.checks import real_array
 from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.render.raster import PIXELS_AT_ONCE, barycentric, contours, corner_normals, project, rasterise
@@ -148,7 +149,7 @@ def save_picture(
     if scalar is None:
         image = render(mesh, width=width, height=height, viewpoint=viewpoint)
     else:
-        values = np.asarray(scalar, dtype=np.float64)
+        values = real_array(scalar, "scalar")
         if values.shape != (len(mesh.vertices),):
             msg = f"scalar must be ({len(mesh.vertices)},), one value per vertex, not {values.shape}"
             raise ValueError(msg)
@@ -186,7 +187,7 @@ def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tu
         flat = np.cos(turn) * across + np.sin(turn) * np.array([-across[1], across[0]])
         eye = center + 2.6 * radius * np.array([*(np.cos(rise) * flat), np.sin(rise)])
     else:
-        eye = np.asarray(viewpoint, dtype=np.float64)
+        eye = real_array(viewpoint, "viewpoint")
         if eye.shape != (3,) or not np.isfinite(eye).all():
             msg = "viewpoint must be (3,) and finite"
             raise ValueError(msg)

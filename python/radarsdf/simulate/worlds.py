@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import whole_number
+
 from . import materials
 from .primitives import Box, CornerReflector, Primitive
 from .radar import RadarSensor, generator
@@ -42,6 +44,10 @@ OCULII_EAGLE = RadarSensor(
     gain_db=66.0, threshold_db=-1.0, floor_db=0.0, saturation_db=36.0, step_db=0.5,
     clutter_per_scan=30.0, ghost_share=0.5,
 )  # fmt: skip
+
+
+def _frames(frames: int | None, default: int) -> int:
+    return default if frames is None else whole_number(frames, "frames", 1)
 
 
 def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -81,7 +87,7 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
     site.fill(int(rng.integers(3, 6)), site.wall, lambda: beside(6, 11))
     site.fill(int(rng.integers(6, 11)), site.car, lambda: beside(4, 9))
     site.fill(int(rng.integers(12, 20)), site.pole, lambda: beside(3, 14))
-    poses = along_path(terrain, path, frames or 120, height_m=1.5, rng=generator(seed, _TRAJECTORY))
+    poses = along_path(terrain, path, _frames(frames, 120), height_m=1.5, rng=generator(seed, _TRAJECTORY))
     return simulate(Scene(site.solids, terrain), HUGIN_A3, poses, name="hugin", seed=seed)
 
 
@@ -124,7 +130,7 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
     for angle in np.arange(0, 2 * np.pi, 2 * np.pi / rng.integers(14, 22)):
         corner = np.clip(1.45 * np.array([np.cos(angle), np.sin(angle)]), -1, 1)
         site.pole(corner * np.array([length, width]), 0.0)
-    poses = along_path(terrain, path, frames or 120, height_m=1.1, rng=generator(seed, _TRAJECTORY))
+    poses = along_path(terrain, path, _frames(frames, 120), height_m=1.1, rng=generator(seed, _TRAJECTORY))
     return simulate(Scene(site.solids, terrain), OCULII_EAGLE, poses, name="oculii", seed=seed)
 
 
@@ -169,7 +175,12 @@ def wall(seed: int = 0, frames: int | None = None) -> Simulation:
         return xy
 
     poses = along_path(
-        terrain, path, frames or 90, height_m=1.2, rng=generator(seed, _TRAJECTORY), look_at=mounted[:2]
+        terrain,
+        path,
+        _frames(frames, 90),
+        height_m=1.2,
+        rng=generator(seed, _TRAJECTORY),
+        look_at=mounted[:2],
     )
     return simulate(Scene([*solids, reflector], terrain), HUGIN_A4, poses, name="wall", seed=seed)
 
