@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 import os
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
@@ -21,6 +22,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch.nn import functional
+
+from radarsdf import _core
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -56,6 +59,17 @@ def _reset_after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_reset_after_fork)
+
+
+def _check_instruction_set() -> None:
+    """The core takes what it knows of the environment, and goes on with its own choice where it knows nothing."""
+    wanted, known = os.environ.get("RADARSDF_ISA"), _core.available_instruction_sets()
+    if wanted and wanted not in known:
+        msg = f"RADARSDF_ISA={wanted!s:.50} is none of {', '.join(known)}: {_core.instruction_set()} is used"
+        warnings.warn(msg, RuntimeWarning, stacklevel=2)
+
+
+_check_instruction_set()
 
 
 def start_vector_library() -> None:

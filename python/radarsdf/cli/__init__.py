@@ -51,6 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         After ``--help``, with status 0, and after a usage error, with status 2.
     """
     words = sys.argv[1:] if arguments is None else arguments
+    if hasattr(
+        sys.stdout, "reconfigure"
+    ):  # a character that a terminal lacks must not cost the work before it
+        sys.stdout.reconfigure(errors="replace")
     options = _parser(words).parse_args(words)
     try:
         _module(options.command).run(options)
@@ -86,5 +90,6 @@ def _interrupted(command: str, interruption: KeyboardInterrupt) -> int:
 
 
 def _failed(command: str, message: str, status: int) -> int:
-    print(f"radarsdf {command}: {message}", file=sys.stderr)
+    if sys.stderr is not None:  # print would take None for standard output
+        print(f"radarsdf {command}: {message}", file=sys.stderr)
     return status
