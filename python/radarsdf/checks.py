@@ -24,7 +24,7 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
         If `values` are not real numbers. NumPy would drop the imaginary part of complex numbers, and parse
         text.
     ValueError
-        If rows have different lengths, or an integer is too large for float64.
+        If rows have different lengths, a value is masked, or an integer is too large for float64.
     """
     refuse_masked(values, name)
     try:

@@ -250,7 +250,7 @@ def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
 
 def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor, Tensor]:
     """:func:`interpolate` without gradients, and the result of :func:`locate`, (N, num_levels) int32."""
-    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
+    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
     table.encode(view(features), view(points), located.numpy(), out.numpy(), threads())
     return out, located
@@ -312,7 +312,7 @@ def locate(points: Tensor, table: VertexTable) -> Tensor:
 
     (N, num_levels) int32, finest level first. -1: the point is in no occupied cell.
     """
-    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32)
+    located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
     table.locate(view(points), located.numpy(), threads())
     return located
 

@@ -143,8 +143,8 @@ class RowAdam:
         """
         self.step_count += 1
         if self.step_count >= len(self._decays):
-            powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64)[:, None]
-            decays = torch.tensor([_BETAS], dtype=torch.float64) ** powers
+            powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64, device="cpu")[:, None]
+            decays = torch.tensor([_BETAS], dtype=torch.float64, device="cpu") ** powers
             # Denormal numbers would be slow, and make no difference beside a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         move = kernels.adam_step(

@@ -161,7 +161,7 @@ class RaySampler:
         points = _returns(ray) - sdf_m[:, None] * _directions(ray)
         if config.sampling.cross_range_noise_rad > 0:
             # Noise in all directions is simpler. Along the beam it is small beside the width of the band.
-            noise = torch.randn(points.shape, generator=self._generator)
+            noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
             points += noise * (config.sampling.cross_range_noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
         return self._split(points, sdf_m, ray, near, near)
@@ -243,7 +243,9 @@ class _Layout:
         kinds = torch.from_numpy(np.repeat(np.tile([0, 1], parts), sizes))
         order = kinds.argsort(stable=True).argsort()
         # Fewer samples of one kind are spread evenly over the rays, so that they cover the whole scene too.
-        index = torch.cat([torch.arange(n) * taken // max(n, 1) for n in (num_near, num_free)])[order]
+        index = torch.cat([torch.arange(n, device="cpu") * taken // max(n, 1) for n in (num_near, num_free)])[
+            order
+        ]
         # From the sensor: near samples in range ± near_band, free ones in [free_from · range, range +
         # free_beyond].
         band_m, before = config.near_band_m, 1 - config.sampling.free_from
@@ -273,12 +275,18 @@ class Dropout:
     def draw(cls, rows: int, columns: int, dropout: float, generator: torch.Generator) -> Dropout:
         """Draws a dropout of a matrix (rows, columns). `dropout`: probability that a number is dropped."""
         # Each random int64 gives eight bytes. To draw bytes one by one would take a tenth of an iteration.
-        words = torch.empty(-(-rows * columns // 8), dtype=torch.int64).random_(
+        words = torch.empty(-(-rows * columns // 8), dtype=torch.int64, device="cpu").random_(
             -(2**63), None, generator=generator
         )
         return cls(words.view(torch.uint8)[: rows * columns].view(rows, columns), round(256 * (1 - dropout)))
 
     @property
     def factors(self) -> Tensor:
-        """(rows, columns): 0 for dropped numbers, 256 / keep for the others, so that the mean is 1."""
-        return (self.bytes <= self.keep - 1) * (256 / self.keep)  # not < keep: 256 does not fit into a byte
+        """(rows, columns) float32: 0 for dropped numbers, 256 / keep for the others, so that the mean is 1."""
+        return self.factors_of(torch.float32)
+
+    def factors_of(self, dtype: torch.dtype) -> Tensor:
+        """:attr:`factors` in another type of floats."""
+        return (self.bytes <= self.keep - 1).to(dtype) * (
+            256 / self.keep
+        )  # not < keep: 256 does not fit into a byte

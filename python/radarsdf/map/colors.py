@@ -7,6 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.checks import real_array
+
 # From indigo through magenta and orange to yellow. The lightness grows from 0.32 to 0.93 in OKLab, in equal
 # steps.
 _ANCHORS = np.array(

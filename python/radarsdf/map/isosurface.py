@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from radarsdf import _core
-from radarsdf.checks import real_array
+from radarsdf.checks import real_array, refuse_masked
 from radarsdf.map import differentiable_isosurface
 
 Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
@@ -318,6 +318,7 @@ def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[n
 
 
 def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    refuse_masked(mask, "mask")
     array = np.asarray(mask)
     if array.dtype != np.bool_:
         msg = f"mask must be boolean, not {array.dtype}"

@@ -32,6 +32,11 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
 
     If the process is killed meanwhile, a hidden file ``.NAME.`` with 16 hexadecimal digits may stay beside
     it.
+
+    Raises
+    ------
+    ValueError
+        If a number of the map is not finite. :func:`load_contents` would refuse the file.
     """
     tensors, description = parts_of(contents)
     for name, tensor in tensors.items():
