@@ -56,7 +56,7 @@ def test_a_viewpoint_for_a_map_without_intensities(scans_file, tmp_path, capsys)
     ("words", "said"),
     [
         (["--voxel", 0], "voxel"),
-        (["--box", 1, 1, 1, 0, 0, 0], "box must be a lower and a higher corner"),
+        (["--box", 1, 1, 1, 0, 0, 0], "box must be a lower and an upper corner"),
         (["--min-confidence", 2], "min_confidence"),
     ],
 )
