@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from radarsdf.evaluation import KNNIntensity, intensity_metrics
+from radarsdf.returns.rays import scan_numbers
 
 from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, world_returns
 from .report import figure, markdown
@@ -31,8 +32,10 @@ def tasks(scene: Scene, options: Options) -> list[Task]:
 def _baseline(scene: Scene) -> list[Row]:
     train, test = scene.split()
     x, sensors, measured = world_returns(test)
-    predicted = KNNIntensity(*world_returns(train)).predict(x, sensors)
-    row: Row = {"scene": scene.name, "method": "kNN", **intensity_metrics(predicted, measured)}
+    scans = scan_numbers(train.points, min_range_m=train.min_range_m, max_range_m=train.max_range_m)
+    knn = KNNIntensity.chosen(*world_returns(train), scans)
+    metrics = intensity_metrics(knn.predict(x, sensors), measured)
+    row: Row = {"scene": scene.name, "method": "kNN", "k": knn.k, "candidates": knn.candidates, **metrics}
     row["lowest"], row["highest"] = (float(v) for v in (measured.min(), measured.max()))
     if test.simulation is not None:
         row["noise_floor"] = test.simulation.intensity_noise_floor()

@@ -102,7 +102,7 @@ def _real(rows: list[Row], part: dict[str, Any]) -> str:
 
 def _intensity(rows: list[Row], _part: dict[str, Any]) -> str:
     text = (
-        "MAE, in dB. kNN answers with the intensities of the nearest returns. "
+        "MAE, in dB. kNN answers with the intensities of the nearest returns, by settings chosen on the training scans. "
         "The floor is the error of the simulator's intensity without noise."
     )
     return "\n\n".join(["## Intensity", _filled(text), tables.intensity(rows), *_reasons(rows)])

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.io.scans import Scans, write_scans
+from radarsdf.evaluation import KNNIntensity
+from radarsdf.io.scans import Scans, read_scans, write_scans
 
 from .calls import call, refusal
 
@@ -53,6 +54,29 @@ def test_held_out_intensities(map_file, scans_file, capsys):
     assert "F-score" in printed
     for name in ("held-out intensity error", "kNN      intensity error"):
         assert "(3000 returns," in row(printed, name)  # of the scans 0 and 3
+
+
+def test_the_baseline_and_its_choice_see_the_training_scans_alone(map_file, scans_file, capsys, monkeypatch):
+    given = []
+    choose = KNNIntensity.chosen
+
+    def chosen(*arrays):
+        given.append([np.asarray(array) for array in arrays])
+        return choose(*arrays)
+
+    monkeypatch.setattr(KNNIntensity, "chosen", chosen)
+    assert call("eval", map_file, scans_file, *SAMPLES, "--holdout", 3) == 0
+    (points, _, intensities, numbers), *more = given
+    assert more == []
+    scans = read_scans(scans_file)
+    train = scans.select(np.array([1, 2, 4, 5]))
+    np.testing.assert_array_equal(numbers, np.repeat(np.arange(4), [len(scan) for scan in train.points]))
+    np.testing.assert_array_equal(intensities, np.concatenate(train.intensities))
+    moved = [x @ T[:3, :3].T + T[:3, 3] for x, T in zip(train.points, train.poses, strict=True)]
+    np.testing.assert_allclose(points, np.concatenate(moved), atol=1e-4)
+    printed = row(capsys.readouterr().out, "kNN")
+    knn = choose(*given[0])
+    assert printed.endswith(f", {knn.k} of {knn.candidates} neighbours")
 
 
 def test_scans_without_lidar_points(map_file, scene, tmp_path, capsys):

@@ -308,6 +308,103 @@ def test_knn_is_the_weighted_mean_it_says():
     np.testing.assert_allclose(knn.predict(x, at), expected, rtol=1e-9)
 
 
+def seen(kind, rng, scans=24, returns=400):
+    """Returns of scans along y: points, sensors, intensities and scan numbers.
+
+    "fine": the intensity changes within centimetres, so the nearest returns are the best ones. "view": it changes with
+    the angle of view alone.
+    """
+    points = np.column_stack([rng.uniform(0, 3, (scans * returns, 2)), np.zeros(scans * returns)])
+    number = np.repeat(np.arange(scans), returns)
+    sensors = np.column_stack([np.full(len(points), 1.5), number - scans / 2, np.full(len(points), 6.0)])
+    if kind == "fine":
+        intensity = 60 + 10 * np.sin(30 * points[:, 0]) * np.sin(30 * points[:, 1])
+    else:
+        view = (points - sensors) / np.linalg.norm(points - sensors, axis=1, keepdims=True)
+        intensity = 60 + 10 * np.sin(3 * view[:, 1])
+    return points, sensors, intensity + rng.normal(0, 1, len(points)), number
+
+
+@pytest.mark.parametrize("kind", ["fine", "view"])
+def test_knn_chooses_what_suits_the_scene(kind):
+    points, sensors, intensity, number = seen(kind, np.random.default_rng(0))
+    test = np.isin(number, holdout(number, 4)[1])
+    train = points[~test], sensors[~test], intensity[~test]
+    knn = KNNIntensity.chosen(*train, number[~test], max_queries=1000)
+    assert knn.candidates <= 4 if kind == "fine" else knn.candidates >= 128
+
+    def error(baseline):
+        predicted = baseline.predict(points[test], sensors[test])
+        return intensity_metrics(predicted, intensity[test])["mae"]
+
+    errors = {
+        (k, c): error(KNNIntensity(*train, k=k, candidates=c))
+        for k, c in ((1, 1), (4, 4), (16, 16), (16, 20), (4, 64), (16, 256))
+    }
+    assert error(knn) <= 1.02 * min(errors.values())
+    assert error(knn) < 0.8 * errors[16, 20]  # the defaults suit neither scene
+
+
+def test_the_choice_is_that_of_an_inner_hold_out():
+    points, sensors, intensity, number = seen("view", np.random.default_rng(1), scans=6, returns=60)
+    number = number * 7 - 3  # any numbers
+    test = np.isin(number, holdout(number, 3)[1])
+    errors = {}
+    for candidates in (1, 2, 4, 8, 16, 32, 64, 128):  # 240 returns remain
+        for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= candidates):
+            inner = (a[~test] for a in (points, sensors, intensity))
+            knn = KNNIntensity(*inner, k=k, candidates=candidates)
+            predicted = knn.predict(points[test], sensors[test])
+            errors[k, candidates] = np.abs(predicted - intensity[test]).mean()
+    knn = KNNIntensity.chosen(points, sensors, intensity, number, every=3)
+    assert (knn.k, knn.candidates) == min(errors, key=errors.get)
+    whole = KNNIntensity(points, sensors, intensity, k=knn.k, candidates=knn.candidates)  # of all six scans
+    assert (knn.predict(points, sensors + 1) == whole.predict(points, sensors + 1)).all()
+
+
+def test_whole_scans_are_held_out_to_choose():
+    """The returns of one scan share its noise here. Its own returns are no fair neighbours."""
+    points, sensors, _, number = seen("view", np.random.default_rng(2), scans=12)
+    intensity = 60 + np.random.default_rng(3).normal(0, 5, 12)[number]
+    knn = KNNIntensity.chosen(points, sensors, intensity, number)
+    assert (knn.k, knn.candidates) == (32, 32)  # an average over many scans
+    knn = KNNIntensity.chosen(points, sensors, intensity, np.arange(len(points)))  # as if each were a scan
+    assert (knn.k, knn.candidates) != (32, 32)
+
+
+def test_the_choice_is_the_same_for_other_threads_and_orders():
+    scans = seen("view", np.random.default_rng(6), scans=12, returns=100)
+    order = np.random.default_rng(7).permutation(1200)
+    found = [KNNIntensity.chosen(*scans, num_threads=threads) for threads in (1, 1, 2)]
+    found.append(KNNIntensity.chosen(*(a[order] for a in scans)))
+    assert len({(knn.k, knn.candidates) for knn in found}) == 1
+    assert len({knn.predict(*scans[:2]).tobytes() for knn in found[:3]}) == 1
+
+
+def test_a_choice_in_parts_is_the_same(monkeypatch):
+    scans = seen("view", np.random.default_rng(4), returns=100)
+    whole = KNNIntensity.chosen(*scans)
+    monkeypatch.setattr("radarsdf.evaluation.intensity._CHUNK", 3000)
+    parts = KNNIntensity.chosen(*scans)
+    assert (whole.k, whole.candidates) == (parts.k, parts.candidates)
+    assert (whole.predict(*scans[:2]) == parts.predict(*scans[:2])).all()
+
+
+def test_a_choice_from_little_and_bad_input():
+    points, sensors, intensity, number = seen("view", np.random.default_rng(5), scans=2, returns=3)
+    one = KNNIntensity.chosen(points, sensors, intensity, np.zeros(6, int))
+    assert (one.k, one.candidates) == (6, 6)  # the defaults, of so few
+    two = KNNIntensity.chosen(points, sensors, intensity, number)
+    assert two.k <= two.candidates <= 3
+    for scans in (number[:5], number * 1.0, number[:, None], np.ma.masked_equal(number, 0)):
+        with pytest.raises(ValueError, match="scans"):
+            KNNIntensity.chosen(points, sensors, intensity, scans)
+    with pytest.raises(ValueError, match="every"):
+        KNNIntensity.chosen(points, sensors, intensity, number, every=1)
+    with pytest.raises(ValueError, match="max_queries"):
+        KNNIntensity.chosen(points, sensors, intensity, number, max_queries=0)
+
+
 def test_knn_with_few_returns_and_bad_input():
     one = KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0])
     assert one.predict([[9.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [0.0, 0.0, 0.0]).tolist() == [55.0, 55.0]

@@ -122,6 +122,22 @@ def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return lengths
 
 
+def _kept(scan: NDArray[np.float64], min_range_m: float, max_range_m: float | None) -> NDArray[np.bool_]:
+    """Mask (N,) of the returns of a scan (N, 3) within the ranges."""
+    ranges = _lengths(scan)
+    keep = (ranges > 0) & (ranges >= min_range_m)  # a return at the sensor itself has no direction
+    return keep if max_range_m is None else keep & (ranges <= max_range_m)
+
+
+def scan_numbers(
+    points: Sequence[ArrayLike], *, min_range_m: float = 0.0, max_range_m: float | None = None
+) -> NDArray[np.int64]:
+    """Number of the scan that each of the :class:`Rays` of :func:`prepare` comes from, (N,), ascending."""
+    scans, _ = _check_scans(points, None)
+    counts = [np.count_nonzero(_kept(scan, min_range_m, max_range_m)) for scan in scans]
+    return np.repeat(np.arange(len(scans)), counts)
+
+
 def prepare(
     points: Sequence[ArrayLike],
     poses: ArrayLike,
@@ -170,16 +186,14 @@ def prepare(
         else check_positions(real_array(origin, "origin")[None], "origin")[0]
     )
     min_range_m = number(min_range_m, "min_range_m")
-    max_range_m = np.inf if max_range_m is None else number(max_range_m, "max_range_m")
+    max_range_m = None if max_range_m is None else number(max_range_m, "max_range_m")
     whole_number(accumulate_scans, "accumulate_scans", 1)
 
     kept_points, kept_origins, kept_values = [], [], []
     for i, scan in enumerate(scans):
         first = i - i % accumulate_scans
         middle = (first + min(first + accumulate_scans, len(scans)) - 1) // 2
-        ranges = _lengths(scan)
-        # A return at the sensor itself has no direction.
-        keep = (ranges > 0) & (ranges >= min_range_m) & (ranges <= max_range_m)
+        keep = _kept(scan, min_range_m, max_range_m)
         kept = scan if keep.all() else scan[keep]
         local = kept @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
@@ -188,7 +202,7 @@ def prepare(
             kept_values.append(values[i][keep])
     local_points = np.concatenate(kept_points)
     if len(local_points) == 0:
-        msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {max_range_m} m"
+        msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
         raise ValueError(msg)
     rays = local_points - np.concatenate(kept_origins)
     ranges = np.maximum(_lengths(rays), 1e-6)
