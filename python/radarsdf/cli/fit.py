@@ -43,6 +43,7 @@ def run(options: argparse.Namespace) -> None:
     config = config_of(options)
 
     from radarsdf import Interrupted, estimate, fit
+    from radarsdf.cli.saving import save_map
     from radarsdf.io.files import check_outputs
     from radarsdf.io.scans import read_scans
 
@@ -68,10 +69,13 @@ def run(options: argparse.Namespace) -> None:
         )
     except Interrupted as stop:
         if stop.radar_map is not None:
-            stop.radar_map.save(options.out)
-            stop.args = (f"{stop}; the map so far is in {options.out}",)
+            try:
+                save_map(stop.radar_map, options.out)
+                stop.args = (f"{stop}; the map so far is in {options.out}",)
+            except OSError as error:
+                stop.args = (f"{stop}; {error}",)
         raise
-    radar_map.save(options.out)
+    save_map(radar_map, options.out)
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
     print(f"fit {time.perf_counter() - started_s:.1f} s: {radar_map}, written to {options.out}")
