@@ -1,15 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Without a standard error, with a standard output of few characters, with a wrong variable in the environment."""
+"""Standard output and error closed, full or without a reader, or of few characters; a wrong environment variable."""
 
 from __future__ import annotations
 
 import io
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import radarsdf
 import trimesh
@@ -41,38 +43,123 @@ def test_no_standard_error(scene, monkeypatch, stream, progress):
 
 @pytest.fixture
 def files(tmp_path, scene):
-    write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
-    return tmp_path
+    return with_scans(tmp_path, scene)
+
+
+def with_scans(folder, scene):
+    truth = np.column_stack([np.random.default_rng(0).uniform([9, -5], [19, 5], (500, 2)), np.zeros(500)])
+    write_scans(folder / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, truth))
+    return folder
 
 
 def shell(folder, words, **environment):
-    code = "import sys; from radarsdf.cli import main; sys.exit(main())"
-    command = f"{sys.executable} -c '{code}' {words}"
+    return run(folder, f"{sys.executable} -c '{MAIN}' {words}", **environment)
+
+
+def run(folder, command, **environment):
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     return subprocess.run(
         command,
         shell=True,
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": SOURCES} | environment,
+        env=buffered | {"PYTHONPATH": SOURCES} | environment,
         capture_output=True,
         text=True,
         check=False,
     )
 
 
-@POSIX
-def test_a_fit_without_standard_error_keeps_the_map(files):
-    done = shell(files, "fit scans.npz -o map.safetensors --quick 2>&-")
-    assert done.returncode == 0
-    assert "written to map.safetensors" in done.stdout
-    radarsdf.load(files / "map.safetensors")
-    done = shell(files, "fit scans.npz -o map.txt --set nonsense=1 2>&-")
-    assert (done.returncode, done.stdout) == (1, "")
+MAIN = "import sys; from radarsdf.cli import main; sys.exit(main())"
+QUICK = ["--quick", "--set", "training.intensity_iterations=5", "--set", "num_threads=1"]
+COMMANDS = {
+    "info": ["info"],
+    "config": ["config"],
+    "fit": ["fit", "scans.npz", "-o", "map.safetensors", "--holdout", "3", *QUICK],
+    "mesh": ["mesh", "map.safetensors", "-o", "mesh.ply", "--voxel", "0.4"],
+    "eval": ["eval", "map.safetensors", "scans.npz", "--holdout", "3", "--samples", "1000"],
+    "demo": ["demo", "--scene", "wall", "--frames", "3", "--out", "demo", *QUICK],
+    "wrong": ["fit", "scans.npz", "-o", "other.safetensors", "--set", "nonsense=1"],
+}
+DRIVER = """
+import json, os, sys
+from radarsdf.cli import main
+commands, before_each = json.load(open("commands.json"))
+statuses = {}
+for name, words in commands.items():
+    exec(before_each)
+    statuses[name] = main(words)
+json.dump(statuses, open("statuses.json", "w"))
+"""
+FULL = "os.dup2(os.open('/dev/full', os.O_WRONLY), 1)"
+NO_READER = "r, w = os.pipe(); os.close(r); os.dup2(w, 1)"
+
+
+def all_commands(folder, redirections="", before_each=""):
+    """Status, output and errors of all commands, run by one process in the folder."""
+    (folder / "commands.json").write_text(json.dumps([COMMANDS, before_each]))
+    (folder / "driver.py").write_text(DRIVER)
+    done = run(folder, f"{sys.executable} driver.py {redirections}")
+    assert done.returncode == 0, done.stderr
+    return json.loads((folder / "statuses.json").read_text()), done.stdout, done.stderr
+
+
+def check_maps(folder, usual):
+    for name in ("map.safetensors", "demo/map.safetensors"):
+        ours, theirs = radarsdf.load(folder / name).field, radarsdf.load(usual / name).field
+        for value, expected in zip(ours.parameters(), theirs.parameters(), strict=True):
+            assert value.numpy().tobytes() == expected.numpy().tobytes()
+
+
+@pytest.fixture(scope="module")
+def usual(scene, tmp_path_factory):
+    """A folder in which all commands have run, what they printed, and the one error."""
+    folder = with_scans(tmp_path_factory.mktemp("usual"), scene)
+    statuses, printed, said = all_commands(folder)
+    assert statuses == dict.fromkeys(COMMANDS, 0) | {"wrong": 1}
+    return folder, printed, said
 
 
 @POSIX
-def test_a_fit_without_standard_output_keeps_the_map(files):
-    assert shell(files, "fit scans.npz -o map.safetensors --quick >&-").returncode == 0
-    radarsdf.load(files / "map.safetensors")
+@pytest.mark.parametrize("redirections", [">&-", "2>&-", ">&- 2>&-", "2>/dev/full"])
+def test_every_command_without_streams(files, usual, redirections):
+    folder, printed, said = usual
+    statuses, output, errors = all_commands(files, redirections)
+    assert statuses == dict.fromkeys(COMMANDS, 0) | {"wrong": 1}
+    assert errors == ("" if "2>" in redirections else said)
+    found, expected = ([line for line in text.splitlines() if " s" not in line] for text in (output, printed))
+    assert found == (
+        [] if ">&- " in f"{redirections} " and redirections[0] == ">" else expected
+    )  # but for seconds
+    check_maps(files, folder)
+    for name in ("mesh.ply", "demo/mesh.ply"):
+        assert (files / name).read_bytes() == (folder / name).read_bytes()
+
+
+@POSIX
+@pytest.mark.parametrize("before_each", [FULL, NO_READER])
+def test_every_command_with_an_output_that_nothing_can_be_written_to(files, usual, before_each):
+    statuses, _, errors = all_commands(files, before_each=before_each)
+    assert statuses == dict.fromkeys(COMMANDS, 1)
+    *lines, wrong = errors.splitlines(keepends=True)
+    assert wrong == usual[2]
+    assert [line.split(":")[0] for line in lines] == [
+        f"radarsdf {name}" for name in COMMANDS if name != "wrong"
+    ]
+    assert all(line.endswith("'standard output'\n") for line in lines)
+    # The files were written before, but for the demo, which says something before its work.
+    assert (files / "mesh.ply").read_bytes() == (usual[0] / "mesh.ply").read_bytes()
+    assert list((files / "demo").iterdir()) == []
+
+
+@POSIX
+@pytest.mark.parametrize("words", ["config", "--help", "config --help"])
+def test_a_process_whose_output_cannot_be_written_ends_with_one_line(tmp_path, words):
+    done = shell(tmp_path, f"{words} > /dev/full")
+    assert done.returncode == 1
+    assert done.stderr.startswith("radarsdf")
+    assert done.stderr.endswith(": [Errno 28] No space left on device: 'standard output'\n")
+    assert done.stderr.count("\n") == 1
+    assert shell(tmp_path, f"{words} > /dev/full 2>&1").returncode == 1
 
 
 @POSIX

@@ -4,9 +4,13 @@
 
 from __future__ import annotations
 
+import os
+import sys
+
 import pytest
 
 from .calls import FAST, refusal
+from .disks import mounted
 
 
 @pytest.fixture(autouse=True)
@@ -55,3 +59,48 @@ def test_the_mesh_is_not_the_map(map_file, tmp_path, capsys):
     path = tmp_path / "mesh.ply"
     path.symlink_to(map_file)
     assert "same file" in refusal(capsys, tmp_path, "mesh", map_file, "-o", path)
+
+
+@pytest.fixture(params=["read-only", "below a file"])
+def closed_folder(request, tmp_path):
+    """A folder in which nothing can be written."""
+    if request.param == "below a file":
+        (tmp_path / "file").write_bytes(b"")
+        yield tmp_path / "file"
+        return
+    if sys.platform == "win32":
+        pytest.skip("permissions of POSIX")
+    folder = tmp_path / "closed"
+    folder.mkdir()
+    if os.geteuid() == 0:  # whom no permission stops
+        with mounted(folder, "ro"):
+            yield folder
+    else:
+        folder.chmod(0o500)
+        yield folder
+        folder.chmod(0o700)
+
+
+@pytest.mark.parametrize(
+    ("command", "outputs"),
+    [
+        ("fit", {"-o": "closed"}),
+        ("fit", {"-o": "open", "--checkpoint": "closed"}),
+        ("mesh", {"-o": "closed"}),
+        ("mesh", {"-o": "open", "--picture": "closed"}),
+        ("demo", {"--out": "closed"}),
+        ("demo", {"--out": "closed/new"}),
+    ],
+)
+def test_a_folder_in_which_nothing_can_be_written(
+    scans_file, map_file, tmp_path, capsys, monkeypatch, closed_folder, command, outputs
+):
+    monkeypatch.setattr("radarsdf.simulate.worlds.hugin", lambda **_: pytest.fail("the work began"))
+    words = {"fit": [scans_file, *FAST], "mesh": [map_file], "demo": ["--frames", 4, *FAST]}[command]
+    for option, where in outputs.items():
+        folder = tmp_path if where == "open" else closed_folder
+        name = {"--out": "", "-o": f"out.{'ply' if command == 'mesh' else 'safetensors'}"}.get(
+            option, "other"
+        )
+        words += [option, folder / where.removeprefix("closed/") if "/" in where else folder / name]
+    assert str(closed_folder) in refusal(capsys, tmp_path, command, *words)

@@ -15,6 +15,7 @@ import radarsdf
 from radarsdf.io.files import write_whole
 
 from .calls import FAST, call, files
+from .disks import mounted
 
 
 @pytest.fixture
@@ -150,3 +151,20 @@ def test_the_map_of_the_demo_is_written_before_what_may_fail(out, monkeypatch, c
     monkeypatch.setattr(radarsdf.RadarMap, "mesh", mesh)
     assert "too large" in failure(capsys, "demo", "--frames", 4, "--out", out.parent, *FAST)
     radarsdf.load(out)
+
+
+@pytest.mark.parametrize("command", ["fit", "mesh", "demo"])
+def test_a_small_disk(scans_file, map_file, out, spare, capsys, command):
+    mesh = out.with_name("mesh.ply")
+    words = {
+        "fit": [scans_file, "-o", out, *FAST],
+        "mesh": [map_file, "-o", mesh, "--voxel", 0.2],
+        "demo": ["--frames", 4, "--out", out.parent, *FAST],
+    }[command]
+    with mounted(out.parent, "size=8k"):
+        said = failure(capsys, command, *words)
+        assert os.strerror(errno.ENOSPC) in said
+        assert str(mesh if command == "mesh" else out) in said
+        assert files(out.parent) == []
+    if command != "mesh":
+        kept_in(spare, said)

@@ -16,6 +16,8 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
+from radarsdf.cli.saying import complain, say
+
 COMMANDS = {
     "demo": "simulate a drive, fit it, write scans, map, mesh and picture, print the errors",
     "fit": "fit a map to scans",
@@ -55,7 +57,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout, "reconfigure"
     ):  # a character that a terminal lacks must not cost the work before it
         sys.stdout.reconfigure(errors="replace")
-    options = _parser(words).parse_args(words)
+    try:
+        options = _parser(words).parse_args(words)
+    except SystemExit:
+        try:
+            say(end="")  # what help printed may still be on its way
+        except OSError as error:
+            return _failed("", str(error), 1)
+        raise
     try:
         _module(options.command).run(options)
     except _ERRORS as error:
@@ -90,6 +99,5 @@ def _interrupted(command: str, interruption: KeyboardInterrupt) -> int:
 
 
 def _failed(command: str, message: str, status: int) -> int:
-    if sys.stderr is not None:  # print would take None for standard output
-        print(f"radarsdf {command}: {message}", file=sys.stderr)
+    complain(f"{f'radarsdf {command}'.strip()}: {message}")
     return status

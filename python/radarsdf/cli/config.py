@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 
 from radarsdf.cli.options import add_config_options, config_of
+from radarsdf.cli.saying import say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,4 +19,4 @@ def run(options: argparse.Namespace) -> None:
     """Print the configuration."""
     from radarsdf.config_toml import to_toml
 
-    print(to_toml(config_of(options)), end="")
+    say(to_toml(config_of(options)), end="")

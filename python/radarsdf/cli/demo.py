@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from radarsdf.cli.options import add_fit_options, config_of, progress_of
+from radarsdf.cli.saying import say
 
 SCENES = ("hugin", "oculii", "wall")
 """The names in `radarsdf.simulate.SCENES`, which is not imported for a help text."""
@@ -46,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     simulation = radarsdf.simulate.SCENES[options.scene](frames=options.frames)
     scans = Scans(simulation.points, simulation.poses, simulation.intensities, simulation.ground_truth)
     train, test = holdout(len(scans.points))
-    print(f"simulated {options.scene}: {sum(map(len, scans.points))} returns in {len(scans.points)} scans")
+    say(f"simulated {options.scene}: {sum(map(len, scans.points))} returns in {len(scans.points)} scans")
 
     started_s = time.perf_counter()
     kept = scans.select(train)
@@ -56,10 +57,10 @@ def run(options: argparse.Namespace) -> None:
     started_s = time.perf_counter()
     viewpoint = scans.poses[len(scans.poses) // 2, :3, 3]
     mesh = radar_map.mesh(viewpoint=viewpoint, progress=progress_of(options))
-    print(f"fit {fit_s:.1f} s, mesh {time.perf_counter() - started_s:.1f} s: {radar_map}")
+    say(f"fit {fit_s:.1f} s, mesh {time.perf_counter() - started_s:.1f} s: {radar_map}")
 
     if scans.ground_truth is not None:
-        print(format_metrics(surface_metrics(mesh, scans.ground_truth, samples=1_000_000)))
+        say(format_metrics(surface_metrics(mesh, scans.ground_truth, samples=1_000_000)))
     print_intensity_errors(radar_map, scans.select(test), kept)
 
     write_scans(options.out / "scans.npz", scans)
@@ -69,5 +70,5 @@ def run(options: argparse.Namespace) -> None:
         save_picture(options.out / "picture.png", mesh, scalar=mesh.vertex_attributes["intensity"])
         files.append("picture.png")
     except ImportError as error:  # Matplotlib is optional
-        print(f"no picture: {error}")
-    print("wrote " + ", ".join(str(options.out / name) for name in files))
+        say(f"no picture: {error}")
+    say("wrote " + ", ".join(str(options.out / name) for name in files))

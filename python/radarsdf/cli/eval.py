@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from radarsdf.cli.options import add_box, box_of
+from radarsdf.cli.saying import say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -56,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
     if ground_truth is not None:
         mesh = radar_map.mesh() if radar_map else read_mesh(options.what)
         metrics = surface_metrics(mesh, ground_truth, box=box_of(options), samples=options.samples)
-        print(format_metrics(metrics))
+        say(format_metrics(metrics))
     if options.holdout is not None and radar_map is not None and scans is not None:
         train, test = holdout(len(scans.points), options.holdout)
         print_intensity_errors(radar_map, scans.select(test), scans.select(train))

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from radarsdf.cli.options import add_fit_options, config_of, progress_of
+from radarsdf.cli.saying import say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
         scans = scans.select(holdout(len(scans.points), options.holdout)[0])
     intensities = None if options.geometry_only else scans.intensities
     if options.dry_run:
-        print(estimate(scans.points, scans.poses, intensities, config=config))
+        say(str(estimate(scans.points, scans.poses, intensities, config=config)))
         return
     started_s = time.perf_counter()
     try:
@@ -78,4 +79,4 @@ def run(options: argparse.Namespace) -> None:
     save_map(radar_map, options.out)
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
-    print(f"fit {time.perf_counter() - started_s:.1f} s: {radar_map}, written to {options.out}")
+    say(f"fit {time.perf_counter() - started_s:.1f} s: {radar_map}, written to {options.out}")

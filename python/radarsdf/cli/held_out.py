@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from radarsdf.cli.saying import say
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.returns.rays import prepare, scan_numbers
 
@@ -29,12 +30,12 @@ def print_intensity_errors(radar_map: RadarMap, test: Scans, train: Scans) -> No
     if not radar_map.has_intensity or test.intensities is None:
         return
     x, sensors, measured = _in_world(test, radar_map.config)
-    print("held-out " + format_metrics(intensity_metrics(radar_map.intensity(x, sensors), measured)))
+    say("held-out " + format_metrics(intensity_metrics(radar_map.intensity(x, sensors), measured)))
     returns = radar_map.config.returns
     scans = scan_numbers(train.points, min_range_m=returns.min_range_m, max_range_m=returns.max_range_m)
     knn = KNNIntensity.chosen(*_in_world(train, radar_map.config), scans)
     metrics = intensity_metrics(knn.predict(x, sensors), measured)
-    print(f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours")
+    say(f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours")
 
 
 def _in_world(scans: Scans, config: FitConfig) -> tuple[Any, Any, Any]:

@@ -7,6 +7,8 @@ from __future__ import annotations
 import argparse
 import platform
 
+from radarsdf.cli.saying import say
+
 
 def add_arguments(_: argparse.ArgumentParser) -> None:
     """The command has no arguments."""
@@ -28,4 +30,4 @@ def run(_: argparse.Namespace) -> None:
         "instruction set": f"{_core.instruction_set()} of {', '.join(_core.available_instruction_sets())}",
     }
     for name, value in rows.items():
-        print(f"{name:<16}{value}")
+        say(f"{name:<16}{value}")

@@ -8,6 +8,7 @@ import argparse
 from pathlib import Path
 
 from radarsdf.cli.options import add_box, add_quiet, box_of, progress_of
+from radarsdf.cli.saying import say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,9 +76,9 @@ def run(options: argparse.Namespace) -> None:
         msg = f"{options.map} has no surface here: nothing written"
         raise ValueError(msg)
     origin = write_mesh(options.out, mesh)
-    print(f"{len(mesh.vertices)} vertices and {len(mesh.faces)} triangles written to {options.out}")
+    say(f"{len(mesh.vertices)} vertices and {len(mesh.faces)} triangles written to {options.out}")
     if origin is not None:
-        print(f"in a local frame, whose origin is in {origin_path(options.out)}")
+        say(f"in a local frame, whose origin is in {origin_path(options.out)}")
     if options.picture:
         save_picture(options.picture, mesh, scalar=mesh.vertex_attributes.get("intensity"))
-        print(f"picture written to {options.picture}")
+        say(f"picture written to {options.picture}")

@@ -9,6 +9,7 @@ import os
 import secrets
 import stat
 from collections.abc import Iterable
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 
@@ -61,7 +62,8 @@ def check_outputs(
             raise ValueError(msg)
         taken[target] = path
         _check_target(Path(target), path)
-        _, temporary = _open_beside(Path(target))
+        descriptor, temporary = _open_beside(Path(target))
+        os.close(descriptor)
         temporary.unlink()
 
 
@@ -89,8 +91,13 @@ def write_whole(path: str | PathLike[str], data: bytes) -> None:
         if mode is not None:
             temporary.chmod(mode)
         temporary.replace(target)
+    except OSError as error:
+        _remove(temporary)
+        if error.errno is None:  # not of the system: its message is all there is
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error  # a full disk names no file
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        _remove(temporary)
         raise
 
 
@@ -115,4 +122,12 @@ def _open_beside(target: Path) -> tuple[int, Path]:
     temporary = target.with_name(f".{target.name[:_MAX_PART_OF_NAME]}.{secrets.token_hex(8)}")
     # Not tempfile: only the owner may read its files, and the rename would keep that.
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-    return os.open(temporary, flags, 0o666), temporary
+    try:
+        return os.open(temporary, flags, 0o666), temporary
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(target)) from error
+
+
+def _remove(temporary: Path) -> None:
+    with suppress(OSError):  # its folder may be gone, or the disk; the first error says so
+        temporary.unlink()
