@@ -263,6 +263,9 @@ class RadarMap:
         With `rows`, a single position (3,) is repeated so many times.
         """
         is_tensor = isinstance(x, Tensor)
+        if is_tensor and (x.device.type != "cpu" or x.layout != torch.strided):
+            msg = f"positions must be a dense tensor on the CPU, not {x.layout} on {x.device}"
+            raise TypeError(msg)
         # Read-only arrays are copied, because PyTorch warns of them.
         world = (
             x.detach()
