@@ -128,6 +128,6 @@ def test_the_surface_is_where_the_returns_are(scans, name):
     ):
         pytest.skip(f"{name}: {done.why_not}")
     assert done.mesh is not None, done.why_not
-    distance_m = scans.scene.distance(done.mesh.triangles_center)
+    distance_m = np.abs(scans.scene.signed_distance(done.mesh.triangles_center))
     assert np.median(np.abs(distance_m)) < 0.15
     assert (done.map_bytes is not None) == (name == "VDBFusion")

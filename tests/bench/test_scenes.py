@@ -43,7 +43,11 @@ def test_every_nth_takes_the_simulation_along(wall):
     assert_array_equal(third.intensities[1], wall.intensities[3])
     assert_array_equal(third.poses, wall.poses[[0, 3]])
     assert third.ground_truth is wall.ground_truth
-    assert third.simulation.is_surface().size == third.simulation.num_returns == sum(map(len, third.points))
+    assert (
+        third.simulation.is_surface().size
+        == len(third.simulation.world_points())
+        == sum(map(len, third.points))
+    )
     assert_array_equal(third.simulation.noiseless_intensities[1], wall.simulation.noiseless_intensities[3])
     with pytest.raises(ValueError, match="n must be at least 1, not 0"):
         wall.every_nth(0)

@@ -56,7 +56,7 @@ def test_hits_lie_on_the_surface_and_nothing_lies_before_them(mixed_scene):
     np.testing.assert_allclose(np.linalg.norm(hits.normals[seen], axis=1), 1.0)
     assert (np.einsum("ni,ni->n", hits.normals[seen], directions[seen]) < 0).all()
     points = origin + hits.range_m[seen, None] * directions[seen]
-    assert mixed_scene.distance(points).max() < 1e-7
+    assert np.abs(mixed_scene.signed_distance(points)).max() < 1e-7
     # A millimetre-high crest of the ground may be skipped, a solid may not.
     before = (
         origin + (rng.uniform(0, 0.999, size=seen.sum()) * hits.range_m[seen])[:, None] * directions[seen]
@@ -132,14 +132,14 @@ def test_arrays_agree(simulation):
         assert (points.dtype, intensities.dtype, noiseless.dtype) == (np.float32, np.float32, np.float32)
         assert kind.dtype == np.int8
         np.testing.assert_array_equal(np.isnan(noiseless), kind != sim.Origin.SURFACE)
-    assert simulation.world_points().shape == (simulation.num_returns, 3)
+    assert simulation.world_points().shape == (sum(map(len, simulation.points)), 3)
     assert simulation.poses.dtype == simulation.ground_truth.dtype == np.float64
 
 
 def test_true_returns_lie_near_the_surface(simulation):
     """Nearer than the position noise of each return allows: 5 sigma along, and across the beam."""
     sensor, surface = simulation.sensor, simulation.is_surface()
-    distance = simulation.scene.distance(simulation.world_points()[surface])
+    distance = np.abs(simulation.scene.signed_distance(simulation.world_points()[surface]))
     range_m = np.linalg.norm(np.concatenate(simulation.points)[surface], axis=1)
     across = np.hypot(sensor.sigma_azimuth_rad, sensor.sigma_elevation_rad)
     sigma = np.hypot(sensor.sigma_range_m, across * range_m)
@@ -163,8 +163,9 @@ def test_intensities_respect_the_sensor(simulation):
 def test_lidar_lies_on_what_the_radar_could_see(simulation):
     truth, sensor = simulation.ground_truth, simulation.sensor
     assert len(truth) > 20_000
-    assert simulation.scene.distance(truth).max() < 0.055
-    assert simulation.scene.distance(truth).mean() < 0.01
+    distance = np.abs(simulation.scene.signed_distance(truth))
+    assert distance.max() < 0.055
+    assert distance.mean() < 0.01
     seen = np.zeros(len(truth), dtype=bool)
     for T in simulation.poses:
         local = (truth - T[:3, 3]) @ T[:3, :3]
@@ -186,8 +187,9 @@ def test_same_seed_same_bits_other_seed_other_layout(simulation):
             np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(simulation.ground_truth, again.ground_truth)
     probe = np.random.default_rng(0).uniform([-5, -8, 0], [40, 8, 3], size=(200, 3))
-    np.testing.assert_array_equal(simulation.scene.distance(probe), again.scene.distance(probe))
-    assert np.mean(np.abs(simulation.scene.distance(probe) - other.scene.distance(probe)) > 0.01) > 0.3
+    first, same, changed = (np.abs(s.scene.signed_distance(probe)) for s in (simulation, again, other))
+    np.testing.assert_array_equal(first, same)
+    assert np.mean(np.abs(first - changed) > 0.01) > 0.3
 
 
 def test_clutter_does_not_change_the_other_returns():
@@ -376,6 +378,6 @@ def test_impossible_materials_and_frames_are_refused():
 
 def test_an_empty_world_returns_nothing():
     simulation = sim.simulate(sim.Scene([]), QUIET, np.eye(4)[None], name="void")
-    assert simulation.num_returns == 0
+    assert simulation.world_points().shape == (0, 3)
     assert simulation.ground_truth.shape == (0, 3)
     assert np.isnan(simulation.intensity_noise_floor())

@@ -123,10 +123,6 @@ class Scene:
                 best[i : i + _CHUNK] = np.minimum(best[i : i + _CHUNK], part.signed_distance(piece))
         return best
 
-    def distance(self, points: ArrayLike) -> FloatArray:
-        """Absolute distance (N,), m, of world points (N, 3) to the nearest surface."""
-        return np.abs(self.signed_distance(points))
-
     def echo_db(self, points: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
         """Strength of the echo of each hit, without the loss by range.
 

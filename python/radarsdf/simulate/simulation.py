@@ -45,13 +45,8 @@ class Simulation:
         """Number of scans."""
         return len(self.points)
 
-    @property
-    def num_returns(self) -> int:
-        """Number of returns in all scans, false ones included."""
-        return sum(len(points) for points in self.points)
-
     def world_points(self) -> FloatArray:
-        """All returns, (num_returns, 3) float64, world frame, m, in the order of the scans."""
+        """All returns, false ones included: (N, 3) float64, world frame, m, in the order of the scans."""
         moved = [
             p.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
             for p, T in zip(self.points, self.poses, strict=True)
@@ -59,7 +54,7 @@ class Simulation:
         return np.concatenate(moved)
 
     def is_surface(self) -> NDArray[np.bool_]:
-        """Mask of the returns from a surface, (num_returns,) bool, in the order of `world_points`."""
+        """Mask of the returns from a surface, (N,) bool, in the order of `world_points`."""
         surface: NDArray[np.bool_] = np.concatenate(self.origin_kind) == Origin.SURFACE
         return surface
 
