@@ -41,7 +41,7 @@ WHOLE = {
     "training.intensity_iterations": (1, MAX_COUNT, 0, MAX_COUNT + 1),
 }
 REAL = {
-    "leaf_size_m": (TINY, LARGE, 0.0, None),
+    "leaf_size_m": (TINY, 1e6, 0.0, 1.1e6),
     "effort": (TINY, 1000.0, 0.0, 1000.1),
     "returns.min_range_m": (0.0, LARGE, -0.1, None),
     "returns.max_range_m": (2.6, LARGE, 2.5, None),  # of which the default's least range is the limit
@@ -208,6 +208,10 @@ def test_limits_are_those_of_the_core():
         ({"training": {"bar": 1}}, "unknown setting training.bar"),
         ({"bar": 1}, "unknown setting bar"),
         ({"sdf_iterations": 1}, "unknown setting sdf_iterations"),
+        ({"self": 1}, "unknown setting self"),
+        ({"x" * 999: 1}, f"unknown setting {'x' * 50}"),
+        ({"training": {"x" * 999: 1}}, f"unknown setting training.{'x' * 50}"),
+        ({"training": {1: 2}}, "training must have names as keys, not 1"),
         ({"returns": {"max_range_m": 1.0}}, "returns.max_range_m must exceed min_range_m, 2.5, not 1.0"),
         (
             {"training": {"start": "average"}},
@@ -220,6 +224,14 @@ def test_messages(values, message):
         with pytest.raises(ValueError, match=r".") as caught:
             make(**values)
         assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("values", [[1], None, "seed", [("seed", 1)], {1: 2}, {None: {}}, {("seed",): 1}])
+def test_what_is_no_mapping_of_names(values):
+    with pytest.raises(
+        ValueError, match=r"^the settings must (be a mapping of names to values|have names as keys), not "
+    ):
+        FitConfig.from_dict(values)
 
 
 @pytest.mark.parametrize("group", GROUPS)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from radarsdf.settings import settings
+from radarsdf.settings import by_name, settings
 
 MAX_LEVELS = 12  # levels of cells that the compiled core allows; a test compares the two numbers
 MAX_FREQUENCIES = 24  # Fourier frequencies that the compiled core allows; likewise
@@ -30,6 +30,7 @@ _MAX_WIDTH = 4096  # units of a layer: far more than a map of a scene can use
 
 _Positive = Annotated[float, Field(gt=0)]
 _NotNegative = Annotated[float, Field(ge=0)]
+_Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
 _Count = Annotated[int, Field(ge=1, le=MAX_ITERATIONS)]
 _Dropout = Annotated[float, Field(ge=0, le=0.95)]
 _Widths = Annotated[
@@ -193,7 +194,8 @@ _Group = ReturnsConfig | EncodingConfig | NetworksConfig | SamplingConfig | Trai
 
 def _from_mapping(group: Any) -> Callable[[Any], Any]:
     """A validator that also accepts a dict of the group's settings."""
-    return lambda value: group(**value) if isinstance(value, Mapping) else value
+    name = group.__name__.removesuffix("Config").lower()
+    return lambda value: group(**by_name(value, name)) if isinstance(value, Mapping) else value
 
 
 @settings
@@ -215,7 +217,7 @@ class FitConfig:
     (200, 0.45)
     """
 
-    leaf_size_m: _Positive = 0.2
+    leaf_size_m: _Length = 0.2
     """Edge of a leaf cell, m (3QFPI: 0.2). It is the unit of all settings in `_cells`."""
     effort: Annotated[float, Field(gt=0, le=1000)] = 1.0
     """Multiplies the iterations that follow from the size of the data. 0.5 takes about half the time."""
@@ -345,7 +347,7 @@ class FitConfig:
             ),
         ).override(**changes)
 
-    def override(self, **changes: Any) -> FitConfig:
+    def override(self, /, **changes: Any) -> FitConfig:
         """This configuration with some settings changed.
 
         Parameters
@@ -363,7 +365,7 @@ class FitConfig:
             group = getattr(self, name, None)
             if isinstance(group, _Group) and isinstance(value, Mapping):
                 own = {field.name: getattr(group, field.name) for field in dataclasses.fields(group)}
-                merged[name] = type(group)(**(own | dict(value)))
+                merged[name] = type(group)(**(own | by_name(value, name)))
             else:
                 merged[name] = value
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
@@ -376,4 +378,4 @@ class FitConfig:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> FitConfig:
         """The inverse of :meth:`to_dict`. Missing settings have defaults; unknown ones raise a ValueError."""
-        return cls().override(**values)
+        return cls().override(**by_name(values, "the settings"))

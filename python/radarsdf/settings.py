@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, cast
 
 from pydantic import ConfigDict, ValidationError
@@ -14,6 +14,18 @@ from pydantic.dataclasses import dataclass
 from typing_extensions import dataclass_transform
 
 _Class = TypeVar("_Class", bound=type)
+
+
+def by_name(values: Any, what: str) -> dict[str, Any]:
+    """`values` as a dict of settings by name. A ValueError says if they are none."""
+    if not isinstance(values, Mapping):
+        msg = f"{what} must be a mapping of names to values, not {values!r:.50}"
+        raise ValueError(msg)  # noqa: TRY004 - of settings, a wrong type is a wrong value: see FitConfig
+    for name in values:
+        if not isinstance(name, str):
+            msg = f"{what} must have names as keys, not {name!r:.50}"
+            raise ValueError(msg)  # noqa: TRY004
+    return dict(values)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -26,7 +38,11 @@ def settings(cls: _Class) -> _Class:
     prefix = "" if group == "fit" else f"{group}."
 
     @functools.wraps(construct)
-    def with_short_errors(self: Any, **values: Any) -> None:
+    def with_short_errors(self: Any, /, **values: Any) -> None:
+        for name in values:
+            if name not in cls.__annotations__:
+                msg = f"unknown setting {prefix}{name:.50}"
+                raise ValueError(msg)
         try:
             construct(self, **values)
         except ValidationError as error:
@@ -34,8 +50,6 @@ def settings(cls: _Class) -> _Class:
             name = prefix + ".".join(part for part in first["loc"] if isinstance(part, str))
             if first["type"] == "value_error":  # of a check of ours or of a group: its message is complete
                 msg = first["msg"].removeprefix("Value error, ")
-            elif first["type"] == "unexpected_keyword_argument":
-                msg = f"unknown setting {name}"
             else:
                 must = re.sub(r"^\w+ should", "must", first["msg"])
                 msg = f"{name} {must}, not {first['input']!r:.50}"

@@ -85,6 +85,10 @@ def test_a_file_that_makes_no_sense(tmp_path, text, said):
     [
         ("seed", "--set takes NAME=VALUE, not 'seed'"),
         ("colour=1", "unknown setting colour"),
+        ("self=1", "unknown setting self"),
+        ("x" * 99, f"--set takes NAME=VALUE, not '{'x' * 49}"),
+        ("training={1: 2}", "training must have names as keys, not 1"),
+        ("leaf_size_m=1e300", "leaf_size_m must be less than or equal to 1000000, not 1e+300"),
         ("training.colour=1", "unknown setting training.colour"),
         ("colour.seed=1", "unknown setting colour"),
         ("seed.a=1", "seed must be a valid integer, not {'a': 1}"),

@@ -90,6 +90,16 @@ def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
         radar_map.intensity(np.zeros((1, 3)), np.zeros(3))
 
 
+@pytest.mark.parametrize(("effort", "why"), [(1.0, "the others were enough"), (0.05, "effort is 0.05")])
+def test_why_samples_were_left_out(scene, monkeypatch, effort, why):
+    monkeypatch.setattr("radarsdf.budget.schedule._LEAST_SDF_ITERATIONS", 10)
+    monkeypatch.setattr("radarsdf.budget.schedule._MOST_SAMPLES_PER_VERTEX", 8.0)
+    config = FitConfig(effort=effort, num_threads=1)
+    skipped = radarsdf.fit(scene.points, scene.poses, config=config, progress=False).report["skipped"]
+    (said,) = (words for words in skipped if "of the samples" in words)
+    assert said.endswith(f" of the samples: {why}")
+
+
 def test_utm_coordinates_change_nothing():
     offset = np.array([5e5, 5.4e6, 300.0])
     near, far = (

@@ -65,7 +65,7 @@ def _setting(text: str) -> dict[str, Any]:
     """One ``NAME=VALUE`` or ``GROUP.NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
     path, equals, value = text.partition("=")
     if not equals:
-        msg = f"--set takes NAME=VALUE, not {text!r}"
+        msg = f"--set takes NAME=VALUE, not {text!r:.50}"
         raise ValueError(msg)
     group, dot, name = path.partition(".")
     try:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FORMAT = "radarsdf.checkpoint"
 _EVERY_S = 30.0  # seconds between two files, at least
+_NONE = object()  # where one of two configurations lacks a setting
 _SHARE = 0.02  # largest share of the time that is spent on writing
 _SETTINGS_NOT_COMPARED = ("num_threads", "max_memory_bytes")  # another number of threads shows in the tensors
 
@@ -138,13 +139,26 @@ class Checkpoint:
             )
             raise ValueError(msg)
         if identity["config"] != self._identity["config"]:
-            ours, theirs = self._identity["config"], identity["config"]
-            names = sorted(k for k in ours.keys() | theirs.keys() if ours.get(k) != theirs.get(k))
+            ours, theirs = _flat(self._identity["config"]), _flat(identity["config"])
+            names = sorted(
+                k for k in ours.keys() | theirs.keys() if ours.get(k, _NONE) != theirs.get(k, _NONE)
+            )
             msg = f"{self._path} is a checkpoint of another configuration: {', '.join(names)!s:.200} differ"
             raise ValueError(msg)
         if identity["scans"] != self._identity["scans"]:
             msg = f"{self._path} is a checkpoint of other scans, poses or intensities"
             raise ValueError(msg)
+
+
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings by names such as training.learning_rate."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            flat |= {f"{name}.{own}": inner for own, inner in value.items()}
+        else:
+            flat[name] = value
+    return flat
 
 
 def _digest(rays: Rays) -> str:

@@ -181,7 +181,8 @@ def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None
             f"the {name}, which the intensity network does not use" for name, used in unused if not used
         ]
     if training.passes < 1 and config.training.sdf_iterations is None:
-        skipped.append(f"{1 - training.passes:.0%} of the samples: the others were enough")
+        why = "the others were enough" if config.effort >= 1 else f"effort is {config.effort:g}"
+        skipped.append(f"{1 - training.passes:.0%} of the samples: {why}")
     if training.moves_rows and training.iterations["sdf"] > 0:
         skipped.append("in each iteration, updates of features that its samples did not use")
     return skipped
