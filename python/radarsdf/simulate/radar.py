@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A radar sensor: radar equation, speckle, noise in range and angle, detection threshold, clutter and ghosts."""
+"""A radar sensor: radar equation, speckle, noise in range and angle, detection threshold and false returns."""
 
 from __future__ import annotations
 
@@ -24,10 +24,15 @@ FloatArray = NDArray[np.float64]
 _OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, not to hit it again
 _MAX_BEAMS = 10**7  # in a scan; their rays take some gigabytes
 _LARGEST = 1e9  # limit of all settings: sums and products of such numbers do not overflow
+_NOT_NEGATIVE = (
+    "sigma_range_m", "sigma_range_per_m", "sigma_azimuth_rad", "sigma_elevation_rad", "weak_noise", "sigma_power_db",
+    "step_db", "clutter_per_scan", "clutter_power_db", "sidelobe_loss_db",
+)  # fmt: skip
+_SHARES = ("clutter_near_share", "clutter_beyond_share", "ghost_share", "sidelobe_share")
 _MIN_LEG_M = 0.01  # shorter paths from a mirror to the next surface are no reflection
 # Separate streams of random numbers within a scan: more clutter, for example, must not change the noise of the surface
 # returns.
-_BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER = range(6)
+_BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER, _SIDELOBES = range(7)
 
 
 class Origin(IntEnum):
@@ -36,6 +41,7 @@ class Origin(IntEnum):
     SURFACE = 0
     CLUTTER = 1
     GHOST = 2
+    SIDELOBE = 3
 
 
 class Scan(NamedTuple):
@@ -78,6 +84,14 @@ class RadarSensor:
     speckle + noise. Speckle is the fading of ``Material.looks`` independent scatterers: a Gamma distribution, with its
     median at 0 dB.
 
+    The standard deviation of a position is √(``sigma_range_m``² + (``sigma_range_per_m`` · range)²) along the beam, and
+    ``sigma_azimuth_rad`` · range and ``sigma_elevation_rad`` · range across it. Each is multiplied by
+    √(1 + ``weak_noise``² · threshold power / power of the return). So a weak return is the worst, and a strong one has
+    the standard deviations of the sensor; the part of weak returns falls as the Cramér-Rao bound does.
+
+    There are three kinds of false returns: clutter, ghosts of mirroring surfaces, and echoes in the side lobes of the
+    antenna, which have the range and the azimuth of a surface and any elevation.
+
     Raises
     ------
     ValueError
@@ -89,17 +103,25 @@ class RadarSensor:
     beams: int = 3000  # directions in a scan, a jittered grid over the field of view; 1..10^7
     min_range_m: float = 0.5  # there are no nearer returns [m], > 0
     max_range_m: float = 60.0  # there are no farther returns [m], > min_range_m
-    sigma_range_m: float = 0.04  # standard deviation along the beam [m]
+    sigma_range_m: float = 0.04  # standard deviation along the beam, near the sensor [m]
+    sigma_range_per_m: float = 0.0  # its growth, in squares, with the range [m/m]
     sigma_azimuth_rad: float = 0.004  # standard deviation of the azimuth [rad]
     sigma_elevation_rad: float = 0.006  # standard deviation of the elevation [rad]
+    weak_noise: float = 0.0  # further noise of a return at the threshold, as a multiple of these, >= 0
     sigma_power_db: float = 1.0  # standard deviation of the receiver's noise, besides speckle [dB]
     gain_db: float = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
     threshold_db: float = 64.0  # weaker returns are not detected [dB]
     floor_db: float = -np.inf  # lower limit of the intensities, to which weaker ones are clipped [dB]
     saturation_db: float = 118.0  # upper limit of the intensities, to which stronger ones are clipped [dB]
     step_db: float = 0.1  # intensities are multiples of this [dB], >= 0; 0: continuous
-    clutter_per_scan: float = 0.0  # expected number of false returns in free space, >= 0
+    clutter_per_scan: float = 0.0  # expected number of returns of no surface, before detection, >= 0
+    clutter_near_share: float = 0.5  # share of them near the sensor; the rest is uniform along the beam, 0..1
+    clutter_beyond_share: float = 0.0  # share of the rest behind the first surface instead of before it, 0..1
+    clutter_power_db: float = 3.0  # mean of their power above the threshold [dB], >= 0
     ghost_share: float = 0.0  # share of the beams on mirroring surfaces that can give a ghost, 0..1
+    sidelobe_share: float = 0.0  # share of the surface echoes seen once more, in a false elevation, 0..1
+    sidelobe_fov_rad: float = 0.52  # full height of the false elevations, uniform in their sine [rad], 0..π
+    sidelobe_loss_db: float = 0.0  # loss of such an echo [dB], >= 0
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -115,16 +137,20 @@ class RadarSensor:
         if not (0 < self.azimuth_fov_rad <= 2 * np.pi and 0 < self.elevation_fov_rad <= np.pi):
             msg = "the field of view must be within (0, 2π] in azimuth and (0, π] in elevation"
             raise ValueError(msg)
+        if not 0 < self.sidelobe_fov_rad <= np.pi:
+            msg = f"sidelobe_fov_rad must be within (0, π], not {self.sidelobe_fov_rad}"
+            raise ValueError(msg)
         if not 0 < self.min_range_m < self.max_range_m < np.inf:
             msg = f"need 0 < min_range_m < max_range_m, not {self.min_range_m} and {self.max_range_m}"
             raise ValueError(msg)
-        sigmas = (self.sigma_range_m, self.sigma_azimuth_rad, self.sigma_elevation_rad, self.sigma_power_db)
-        if not all(value >= 0 for value in (*sigmas, self.step_db, self.clutter_per_scan)):
-            msg = "standard deviations, step_db and clutter_per_scan must not be negative"
-            raise ValueError(msg)
-        if not 0 <= self.ghost_share <= 1:
-            msg = f"ghost_share must be in [0, 1], not {self.ghost_share}"
-            raise ValueError(msg)
+        for name in _NOT_NEGATIVE:
+            if getattr(self, name) < 0:
+                msg = f"{name} must not be negative, not {getattr(self, name)}"
+                raise ValueError(msg)
+        for name in _SHARES:
+            if not 0 <= getattr(self, name) <= 1:
+                msg = f"{name} must be in [0, 1], not {getattr(self, name)}"
+                raise ValueError(msg)
         if not self.saturation_db > max(self.threshold_db, self.floor_db):
             msg = "saturation_db must be above threshold_db and floor_db"
             raise ValueError(msg)
@@ -150,10 +176,12 @@ class RadarSensor:
         R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
         directions = unit_vectors(angles) @ R.T
         rays = _Rays(origin, directions, angles, scene.raycast(origin, directions, self.max_range_m))
+        surface = self._surface(scene, rays, generator(seed, frame, _SPECKLE))
         candidates = {
-            Origin.SURFACE: self._surface(scene, rays, generator(seed, frame, _SPECKLE)),
+            Origin.SURFACE: surface,
             Origin.CLUTTER: self._clutter(angles, rays.hits.range_m, generator(seed, frame, _CLUTTER)),
             Origin.GHOST: self._ghosts(scene, rays, generator(seed, frame, _GHOSTS)),
+            Origin.SIDELOBE: self._sidelobes(surface, generator(seed, frame, _SIDELOBES)),
         }
         scans = [
             self._measure(echoes, kind, generator(seed, frame, _NOISE, int(kind)))
@@ -234,21 +262,39 @@ class RadarSensor:
         looks = scene.material_values(second, "looks", 1.0)
         return _Echoes(path, angles[rows], power + _speckle_db(looks, rng), np.full(len(rows), np.nan))
 
+    def _sidelobes(self, surface: _Echoes, rng: np.random.Generator) -> _Echoes:
+        """Some of the echoes of surfaces once more, as if from another elevation."""
+        rows = np.flatnonzero(rng.random(len(surface.range_m)) < self.sidelobe_share)
+        angles = surface.angles[rows]
+        angles[:, 1] = np.arcsin(rng.uniform(-1, 1, size=len(rows)) * np.sin(self.sidelobe_fov_rad / 2))
+        power = surface.power_db[rows] - self.sidelobe_loss_db
+        return _Echoes(surface.range_m[rows], angles, power, np.full(len(rows), np.nan))
+
     def _clutter(self, angles: FloatArray, range_m: FloatArray, rng: np.random.Generator) -> _Echoes:
-        """Weak false returns in free space: half of them anywhere along a beam, half of them near the sensor."""
+        """Weak returns of no surface: near the sensor, and anywhere along a beam, before or behind its surface."""
         beam = rng.integers(len(angles), size=rng.poisson(self.clutter_per_scan))
         free = np.minimum(range_m[beam], self.max_range_m)
         anywhere = free * rng.uniform(0.05, 0.95, size=len(beam))
         near = self.min_range_m + rng.exponential(1.5, size=len(beam))
-        distance = np.where(rng.random(len(beam)) < 0.5, anywhere, near)
-        power = self.threshold_db + rng.exponential(3.0, size=len(beam))
+        is_far = rng.random(len(beam)) < 1 - self.clutter_near_share
+        distance = np.where(is_far, anywhere, near)
+        power = self.threshold_db + rng.exponential(self.clutter_power_db, size=len(beam))
         rows = (distance >= self.min_range_m) & (distance < 0.95 * free)
+        if self.clutter_beyond_share > 0:
+            is_beyond = is_far & (rng.random(len(beam)) < self.clutter_beyond_share)
+            beyond = free + (self.max_range_m - free) * rng.uniform(0.05, 0.95, size=len(beam))
+            distance = np.where(is_beyond, beyond, distance)
+            rows = np.where(is_beyond, free < self.max_range_m, rows)
         return _Echoes(distance[rows], angles[beam[rows]], power[rows], np.full(int(rows.sum()), np.nan))
 
     def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> Scan:
         """Add the sensor's noise, detect, round and clip the intensities."""
         noise = rng.standard_normal((len(echoes.range_m), 4))
-        range_m = echoes.range_m + self.sigma_range_m * noise[:, 0]
+        # What noise lifts above the threshold counts as if at it.
+        excess_db = np.maximum(echoes.power_db - self.threshold_db, 0.0)
+        noise[:, :3] *= np.sqrt(1 + self.weak_noise**2 * 10 ** (-excess_db / 10))[:, None]
+        sigma_range_m = np.hypot(self.sigma_range_m, self.sigma_range_per_m * echoes.range_m)
+        range_m = echoes.range_m + sigma_range_m * noise[:, 0]
         angles = echoes.angles + noise[:, 1:3] * [self.sigma_azimuth_rad, self.sigma_elevation_rad]
         power = echoes.power_db + self.sigma_power_db * noise[:, 3]
         if self.step_db > 0:
