@@ -11,7 +11,7 @@ from pathlib import Path
 from radarsdf.cli.options import add_fit_options, config_of, progress_of
 from radarsdf.cli.saying import say
 
-SCENES = ("hugin", "oculii", "wall")
+SCENES = ("hugin", "oculii", "wall", "astyx")
 """The names in `radarsdf.simulate.SCENES`, which is not imported for a help text."""
 
 

@@ -18,7 +18,7 @@ from .radar import Origin, RadarSensor, Scan
 from .scene import Hits, Scene
 from .simulation import Simulation, simulate
 from .terrain import Terrain
-from .worlds import SCENES, hugin, oculii, wall
+from .worlds import SCENES, astyx, hugin, oculii, wall
 
 __all__ = [
     "SCENES",
@@ -34,6 +34,7 @@ __all__ = [
     "Scene",
     "Simulation",
     "Terrain",
+    "astyx",
     "hugin",
     "oculii",
     "simulate",

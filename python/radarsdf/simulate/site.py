@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Random placement of buildings, walls, cars and poles on the ground, without overlap."""
+"""Random placement of buildings, walls, cars, poles and plants on the ground, without overlap."""
 
 from __future__ import annotations
 
@@ -101,6 +101,23 @@ class Site:
             return False
         base = float(self._terrain.height(xy[None])[0]) - _BURIED_M
         self.solids.append(Pole(np.array([*xy, base]), radius, height + _BURIED_M, material))
+        return True
+
+    def hedge(self, xy: FloatArray, yaw: float) -> bool:
+        """A hedge along a road, 1 to 2 m high."""
+        size = self._rng.uniform([4, 0.7, 1.0], [14, 1.2, 2.0])
+        return self._block(xy, yaw + self._rng.normal(0, 0.05), size, vary(self._rng, materials.TREE))
+
+    def tree(self, xy: FloatArray, _yaw: float) -> bool:
+        """A trunk, and a crown that begins 2 to 3 m above the ground."""
+        radius, crown = self._rng.uniform(0.15, 0.35), self._rng.uniform([1.2, 2.0], [2.6, 5.0])
+        if not self._free([(*xy, 0.5 * float(crown[0]))]):
+            return False
+        wood, ground = vary(self._rng, materials.TREE), float(self._terrain.height(xy[None])[0])
+        bottom = ground + self._rng.uniform(2.0, 3.0)
+        base = np.array([*xy, ground - _BURIED_M])
+        self.solids.append(Pole(base, radius, bottom - ground + 2 * _BURIED_M, wood))
+        self.solids.append(Pole(np.array([*xy, bottom]), float(crown[0]), float(crown[1]), wood))
         return True
 
     def basket(self, xy: FloatArray, facing: float) -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Three ready-made simulations: a lane among buildings, a sports court, and a corner reflector on a wall."""
+"""Ready-made simulations: a lane among buildings, a sports court, a corner reflector on a wall, and a street."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .site import Site, vary
 from .terrain import Terrain
 from .trajectory import along_path
 
-__all__ = ["SCENES", "hugin", "oculii", "wall"]
+__all__ = ["SCENES", "astyx", "hugin", "oculii", "wall"]
 
 FloatArray = NDArray[np.float64]
 
@@ -43,6 +43,13 @@ OCULII_EAGLE = RadarSensor(
     sigma_range_m=0.1, sigma_azimuth_rad=np.deg2rad(0.9), sigma_elevation_rad=np.deg2rad(1.3), sigma_power_db=2.5,
     gain_db=66.0, threshold_db=-1.0, floor_db=0.0, saturation_db=36.0, step_db=0.5,
     clutter_per_scan=30.0, ghost_share=0.5,
+)  # fmt: skip
+ASTYX_HIRES = RadarSensor(
+    azimuth_fov_rad=np.deg2rad(115), elevation_fov_rad=np.deg2rad(16), beams=4000, min_range_m=2.0, max_range_m=102.0,
+    sigma_range_m=0.09, sigma_range_per_m=0.0025, sigma_azimuth_rad=0.0055, sigma_elevation_rad=0.014, weak_noise=1.2,
+    sigma_power_db=1.0, gain_db=113.0, threshold_db=45.0, saturation_db=102.0, step_db=0.5,
+    clutter_per_scan=500.0, clutter_near_share=0.02, clutter_beyond_share=0.8, clutter_power_db=5.0,
+    ghost_share=0.5, sidelobe_share=0.15, sidelobe_fov_rad=np.deg2rad(39),
 )  # fmt: skip
 
 
@@ -185,4 +192,53 @@ def wall(seed: int = 0, frames: int | None = None) -> Simulation:
     return simulate(Scene([*solids, reflector], terrain), HUGIN_A4, poses, name="wall", seed=seed)
 
 
-SCENES: dict[str, Callable[..., Simulation]] = {"hugin": hugin, "oculii": oculii, "wall": wall}
+def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
+    """An automotive radar on a street: few scans, noise that grows with the range, and many false returns.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of layout, path and noise.
+    frames : int, optional
+        Number of scans, always along the whole path: four seconds at 5 to 10 m/s. Default: 20.
+
+    Returns
+    -------
+    Simulation
+        Intensities are 45 to 102 dB, as of an Astyx HiRes 2019. There are clutter, ghosts and side lobes.
+    """
+    rng = generator(seed, _LAYOUT)
+    terrain = Terrain.random(rng, rng.uniform(0.05, 0.3), materials.GRASS)
+    length = 4.0 * rng.uniform(5, 10)
+    sway, wave, phase = rng.uniform(1.0, 5.0), rng.uniform(80, 140), rng.uniform(0, 2 * np.pi)
+
+    def path(u: FloatArray) -> FloatArray:
+        x = length * u
+        return np.stack([x, sway * np.sin(2 * np.pi * x / wave + phase)], axis=1)
+
+    first, last = -10.0, length + 100.0
+    road = path(np.arange(first, last, 2.0) / length)
+    site = Site(rng, terrain, taken=[(x, y, 2.8) for x, y in road])
+
+    def beside(near: float, far: float) -> tuple[FloatArray, float]:
+        here, ahead = path(rng.uniform(first, last) / length + np.array([0.0, 0.01]))
+        yaw = float(np.arctan2(*(ahead - here)[::-1]))
+        side = rng.choice([-1.0, 1.0]) * rng.uniform(near, far)
+        return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
+
+    site.fill(int(rng.integers(4, 14)), site.building, lambda: beside(12, 40))
+    site.fill(int(rng.integers(2, 16)), site.car, lambda: beside(4, 6))
+    site.fill(int(rng.integers(3, 12)), site.hedge, lambda: beside(5, 14))
+    site.fill(int(rng.integers(1, 6)), site.wall, lambda: beside(6, 20))
+    site.fill(int(rng.integers(10, 30)), site.tree, lambda: beside(6, 45))
+    site.fill(int(rng.integers(8, 16)), site.pole, lambda: beside(3.5, 8))
+    poses = along_path(terrain, path, _frames(frames, 20), height_m=1.25, rng=generator(seed, _TRAJECTORY))
+    return simulate(Scene(site.solids, terrain), ASTYX_HIRES, poses, name="astyx", seed=seed)
+
+
+SCENES: dict[str, Callable[..., Simulation]] = {
+    "hugin": hugin,
+    "oculii": oculii,
+    "wall": wall,
+    "astyx": astyx,
+}
