@@ -96,6 +96,7 @@ def sharp_map(scene):
             "intensity_iterations": 60,
             "batch_size": 4096,
             "learning_rate": 1e-2,
+            "sigma_cells": 0.75,
         },
     )
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)

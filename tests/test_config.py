@@ -45,6 +45,9 @@ REAL = {
     "effort": (TINY, 1000.0, 0.0, 1000.1),
     "returns.min_range_m": (0.0, LARGE, -0.1, None),
     "returns.max_range_m": (2.6, LARGE, 2.5, None),  # of which the default's least range is the limit
+    "returns.range_noise_m": (TINY, 100.0, 0.0, 100.1),
+    "returns.azimuth_noise_rad": (TINY, 1.0, 0.0, 1.1),
+    "returns.elevation_noise_rad": (TINY, 1.0, 0.0, 1.1),
     "encoding.fourier_half_width_cells": (TINY, LARGE, 0.0, None),
     "networks.feature_dropout": (0.0, 0.95, -0.01, 0.96),
     "networks.fourier_dropout": (0.0, 0.95, -0.01, 0.96),
@@ -76,7 +79,15 @@ WORDS = {
     "training.gradients": ["core", "autograd"],
 }
 WIDTHS = ["networks.sdf_hidden", "networks.intensity_hidden"]
-NONE = ["max_memory_bytes", "returns.max_range_m", "training.sdf_iterations", "training.intensity_iterations"]
+NONE = [
+    "max_memory_bytes",
+    "returns.max_range_m",
+    "returns.range_noise_m",
+    "returns.azimuth_noise_rad",
+    "returns.elevation_noise_rad",
+    "training.sdf_iterations",
+    "training.intensity_iterations",
+]
 
 
 def nested(name, value):
@@ -327,8 +338,8 @@ def test_configurations_are_values():
 
 def test_lengths_go_with_the_cells():
     lengths = ("near_band_m", "free_beyond_m", "sigma_m", "truncation_m", "fourier_half_width_m")
-    assert [getattr(FitConfig(), name) for name in lengths] == [0.3, 0.8, 0.15, 0.6, 409.6]
-    assert [getattr(FitConfig(leaf_size_m=0.4), name) for name in lengths] == [0.6, 1.6, 0.3, 1.2, 819.2]
+    assert [getattr(FitConfig(), name) for name in lengths] == [0.3, 0.8, 0.1, 0.6, 409.6]
+    assert [getattr(FitConfig(leaf_size_m=0.4), name) for name in lengths] == [0.6, 1.6, 0.2, 1.2, 819.2]
     config = FitConfig(leaf_size_m=0.5, sampling={"near_band_cells": 3.0, "free_beyond_cells": 0.0})
     assert (config.near_band_m, config.free_beyond_m) == (1.5, 0.0)
     for name in lengths:
@@ -347,6 +358,9 @@ PUBLISHED = {
         "max_range_m": None,
         "accumulate_scans": 5,
         "drop_ghosts": False,
+        "range_noise_m": None,
+        "azimuth_noise_rad": None,
+        "elevation_noise_rad": None,
         "onto_planes": False,
     },
     "encoding": {

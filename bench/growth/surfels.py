@@ -9,10 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from radarsdf import FitConfig
 from radarsdf.fitting.start import near_leaf_keys
 from radarsdf.returns.ghosts import find_ghosts
-from radarsdf.returns.rays import prepare
+from radarsdf.returns.noise import sensor_noise
+from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.support import support_of_points
 from radarsdf.returns.surfels import Surfels
 
@@ -52,10 +55,7 @@ def row(returns: int, threads: int) -> dict[str, Any]:
     rays = prepare(scans.points, scans.poses)
     del scans
     config = FitConfig()
-    is_ghost, ghosts = _measured(
-        "ghosts",
-        lambda: find_ghosts(Surfels.of(rays, config.leaf_size_m, threads), rays, num_threads=threads),
-    )
+    is_ghost, ghosts = _measured("ghosts", lambda: _ghosts(rays, config, threads))
     kept = rays.select(~is_ghost)
     leaf_keys = near_leaf_keys(kept, config, threads)
     counts, support = _measured(
@@ -68,6 +68,12 @@ def row(returns: int, threads: int) -> dict[str, Any]:
         )
         raise RuntimeError(msg)
     return {"ghosts": int(is_ghost.sum()), "leaf_cells": len(leaf_keys), **ghosts, **support}
+
+
+def _ghosts(rays: Rays, config: FitConfig, threads: int) -> NDArray[np.bool_]:
+    surfels = Surfels.of(rays, config.leaf_size_m, threads)
+    noise = sensor_noise(surfels, rays, surfels.cells.cell_of_ray, config.returns)
+    return find_ghosts(surfels, rays, noise, num_threads=threads)
 
 
 def _measured(name: str, function: Callable[[], Result]) -> tuple[Result, dict[str, float]]:

@@ -9,6 +9,7 @@ why, and the peer stays in the tables.
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -57,7 +58,9 @@ class Peer:
 
 
 # What the published mesh leaves out.
-_MESHES: dict[str, dict[str, Any]] = {"paper": {"min_support": 0.0, "min_component_triangles": 300}}
+_MESHES: dict[str, dict[str, Any]] = {
+    "paper": {"min_support": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 300}
+}
 
 
 def _fit(name: str, base: str, *, intensities: bool = False, voxel_m: float = 0.1, **changes: Any) -> Peer:

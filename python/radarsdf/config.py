@@ -28,6 +28,8 @@ _MAX_BRIDGE_CELLS = 8  # the time grows with the square, and longer bridges join
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
 _MAX_WIDTH = 4096  # units of a layer: far more than a map of a scene can use
 
+_NoiseM = Annotated[float, Field(gt=0, le=100)]
+_NoiseRad = Annotated[float, Field(gt=0, le=1)]
 _Positive = Annotated[float, Field(gt=0)]
 _NotNegative = Annotated[float, Field(ge=0)]
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
@@ -54,9 +56,16 @@ class ReturnsConfig:
     """Whether the sdf stage leaves out ghosts: returns behind a surface that their rays crossed, as mirrors
     cause them (3QFPI: no). Measured: 84 to 94 % of the surface that ghosts cause is gone, and 0.7 % of the
     true returns. The intensity stage still uses ghosts."""
+    range_noise_m: _NoiseM | None = None
+    """Standard deviation of a return along the beam, m. None: estimated from the returns; see
+    :func:`radarsdf.returns.noise.sensor_noise`."""
+    azimuth_noise_rad: _NoiseRad | None = None
+    """The same in azimuth, rad. None: likewise."""
+    elevation_noise_rad: _NoiseRad | None = None
+    """The same in elevation, rad. None: likewise."""
     onto_planes: bool = True
-    """Whether each return is moved onto the surfel of its cell, a plane through the returns there, if there
-    is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.2 to 0.5 on real ones;
+    """Whether each return is moved towards the surfel of its cell, a plane through the returns there, if there
+    is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones;
     up to 1 % more error of intensities."""
 
     @property
@@ -151,9 +160,10 @@ class TrainingConfig:
     """For that average: distances are truncated here, and a ray counts up to this far before and behind its
     return, in leaf cells (VDBFusion: 3 voxels). Measured: 4 and 5 are as good on simulated scenes, 0.5 and
     1.2 points worse on real ones."""
-    sigma_cells: _Positive = 0.75
-    """Scale of the sigmoid from signed distance to occupancy, in leaf cells (3QFP: 0.0275 m). Measured: 0.1
-    to 0.2 m is best."""
+    sigma_cells: _Positive = 0.5
+    """Scale of the sigmoid from signed distance to occupancy, in leaf cells (3QFP: 0.0275 m). Measured: 0.4
+    to 0.75 differ by 0.2 points of F-score on simulated scenes; on real ones 0.4 to 0.5 are 0.4 to 2 points
+    better."""
     sdf_loss_weight: _NotNegative = 1.0
     """Weight of the sdf loss in the joint iterations, where that of the intensity loss is 1 (3QFPI: 1). 0 is
     for ablations: features and networks then learn from intensities alone, and there is no surface."""
@@ -319,7 +329,7 @@ class FitConfig:
     def paper(cls, **changes: Any) -> FitConfig:
         """The settings of 3QFPI as published. `changes`: as for :meth:`override`.
 
-        For a mesh as published, call ``mesh(min_support=0, min_component_triangles=300)``.
+        For a mesh as published, call ``mesh(min_support=0, max_uncertainty=math.inf, min_component_triangles=300)``.
         """
         return cls(
             returns=ReturnsConfig(accumulate_scans=5, drop_ghosts=False, onto_planes=False),

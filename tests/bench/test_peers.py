@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import math
 
 import numpy as np
 import pytest
@@ -32,7 +33,8 @@ def test_changes_of_a_group_leave_its_other_settings():
         "training": {"learning_rate": 1e-2},
         "seed": 1,
     }
-    assert peer.options["mesh"] == {"voxel_size": 0.3, "min_support": 0.0, "min_component_triangles": 300}
+    published = {"min_support": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 300}
+    assert peer.options["mesh"] == {"voxel_size": 0.3, **published}
     assert "num_levels" not in PEERS["SHINE (octree)"].options["changes"]["encoding"]
 
 

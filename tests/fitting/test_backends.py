@@ -34,6 +34,7 @@ def fitted(gradients, *, with_intensity=True, **changes):
         "intensity_iterations": 24,
         "batch_size": 512,
         "intensity_batch_size": 256,
+        "sigma_cells": 0.75,
     }
     config = FitConfig(num_threads=2, **grouped(gradients=gradients, **(settings | changes)))
     intensities = SCENE.intensities if with_intensity else None

@@ -38,6 +38,8 @@ def moved(radar_map, origin):
             intensity_scale=radar_map.intensity_scale,
             config=radar_map.config,
             support=radar_map.support,
+            information=radar_map._contents.information,
+            max_uncertainty_m=radar_map._contents.max_uncertainty_m,
             report={},
         )
     )
@@ -141,7 +143,7 @@ def test_meshes_are_manifold(sharp_map, voxel_size):
 
 def test_meshes_are_open_only_where_the_occupied_region_ends(sharp_map):
     voxel_size = 0.1
-    mesh = sharp_map.mesh(voxel_size, min_component_triangles=0, min_support=0)
+    mesh = sharp_map.mesh(voxel_size, min_component_triangles=0, min_support=0, max_uncertainty=np.inf)
     edges = single_edges(mesh.faces)
     assert len(edges) > 0
     voxels = {tuple(v) for v in occupied_voxels(sharp_map, voxel_size).tolist()}
@@ -380,7 +382,7 @@ def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path)
 
 
 def test_less_confident_triangles_are_cut(sharp_map):
-    all_of_it = {"min_support": 0, "min_component_triangles": 0}
+    all_of_it = {"min_support": 0, "max_uncertainty": np.inf, "min_component_triangles": 0}
     confidence = sharp_map.mesh(**all_of_it).vertex_attributes["confidence"]
     half = float(np.median(confidence))
     cut = sharp_map.mesh(min_confidence=half, **all_of_it)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Planes through returns: what lies behind them, how noisy the sensor is, how many returns support a place."""
+"""Planes through returns: what lies behind them, and how many returns support a place."""
 
 from __future__ import annotations
 
@@ -11,63 +11,32 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
+from radarsdf.config import ReturnsConfig
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays
-from radarsdf.returns.noise import beam_noise
+from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.support import support_of_points
 from radarsdf.returns.surfels import Surfels
 
 from ..conftest import ground_and_wall
+from .walls import a_wall
 
 CELL_M = 0.4
 LEAF_M = 0.2
-
-
-def noise_of(surfels, rays):
-    return beam_noise(surfels, rays, surfels.cells.cell_of_ray)
-
-
-def a_wall(noise_range_m=0.05, noise_angle_rad=0.01, scans=8, returns=1500, ghosts=0):
-    """Scans of the ground and of a wall at x = 15; the last `ghosts` of each lie behind the wall, or below the ground."""
-    rng = np.random.default_rng(0)
-    points, poses, is_ghost = [], [], []
-    for i in range(scans):
-        T_world_sensor = np.eye(4)
-        T_world_sensor[:3, 3] = [0.5 * i, 0.5 * np.sin(i), 1.5]
-        half = returns // 2
-        ground = np.column_stack([rng.uniform(4, 15, half), rng.uniform(-5, 5, half), np.zeros(half)])
-        wall = np.column_stack([np.full(half, 15.0), rng.uniform(-5, 5, half), rng.uniform(0, 4, half)])
-        rays = np.concatenate([ground, wall]) - T_world_sensor[:3, 3]
-        range_m = np.linalg.norm(rays, axis=1, keepdims=True)
-        rays = rays / range_m + noise_angle_rad * rng.normal(size=rays.shape)
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        measured = rays * (range_m + noise_range_m * rng.normal(size=range_m.shape))
-        mirrored = measured[-ghosts:] * rng.uniform(1.15, 1.5, (ghosts, 1)) if ghosts else measured[:0]
-        points.append(np.concatenate([measured, mirrored]))
-        is_ghost.append(np.arange(len(points[-1])) >= len(measured))
-        poses.append(T_world_sensor)
-    return points, np.stack(poses), np.concatenate(is_ghost)
-
-
-@pytest.mark.parametrize(("range_m", "angle_rad"), [(0.05, 0.004), (0.05, 0.012), (0.1, 0.008)])
-def test_the_noise_is_found_in_the_data(range_m, angle_rad):
-    points, poses, _ = a_wall(range_m, angle_rad)
-    rays = prepare(points, poses)
-    noise = noise_of(Surfels.of(rays, LEAF_M), rays)
-    assert noise.range_m == pytest.approx(range_m, rel=0.35)
-    assert noise.angle_rad == pytest.approx(angle_rad, rel=0.35)
+NOISE = SensorNoise(0.05, 0.01, 0.01)
+"""That of `a_wall`."""
 
 
 def test_ghosts_are_found_and_the_surface_is_kept():
     points, poses, is_ghost = a_wall(ghosts=40)
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
-    dropped = find_ghosts(surfels, rays)
+    dropped = find_ghosts(surfels, rays, NOISE)
     assert dropped[is_ghost].mean() > 0.9
     assert dropped[~is_ghost].mean() < 0.005
-    np.testing.assert_array_equal(dropped, find_ghosts(surfels, rays, num_threads=1))
-    np.testing.assert_array_equal(dropped, find_ghosts(surfels, rays, num_threads=3))
+    np.testing.assert_array_equal(dropped, find_ghosts(surfels, rays, NOISE, num_threads=1))
+    np.testing.assert_array_equal(dropped, find_ghosts(surfels, rays, NOISE, num_threads=3))
 
 
 def test_one_ray_of_a_cell_finds_them_too():
@@ -76,15 +45,16 @@ def test_one_ray_of_a_cell_finds_them_too():
     surfels = Surfels.of(rays, LEAF_M)
     averaged = MeanRays.of(rays, 0.2)
     assert len(averaged.first) < 0.7 * len(rays)
-    dropped = find_ghosts(surfels, rays, averaged)
+    dropped = find_ghosts(surfels, rays, NOISE, averaged)
     assert dropped[is_ghost].mean() > 0.9
     assert dropped[~is_ghost].mean() < 0.005
     everyone = find_ghosts(
         surfels,
         rays,
+        NOISE,
         dataclasses.replace(averaged, first=np.arange(len(rays)), counts=np.ones(len(rays), np.float32)),
     )
-    assert (everyone != find_ghosts(surfels, rays)).mean() < 0.001  # but for the noise of fewer of them
+    np.testing.assert_array_equal(everyone, find_ghosts(surfels, rays, NOISE))
 
 
 def test_planes_of_cells():
@@ -122,15 +92,16 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     passed = [np.concatenate([p[-750:] * rng.uniform(1.3, 1.9, (750, 1)) for _ in range(5)]) for p in points]
     rays = prepare([np.concatenate(pair) for pair in zip(points, passed, strict=True)], poses)
     behind = np.concatenate([np.arange(1500 + 3750) >= 1500] * len(points))
-    assert find_ghosts(Surfels.of(rays, LEAF_M), rays)[behind].mean() < 0.05
+    surfels = Surfels.of(rays, LEAF_M)
+    noise = sensor_noise(surfels, rays, surfels.cells.cell_of_ray, ReturnsConfig())
+    assert find_ghosts(surfels, rays, noise)[behind].mean() < 0.05
 
 
 def test_few_returns_make_no_plane():
     few = ground_and_wall(scans=2, returns_per_scan=20)
     rays = prepare(few.points, few.poses)
     surfels = Surfels.of(rays, LEAF_M)
-    assert not find_ghosts(surfels, rays).any()
-    assert np.isfinite([noise_of(surfels, rays).range_m, noise_of(surfels, rays).angle_rad]).all()
+    assert not find_ghosts(surfels, rays, NOISE).any()
 
 
 def one_surfel(normal=(-1.0, 0, 0), thickness_m=0.0):
@@ -229,51 +200,3 @@ def test_support_counts_the_returns_in_27_cells():
     np.testing.assert_array_equal(support, expected)
     crowd = np.full((70_000, 3), 0.1, np.float32)
     assert support_of_points(crowd, np.unique(cell_keys(crowd, 0.2)), 0.2).tolist() == [65535]
-
-
-def test_returns_come_onto_the_planes_that_they_make():
-    points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01)
-    rays = prepare(points, poses)
-    surfels = Surfels.of(rays, LEAF_M)
-    moved = surfels.onto_planes(rays)
-    np.testing.assert_array_equal(moved.points, surfels.onto_planes(rays, chunk=777).points)
-
-    def error_m(rays):
-        x, _, z = rays.points.T + rays.origin[:, None]
-        wall = (
-            (np.abs(x - 15) < 0.6) & (z > 1) & (z < 3)
-        )  # far from where wall and ground meet, and from their ends
-        ground = (np.abs(z) < 0.6) & (x > 6) & (x < 13)
-        return np.sqrt(np.mean(np.concatenate([x[wall] - 15, z[ground]]) ** 2))
-
-    assert error_m(moved) < 0.35 * error_m(rays)
-    # Seen from where they were, and whole rays.
-    sensors = [r.points - r.directions * r.ranges_m[:, None] for r in (rays, moved)]
-    np.testing.assert_allclose(*sensors, atol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(moved.directions, axis=1), 1, atol=1e-6)
-
-
-def test_returns_that_make_no_plane_stay_where_they_are():
-    points = np.random.default_rng(0).uniform([5, -3, -3], [11, 3, 3], (4000, 3))
-    rays = prepare([points], np.eye(4)[None])
-    surfels = Surfels.of(rays, LEAF_M)
-    moved = surfels.onto_planes(rays)
-    assert (surfels.flat_plane_of(surfels.cells.cell_of_ray) < 0).mean() > 0.5
-    still = surfels.flat_plane_of(surfels.cells.cell_of_ray) < 0
-    for name in ("points", "directions", "ranges_m"):
-        np.testing.assert_array_equal(getattr(moved, name)[still], getattr(rays, name)[still])
-    lone = prepare([[[5.0, 0, 0]]], np.eye(4)[None])
-    assert Surfels.of(lone, LEAF_M).onto_planes(lone).points.tolist() == [[5, 0, 0]]
-
-
-def test_a_fit_to_planes_is_nearer_to_the_surface():
-    scene = ground_and_wall(noise_m=0.15)
-    errors_m = []
-    for onto_planes in (False, True):
-        config = FitConfig(
-            num_threads=2, returns={"onto_planes": onto_planes}, training={"sdf_iterations": 150}
-        )
-        vertices = radarsdf.fit(scene.points, scene.poses, config=config).mesh().vertices
-        on_wall = (np.abs(vertices[:, 0] - 20) < 0.8) & (vertices[:, 2] > 1) & (vertices[:, 2] < 3)
-        errors_m.append(np.sqrt(np.mean((vertices[on_wall, 0] - 20) ** 2)))
-    assert errors_m[1] < 0.7 * errors_m[0]

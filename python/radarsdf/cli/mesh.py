@@ -43,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "default: 0.12, for a quick map 0.15",
     )
     parser.add_argument(
+        "--max-uncertainty",
+        type=float,
+        metavar="M",
+        help="leave out the surface whose standard error is above M, m; default: what the fit found",
+    )
+    parser.add_argument(
         "--min-component",
         type=int,
         default=30,
@@ -69,6 +75,7 @@ def run(options: argparse.Namespace) -> None:
         viewpoint=options.viewpoint,
         min_confidence=options.min_confidence,
         min_support=options.min_support,
+        max_uncertainty=options.max_uncertainty,
         min_component_triangles=options.min_component,
         progress=progress_of(options),
     )

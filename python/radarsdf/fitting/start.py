@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf._core import CellSet
+from radarsdf._core import CellSet, cell_keys
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.support import support_of_cells, support_of_points
+from radarsdf.returns.support import information_of_cells, support_of_cells, support_of_points
 from radarsdf.returns.surfels import Surfels
 
 
@@ -41,6 +41,10 @@ class Start(ABC):
     def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
         """(C,) uint16, support of the leaf cells: number of returns in each and the 26 cells round it."""
 
+    @abstractmethod
+    def information(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.float32]:
+        """(C,) float32, m⁻²: sum of 1 / variance over the returns in each leaf cell and the 26 cells round it."""
+
 
 class FromNoise(Start):
     """Random networks and features (3QFP)."""
@@ -55,6 +59,12 @@ class FromNoise(Start):
         points, leaf_size_m = self._surface.rays.points, self._config.leaf_size_m
         return support_of_points(points, leaf_keys, leaf_size_m, self._num_threads)
 
+    def information(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.float32]:
+        rays = self._surface.rays
+        keys = cell_keys(np.ascontiguousarray(rays.points), self._config.leaf_size_m, self._num_threads)
+        information: NDArray[np.float32] = np.float32(1) / self._surface.noise.variances_m2(rays.ranges_m)
+        return information_of_cells(keys, information, leaf_keys, self._num_threads)
+
 
 class FromAverage(Start):
     """The average of the rays' truncated signed distances (Curless and Levoy, 1996). It needs no training."""
@@ -68,12 +78,16 @@ class FromAverage(Start):
         # used, else 0.
         learns = self._config.training.sdf_iterations != 0 or field.intensity_network is not None
         field.initialise(generator, features=learns)
-        surfels = self._surface.surfels
-        assert surfels is not None
-        average_rays(field, self._means, surfels, self._config, self._num_threads)
+        average_rays(field, self._means, self._surface.surfels, self._config, self._num_threads)
 
     def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
         return support_of_cells(self._means.keys, self._means.counts, leaf_keys, self._num_threads)
+
+    def information(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.float32]:
+        # The returns of a cell are at nearly the same range if they are of the same sensor position.
+        means = self._means
+        information = means.counts / self._surface.noise.variances_m2(means.ranges_m)
+        return information_of_cells(means.keys, information, leaf_keys, self._num_threads)
 
     @property
     def _means(self) -> MeanRays:

@@ -29,5 +29,9 @@ class MapContents:
     """Settings of the fit."""
     support: NDArray[np.uint16]
     """(C,) number of returns in each leaf cell and the 26 round it, in the order of the cells' keys."""
+    information: NDArray[np.float32]
+    """(C,) sum of 1 / variance over the same returns, m⁻²."""
+    max_uncertainty_m: float
+    """Standard error up to which a surface is meshed by default, m."""
     report: dict[str, Any]
-    """Counts, losses and seconds of the fit. `skipped`: parts of the method that it did not run."""
+    """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""

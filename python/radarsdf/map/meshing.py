@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Extracts the mesh of a map, with confidence and intensity at its vertices."""
+"""Extracts the mesh of a map, with confidence, uncertainty and intensity at its vertices."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import MAX_POSITION_M, not_negative, positive, real_array, whole_number
+from radarsdf.checks import MAX_POSITION_M, not_negative, number, positive, real_array, whole_number
 from radarsdf.config import FitConfig
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
@@ -34,6 +34,7 @@ def extract_mesh(
     viewpoint: ArrayLike | None = None,
     min_confidence: float = 0.0,
     min_support: float | None = None,
+    max_uncertainty: float | None = None,
     min_component_triangles: int = 30,
     progress: bool | None = None,
 ) -> trimesh.Trimesh:
@@ -44,6 +45,12 @@ def extract_mesh(
     if min_support is None:
         min_support = _MIN_SUPPORT_OF_AVERAGE if _is_average(contents.config) else _MIN_SUPPORT
     min_support = not_negative(min_support, "min_support")
+    if max_uncertainty is None:
+        max_uncertainty = contents.max_uncertainty_m
+    max_uncertainty = number(max_uncertainty, "max_uncertainty")
+    if max_uncertainty < 0:
+        msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
+        raise ValueError(msg)
     whole_number(min_component_triangles, "min_component_triangles", 0)
     voxel_size = positive(voxel_size, "voxel_size")
     if voxel_size > MAX_POSITION_M:
@@ -59,9 +66,12 @@ def extract_mesh(
         spacing=[voxel_size] * 3,
         num_threads=torch.get_num_threads(),
     )
-    confidence = queries.confidence(contents, _local(contents, vertices + contents.origin)).numpy()
-    least = max(min_confidence, queries.confidence_of_median(contents, min_support))
-    faces = faces[(confidence[faces] >= least).all(axis=1)]
+    points = _local(contents, vertices + contents.origin)
+    confidence = queries.confidence(contents, points).numpy()
+    uncertainty_m = queries.uncertainty(contents, points).numpy()
+    kept = confidence >= max(min_confidence, queries.confidence_of_median(contents, min_support))
+    kept &= np.nan_to_num(uncertainty_m, nan=np.inf) <= max_uncertainty
+    faces = faces[kept[faces].all(axis=1)]
     kept, faces = _without_small_components(len(vertices), faces, min_component_triangles)
     mesh = trimesh.Trimesh(vertices[kept] + contents.origin, faces, process=False)
     mesh.metadata |= {
@@ -69,6 +79,7 @@ def extract_mesh(
         "leaf_cells_searched": lattice.cells_searched,
     }
     mesh.vertex_attributes["confidence"] = confidence[kept]
+    mesh.vertex_attributes["uncertainty_m"] = uncertainty_m[kept]
     if sensor_position is not None:
         _add_intensity(mesh, contents, sensor_position)
     return mesh

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -18,6 +19,9 @@ from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
 _HALF_SUPPORT = 10.0  # returns round a point that give a confidence of one half
+# Of the uncertainty, leaf cells: the field does not resolve less, however many returns there are. Measured: 0.6 to 3 cm
+# on simulated scenes with cells of 0.2 m.
+_FLOOR_CELLS = 0.1
 _CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
 _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
 
@@ -54,17 +58,15 @@ def occupied(contents: MapContents, points: Tensor) -> Tensor:
 
 def confidence(contents: MapContents, points: Tensor) -> Tensor:
     """(N,) n / (n + 10) for the interpolated number n of returns in the 27 leaf cells round each point."""
-    # Interpolated trilinearly between the centres of cells, because a vertex of a mesh may be on the face of
-    # two cells.
-    table = contents.field.cells.table
-    # Points that are too far away for a key are moved to the limit, where there are no cells.
-    limit_m = MAX_CELLS_FROM_ORIGIN * table.leaf_size_m
-    near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
-    cells = CellBlocks(table.leaf_keys())
-    returns = cells.interpolate(
-        table.leaf_size_m, contents.support.astype(np.float32), near.numpy(), resolve_num_threads(0)
-    )
-    return _confidence_of(torch.from_numpy(returns))
+    returns = _interpolated(contents, contents.support.astype(np.float32), points)
+    return _confidence_of(returns)
+
+
+def uncertainty(contents: MapContents, points: Tensor) -> Tensor:
+    """(N,) standard error of the surface's position at each point, m. NaN where there are no returns round it."""
+    information = _interpolated(contents, contents.information, points)
+    floor_m = _FLOOR_CELLS * contents.config.leaf_size_m
+    return torch.where(information > 0, (1 / information + floor_m**2).sqrt(), torch.nan)
 
 
 def confidence_of_median(contents: MapContents, share: float) -> float:
@@ -124,3 +126,16 @@ def evaluate(
 
 def _confidence_of(returns: Tensor) -> Tensor:
     return returns / (returns + _HALF_SUPPORT)
+
+
+def _interpolated(contents: MapContents, of_cells: NDArray[np.float32], points: Tensor) -> Tensor:
+    """(N,) values of leaf cells (C,), interpolated between the centres of the cells. 0 where there are none."""
+    # Trilinearly, because a vertex of a mesh may be on the face of two cells.
+    table = contents.field.cells.table
+    # Points that are too far away for a key are moved to the limit, where there are no cells.
+    limit_m = MAX_CELLS_FROM_ORIGIN * table.leaf_size_m
+    near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
+    cells = CellBlocks(table.leaf_keys())
+    return torch.from_numpy(
+        cells.interpolate(table.leaf_size_m, of_cells, near.numpy(), resolve_num_threads(0))
+    )

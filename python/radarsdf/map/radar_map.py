@@ -60,7 +60,7 @@ class RadarMap:
 
     @property
     def report(self) -> dict[str, Any]:
-        """Counts, losses and seconds of the fit. `skipped`: parts of the method that it did not run."""
+        """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
         return self._contents.report
 
     @property
@@ -158,6 +158,35 @@ class RadarMap:
         return answer(queries.confidence(self._contents, points))
 
     @overload
+    def uncertainty(self, x: Tensor) -> Tensor: ...
+    @overload
+    def uncertainty(self, x: ArrayLike) -> NDArray[Any]: ...
+    def uncertainty(self, x: Any) -> Any:
+        """Standard error of the surface's position at points, from the noise of the returns round them.
+
+        Parameters
+        ----------
+        x : (N, 3) array or tensor
+            World, m.
+
+        Returns
+        -------
+        (N,) array or tensor
+            (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells round the point, interpolated between cells, and
+            a tenth of a leaf cell, which no number of returns makes better, added in quadrature; m.
+            The noise σ of a return is that along the beam and across it together; see ``report["noise"]``. It
+            grows with the range, so that far returns tell less than near ones. NaN where nothing was observed.
+            It does not know false returns, nor errors of the poses.
+
+        Raises
+        ------
+        ValueError
+            If `x` does not have shape (N, 3).
+        """
+        points, answer = self._local(x)
+        return answer(queries.uncertainty(self._contents, points))
+
+    @overload
     def intensity(self, x: Tensor, sensor_positions: Tensor) -> Tensor: ...
     @overload
     def intensity(self, x: ArrayLike, sensor_positions: ArrayLike) -> NDArray[Any]: ...
@@ -196,6 +225,7 @@ class RadarMap:
         viewpoint: ArrayLike | None = None,
         min_confidence: float = 0.0,
         min_support: float | None = None,
+        max_uncertainty: float | None = None,
         min_component_triangles: int = 30,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
@@ -216,6 +246,10 @@ class RadarMap:
             Triangles with a vertex of less support are left out, as a share of the median support of the map,
             because sensors differ in their number of returns (3QFP: 0). Default: 0.12, or 0.15 for an average
             without training.
+        max_uncertainty : float, optional
+            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. The default
+            follows from the share of returns that lie on no thin surface, ``report["rough_share"]``: 0.27 leaf
+            cells over that share. ``math.inf``: all are kept.
         min_component_triangles : int
             Components of fewer triangles are then left out (3QFP: 300, which on sparse scans costs ten points
             of completion).
@@ -226,7 +260,8 @@ class RadarMap:
         -------
         trimesh.Trimesh
             World frame, m. Triangles and vertex normals face free space. The mesh is empty if there is no
-            surface. The vertices have their :meth:`confidence` as ``mesh.vertex_attributes["confidence"]``.
+            surface. The vertices have their :meth:`confidence` as ``mesh.vertex_attributes["confidence"]``,
+            and their :meth:`uncertainty` as ``"uncertainty_m"``.
             In ``mesh.metadata``, `leaf_cells` is the number of leaf cells, and `leaf_cells_searched` of those
             in which the surface can be.
 
@@ -246,6 +281,7 @@ class RadarMap:
             viewpoint=viewpoint,
             min_confidence=min_confidence,
             min_support=min_support,
+            max_uncertainty=max_uncertainty,
             min_component_triangles=min_component_triangles,
             progress=progress,
         )

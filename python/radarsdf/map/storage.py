@@ -23,7 +23,7 @@ from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.map.contents import MapContents
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 
 
@@ -73,10 +73,12 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     # Morton keys have 63 bits, so they fit into int64, which all readers of safetensors have.
     tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
     tensors["support"] = torch.from_numpy(contents.support)
+    tensors["information"] = torch.from_numpy(contents.information)
     scale = contents.intensity_scale
     description = {
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
+        "max_uncertainty_m": contents.max_uncertainty_m,
         "report": contents.report,
     }
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
@@ -136,6 +138,13 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     if support.shape != leaf_keys.shape or support.dtype != torch.uint16:
         msg = "support is not one count for each leaf cell"
         raise ValueError(msg)
+    information = tensors.pop("information")
+    if information.shape != leaf_keys.shape or information.dtype != torch.float32:
+        msg = "information is not one number for each leaf cell"
+        raise ValueError(msg)
+    if not (information.isfinite() & (information >= 0)).all():
+        msg = "information holds something other than finite numbers of at least 0"
+        raise ValueError(msg)
     scale = None
     if description["intensity_scale"] is not None:
         low, high = description["intensity_scale"]
@@ -143,6 +152,10 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         if not -math.inf < scale.low < scale.high < math.inf:
             msg = f"the intensity scale must be finite and ascending, not {low} to {high}"
             raise ValueError(msg)
+    max_uncertainty_m = float(description["max_uncertainty_m"])
+    if not 0 < max_uncertainty_m < math.inf:
+        msg = f"max_uncertainty_m must be positive and finite, not {max_uncertainty_m}"
+        raise ValueError(msg)
     # A damaged description could ask for networks of any size. So the number of layers is limited, and the
     # field is made without memory: it only serves to check the shapes of the tensors.
     if len(config.networks.sdf_hidden + config.networks.intensity_hidden) > len(tensors):
@@ -164,4 +177,6 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         config=config,
         report=dict(description["report"]),
         support=support.numpy().copy(),
+        information=information.numpy().copy(),
+        max_uncertainty_m=max_uncertainty_m,
     )

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from radarsdf._core import SurfelMap
 from radarsdf.returns.mean_rays import MeanRays
-from radarsdf.returns.noise import beam_noise
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import NEIGHBOUR_WEIGHT, Surfels
 
 # Measured on simulated and real scans; see docs/levers.md.
-_NOISE_RETURNS_OF_MEANS = 20_000  # returns. They give the noise to 2 %, which is enough for a quick fit
 # A ghost is farther behind the surface than these two together, since noise puts returns of the surface
 # itself behind it.
 _MARGIN = 0.25  # cells of surfels
@@ -30,7 +29,7 @@ _MIN_SHARE = 0.5
 
 
 def find_ghosts(
-    surfels: Surfels, rays: Rays, means: MeanRays | None = None, num_threads: int = 0
+    surfels: Surfels, rays: Rays, noise: SensorNoise, means: MeanRays | None = None, num_threads: int = 0
 ) -> NDArray[np.bool_]:
     """Finds the returns that are ghosts.
 
@@ -40,6 +39,8 @@ def find_ghosts(
         Surfels of the returns of `rays`.
     rays : Rays
         N rays.
+    noise : SensorNoise
+        Noise of the returns.
     means : MeanRays, optional
         Makes it faster: only the first ray of each of these cells is followed, for all returns of the cell.
     num_threads : int
@@ -54,11 +55,9 @@ def find_ghosts(
     if means is None:
         cell_of_ray, weights = all_cell_of_ray, None
         returns = cells.moments[:, 0]
-        noise = beam_noise(surfels, rays, cell_of_ray)
     else:
         rays, cell_of_ray, weights = rays.select(means.first), all_cell_of_ray[means.first], means.counts
         returns = np.bincount(cell_of_ray, weights, len(cells.keys)).astype(np.float64)
-        noise = beam_noise(surfels, rays, cell_of_ray, _NOISE_RETURNS_OF_MEANS)
     table = np.concatenate([surfels.centres, surfels.normals, np.sqrt(surfels.variances[:, :1])], 1)
     table = table.astype(np.float32)
 

@@ -34,6 +34,8 @@ class MeanRays:
     """(M, 3) mean direction of their rays, unit vectors."""
     counts: NDArray[np.float32]
     """(M,) number of returns in each cell."""
+    ranges_m: NDArray[np.float32]
+    """(M,) range of the first return in each cell."""
 
     @classmethod
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> MeanRays:
@@ -56,12 +58,18 @@ class MeanRays:
             points=(moments[:, 1:4] / moments[:, :1]).astype(np.float32),
             directions=directions.astype(np.float32),
             counts=moments[:, 0].astype(np.float32),
+            ranges_m=rays.ranges_m[first],
         )
 
     def select(self, part: NDArray[np.bool_]) -> MeanRays:
         """The mean rays of some of the cells."""
         return MeanRays(
-            self.keys[part], self.first[part], self.points[part], self.directions[part], self.counts[part]
+            self.keys[part],
+            self.first[part],
+            self.points[part],
+            self.directions[part],
+            self.counts[part],
+            self.ranges_m[part],
         )
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:

@@ -1,45 +1,76 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Estimates the noise of the sensor from its returns."""
+"""Estimates the noise of the sensor from its returns: along the beam, in azimuth and in elevation."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.config import ReturnsConfig
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
-_MAX_FLATNESS = 0.1  # smallest variance over the middle one of the surfels that are used
-_MAX_RETURNS = 1_000_000  # more do not make the estimate better
+_MAX_RETURNS = 300_000  # more do not make the estimate better
 _MIN_RETURNS = 100  # with fewer, the result is the guess that the estimate starts from
 _SIGMAS2 = 6.0  # variances. A larger squared residual is an outlier
 # The variance of a normal distribution is so many times its variance without these outliers.
 _TRUNCATION = 1.05
+_ROUNDS = 10
+_FIRST_ANGLE_RAD = 0.01
 
 
 @dataclass(frozen=True)
-class BeamNoise:
-    """Standard deviations of the noise of a return."""
+class SensorNoise:
+    """Standard deviations of the position of a return.
+
+    The errors along the beam, in azimuth and in elevation are independent.
+    """
 
     range_m: float
     """Along the beam, m."""
-    angle_rad: float
-    """Across the beam, as an angle, rad."""
+    azimuth_rad: float
+    """In azimuth, rad."""
+    elevation_rad: float
+    """In elevation, rad."""
+
+    @property
+    def angle_rad(self) -> float:
+        """Across the beam, root mean square of azimuth and elevation, rad."""
+        return float(np.hypot(self.azimuth_rad, self.elevation_rad) / np.sqrt(2))
+
+    def variances_m2(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(N,) variance of returns at these ranges (N,), along the beam and across it together, m²."""
+        variances: NDArray[np.float32] = np.float32(self.range_m**2) + np.square(
+            np.float32(self.angle_rad) * ranges_m
+        )
+        return variances
+
+    def variances_across_m2(
+        self, rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(M,) variance of the returns in these `rows` (M,) along the unit vectors `normals` (M, 3), m²."""
+        return _shares(rays, rows, normals) @ np.square(dataclasses.astuple(self))
 
 
-def beam_noise(
+def sensor_noise(
     surfels: Surfels,
     rays: Rays,
     cell_of_ray: NDArray[np.int32],
+    config: ReturnsConfig,
     max_returns: int = _MAX_RETURNS,
-) -> BeamNoise:
+) -> SensorNoise:
     """Estimates the noise of the sensor from the distances of returns to their surfels.
 
-    At an angle of incidence θ, the variance across the plane is (σ_range · cos θ)² + (σ_angle · range · sin
-    θ)². The two deviations are fitted to the squared distances by weighted least squares.
+    The variance across a plane is the sum of the three variances, each times the squared share of its axis in
+    the plane's normal. Across the beam, the deviation is an angle times the range. The three deviations are
+    fitted to the squared distances by weighted least squares. What is given in `config` stays as it is.
+
+    A surfel of leaf cells of 0.2 m is 1.2 m wide, so noise of more than some 0.4 m is underestimated. The
+    roughness of a surface counts as noise. Measured on simulated scenes: 0.7 to 1.2 times the true deviation.
 
     Parameters
     ----------
@@ -49,28 +80,40 @@ def beam_noise(
         N rays.
     cell_of_ray : ndarray
         (N,) row of the surfel cell of each return.
+    config : ReturnsConfig
+        Deviations that the user knows.
     max_returns : int
         About so many returns are used at most.
     """
-    plane_of_cell = surfels.plane_of_cell(np.flatnonzero(surfels.is_flat(_MAX_FLATNESS)))
-    plane = plane_of_cell[cell_of_ray]
-    used_rays = np.flatnonzero(plane >= 0)
-    used_rays = used_rays[:: -(-len(used_rays) // max_returns) or 1]
-    sigma2 = np.array([(0.25 * surfels.cell_size_m) ** 2, 0.01**2])
-    if len(used_rays) < _MIN_RETURNS:
-        return BeamNoise(*np.sqrt(sigma2).tolist())
-    plane, range_m = plane[used_rays], rays.ranges_m[used_rays].astype(np.float64)
-    offset_m = rays.points[used_rays] - surfels.centres[plane]
-    normals = surfels.normals[plane]
-    residual2 = np.einsum("ni,ni->n", offset_m, normals) ** 2
-    cosine2 = np.einsum("ni,ni->n", rays.directions[used_rays], normals) ** 2
-    least = [(0.025 * surfels.cell_size_m) ** 2, 1e-6]
-    parts = np.stack([cosine2, range_m**2 * (1 - cosine2)], 1)
-    for _ in range(10):  # the weights are the variances of the round before
-        variance = parts @ sigma2
-        used = residual2 < _SIGMAS2 * variance
-        kept = parts[used]
-        weighted = kept / variance[used, None] ** 2
-        solution = np.linalg.lstsq(weighted.T @ kept, weighted.T @ residual2[used], rcond=None)[0]
-        sigma2 = _TRUNCATION * np.maximum(solution, least)
-    return BeamNoise(*np.sqrt(sigma2).tolist())
+    known = np.array([config.range_noise_m, config.azimuth_noise_rad, config.elevation_noise_rad], np.float64)
+    free = np.isnan(known)
+    sigma2 = np.where(free, [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD], known) ** 2
+    plane = surfels.flat_plane_of(cell_of_ray)
+    rows = np.flatnonzero(plane >= 0)
+    rows = rows[:: -(-len(rows) // max_returns) or 1]
+    if free.any() and len(rows) >= _MIN_RETURNS:
+        plane = plane[rows]
+        normals = surfels.normals[plane]
+        residual2 = np.einsum("ni,ni->n", rays.points[rows] - surfels.centres[plane], normals) ** 2
+        shares = _shares(rays, rows, normals)
+        least = np.array([0.025 * surfels.cell_size_m, 1e-3, 1e-3]) ** 2
+        for _ in range(_ROUNDS):  # the weights are the variances of the round before
+            variance = shares @ sigma2
+            used = residual2 < _SIGMAS2 * variance
+            weighted = shares[used] / variance[used, None] ** 2
+            rest = residual2[used] - shares[used][:, ~free] @ sigma2[~free]
+            weighted = weighted[:, free]
+            solution = np.linalg.lstsq(weighted.T @ shares[used][:, free], weighted.T @ rest, rcond=None)[0]
+            sigma2[free] = _TRUNCATION * np.maximum(solution, least[free])
+    return SensorNoise(*np.sqrt(sigma2).tolist())
+
+
+def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(M, 3) factors of the variances along the beam, in azimuth and in elevation, across planes."""
+    ranges2 = np.square(rays.ranges_m[rows].astype(np.float64))
+    azimuth, elevation = rays.cross_axes(rows)
+    squares = [
+        np.square(np.einsum("ni,ni->n", axis, normals))
+        for axis in (rays.directions[rows], azimuth, elevation)
+    ]
+    return np.stack([squares[0], squares[1] * ranges2, squares[2] * ranges2], 1)

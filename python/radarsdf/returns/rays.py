@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import MAX_POSITION_M, check_poses, number, real_array, whole_number
 from radarsdf.checks import positions as check_positions
 
+_MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -33,6 +35,10 @@ class Rays:
     """(N,) distance of the return from the sensor."""
     intensities: NDArray[np.float32] | None
     """(N,) sensor units. None if there are no intensities."""
+    scans: NDArray[np.int32]
+    """(N,) scan of each return."""
+    up_of_scan: NDArray[np.float64]
+    """(F, 3) z axis of the sensor in each scan, local frame."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -58,7 +64,18 @@ class Rays:
             directions=np.ascontiguousarray(chosen(self.directions)),
             ranges_m=np.ascontiguousarray(chosen(self.ranges_m)),
             intensities=None if self.intensities is None else chosen(self.intensities),
+            scans=np.ascontiguousarray(chosen(self.scans)),
         )
+
+    def cross_axes(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Unit vectors (M, 3) in which azimuth and elevation of the returns in these `rows` (M,) grow, local frame.
+
+        A return straight above the sensor has no azimuth: there, both vectors are 0.
+        """
+        directions = self.directions[rows].astype(np.float64)
+        azimuth = np.cross(self.up_of_scan[self.scans[rows]], directions)
+        azimuth /= np.maximum(_lengths(azimuth), _MIN_SINE)[:, None]
+        return azimuth, np.cross(directions, azimuth)
 
     def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns, and for each the sensor position it was seen from: (N, 3) and (N, 3) float64, world, m."""
@@ -189,7 +206,7 @@ def prepare(
     max_range_m = None if max_range_m is None else number(max_range_m, "max_range_m")
     whole_number(accumulate_scans, "accumulate_scans", 1)
 
-    kept_points, kept_origins, kept_values = [], [], []
+    kept_points, kept_origins, kept_values, counts = [], [], [], []
     for i, scan in enumerate(scans):
         first = i - i % accumulate_scans
         middle = (first + min(first + accumulate_scans, len(scans)) - 1) // 2
@@ -197,6 +214,7 @@ def prepare(
         kept = scan if keep.all() else scan[keep]
         local = kept @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
+        counts.append(len(local))
         kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))
         if values is not None:
             kept_values.append(values[i][keep])
@@ -221,4 +239,6 @@ def prepare(
         directions=(rays / ranges[:, None]).astype(np.float32),
         ranges_m=ranges.astype(np.float32),
         intensities=intensity,
+        scans=np.repeat(np.arange(len(scans), dtype=np.int32), counts),
+        up_of_scan=T_world_sensor[:, :3, 2].copy(),
     )

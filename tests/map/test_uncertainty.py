@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The standard error of the surface's position: from the noise of the returns, by range and number."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.returns.noise import SensorNoise
+
+KNOWN = SensorNoise(range_m=0.1, azimuth_rad=0.006, elevation_rad=0.012)
+LEAF_M = 0.2
+FLOOR_M = 0.1 * LEAF_M
+CONFIG = FitConfig.quick().override(
+    num_threads=2,
+    returns={
+        "min_range_m": 0.0,
+        "drop_ghosts": False,
+        "range_noise_m": KNOWN.range_m,
+        "azimuth_noise_rad": KNOWN.azimuth_rad,
+        "elevation_noise_rad": KNOWN.elevation_rad,
+    },
+    encoding={"bridge_cells": 0},
+)
+
+
+def two_walls(scans=4, returns=400):
+    """A wall at x = 5 and one at x = 40, each 4 m wide and 2 m high, seen from the origin."""
+    rng = np.random.default_rng(0)
+    points = [
+        np.column_stack(
+            [
+                np.repeat([5.0, 40.0], returns),
+                np.concatenate([rng.uniform(-4, -0.5, returns), rng.uniform(0.5, 4, returns)]),
+                rng.uniform(-1, 1, 2 * returns),
+            ]
+        )
+        for _ in range(scans)
+    ]
+    return points, np.tile(np.eye(4), (scans, 1, 1))
+
+
+@pytest.fixture(scope="module", params=["quick", "trained"])
+def walls(request):
+    points, poses = two_walls()
+    config = CONFIG
+    if request.param == "trained":
+        config = FitConfig(
+            num_threads=2,
+            returns=CONFIG.returns,
+            encoding=CONFIG.encoding,
+            training={"sdf_iterations": 100},
+        ).override(returns={"onto_planes": False})
+    return points, radarsdf.fit(points, poses, config=config, progress=False)
+
+
+def test_it_is_the_standard_error_of_the_returns_round_a_cell(walls):
+    points, radar_map = walls
+    returns = np.concatenate(points)
+    local = returns - radar_map.origin
+    cells = np.floor(local / LEAF_M)
+    centres = np.unique(cells, axis=0)[::29]
+    variances = KNOWN.variances_m2(np.linalg.norm(returns, axis=1).astype(np.float32))
+    expected = [
+        np.hypot(np.sum(1 / variances[(np.abs(cells - centre) <= 1).all(axis=1)]) ** -0.5, FLOOR_M)
+        for centre in centres
+    ]
+    found = radar_map.uncertainty((centres + 0.5) * LEAF_M + radar_map.origin)
+    np.testing.assert_allclose(found, expected, rtol=0.01)
+    assert found.dtype == np.float64
+
+
+def test_far_returns_tell_less(walls):
+    _, radar_map = walls
+    near_m, far_m = (np.nanmedian(radar_map.uncertainty([[x, y, 0.0]])) for x, y in ((5, -2), (40, 2)))
+    near_m, far_m = (np.sqrt(sigma_m**2 - FLOOR_M**2) for sigma_m in (near_m, far_m))
+    # At 40 m a return has a deviation of 0.39 m, at 5 m of 0.11 m.
+    assert far_m / near_m == pytest.approx(0.39 / 0.11, rel=0.25)
+
+
+def test_nothing_is_known_where_nothing_was_observed(walls):
+    _, radar_map = walls
+    assert np.isnan(radar_map.uncertainty([[20.0, 0, 0], [1e9, 0, 0], [np.nan, 0, 0]])).all()
+
+
+def test_the_mesh_leaves_out_what_is_uncertain(walls):
+    _, radar_map = walls
+    kept = {"min_support": 0, "min_component_triangles": 0}
+    everything = radar_map.mesh(max_uncertainty=math.inf, **kept)
+    certain = radar_map.mesh(max_uncertainty=0.035, **kept)
+    assert everything.vertices[:, 0].max() > 39
+    assert certain.vertices[:, 0].max() < 6
+    assert len(certain.faces) > 0
+    assert (certain.vertex_attributes["uncertainty_m"] <= 0.035).all()
+    np.testing.assert_allclose(
+        certain.vertex_attributes["uncertainty_m"], radar_map.uncertainty(certain.vertices), rtol=1e-4
+    )
+    default = radar_map.mesh(**kept)
+    limit_m = 0.27 * LEAF_M / max(radar_map.report["rough_share"], 1e-3)
+    np.testing.assert_array_equal(default.faces, radar_map.mesh(max_uncertainty=limit_m, **kept).faces)
+
+
+def test_clutter_asks_for_more_evidence():
+    """A wall among returns of nothing: the more of these, the surer a surface must be to be meshed."""
+    rng = np.random.default_rng(1)
+    limits_m = []
+    for count in (0, 4000):
+        points, poses = two_walls(scans=8)
+        clutter = rng.uniform([8, -3, -2], [14, 3, 2], (8, count // 8, 3))
+        points = [np.concatenate(pair) for pair in zip(points, clutter, strict=True)]
+        radar_map = radarsdf.fit(points, poses, config=CONFIG, progress=False)
+        limits_m.append(radar_map._contents.max_uncertainty_m)
+    assert limits_m[0] > 1
+    assert limits_m[1] < 0.2
+
+
+def test_more_scans_make_it_certain():
+    place = [[40.0, 2.0, 0.0]]
+    few, many, very_many = (
+        radarsdf.fit(*two_walls(scans), config=CONFIG, progress=False).uncertainty(place)[0]
+        for scans in (4, 16, 1024)
+    )
+    few, many = (np.sqrt(sigma_m**2 - FLOOR_M**2) for sigma_m in (few, many))
+    assert many / few == pytest.approx(0.5, rel=0.15)
+    assert FLOOR_M < very_many < 1.2 * FLOOR_M
+
+
+def test_the_file_keeps_it(walls, tmp_path):
+    points, radar_map = walls
+    radar_map.save(tmp_path / "map.safetensors")
+    places = points[0]
+    np.testing.assert_array_equal(
+        radarsdf.load(tmp_path / "map.safetensors").uncertainty(places), radar_map.uncertainty(places)
+    )
+    assert radar_map.report["noise"] == pytest.approx(
+        {"range_m": 0.1, "azimuth_rad": 0.006, "elevation_rad": 0.012}
+    )
+
+
+@pytest.mark.parametrize("wrong", [-0.1, math.nan, "much"])
+def test_wrong_limits_are_refused(walls, wrong):
+    with pytest.raises((ValueError, TypeError), match="max_uncertainty"):
+        walls[1].mesh(max_uncertainty=wrong)

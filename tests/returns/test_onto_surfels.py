@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Returns come nearer to the surface by the planes that they make, and keep its shape."""
+
+from __future__ import annotations
+
+import numpy as np
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.onto_surfels import onto_surfels
+from radarsdf.returns.rays import prepare
+from radarsdf.returns.surfels import Surfels
+
+from ..conftest import ground_and_wall
+from .walls import a_wall
+
+LEAF_M = 0.2
+
+
+def test_returns_come_onto_the_planes_that_they_make():
+    points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01)
+    noise = SensorNoise(0.1, 0.01, 0.01)
+    rays = prepare(points, poses)
+    surfels = Surfels.of(rays, LEAF_M)
+    moved = onto_surfels(surfels, rays, noise)
+    np.testing.assert_array_equal(moved.points, onto_surfels(surfels, rays, noise, chunk=777).points)
+
+    def error_m(rays):
+        x, _, z = rays.points.T + rays.origin[:, None]
+        wall = (
+            (np.abs(x - 15) < 0.6) & (z > 1) & (z < 3)
+        )  # far from where wall and ground meet, and from their ends
+        ground = (np.abs(z) < 0.6) & (x > 6) & (x < 13)
+        return np.sqrt(np.mean(np.concatenate([x[wall] - 15, z[ground]]) ** 2))
+
+    assert error_m(moved) < 0.35 * error_m(rays)
+    # Seen from where they were, and whole rays.
+    sensors = [r.points - r.directions * r.ranges_m[:, None] for r in (rays, moved)]
+    np.testing.assert_allclose(*sensors, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(moved.directions, axis=1), 1, atol=1e-6)
+
+
+def test_returns_that_make_no_plane_stay_where_they_are():
+    noise = SensorNoise(0.1, 0.01, 0.01)
+    points = np.random.default_rng(0).uniform([5, -3, -3], [11, 3, 3], (4000, 3))
+    rays = prepare([points], np.eye(4)[None])
+    surfels = Surfels.of(rays, LEAF_M)
+    moved = onto_surfels(surfels, rays, noise)
+    assert (surfels.flat_plane_of(surfels.cells.cell_of_ray) < 0).mean() > 0.5
+    still = surfels.flat_plane_of(surfels.cells.cell_of_ray) < 0
+    for name in ("points", "directions", "ranges_m"):
+        np.testing.assert_array_equal(getattr(moved, name)[still], getattr(rays, name)[still])
+    lone = prepare([[[5.0, 0, 0]]], np.eye(4)[None])
+    assert onto_surfels(Surfels.of(lone, LEAF_M), lone, noise).points.tolist() == [[5, 0, 0]]
+
+
+def test_a_fit_to_planes_is_nearer_to_the_surface():
+    scene = ground_and_wall(noise_m=0.15)
+    errors_m = []
+    for onto_planes in (False, True):
+        config = FitConfig(
+            num_threads=2, returns={"onto_planes": onto_planes}, training={"sdf_iterations": 150}
+        )
+        vertices = radarsdf.fit(scene.points, scene.poses, config=config).mesh().vertices
+        on_wall = (np.abs(vertices[:, 0] - 20) < 0.8) & (vertices[:, 2] > 1) & (vertices[:, 2] < 3)
+        errors_m.append(np.sqrt(np.mean((vertices[on_wall, 0] - 20) ** 2)))
+    assert errors_m[1] < 0.7 * errors_m[0]
+
+
+def test_a_rough_surface_keeps_its_shape():
+    """A sensor with little noise sees a wall with grooves: the scatter across the plane is shape, not noise."""
+    rng = np.random.default_rng(0)
+    y, z = rng.uniform(-3, 3, 20_000), rng.uniform(-3, 3, 20_000)
+    depth_m = 0.1 * np.sin(2 * np.pi * y / 0.5)
+    rays = prepare([np.column_stack([10 + depth_m + rng.normal(0, 0.01, len(y)), y, z])], np.eye(4)[None])
+    surfels = Surfels.of(rays, LEAF_M)
+    kept = {
+        sigma_m: np.std(onto_surfels(surfels, rays, SensorNoise(sigma_m, 1e-4, 1e-4)).points[:, 0])
+        / np.std(rays.points[:, 0])
+        for sigma_m in (0.01, 0.1)
+    }
+    assert kept[0.01] > 0.95
+    assert kept[0.1] < 0.3  # a sensor with so much noise would not tell the grooves
