@@ -19,6 +19,7 @@ _FEWEST = 50  # returns for a figure; of fewer there is none
 _CONE_RAD = np.deg2rad(1.5)  # the lidar covers a direction if it has points this near to it,
 _CONE_POINTS = 3  # at least so many in the same scan
 _GATE_M = 1.5  # returns farther from their plane say nothing of the noise
+_TOGETHER = 1000  # returns whose pieces are in memory at once
 _ALONG_NORMAL = 0.85  # a plane measures the axis whose share in its normal is at least this
 _FALSE_M = 1.0  # a return farther from every lidar point is called false
 _REPEAT_PER_M = 0.02  # returns of two scans agree if they are nearer than this share of the range
@@ -112,21 +113,34 @@ def plane_errors(
     axes = np.stack([drive.in_world(v) for v in (beam, left, np.cross(beam, left))], axis=1)
     tree, errors_m = cKDTree(drive.lidar), np.full(len(world), np.nan)
     axis = np.full(len(world), -1)
-    for i in np.flatnonzero(np.linalg.norm(world - drive.lidar[nearest], axis=1) < 2.0):
-        radius_m = max(0.4, 0.025 * range_m[i])
-        piece = drive.lidar[tree.query_ball_point(drive.lidar[nearest[i]], radius_m)]
-        if len(piece) < 10:
-            continue
-        centre = piece.mean(axis=0)
-        spread_m = piece - centre
-        variances, directions = np.linalg.eigh(spread_m.T @ spread_m / (len(piece) - 1))
-        wide = variances[1] > 0.03 * radius_m**2
-        if not (wide and variances[0] < 0.06**2 and variances[0] < 0.05 * variances[1]):
-            continue
-        error_m, shares = directions[:, 0] @ (world[i] - centre), np.abs(axes[i] @ directions[:, 0])
-        if abs(error_m) < _GATE_M and shares.max() > _ALONG_NORMAL:
-            errors_m[i], axis[i] = error_m, int(shares.argmax())
+    near = np.flatnonzero(np.linalg.norm(world - drive.lidar[nearest], axis=1) < 2.0)
+    for rows in np.split(near, range(_TOGETHER, len(near), _TOGETHER)):
+        middle, radius_m = drive.lidar[nearest[rows]], np.maximum(0.4, 0.025 * range_m[rows])
+        count, centre, normal, variances = _pieces(drive.lidar, tree, middle, radius_m)
+        thin, wide = variances[:, 0], variances[:, 1]
+        flat = (count >= 10) & (wide > 0.03 * radius_m**2) & (thin < 0.06**2) & (thin < 0.05 * wide)
+        error_m = np.einsum("ni,ni->n", normal, world[rows] - centre)
+        shares = np.abs(np.einsum("nai,ni->na", axes[rows], normal))
+        used = flat & (np.abs(error_m) < _GATE_M) & (shares.max(axis=1) > _ALONG_NORMAL)
+        errors_m[rows[used]], axis[rows[used]] = error_m[used], shares[used].argmax(axis=1)
     return errors_m, axis
+
+
+def _pieces(
+    points: FloatArray, tree: cKDTree, middle: FloatArray, radius_m: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
+    """Count (n,), mean (n, 3), least axis (n, 3) and ascending variances (n, 3) of the points in n balls, none empty."""
+    own = tree.query_ball_point(middle, radius_m, return_sorted=False)
+    count = np.array([len(rows) for rows in own])
+    first = np.cumsum(count) - count
+    # From the middle, or UTM coordinates would cost digits.
+    spread_m = points[np.concatenate(own).astype(np.int64)] - np.repeat(middle, count, axis=0)
+    mean = np.add.reduceat(spread_m, first) / count[:, None]
+    spread_m -= np.repeat(mean, count, axis=0)
+    products = [np.add.reduceat(spread_m * spread_m[:, k, None], first) for k in range(3)]
+    covariance = np.stack(products, axis=1) / np.maximum(count - 1, 1)[:, None, None]
+    variances, directions = np.linalg.eigh(covariance)
+    return count, middle + mean, directions[:, :, 0], variances
 
 
 def deviation(errors: FloatArray, gate: float) -> float:
