@@ -67,19 +67,29 @@ def recorded(path: Path) -> Drive:
         )
 
 
-def with_lidar(simulation: Simulation) -> Drive:
-    """A simulated drive, with the points that a lidar of 16 rings finds on its surfaces."""
+def with_lidar(simulation: Simulation, same_lidar: Drive | None = None) -> Drive:
+    """A simulated drive, with the points that a lidar of 16 rings finds on its surfaces.
+
+    They do not depend on the radar: they can be those of another drive through the same scene, with the same poses.
+    """
     points = np.concatenate(simulation.points).astype(np.float64)
     used = np.linalg.norm(points, axis=1) >= MIN_RANGE_M
-    lidar = [_lidar_scan(simulation, frame) for frame in range(len(simulation))]
+    if same_lidar is None:
+        scans = [_lidar_scan(simulation, frame) for frame in range(len(simulation))]
+        lidar, lidar_frame = (
+            np.concatenate(scans),
+            np.repeat(np.arange(len(scans)), [len(scan) for scan in scans]),
+        )
+    else:
+        lidar, lidar_frame = same_lidar.lidar, same_lidar.lidar_frame
     return Drive(
         name=f"{simulation.name}, seed {simulation.seed}",
         points=points[used],
         intensities=np.concatenate(simulation.intensities).astype(np.float64)[used],
         frame=np.repeat(np.arange(len(simulation)), [len(scan) for scan in simulation.points])[used],
         poses=simulation.poses,
-        lidar=np.concatenate(lidar),
-        lidar_frame=np.repeat(np.arange(len(lidar)), [len(scan) for scan in lidar]),
+        lidar=lidar,
+        lidar_frame=lidar_frame,
     )
 
 
