@@ -80,9 +80,15 @@ COMMANDS = {
     "demo": ["demo", "--scene", "wall", "--frames", "3", "--out", "demo", *QUICK],
     "wrong": ["fit", "scans.npz", "-o", "other.safetensors", "--set", "nonsense=1"],
 }
+# One process for all commands; the demo, whose sizes have no options, is made smaller.
 DRIVER = """
-import json, os, sys
+import functools, json, os, sys
+from radarsdf import evaluation
 from radarsdf.cli import main
+from radarsdf.render import picture
+picture.save_picture = functools.partial(picture.save_picture, width=160, height=100)
+surface_metrics = evaluation.surface_metrics
+evaluation.surface_metrics = lambda *given, samples, **named: surface_metrics(*given, samples=min(samples, 1000), **named)
 commands, before_each = json.load(open("commands.json"))
 statuses = {}
 for name, words in commands.items():
