@@ -16,6 +16,8 @@ from radarsdf import FitConfig, evaluation
 from radarsdf.io.scans import Scans, read_scans, write_scans
 from radarsdf.render.picture import save_picture
 
+from .conftest import ground_and_wall
+
 
 @contextlib.contextmanager
 def float64():
@@ -87,16 +89,22 @@ def answers(scene, path, changes):
 
 
 @pytest.fixture(scope="module")
-def usual(scene, tmp_path_factory):
+def few():
+    """Few returns: what is fitted many times here need not be good."""
+    return ground_and_wall(scans=4, returns_per_scan=300)
+
+
+@pytest.fixture(scope="module")
+def usual(few, tmp_path_factory):
     path = tmp_path_factory.mktemp("maps") / "map.safetensors"
-    return {name: answers(scene, path, changes) for name, changes in CONFIGS.items()}
+    return {name: answers(few, path, changes) for name, changes in CONFIGS.items()}
 
 
 @pytest.mark.parametrize("config", CONFIGS)
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_the_same_bits(scene, tmp_path, usual, setting, config):
+def test_the_same_bits(few, tmp_path, usual, setting, config):
     with SETTINGS[setting]():
-        found = answers(scene, tmp_path / "map.safetensors", CONFIGS[config])
+        found = answers(few, tmp_path / "map.safetensors", CONFIGS[config])
     assert found == usual[config]
 
 
@@ -189,22 +197,22 @@ def bits(arrays):
 
 
 @pytest.fixture(scope="module")
-def fitted(scene):
+def fitted(few):
     config = FitConfig(num_threads=2, training=TRAINING)
-    return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+    return radarsdf.fit(few.points, few.poses, few.intensities, config=config, progress=False)
 
 
 @pytest.fixture(scope="module")
-def usual_bits(scene, fitted, tmp_path_factory):
+def usual_bits(few, fitted, tmp_path_factory):
     path = tmp_path_factory.mktemp("usual") / "file.safetensors"
-    return {name: bits(function(scene, fitted, path)) for name, function in FUNCTIONS.items()}
+    return {name: bits(function(few, fitted, path)) for name, function in FUNCTIONS.items()}
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_every_function_has_the_same_bits(scene, fitted, tmp_path, usual_bits, name, setting):
+def test_every_function_has_the_same_bits(few, fitted, tmp_path, usual_bits, name, setting):
     with SETTINGS[setting]():
-        found = bits(FUNCTIONS[name](scene, fitted, tmp_path / "file.safetensors"))
+        found = bits(FUNCTIONS[name](few, fitted, tmp_path / "file.safetensors"))
     assert found == usual_bits[name]
 
 
@@ -232,16 +240,16 @@ def threads(number):
         torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("number", [1, 2, 3, 7, 16])
-def test_any_number_of_threads_gives_the_same_answers(scene, fitted, tmp_path, usual_bits, number):
+@pytest.mark.parametrize("number", [1, 3, 16])
+def test_any_number_of_threads_gives_the_same_answers(few, fitted, tmp_path, usual_bits, number):
     with threads(number):
         for name, function in FUNCTIONS.items():
             if not name.startswith("estimate"):  # which counts the threads
-                assert bits(function(scene, fitted, tmp_path / "file.safetensors")) == usual_bits[name], name
+                assert bits(function(few, fitted, tmp_path / "file.safetensors")) == usual_bits[name], name
         assert torch.get_num_threads() == number
 
 
-@pytest.mark.parametrize("number", [1, 2, 3, 7, 16])
+@pytest.mark.parametrize("number", [1, 3, 16])
 def test_any_number_of_threads_gives_a_fit_as_good(scene, number):
     training = {"sdf_iterations": 150, "intensity_iterations": 60, "learning_rate": 1e-2}
     config = FitConfig(training=training)
@@ -256,10 +264,10 @@ def test_any_number_of_threads_gives_a_fit_as_good(scene, number):
 
 @pytest.mark.parametrize("config", CONFIGS)
 @pytest.mark.parametrize("size", [1, 2, 3])
-def test_small_batches_give_a_finite_map(scene, tmp_path, size, config):
+def test_small_batches_give_a_finite_map(few, tmp_path, size, config):
     small = {"batch_size": size, "intensity_batch_size": size, "sdf_iterations": 3, "intensity_iterations": 6}
     given = FitConfig(num_threads=3).override(**CONFIGS[config]).override(training=small)
-    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=given, progress=False)
+    radar_map = radarsdf.fit(few.points, few.poses, few.intensities, config=given, progress=False)
     assert radar_map.report["iterations_done"] == radar_map.report["iterations"]
     radar_map.save(tmp_path / "map.safetensors")  # which refuses what is not finite
     assert bits(queries(radarsdf.load(tmp_path / "map.safetensors"), POINTS[:size])) == bits(
