@@ -3,7 +3,7 @@
 # SPDX-License-Identifier: MIT
 #
 # tools/test_core.sh            the C++ tests, and a project that uses the installed core; without Python
-# tools/test_core.sh address    the C++ tests under AddressSanitizer and UBSan (gcc)
+# tools/test_core.sh address    the same under AddressSanitizer and UBSan (gcc)
 # tools/test_core.sh thread     the same results on several threads, under ThreadSanitizer (clang, libomp, Archer)
 #
 # On Debian: apt-get install doctest-dev, and clang libclang-rt-14-dev libomp-dev for `thread`. Builds in build/.
@@ -16,17 +16,21 @@ build() { # folder, targets, options of CMake
   cmake --build "$1" --parallel 2 --target $2
 }
 
+use_installed() { # folder of the build, options of CMake
+  local prefix=$PWD/$1/installed
+  rm -rf "$prefix" "$1/consumer"
+  cmake --install "$1" --prefix "$prefix" --component core
+  cmake -S tests/core_cpp/consumer -B "$1/consumer" -DCMAKE_PREFIX_PATH="$prefix" "${@:2}"
+  cmake --build "$1/consumer"
+  "$1/consumer/consumer"
+}
+
 case "${1:-plain}" in
   plain)
     folder=build/test_core
     build $folder all
     ctest --test-dir $folder --output-on-failure
-    prefix=$PWD/$folder/installed
-    rm -rf "$prefix" $folder/consumer
-    cmake --install $folder --prefix "$prefix" --component core
-    cmake -S tests/core_cpp/consumer -B $folder/consumer -DCMAKE_PREFIX_PATH="$prefix" -DCMAKE_BUILD_TYPE=Release
-    cmake --build $folder/consumer
-    $folder/consumer/consumer
+    use_installed $folder -DCMAKE_BUILD_TYPE=Release
     ;;
   address)
     folder=build/test_core_address
@@ -34,6 +38,7 @@ case "${1:-plain}" in
     build $folder all -DRADARSDF_SANITIZE=address,undefined -DCMAKE_BUILD_TYPE=None -DCMAKE_CXX_FLAGS=-O1 \
       -DCMAKE_CXX_COMPILER="${CXX:-g++}"
     UBSAN_OPTIONS=print_stacktrace=1 ctest --test-dir $folder --output-on-failure
+    use_installed $folder -DCMAKE_CXX_COMPILER="${CXX:-g++}"
     ;;
   thread)
     # Not in Python: PyTorch brings gcc's OpenMP, whose barriers ThreadSanitizer does not see. LLVM's tells it of them
