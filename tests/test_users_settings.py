@@ -181,6 +181,12 @@ FUNCTIONS = {
         np.array(str(evaluation.surface_metrics(BOX, POINTS, samples=5000, num_threads=2)))
     ],
     "intensity_metrics": lambda *_: [np.array(str(evaluation.intensity_metrics(VALUES, VALUES[::-1])))],
+    "uncertainty_metrics": lambda *_: [
+        np.array(str(evaluation.uncertainty_metrics(VALUES - VALUES.mean(), np.abs(VALUES) + 0.1)))
+    ],
+    "confidence_metrics": lambda *_: [
+        np.array(str(evaluation.confidence_metrics(np.linspace(0, 1, len(VALUES)), VALUES > 60)))
+    ],
     "adjacent_angles": lambda *_: [evaluation.adjacent_angles(BOX)],
     "gamma_from_moments": lambda *_: [np.array(evaluation.gamma_from_moments(np.abs(VALUES)))],
     "holdout": lambda *_: evaluation.holdout(30),

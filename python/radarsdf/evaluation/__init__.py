@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Errors of a map: its surface against lidar points, its intensity against held-out radar scans.
+"""Errors of a map: its surface against lidar points, its intensity against held-out radar scans, its uncertainty
+and confidence against both.
 
 The functions take meshes and arrays, not maps, so they measure the results of other programs in the same way.
 """
@@ -8,19 +9,31 @@ The functions take meshes and arrays, not maps, so they measure the results of o
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 
 from ._report import format_metrics
+from .calibration import (
+    CALIBRATION_PROTOCOL,
+    ConfidenceMetrics,
+    UncertaintyMetrics,
+    confidence_metrics,
+    uncertainty_metrics,
+)
 from .intensity import INTENSITY_PROTOCOL, IntensityMetrics, KNNIntensity, holdout, intensity_metrics
 from .surface import PROTOCOL, SurfaceMetrics, adjacent_angles, gamma_from_moments, surface_metrics
 
 __all__ = [
+    "CALIBRATION_PROTOCOL",
     "INTENSITY_PROTOCOL",
     "PROTOCOL",
+    "ConfidenceMetrics",
     "IntensityMetrics",
     "KNNIntensity",
     "SurfaceMetrics",
+    "UncertaintyMetrics",
     "adjacent_angles",
+    "confidence_metrics",
     "format_metrics",
     "gamma_from_moments",
     "holdout",
     "intensity_metrics",
     "surface_metrics",
+    "uncertainty_metrics",
 ]
