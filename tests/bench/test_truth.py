@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Distances to true surfaces along normals, where they are known in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from radarsdf.simulate import Box, Pole, Terrain, materials
+from radarsdf.simulate import Scene as World
+
+from bench.paper.scenes import load_scene
+from bench.paper.truth import along_normals, to_planes, truth_of
+
+X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+def flat_ground():
+    return Terrain(np.ones((1, 2)), np.zeros(1), np.zeros(1), 0.0, materials.GRASS)
+
+
+def wall_world():
+    """A wall whose front is x = 0 and whose back is x = -0.3, on ground at z = 0 and reaching below it."""
+    wall = Box(np.array([-0.15, 0.0, 1.0]), np.array([0.15, 5.0, 2.0]), 0.0, materials.BRICK)
+    pole = Pole(np.array([4.0, 0.0, 0.0]), 0.1, 3.0, materials.METAL)
+    return World([wall, pole], flat_ground())
+
+
+def errors(points, normal):
+    points = np.atleast_2d(points).astype(np.float64)
+    return along_normals(wall_world(), points, np.broadcast_to(normal, points.shape))
+
+
+def test_errors_are_positive_in_front_and_negative_behind():
+    points = [[0.2, 0, 1.5], [0.01, 1, 1], [0, 1, 1], [-0.1, 2, 1], [-0.29, 2, 1], [-0.5, 2, 1]]
+    # The last three are nearer to the back, which faces the other way.
+    np.testing.assert_allclose(errors(points, X), [0.2, 0.01, 0, -0.1, -0.29, -0.5], atol=1e-6)
+    np.testing.assert_allclose(errors([[-0.5, 2, 1], [-0.1, 2, 1]], -X), [0.2, -0.2], atol=1e-6)
+
+
+def test_an_oblique_normal_lengthens_the_distance():
+    tilted = np.array([np.cos(0.5), 0.0, np.sin(0.5)])
+    np.testing.assert_allclose(errors([0.2, 0, 1.5], tilted), [0.2 / np.cos(0.5)], atol=1e-6)
+
+
+def test_no_surface_within_reach():
+    assert np.isnan(errors([[1.5, 0, 2.0], [-1.4, 0, 1.0], [0.1, 9.0, 1.0]], X)).all()
+
+
+def test_a_surface_turned_round_belongs_to_the_other_side():
+    np.testing.assert_allclose(errors([[0.1, 0, 1.0], [0.5, 0, 1.0]], -X), [-0.4, -0.8], atol=1e-6)
+
+
+def test_ground_under_things_and_foundations():
+    # Beside the wall; and 5 cm below the ground, 10 cm in front of the foundation, which is not the surface.
+    np.testing.assert_allclose(errors([[0.1, 0, 0.1], [0.1, 0, -0.05]], Z), [0.1, -0.05], atol=1e-6)
+    np.testing.assert_allclose(errors([4.0 - 0.15, 0, 1.0], -X), [0.05], atol=1e-6)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (5e5, 5.4e6, 120.0)], ids=["local", "UTM"])
+def test_planes_through_noisy_points(offset):
+    rng = np.random.default_rng(0)
+    lidar = np.column_stack([0.02 * rng.standard_normal(20_000), rng.uniform(-4, 4, (20_000, 2))]) + offset
+    x = np.column_stack([rng.uniform(-0.4, 0.4, 200), rng.uniform(-3, 3, (200, 2))])
+    nearest = np.array([np.argmin(np.linalg.norm(lidar - offset - point, axis=1)) for point in x])
+    for normal, sign in ((X, 1.0), (-X, -1.0), (np.array([0.8, 0.6, 0.0]), 1 / 0.8)):
+        found = to_planes(lidar, nearest, x + offset, np.broadcast_to(normal, x.shape))
+        np.testing.assert_allclose(found, sign * x[:, 0], atol=0.012)
+    assert np.isnan(to_planes(lidar, nearest, x + offset, np.broadcast_to(Z, x.shape))).all()
+
+
+def test_lines_bushes_and_single_points_are_no_planes():
+    rng = np.random.default_rng(0)
+    line = np.column_stack([np.zeros(500), np.linspace(-2, 2, 500), 0.01 * rng.standard_normal(500)])
+    bush = rng.uniform(-0.4, 0.4, (500, 3)) + [10, 0, 0]
+    lidar = np.concatenate([line, bush, [[20.0, 0, 0]]])
+    x = np.array([[0.1, 0, 0], [10, 0, 0], [20.1, 0, 0]])
+    nearest = np.array([250, 600, 1000])
+    assert np.isnan(to_planes(lidar, nearest, x, np.broadcast_to(X, x.shape))).all()
+
+
+def test_lidar_points_and_solids_of_a_scene_agree():
+    scene = load_scene("wall", frames=20)
+    assert scene.simulation is not None
+    rng = np.random.default_rng(0)
+    y, z = rng.uniform(-5, 5, 300), rng.uniform(1.0, 2.0, 300)
+    x = np.column_stack([rng.uniform(-0.2, 0.2, 300), y, z])
+    normals = np.broadcast_to(X, x.shape)
+    exact = truth_of(scene, x, normals)
+    lidar = truth_of(dataclasses.replace(scene, simulation=None), x, normals)
+    flat = np.isfinite(lidar.error_m) & (np.abs(exact.error_m - x[:, 0]) < 1e-6)  # not in front of windows
+    assert flat.mean() > 0.5
+    assert np.median(np.abs(lidar.error_m - exact.error_m)[flat]) < 0.01
+    assert (exact.distance_m <= np.abs(exact.error_m) + 1e-6).all()
+    assert (exact.sigma_m == 0).all()
+    assert (lidar.sigma_m > 0).all()
+    with pytest.raises(ValueError, match="no ground truth"):
+        truth_of(dataclasses.replace(scene, simulation=None, ground_truth=None), x, normals)
