@@ -66,9 +66,11 @@ def test_planes_through_noisy_points(offset):
     x = np.column_stack([rng.uniform(-0.4, 0.4, 200), rng.uniform(-3, 3, (200, 2))])
     nearest = np.array([np.argmin(np.linalg.norm(lidar - offset - point, axis=1)) for point in x])
     for normal, sign in ((X, 1.0), (-X, -1.0), (np.array([0.8, 0.6, 0.0]), 1 / 0.8)):
-        found = to_planes(lidar, nearest, x + offset, np.broadcast_to(normal, x.shape))
-        np.testing.assert_allclose(found, sign * x[:, 0], atol=0.012)
-    assert np.isnan(to_planes(lidar, nearest, x + offset, np.broadcast_to(Z, x.shape))).all()
+        found = to_planes(lidar, nearest, x + offset, np.broadcast_to(normal, x.shape), offset + 9 * X[None])
+        np.testing.assert_allclose(found, sign * x[:, 0], atol=0.03)
+    assert np.isnan(
+        to_planes(lidar, nearest, x + offset, np.broadcast_to(Z, x.shape), offset + 9 * X[None])
+    ).all()
 
 
 def test_lines_bushes_and_single_points_are_no_planes():
@@ -78,7 +80,28 @@ def test_lines_bushes_and_single_points_are_no_planes():
     lidar = np.concatenate([line, bush, [[20.0, 0, 0]]])
     x = np.array([[0.1, 0, 0], [10, 0, 0], [20.1, 0, 0]])
     nearest = np.array([250, 600, 1000])
-    assert np.isnan(to_planes(lidar, nearest, x, np.broadcast_to(X, x.shape))).all()
+    assert np.isnan(to_planes(lidar, nearest, x, np.broadcast_to(X, x.shape), np.zeros((1, 3)))).all()
+
+
+def test_far_rings_make_a_plane():
+    rings = np.stack(np.meshgrid(np.linspace(-3, 3, 100), np.arange(-2, 2.1, 0.9)), axis=-1).reshape(-1, 2)
+    lidar = np.column_stack([np.zeros(len(rings)), rings])
+    x, nearest = np.array([[0.3, 0, 0.1]]), np.argmin(np.linalg.norm(lidar, axis=1), keepdims=True)
+    near, far = (to_planes(lidar, nearest, x, X[None], np.array([[d, 0, 0]])) for d in (9.0, 30.0))
+    assert np.isnan(near).all()
+    np.testing.assert_allclose(far, 0.3, atol=1e-9)
+
+
+def test_beyond_an_edge_there_is_no_error():
+    scene = load_scene("wall", frames=2)
+    assert scene.simulation is not None
+    simulation = dataclasses.replace(scene.simulation, scene=wall_world())
+    scene = dataclasses.replace(scene, simulation=simulation)
+    # Above the wall, whose top is at 3 m; beside it, with the normal up; and on the ground, 60 cm under that.
+    x = np.array([[-0.1, 0, 3.05], [0.05, 0, 0.6], [0.7, 0, 0.02]])
+    truth = truth_of(scene, x, np.broadcast_to(Z, x.shape))
+    np.testing.assert_allclose(truth.error_m, [0.05, np.nan, 0.02], atol=1e-6)
+    np.testing.assert_allclose(truth.distance_m, [0.05, 0.05, 0.02], atol=1e-6)
 
 
 def test_lidar_points_and_solids_of_a_scene_agree():
@@ -93,7 +116,7 @@ def test_lidar_points_and_solids_of_a_scene_agree():
     flat = np.isfinite(lidar.error_m) & (np.abs(exact.error_m - x[:, 0]) < 1e-6)  # not in front of windows
     assert flat.mean() > 0.5
     assert np.median(np.abs(lidar.error_m - exact.error_m)[flat]) < 0.01
-    assert (exact.distance_m <= np.abs(exact.error_m) + 1e-6).all()
+    assert not (exact.distance_m > np.abs(exact.error_m) + 1e-6).any()  # NaN in front of edges
     assert (exact.sigma_m == 0).all()
     assert (lidar.sigma_m > 0).all()
     with pytest.raises(ValueError, match="no ground truth"):
