@@ -16,7 +16,7 @@ from tqdm import tqdm
 from bench.peers.interface import PEERS
 from bench.settings import Changes, parsed
 
-from . import ablation, angles, curve, intensity, map_size, sparse, surface, views
+from . import ablation, angles, calibration, curve, intensity, map_size, sparse, surface, views
 from .experiment import Experiment, Options, Row
 from .report import provenance, write_json
 from .scenes import load_scene
@@ -30,6 +30,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "angles": angles.EXPERIMENT,
     "views": views.EXPERIMENT,
     "curve": curve.EXPERIMENT,
+    "calibration": calibration.EXPERIMENT,
 }
 _QUICK_FRAMES = 4
 
@@ -112,9 +113,15 @@ def _parser() -> argparse.ArgumentParser:
         "--quick", action="store_true", help="only check that everything runs, in about a minute"
     )
     parser.add_argument(
-        "--repetitions", type=int, help="number of fits with different seeds; default: as in the paper"
+        "--repetitions",
+        type=int,
+        help="number of fits with different seeds, calibration: of simulated scenes too; default: as in the paper",
     )
-    parser.add_argument("--samples", type=int, help="points on a mesh for its errors; default: 10000000")
+    parser.add_argument(
+        "--samples",
+        type=int,
+        help="points on a mesh for its errors; default: 10000000, of which calibration takes at most 40000",
+    )
     parser.add_argument(
         "--meshes",
         action="store_true",
@@ -145,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="curve: one more point, with these settings of FitConfig, such as training.joint=False, or of the mesh, such as "
+        help="curve, calibration: one more fit, with these settings of FitConfig, such as training.joint=False, or of the mesh, such as "
         "mesh.min_support=0; may be repeated",
     )
     return parser

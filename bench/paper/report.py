@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from radarsdf import _core
-from radarsdf.evaluation import INTENSITY_PROTOCOL, PROTOCOL
+from radarsdf.evaluation import CALIBRATION_PROTOCOL, INTENSITY_PROTOCOL, PROTOCOL
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -26,7 +26,7 @@ def provenance(module: str = "bench.paper") -> dict[str, Any]:
     return {
         "command": " ".join([f"python -m {module}", *sys.argv[1:]]),
         "commit": _commit(),
-        "protocols": [PROTOCOL, INTENSITY_PROTOCOL],
+        "protocols": [PROTOCOL, INTENSITY_PROTOCOL, CALIBRATION_PROTOCOL],
         "processor": _processor(),
         "threads": torch.get_num_threads(),
         "instruction_set": _core.instruction_set(),
