@@ -18,6 +18,7 @@ from radarsdf.evaluation import confidence_metrics, uncertainty_metrics
 from radarsdf.returns.rays import prepare, scan_numbers
 from scipy.spatial import cKDTree
 
+from bench.sensor.figures import deviation
 from bench.settings import Changes, flat
 
 from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation
@@ -47,6 +48,7 @@ _COLUMNS: tuple[tuple[str, str, float], ...] = (
     ("worst_decile_factor", "worst decile, factor", 1),
     ("mean_error_m", "bias, cm", 100),
     ("rmse_m", "RMSE, cm", 100),
+    ("core_m", "core, cm", 100),
     ("mean_uncertainty_m", "mean predicted, cm", 100),
     ("false_share", "false, %", 100),
     ("aside_share", "aside, %", 100),
@@ -126,7 +128,9 @@ def compared(
     Shares of all points: `false_share` is farther than `TRUE_M` from the truth, `aside_share` is not, but no surface is
     met along the normal (beyond an edge, or the truth is not flat), `unobserved_share` is the share of NaN. The figures
     of the uncertainty are those of the other points. The standard error of the truth is added to the prediction in
-    quadrature.
+    quadrature. `core_m` is the deviation of the errors up to `TRUE_M` without a uniform background: points that by
+    chance are near another surface raise the root mean square, but not this. A map that calls them surface is wrong in
+    its confidence, not in its uncertainty.
 
     Raises
     ------
@@ -144,6 +148,7 @@ def compared(
         "unobserved_share": float(np.mean(np.isnan(uncertainty_m))),
         "truth_sigma_m": float(truth.sigma_m[0]),
         **uncertainty_metrics(error_m, predicted_m),
+        "core_m": _core(error_m[np.isfinite(predicted_m)]),
         "by_range": _bands(range_m, _RANGES_M, error_m, predicted_m, is_true),
         "by_scans": _bands(scans, _SCANS, error_m, predicted_m, is_true),
     }
@@ -185,9 +190,16 @@ def _bands(
         if np.count_nonzero(own & np.isfinite(error_m) & np.isfinite(predicted_m)) >= _FEWEST:
             metrics = uncertainty_metrics(error_m[own], predicted_m[own], bins=1)
             band |= {key: metrics[key] for key in ("rmse_m", "mean_error_m", "z_rms", "coverage_95")}
+            band["core_m"] = _core(error_m[own & np.isfinite(predicted_m)])
             band["predicted_m"] = metrics["bin_predicted_m"][0]
         found.append(band)
     return found
+
+
+def _core(error_m: FloatArray) -> float | None:
+    """Deviation of the Gaussian in a uniform background of errors (N,), m; None of few. NaN does not count."""
+    sigma_m = deviation(error_m[np.abs(error_m) <= TRUE_M], TRUE_M)
+    return sigma_m if np.isfinite(sigma_m) else None
 
 
 def table(rows: list[Row]) -> str:
@@ -235,10 +247,19 @@ def _details(name: str, rows: list[Row]) -> list[str]:
             own = [row[key][i] for row in rows]
             lines.append([
                 _interval(band, key), str(sum(b["samples"] for b in own)), _text(own, "predicted_m", 100),
-                _text(own, "rmse_m", 100), _text(own, "mean_error_m", 100), _text(own, "coverage_95", 100),
+                _text(own, "rmse_m", 100), _text(own, "core_m", 100), _text(own, "mean_error_m", 100), _text(own, "coverage_95", 100),
                 _text(own, "true_share", 100),
             ])  # fmt: skip
-        header = [heading, "points", "predicted, cm", "RMSE, cm", "bias, cm", "95 % interval, %", "true, %"]
+        header = [
+            heading,
+            "points",
+            "predicted, cm",
+            "RMSE, cm",
+            "core, cm",
+            "bias, cm",
+            "95 % interval, %",
+            "true, %",
+        ]
         parts += [f"#### {name}: by {heading}", markdown(header, lines)]
     header, lines = ["confidence", "points", "mean confidence, %", "true, %"], []
     bins = len(rows[0]["confidence_bin_count"])

@@ -45,7 +45,8 @@ class Drive:
 
     def in_world(self, vectors: FloatArray) -> FloatArray:
         """One vector (N, 3) in the sensor frame for each return, turned into the world frame."""
-        return np.einsum("nij,nj->ni", self.poses[self.frame, :3, :3], vectors)
+        turned: FloatArray = np.einsum("nij,nj->ni", self.poses[self.frame, :3, :3], vectors)
+        return turned
 
     def world_points(self) -> FloatArray:
         """The returns (N, 3) in the world frame, m."""

@@ -73,6 +73,15 @@ def test_false_surface_and_unknown_points_are_shares(scene, surface):
     assert row["confidence_auc"] > 0.95
 
 
+def test_points_near_another_surface_by_chance_do_not_widen_the_core(scene, surface):
+    x, normals, sigma_m = surface
+    x = x.copy()
+    x[:1500, 0] = np.random.default_rng(1).uniform(-0.4, 0.4, 1500)
+    row = compared(scene, x, normals, sigma_m, np.ones(len(x)))
+    assert row["rmse_m"] > 0.1
+    assert row["core_m"] == pytest.approx(np.sqrt(np.mean(sigma_m**2)), rel=0.15)
+
+
 def test_samples_lie_on_the_mesh_with_its_normals():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=2.0)
     x, normals = sampled(ball, 20_000, None)
