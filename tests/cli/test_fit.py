@@ -22,7 +22,13 @@ def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     assert call("fit", scans_file, "-o", path, "--quick", "--geometry-only") == 0
     printed = capsys.readouterr().out
     assert printed.startswith("fit ")
-    assert printed.endswith(f", written to {path}\n")
+    written, noise = printed.splitlines()[-2:]
+    assert written.endswith(f", written to {path}")
+    sigma = radarsdf.load(path).report["noise"]
+    assert noise == (
+        f"noise {sigma['range_m']:.3f} m, azimuth {sigma['azimuth_rad']:.4f} rad, "
+        f"elevation {sigma['elevation_rad']:.4f} rad"
+    )
     radar_map = radarsdf.load(path)
     assert not radar_map.has_intensity
     assert radar_map.config == radarsdf.FitConfig.quick()

@@ -80,3 +80,8 @@ def run(options: argparse.Namespace) -> None:
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
     say(f"fit {time.perf_counter() - started_s:.1f} s: {radar_map}, written to {options.out}")
+    say(
+        "noise {range_m:.3f} m, azimuth {azimuth_rad:.4f} rad, elevation {elevation_rad:.4f} rad".format(
+            **radar_map.report["noise"]
+        )
+    )
