@@ -15,13 +15,12 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from radarsdf.evaluation import confidence_metrics, uncertainty_metrics
-from radarsdf.returns.rays import prepare, scan_numbers
 from scipy.spatial import cKDTree
 
 from bench.sensor.figures import deviation
 from bench.settings import Changes, flat
 
-from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation
+from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, rays_of
 from .report import figure, markdown
 from .scenes import Scene, load_scene
 from .truth import truth_of
@@ -78,8 +77,7 @@ def _rows(scene: Scene, options: Options, base: str, changes: Changes, repetitio
     if scene.simulation is None and scene.ground_truth is None:
         return [row | {"why_not": "the scene has no ground truth"}]
     settings = {name: value for name, value in changes.items() if name != "mesh"}
-    # The map of another version may have no uncertainty, so its type is left open.
-    radar_map: Any = fit(scene, options.config(base, scene, seed=repetition, **settings))
+    radar_map = fit(scene, options.config(base, scene, seed=repetition, **settings))
     mesh = radar_map.mesh(progress=False, **changes.get("mesh", {}))
     x, normals = sampled(mesh, min(options.samples, _MOST_SAMPLES), scene.box)
     if len(x) == 0:
@@ -160,9 +158,7 @@ def seen_from(scene: Scene, x: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     Without returns near a point, the range is that of the nearest one.
     """
-    low_m, high_m = scene.min_range_m, scene.max_range_m
-    rays = prepare(scene.points, scene.poses, min_range_m=low_m, max_range_m=high_m)
-    scan = scan_numbers(scene.points, min_range_m=low_m, max_range_m=high_m)
+    rays = rays_of(scene)
     tree = cKDTree(rays.points)
     local = x - rays.origin
     range_m = rays.ranges_m[tree.query(local)[1]].astype(np.float64)
@@ -170,7 +166,7 @@ def seen_from(scene: Scene, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     for i, near in enumerate(tree.query_ball_point(local, _NEAR_M)):
         if near:
             range_m[i] = np.median(rays.ranges_m[near])
-            scans[i] = len(np.unique(scan[near]))
+            scans[i] = len(np.unique(rays.scans[near]))
     return range_m, scans
 
 

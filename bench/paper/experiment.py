@@ -15,7 +15,7 @@ import trimesh
 from radarsdf import FitConfig, RadarMap
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 from radarsdf.render.picture import save_picture
-from radarsdf.returns.rays import prepare
+from radarsdf.returns.rays import Rays, prepare
 
 from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
 from bench.settings import Changes, merged
@@ -132,18 +132,23 @@ def fit(scene: Scene, config: FitConfig) -> RadarMap:
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
 
 
-def world_returns(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (N, 3) and sensor positions (N, 3), world frame, m, and intensities (N,), sensor units.
-
-    They are those of the returns within the ranges of the scene.
-    """
-    rays = prepare(
+def rays_of(scene: Scene) -> Rays:
+    """The returns within the ranges of the scene."""
+    return prepare(
         scene.points,
         scene.poses,
         scene.intensities,
         min_range_m=scene.min_range_m,
         max_range_m=scene.max_range_m,
     )
+
+
+def world_returns(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (N, 3) and sensor positions (N, 3), world frame, m, and intensities (N,), sensor units.
+
+    They are those of the returns within the ranges of the scene.
+    """
+    rays = rays_of(scene)
     assert rays.intensities is not None
     return *rays.in_world(), rays.intensities
 

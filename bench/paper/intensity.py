@@ -9,9 +9,18 @@ from pathlib import Path
 
 import numpy as np
 from radarsdf.evaluation import KNNIntensity, intensity_metrics
-from radarsdf.returns.rays import scan_numbers
 
-from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, world_returns
+from .experiment import (
+    Experiment,
+    Options,
+    Row,
+    Task,
+    fit,
+    groups,
+    mean_and_deviation,
+    rays_of,
+    world_returns,
+)
 from .report import figure, markdown
 from .scenes import Scene
 
@@ -32,8 +41,9 @@ def tasks(scene: Scene, options: Options) -> list[Task]:
 def _baseline(scene: Scene) -> list[Row]:
     train, test = scene.split()
     x, sensors, measured = world_returns(test)
-    scans = scan_numbers(train.points, min_range_m=train.min_range_m, max_range_m=train.max_range_m)
-    knn = KNNIntensity.chosen(*world_returns(train), scans)
+    known = rays_of(train)
+    assert known.intensities is not None
+    knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
     metrics = intensity_metrics(knn.predict(x, sensors), measured)
     row: Row = {"scene": scene.name, "method": "kNN", "k": knn.k, "candidates": knn.candidates, **metrics}
     row["lowest"], row["highest"] = (float(v) for v in (measured.min(), measured.max()))

@@ -11,7 +11,7 @@ import trimesh
 from radarsdf import FitConfig
 from radarsdf.evaluation import KNNIntensity, holdout, intensity_metrics, surface_metrics
 from radarsdf.io.scans import read_scans
-from radarsdf.returns.rays import prepare, scan_numbers
+from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 
 from ..conftest import recorded_scans
@@ -38,8 +38,8 @@ def test_held_out_intensities_are_better_than_the_neighbours(job):
     radar_map, train, test = job
     x, sensors, measured = rays_of(test)
     ours = intensity_metrics(radar_map.intensity(x, sensors), measured)
-    scans = scan_numbers(train.points, min_range_m=2.5, max_range_m=60.0)
-    knn = KNNIntensity.chosen(*rays_of(train), scans)
+    known = prepare(train.points, train.poses, train.intensities, min_range_m=2.5, max_range_m=60.0)
+    knn = KNNIntensity.chosen(*rays_of(train), known.scans)
     neighbours = intensity_metrics(knn.predict(x, sensors), measured)
     assert ours["mae"] < neighbours["mae"]
 

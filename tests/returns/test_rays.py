@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from radarsdf.checks import check_poses
-from radarsdf.returns.rays import prepare, scan_numbers
+from radarsdf.returns.rays import prepare
 
 from ..conftest import pose
 
@@ -57,8 +57,9 @@ def test_ranges_are_measured_from_the_sensor_and_take_the_intensities_along():
     intensities = [np.array([1.0, 2, 3]), np.array([4.0, 5, 6])]
     poses = np.stack([pose([100.0, 0, 0]), pose([0, 300.0, 0], 1.0)])
     rays = prepare(points, poses, intensities, min_range_m=2.5, max_range_m=60)
-    assert scan_numbers(points, min_range_m=2.5, max_range_m=60).tolist() == [0, 0, 1, 1]
-    assert scan_numbers(points).tolist() == [0, 0, 0, 1, 1, 1]
+    assert rays.scans.tolist() == [0, 0, 1, 1]
+    assert prepare(points, poses).scans.tolist() == [0, 0, 0, 1, 1, 1]
+    assert rays.select(np.array([3, 0])).scans.tolist() == [1, 0]
     # Both bounds belong to what is kept.
     assert rays.intensities.tolist() == [2, 3, 4, 6]
     sensors = rays.points - rays.directions * rays.ranges_m[:, None] + rays.origin
@@ -68,7 +69,7 @@ def test_ranges_are_measured_from_the_sensor_and_take_the_intensities_along():
 
 def test_a_return_at_the_sensor_has_no_direction_and_is_dropped():
     rays = prepare([np.array([[0.0, 0, 0], [1, 0, 0]])], np.eye(4)[None])
-    assert len(rays) == len(scan_numbers([np.array([[0.0, 0, 0], [1, 0, 0]])])) == 1
+    assert len(rays) == len(rays.scans) == 1
 
 
 def test_accumulated_scans_are_seen_from_the_middle_one():

@@ -4,11 +4,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from radarsdf.cli.saying import say
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
-from radarsdf.returns.rays import prepare, scan_numbers
+from radarsdf.returns.rays import Rays, prepare
 
 if TYPE_CHECKING:
     from radarsdf import FitConfig, RadarMap
@@ -29,22 +29,22 @@ def print_intensity_errors(radar_map: RadarMap, test: Scans, train: Scans) -> No
     """
     if not radar_map.has_intensity or test.intensities is None:
         return
-    x, sensors, measured = _in_world(test, radar_map.config)
+    tested, known = (_rays(scans, radar_map.config) for scans in (test, train))
+    (x, sensors), measured = tested.in_world(), tested.intensities
+    assert measured is not None
+    assert known.intensities is not None
     say("held-out " + format_metrics(intensity_metrics(radar_map.intensity(x, sensors), measured)))
-    returns = radar_map.config.returns
-    scans = scan_numbers(train.points, min_range_m=returns.min_range_m, max_range_m=returns.max_range_m)
-    knn = KNNIntensity.chosen(*_in_world(train, radar_map.config), scans)
+    knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
     metrics = intensity_metrics(knn.predict(x, sensors), measured)
     say(f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours")
 
 
-def _in_world(scans: Scans, config: FitConfig) -> tuple[Any, Any, Any]:
-    """Points, sensor positions and intensities of the returns whose range the fit accepted; world frame, m."""
-    rays = prepare(
+def _rays(scans: Scans, config: FitConfig) -> Rays:
+    """The returns whose range the fit accepted."""
+    return prepare(
         scans.points,
         scans.poses,
         scans.intensities,
         min_range_m=config.returns.min_range_m,
         max_range_m=config.returns.max_range_m,
     )
-    return *rays.in_world(), rays.intensities

@@ -146,15 +146,6 @@ def _kept(scan: NDArray[np.float64], min_range_m: float, max_range_m: float | No
     return keep if max_range_m is None else keep & (ranges <= max_range_m)
 
 
-def scan_numbers(
-    points: Sequence[ArrayLike], *, min_range_m: float = 0.0, max_range_m: float | None = None
-) -> NDArray[np.int64]:
-    """Number of the scan that each of the :class:`Rays` of :func:`prepare` comes from, (N,), ascending."""
-    scans, _ = _check_scans(points, None)
-    counts = [np.count_nonzero(_kept(scan, min_range_m, max_range_m)) for scan in scans]
-    return np.repeat(np.arange(len(scans)), counts)
-
-
 def prepare(
     points: Sequence[ArrayLike],
     poses: ArrayLike,
