@@ -17,5 +17,6 @@ PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   radarsdf::bind_field_loss(m);
   radarsdf::bind_surfaces(m);
   radarsdf::bind_cell_sums(m);
+  radarsdf::bind_looks(m);
   radarsdf::bind_surface_crossings(m);
 }

@@ -29,6 +29,8 @@ __all__: list[str] = [
     "available_instruction_sets",
     "cell_keys",
     "compiler",
+    "count_looks",
+    "count_scans",
     "fourier",
     "instruction_set",
     "marching_cubes_dense",
@@ -613,6 +615,29 @@ def cell_keys(
 def compiler() -> str:
     """
     Compiler that built the core.
+    """
+
+def count_looks(
+    leaf_keys: numpy.typing.NDArray[numpy.uint64],
+    leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
+    points: numpy.typing.NDArray[numpy.float32],
+    directions: numpy.typing.NDArray[numpy.float32],
+    ranges_m: numpy.typing.NDArray[numpy.float32],
+    scans: numpy.typing.NDArray[numpy.int32],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.uint32]:
+    """
+    For each leaf cell (C,) the number of scans with a ray through its cube of 8 x 8 x 8 leaf cells, or to there: (C,) uint32. `leaf_keys` (C,) uint64, ascending; `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m; `scans` (N,) int32, ascending.
+    """
+
+def count_scans(
+    cells: numpy.typing.NDArray[numpy.int32],
+    scans: numpy.typing.NDArray[numpy.int32],
+    num_cells: typing.SupportsInt | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.uint32]:
+    """
+    Number of different scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each return's cell; `scans` (N,) int32, ascending.
     """
 
 @typing.overload

@@ -22,6 +22,7 @@
 #include "lattice/cell_set.hpp"
 #include "lattice/vertex_table.hpp"
 #include "returns/cell_sums.hpp"
+#include "returns/looks.hpp"
 #include "returns/ray_average.hpp"
 #include "returns/surface_crossings.hpp"
 #include "surface/marching_cubes.hpp"
@@ -200,9 +201,21 @@ void sums_and_rays(int threads, Results& results) {
   if (std::all_of(crossed.begin(), crossed.end(), [](std::int32_t c) { return c < 0; })) std::abort();
   results.add(crossed.data(), kPoints);
 
+  std::vector<std::int32_t> scans(kPoints);
+  for (std::size_t i = 0; i < kPoints; ++i) scans[i] = static_cast<std::int32_t>(i / 300);
+  std::vector<std::uint32_t> scans_of_cell(sorted.size());
+  radarsdf::count_scans(rows.data(), scans.data(), kPoints, num_cells, scans_of_cell.data(), threads);
+  results.add(scans_of_cell.data(), num_cells);
+
   radarsdf::CellSet along(0.2);
   along.insert_rays(points.data(), directions.data(), kPoints, 0.4, threads);
-  const radarsdf::VertexTable table(along.sorted_keys(threads), 0.2, 1, radarsdf::Encoding::kOctree, threads);
+  const std::vector<std::uint64_t> leaf_keys = along.sorted_keys(threads);
+  const auto num_leaves = static_cast<std::int64_t>(leaf_keys.size());
+  std::vector<std::uint32_t> looks(leaf_keys.size());
+  radarsdf::count_looks(leaf_keys.data(), num_leaves, 0.2, points.data(), directions.data(), ranges.data(),
+                        scans.data(), kPoints, looks.data(), threads);
+  results.add(looks.data(), num_leaves);
+  const radarsdf::VertexTable table(leaf_keys, 0.2, 1, radarsdf::Encoding::kOctree, threads);
   std::vector<float> weights(kPoints, 1.0F), distances(static_cast<std::size_t>(table.num_rows()));
   radarsdf::average_rays(table, {points.data(), directions.data(), directions.data(), weights.data(), kPoints}, 0.6,
                          distances.data(), threads);

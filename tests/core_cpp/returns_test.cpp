@@ -7,7 +7,9 @@
 #include <cmath>
 #include <limits>
 #include <map>
+#include <set>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
 #include "helpers.hpp"
@@ -16,6 +18,7 @@
 #include "lattice/cell_walk.hpp"
 #include "lattice/morton.hpp"
 #include "returns/cell_sums.hpp"
+#include "returns/looks.hpp"
 #include "returns/principal_axes.hpp"
 #include "returns/ray_average.hpp"
 #include "returns/surface_crossings.hpp"
@@ -305,5 +308,81 @@ TEST_CASE("rays that meet a plane straight average to its distance, cut at the t
   const radarsdf::VertexTable planes(cells.sorted_keys(1), kSize, 1, radarsdf::Encoding::kTriQuadtree, 1);
   float none = 0;
   CHECK_THROWS_AS(radarsdf::average_rays(planes, {nullptr, nullptr, nullptr, nullptr, 0}, kTruncation, &none, 1),
+                  std::invalid_argument);
+}
+
+TEST_CASE("a scan looks once at each cube that one of its rays goes through") {
+  constexpr std::size_t kRays = 20000;
+  constexpr double kSize = 0.25, kCube = 8 * kSize;
+  const auto points = test::normal_numbers<float>(3 * kRays, 4, 9);
+  const auto directions = test::unit_vectors<float>(kRays, 10);
+  auto ranges = test::normal_numbers<float>(kRays, 4, 11);
+  std::vector<std::int32_t> scans;
+  for (std::size_t i = 0; i < kRays; ++i) {
+    ranges[i] = std::abs(ranges[i]);
+    // Two thirds of the rays are of one scan: more than a thread's share.
+    scans.push_back(static_cast<std::int32_t>(i < kRays / 3 ? i / 50 : 900));
+  }
+  const Cells cells = cells_of(test::normal_numbers<float>(3 * 300, 4, 12), kSize);
+  std::vector<std::uint32_t> expected;
+  for (const std::uint64_t key : cells.keys) {
+    std::set<std::int32_t> looked;
+    for (std::size_t i = 0; i < kRays; ++i) {
+      double begin = -double{ranges[i]}, end = 0;  // of the ray in the cube
+      for (std::size_t axis = 0; axis < 3; ++axis) {
+        const std::int64_t cell = radarsdf::morton_coordinate(key, static_cast<int>(axis));
+        const double low = static_cast<double>((cell >> 3) - (radarsdf::kAxisBias >> 3)) * kCube;
+        const double at = points[3 * i + axis], speed = directions[3 * i + axis];
+        begin = std::max(begin, std::min((low - at) / speed, (low + kCube - at) / speed));
+        end = std::min(end, std::max((low - at) / speed, (low + kCube - at) / speed));
+      }
+      if (begin <= end) looked.insert(scans[i]);
+    }
+    expected.push_back(static_cast<std::uint32_t>(looked.size()));
+  }
+  CHECK(*std::min_element(expected.begin(), expected.end()) == 0);
+  CHECK(*std::max_element(expected.begin(), expected.end()) > 20);
+  const auto num_cells = static_cast<std::int64_t>(cells.keys.size());
+  const auto count = [&](std::vector<std::uint32_t>& looks, int threads) {
+    radarsdf::count_looks(cells.keys.data(), num_cells, kSize, points.data(), directions.data(), ranges.data(),
+                          scans.data(), kRays, looks.data(), threads);
+  };
+  std::vector<std::uint32_t> looks(expected.size());
+  for (const int threads : test::kThreads) {
+    std::fill(looks.begin(), looks.end(), 77U);
+    count(looks, threads);
+    CHECK(looks == expected);
+  }
+  ranges[7] = -1;
+  CHECK_THROWS_AS(count(looks, 1), std::invalid_argument);
+  ranges[7] = std::numeric_limits<float>::quiet_NaN();
+  CHECK_THROWS_AS(count(looks, 1), std::invalid_argument);
+  ranges[7] = 600000;  // the point is near, the sensor too far away
+  CHECK_THROWS_AS(count(looks, 1), std::invalid_argument);
+  ranges[7] = 1;
+  std::swap(scans.front(), scans.back());
+  CHECK_THROWS_AS(count(looks, 1), std::invalid_argument);
+}
+
+TEST_CASE("the scans of a cell are counted once each") {
+  constexpr std::size_t kCount = 40000;
+  const Cells cells = cells_of(test::normal_numbers<float>(3 * kCount, 1, 13), 0.5);
+  std::vector<std::int32_t> scans;
+  for (std::size_t i = 0; i < kCount; ++i) scans.push_back(static_cast<std::int32_t>(i < kCount / 2 ? i / 90 : 500));
+  std::set<std::pair<std::int32_t, std::int32_t>> pairs;
+  for (std::size_t i = 0; i < kCount; ++i) pairs.insert({cells.rows[i], scans[i]});
+  std::vector<std::uint32_t> expected(cells.keys.size() + 1);  // the last cell has no returns
+  for (const auto& [cell, scan] : pairs) ++expected[static_cast<std::size_t>(cell)];
+  const auto num_cells = static_cast<std::int64_t>(expected.size());
+  for (const int threads : test::kThreads) {
+    std::vector<std::uint32_t> counts(expected.size(), 77);
+    radarsdf::count_scans(cells.rows.data(), scans.data(), kCount, num_cells, counts.data(), threads);
+    CHECK(counts == expected);
+  }
+  std::uint32_t none = 77;
+  radarsdf::count_scans(nullptr, nullptr, 0, 1, &none, 2);
+  CHECK(none == 0);
+  std::swap(scans.front(), scans.back());
+  CHECK_THROWS_AS(radarsdf::count_scans(cells.rows.data(), scans.data(), kCount, num_cells, expected.data(), 1),
                   std::invalid_argument);
 }

@@ -1,0 +1,152 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "returns/looks.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <functional>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+#include "lattice/cell_blocks.hpp"
+#include "lattice/cell_walk.hpp"
+#include "util/parallel.hpp"
+
+namespace radarsdf {
+namespace {
+
+// Counts each scan once for each place.
+class ScanCounter {
+ public:
+  explicit ScanCounter(std::int64_t places)
+      : counts_(static_cast<std::size_t>(places)), last_(static_cast<std::size_t>(places), -1) {}
+
+  void add(std::int32_t place, std::int32_t scan) {
+    const auto i = static_cast<std::size_t>(place);
+    counts_[i] += last_[i] != scan ? 1 : 0;
+    last_[i] = scan;
+  }
+
+  std::vector<std::uint32_t> take_counts() { return std::move(counts_); }
+
+ private:
+  std::vector<std::uint32_t> counts_;
+  std::vector<std::int32_t> last_;  // scan that was counted last
+};
+
+// Calls count(begin, end, counter) for parts of the returns that hold whole scans, and adds the counts up. Integers: the
+// sums do not depend on the number of threads.
+template <typename Count>
+std::vector<std::uint32_t> count_by_scans(const std::int32_t* scans, std::int64_t size, std::int64_t places,
+                                          int num_threads, const Count& count) {
+  const std::int64_t parts = size > (1 << 14) ? resolve_num_threads(num_threads) : 1;
+  std::vector<std::vector<std::uint32_t>> counts(static_cast<std::size_t>(parts));
+  const auto begin_of = [&](std::int64_t part) {
+    const std::int64_t near = size * part / parts;
+    if (near == 0 || near == size) return near;
+    return static_cast<std::int64_t>(std::lower_bound(scans, scans + size, scans[near]) - scans);
+  };
+  parallel_tasks(parts, num_threads, [&](std::int64_t part) {
+    ScanCounter counter(places);
+    count(begin_of(part), begin_of(part + 1), counter);
+    counts[static_cast<std::size_t>(part)] = counter.take_counts();
+  });
+  for (std::size_t part = 1; part < counts.size(); ++part) {
+    std::transform(counts[0].begin(), counts[0].end(), counts[part].begin(), counts[0].begin(), std::plus<>());
+  }
+  return counts[0];
+}
+
+void check_scans(const std::int32_t* scans, std::int64_t count) {
+  if (!std::is_sorted(scans, scans + count) || (count > 0 && scans[0] < 0)) {
+    throw std::invalid_argument("scans must be ascending numbers of at least 0");
+  }
+}
+
+// Throws std::invalid_argument unless all rays lie within a million leaf cells of the origin, from the sensor on.
+void check_whole_rays(const float* points, const float* directions, const float* ranges_m, std::int64_t count,
+                      double leaf_size_m) {
+  const double limit_m = (kAxisBias - (1 << kMaxLevels)) * leaf_size_m;
+  bool inside = true;
+  for (std::int64_t i = 0; i < 3 * count; ++i) {  // NaN fails the comparison too
+    const double sensor_m = points[i] - double{ranges_m[i / 3]} * double{directions[i]};
+    inside = inside && std::abs(double{points[i]}) < limit_m && std::abs(sensor_m) < limit_m && ranges_m[i / 3] >= 0;
+  }
+  if (!inside) throw std::invalid_argument("rays must be finite and within a million cells of the origin");
+}
+
+// Rows of the cubes along a ray: most of them have the region and often the block of the one before.
+class CubeRows {
+ public:
+  explicit CubeRows(const CellBlocks& cubes) : cubes_(&cubes) {}
+
+  std::int32_t row(std::uint64_t key) {
+    if (CellBlocks::region_key(key) != region_key_) {
+      region_key_ = CellBlocks::region_key(key);
+      region_ = cubes_->region(region_key_);
+    }
+    if (region_ == nullptr) return -1;
+    if (CellBlocks::block_key(key) != block_key_) {
+      block_key_ = CellBlocks::block_key(key);
+      block_ = cubes_->block(*region_, block_key_);
+    }
+    return block_ != nullptr ? block_->row(key) : -1;
+  }
+
+ private:
+  static constexpr std::uint64_t kNone = ~std::uint64_t{0};
+
+  const CellBlocks* cubes_;
+  std::uint64_t region_key_ = kNone, block_key_ = kNone;
+  const Occupancy *region_ = nullptr, *block_ = nullptr;
+};
+
+}  // namespace
+
+void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double leaf_size_m, const float* points,
+                 const float* directions, const float* ranges_m, const std::int32_t* scans, std::int64_t count,
+                 std::uint32_t* looks, int num_threads) {
+  constexpr double kCube = 1 << kLookLevels;
+  const auto cube_key = [](std::uint64_t leaf_key) { return leaf_key >> (3 * kLookLevels); };
+  std::vector<std::uint64_t> keys;
+  for (std::int64_t i = 0; i < num_leaves; ++i) {
+    if (keys.empty() || keys.back() != cube_key(leaf_keys[i])) keys.push_back(cube_key(leaf_keys[i]));
+  }
+  check_scans(scans, count);
+  const CellBlocks cubes(keys.data(), static_cast<std::int64_t>(keys.size()));
+  check_whole_rays(points, directions, ranges_m, count, leaf_size_m);
+  const auto of_rays = [&](std::int64_t begin, std::int64_t end, ScanCounter& counter) {
+    CubeRows rows(cubes);
+    for (std::int64_t i = begin; i < end; ++i) {
+      if (i % (1 << 12) == 0) check_interrupt();
+      walk_cells(points + 3 * i, directions + 3 * i, -double{ranges_m[i]}, 0, 1 / (kCube * leaf_size_m),
+                 [&](const std::int32_t* cube) {
+                   constexpr std::int32_t kBias = kAxisBias >> kLookLevels;  // as in the shifted keys
+                   const std::uint64_t key = morton_key(static_cast<std::uint32_t>(cube[0] + kBias),
+                                                        static_cast<std::uint32_t>(cube[1] + kBias),
+                                                        static_cast<std::uint32_t>(cube[2] + kBias));
+                   const std::int32_t row = rows.row(key);
+                   if (row >= 0) counter.add(row, scans[i]);
+                 });
+    }
+  };
+  const auto counts = count_by_scans(scans, count, cubes.size(), num_threads, of_rays);
+  std::size_t row = 0;
+  for (std::int64_t i = 0; i < num_leaves; ++i) {
+    if (keys[row] != cube_key(leaf_keys[i])) ++row;
+    looks[i] = counts[row];
+  }
+}
+
+void count_scans(const std::int32_t* cells, const std::int32_t* scans, std::int64_t count, std::int64_t num_cells,
+                 std::uint32_t* scans_of_cell, int num_threads) {
+  check_scans(scans, count);
+  const auto of_returns = [&](std::int64_t begin, std::int64_t end, ScanCounter& counter) {
+    for (std::int64_t i = begin; i < end; ++i) counter.add(cells[i], scans[i]);
+  };
+  const auto counts = count_by_scans(scans, count, num_cells, num_threads, of_returns);
+  std::copy(counts.begin(), counts.end(), scans_of_cell);
+}
+
+}  // namespace radarsdf

@@ -1,0 +1,228 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""How many scans looked at a place, and how many had returns there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radarsdf._core import cell_keys, count_looks, count_scans
+
+from ..reference_looks import CUBE_CELLS, looks_at
+
+LEAF_M = 0.2
+CUBE_M = CUBE_CELLS * LEAF_M
+THREADS = (1, 2, 3, 7)
+MANY = 25_000  # enough for several threads
+
+
+def sorted_cells(cells):
+    """Different cells (C, 3) in the order of their keys, and these."""
+    cells = np.unique(cells, axis=0)
+    keys = cell_keys((cells + 0.5) * LEAF_M, LEAF_M)
+    order = np.argsort(keys)
+    return cells[order], keys[order]
+
+
+def rays_of(kind, count, seed=0):
+    """Points, directions, ranges, float32."""
+    rng = np.random.default_rng(seed)
+    sensors = rng.uniform(-15, 15, (count, 3))
+    directions = rng.normal(size=(count, 3))
+    if kind == "along axes":
+        directions = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1.0, 1.0], (count, 1))
+    if kind == "in planes":  # one coordinate stays as it is
+        directions[np.arange(count), rng.integers(0, 3, count)] = 0
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ranges_m = rng.uniform(0, 25, count)
+    if kind == "short":  # most end in the cube of their sensor
+        ranges_m = rng.uniform(0, 0.5 * CUBE_M, count)
+        ranges_m[::7] = 0
+    if kind == "far":
+        sensors += [-190_000.0, 170_000.0, -150_000.0]
+    points = sensors + directions * ranges_m[:, None]
+    return tuple(a.astype(np.float32) for a in (points, directions, ranges_m))
+
+
+def cells_near(points, seed=0):
+    """A few leaf cells in about every fourth cube where the points are, and some far from them."""
+    rng = np.random.default_rng(seed)
+    middle = np.round(np.median(points, axis=0) / LEAF_M).astype(int)
+    near = middle + rng.integers(-80, 80, (1500, 3))
+    beside = near[:500] + rng.integers(0, 2, (500, 3))
+    far = middle + rng.integers(2000, 4000, (50, 3))
+    return sorted_cells(np.concatenate([near, beside, far]))
+
+
+def scans_of(count, seed=0):
+    """(N,) int32: scans of a few returns, one of more than half of all, and numbers that no return has."""
+    rng = np.random.default_rng(seed)
+    scans = rng.integers(0, 400, count) * 3
+    scans[rng.random(count) < 0.6] = 600
+    return np.sort(scans).astype(np.int32)
+
+
+@pytest.mark.parametrize("kind", ["any", "along axes", "in planes", "short", "far"])
+def test_looks_are_those_of_a_plain_search(kind):
+    rays = rays_of(kind, 3000)
+    cells, keys = cells_near(rays[0])
+    scans = np.sort(np.random.default_rng(1).integers(0, 30, 3000)).astype(np.int32)
+    expected = looks_at(cells, LEAF_M, *rays, scans)
+    assert (expected == 0).mean() > 0.02
+    assert expected.max() > 3
+    looks = count_looks(keys, LEAF_M, *rays, scans)
+    assert looks.dtype == np.uint32
+    np.testing.assert_array_equal(looks, expected)
+
+
+def test_the_number_of_threads_changes_nothing():
+    rays, scans = rays_of("any", MANY), scans_of(MANY)
+    cells, keys = (a[::8] for a in cells_near(rays[0]))
+    keys = np.ascontiguousarray(keys)
+    expected = looks_at(cells, LEAF_M, *rays, scans)
+    for num_threads in THREADS:
+        np.testing.assert_array_equal(count_looks(keys, LEAF_M, *rays, scans, num_threads), expected)
+
+
+def through(y_m, x_m=0.7, range_m=50.0):
+    """Rays of this range along x, all at the same place across it: points, directions, ranges, float32."""
+    points = np.column_stack([np.full_like(y_m, x_m), y_m, np.full_like(y_m, 0.3)])
+    directions = np.tile([1.0, 0, 0], (len(y_m), 1))
+    return tuple(a.astype(np.float32) for a in (points, directions, np.full_like(y_m, range_m)))
+
+
+def test_a_scan_counts_once_however_many_rays_it_has():
+    rays = through(np.linspace(0.1, 1.5, 600))
+    _, keys = sorted_cells([[0, 0, 0], [-1, 0, 0], [-5, 7, 7], [-100, 3, 1]])
+    for number_of_scans in (1, 2, 600):
+        scans = (np.arange(600) * number_of_scans // 600).astype(np.int32)
+        assert count_looks(keys, LEAF_M, *rays, scans).tolist() == [number_of_scans] * 4
+
+
+def test_a_look_is_from_the_sensor_to_the_return():
+    """One ray along x from -49.3 m to 0.7 m: the cubes of 1.6 m from -31 to 0."""
+    ray, scan = through(np.array([0.5])), np.zeros(1, np.int32)
+    cells = np.array([[x, 0, 0] for x in range(-40 * CUBE_CELLS, 10 * CUBE_CELLS)])
+    cells, keys = sorted_cells(cells)
+    looks = count_looks(keys, LEAF_M, *ray, scan)
+    cubes = np.floor_divide(cells[:, 0], CUBE_CELLS)
+    np.testing.assert_array_equal(looks, (cubes >= -31) & (cubes <= 0))
+    # Its neighbours across the ray saw nothing.
+    _, beside = sorted_cells([[-50, -1, 0], [-50, 8, 0], [-50, 0, -1], [-50, 0, 8]])
+    assert count_looks(beside, LEAF_M, *ray, scan).tolist() == [0] * 4
+
+
+def test_cells_of_one_cube_have_the_same_looks():
+    rays, scans = rays_of("any", 2000), np.arange(2000, dtype=np.int32)
+    corner = np.array([-8, 0, -16])
+    cells, keys = sorted_cells(corner + np.stack(np.meshgrid(*[np.arange(8)] * 3), -1).reshape(-1, 3))
+    looks = count_looks(keys, LEAF_M, *rays, scans)
+    assert len(looks) == 512
+    assert np.unique(looks).tolist() == [looks_at(cells[:1], LEAF_M, *rays, scans)[0]] != [0]
+
+
+def test_without_rays_and_without_cells():
+    rays = rays_of("any", 10)
+    none = tuple(a[:0] for a in rays)
+    _, keys = sorted_cells([[0, 0, 0], [-9, 4, 4]])
+    assert count_looks(keys, LEAF_M, *none, np.zeros(0, np.int32)).tolist() == [0, 0]
+    assert count_looks(keys[:0], LEAF_M, *rays, np.zeros(10, np.int32)).tolist() == []
+
+
+def changed(arrays, name, value):
+    """The arguments of `count_looks`, one of which is `value`, or made from what it was."""
+    return {**arrays, name: value(arrays[name].copy()) if callable(value) else value}
+
+
+def with_number(row, number):
+    def change(array):
+        array.reshape(-1)[row] = number
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("scans", lambda a: a[::-1].copy(), "scans must be ascending"),
+        ("leaf_keys", lambda a: a[::-1].copy(), "ascending"),
+        ("leaf_keys", lambda a: a[None], "leaf_keys must have shape"),
+        ("points", lambda a: a[:, :2].copy(), r"points must have shape \(N, 3\)"),
+        ("points", lambda a: a[0], r"points must have shape \(N, 3\)"),
+        ("directions", lambda a: a[:-1], r"directions must have shape \(9, 3\)"),
+        ("ranges_m", lambda a: a[:-1], "one for each point"),
+        ("ranges_m", lambda a: a[:, None], "one for each point"),
+        ("scans", lambda a: a[:-1], "one for each point"),
+        ("scans", lambda a: a[None], "one for each point"),
+        *((name, with_number(8, n), "finite") for name in ("points", "ranges_m") for n in (np.nan, np.inf)),
+        *(("directions", with_number(26, n), "finite") for n in (np.nan, np.inf)),
+        ("ranges_m", with_number(8, -0.5), "rays must be finite"),
+        ("points", with_number(26, 210_000.0), "within a million cells"),
+        ("points", with_number(0, -210_000.0), "within a million cells"),
+        *(("leaf_size_m", size_m, "cells") for size_m in (0.0, -0.2, np.nan)),
+    ],
+)
+def test_wrong_rays_are_refused(name, value, said):
+    points, directions, ranges_m = rays_of("any", 9)
+    _, keys = sorted_cells([[0, 0, 0], [-9, 4, 4], [50, 0, 1]])
+    arrays = {"leaf_keys": keys, "leaf_size_m": LEAF_M, "points": points, "directions": directions}
+    arrays |= {"ranges_m": ranges_m, "scans": np.arange(9, dtype=np.int32)}
+    count_looks(**arrays)
+    with pytest.raises(ValueError, match=said):
+        count_looks(**changed(arrays, name, value))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("sensor_x_m", "x_m"), [(208_000, 209_200), (209_200, 208_000)])
+def test_sensor_and_return_must_both_be_within_a_million_cells(sensor_x_m, x_m, sign):
+    """The limit is 208,896 m."""
+    _, keys = sorted_cells([[0, 0, 0]])
+    ray = [[sign * x_m, 0, 0]], [[sign * np.sign(x_m - sensor_x_m), 0, 0]], [1200]
+    with pytest.raises(ValueError, match="within a million cells"):
+        count_looks(keys, LEAF_M, *(np.array(a, np.float32) for a in ray), np.zeros(1, np.int32))
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"), [("leaf_keys", np.int64), ("points", np.float64), ("scans", np.int64)]
+)
+def test_other_types_are_refused(name, dtype):
+    points, directions, ranges_m = rays_of("any", 2)
+    arrays = {"leaf_keys": np.zeros(1, np.uint64), "leaf_size_m": LEAF_M, "points": points}
+    arrays |= {"directions": directions, "ranges_m": ranges_m, "scans": np.zeros(2, np.int32)}
+    with pytest.raises(TypeError, match="incompatible"):
+        count_looks(**changed(arrays, name, lambda a: a.astype(dtype)))
+
+
+@pytest.mark.parametrize("num_cells", [1, 300, 40_000])
+def test_scans_of_cells_are_counted_once(num_cells):
+    rng = np.random.default_rng(num_cells)
+    cells, scans = rng.integers(0, num_cells, MANY).astype(np.int32), scans_of(MANY)
+    pairs = np.unique(np.stack([cells, scans], 1), axis=0)
+    expected = np.bincount(pairs[:, 0], minlength=num_cells)
+    for num_threads in (0, *THREADS):
+        counts = count_scans(cells, scans, num_cells, num_threads)
+        assert counts.dtype == np.uint32
+        np.testing.assert_array_equal(counts, expected)
+
+
+def test_cells_without_returns_have_no_scans():
+    none = np.zeros(0, np.int32)
+    assert count_scans(none, none, 0).tolist() == []
+    assert count_scans(none, none, 3).tolist() == [0, 0, 0]
+    assert count_scans(np.array([1, 1, 1], np.int32), np.array([4, 4, 9], np.int32), 3).tolist() == [0, 2, 0]
+
+
+@pytest.mark.parametrize(
+    ("cells", "scans", "said"),
+    [
+        ([0, -1, 1], [0, 0, 1], "cells must lie in"),
+        ([0, 3, 1], [0, 0, 1], "cells must lie in"),
+        ([0, 1, 1], [0, 2, 1], "scans must be ascending"),
+        ([0, 1], [0, 0, 1], "must have shape"),
+        ([[0, 1]], [[0, 0]], "must have shape"),
+    ],
+)
+def test_wrong_cells_are_refused(cells, scans, said):
+    with pytest.raises(ValueError, match=said):
+        count_scans(np.array(cells, np.int32), np.array(scans, np.int32), 3)
