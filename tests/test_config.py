@@ -48,6 +48,8 @@ REAL = {
     "returns.range_noise_m": (TINY, 100.0, 0.0, 100.1),
     "returns.azimuth_noise_rad": (TINY, 1.0, 0.0, 1.1),
     "returns.elevation_noise_rad": (TINY, 1.0, 0.0, 1.1),
+    "returns.pose_sigma_m": (0.0, 100.0, -0.1, 100.1),
+    "returns.pose_sigma_rad": (0.0, 1.0, -0.1, 1.1),
     "encoding.fourier_half_width_cells": (TINY, LARGE, 0.0, None),
     "networks.feature_dropout": (0.0, 0.95, -0.01, 0.96),
     "networks.fourier_dropout": (0.0, 0.95, -0.01, 0.96),
@@ -361,6 +363,8 @@ PUBLISHED = {
         "range_noise_m": None,
         "azimuth_noise_rad": None,
         "elevation_noise_rad": None,
+        "pose_sigma_m": 0.0,
+        "pose_sigma_rad": 0.0,
         "onto_planes": False,
     },
     "encoding": {

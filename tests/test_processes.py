@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import multiprocessing
 import os
 import pickle
@@ -99,7 +100,9 @@ def test_pickles_and_copies_are_the_same_map(radar_map):
             np.testing.assert_array_equal(other.sdf(X), original.sdf(X))
             assert (other.config, other.report) == (original.config, original.report)
             assert other.has_intensity == original.has_intensity
-            np.testing.assert_array_equal(other.support, original.support)
+            for name, column in dataclasses.asdict(original.evidence).items():
+                np.testing.assert_array_equal(getattr(other.evidence, name), column)
+            assert other.rough_share == original.rough_share
             assert other.origin.tolist() == original.origin.tolist()
 
 

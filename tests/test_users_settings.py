@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import pickle
 
 import numpy as np
@@ -74,7 +75,8 @@ def answers(scene, path, changes):
         fitted.save(path)
         for radar_map in (fitted, radarsdf.load(path)):
             x = scene.points[0][:50].astype(np.float64) @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
-            given = [radar_map.sdf(x), radar_map.gradient(x), radar_map.confidence(x), radar_map.observed(x)]
+            given = [radar_map.sdf(x), radar_map.gradient(x), radar_map.observed(x)]
+            given += [radar_map.confidence(x), radar_map.uncertainty(x)]
             given += [
                 radar_map.sdf(torch.from_numpy(x)).numpy(),
                 radar_map.gradient(torch.from_numpy(x)).numpy(),
@@ -149,8 +151,8 @@ def queries(radar_map, x):
     sensor = np.array([0.0, 0.0, 1.5])
     mesh = radar_map.mesh(0.3, viewpoint=sensor, min_component_triangles=0, progress=False)
     found = [radar_map.sdf(x), radar_map.gradient(x), radar_map.observed(x), radar_map.confidence(x)]
-    found += [radar_map.intensity(x, sensor), radar_map.support, mesh.vertices, mesh.faces]
-    return [*found, *mesh.vertex_attributes.values()]
+    found += [radar_map.uncertainty(x), radar_map.intensity(x, sensor), mesh.vertices, mesh.faces]
+    return [*found, *dataclasses.astuple(radar_map.evidence), *mesh.vertex_attributes.values()]
 
 
 FUNCTIONS = {

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from bench.peers.interface import PEERS
 from bench.settings import Changes, parsed
 
-from . import ablation, angles, calibration, curve, intensity, map_size, sparse, surface, views
+from . import ablation, angles, calibration, curve, intensity, map_size, ranges, sparse, surface, views
 from .experiment import Experiment, Options, Row
 from .report import provenance, write_json
 from .scenes import load_scene
@@ -31,6 +31,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "views": views.EXPERIMENT,
     "curve": curve.EXPERIMENT,
     "calibration": calibration.EXPERIMENT,
+    "ranges": ranges.EXPERIMENT,
 }
 _QUICK_FRAMES = 4
 
@@ -153,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         metavar="NAME=VALUE",
         help="curve, calibration: one more fit, with these settings of FitConfig, such as training.joint=False, or of the mesh, such as "
-        "mesh.min_support=0; may be repeated",
+        "mesh.min_detection_rate=0; may be repeated",
     )
     return parser
 

@@ -28,7 +28,7 @@ from .truth import truth_of
 FloatArray = NDArray[np.float64]
 
 TRUE_M = 0.5
-"""A point of the mesh this near to the truth belongs to a true surface."""
+"""A point of the mesh this near to the truth has an error. Farther ones are false."""
 
 _MOST_SAMPLES = 40_000  # more change nothing: neighbours have the same error
 _NEAR_M = 0.3  # returns this near tell the range of a point, and how many scans saw it
@@ -83,7 +83,8 @@ def _rows(scene: Scene, options: Options, base: str, changes: Changes, repetitio
     if len(x) == 0:
         return [row | {"why_not": "the mesh has no surface" + ("" if scene.box is None else " in the box")}]
     try:
-        return [row | compared(scene, x, normals, radar_map.uncertainty(x), radar_map.confidence(x))]
+        answers = radar_map.uncertainty(x), radar_map.confidence(x)
+        return [row | compared(scene, x, normals, *answers, radar_map.config.leaf_size_m)]
     except ValueError as error:  # too few points of true surface
         return [row | {"why_not": str(error)}]
 
@@ -119,7 +120,12 @@ def sampled(mesh: trimesh.Trimesh, count: int, box: FloatArray | None) -> tuple[
 
 
 def compared(
-    scene: Scene, x: FloatArray, normals: FloatArray, uncertainty_m: FloatArray, confidence: FloatArray
+    scene: Scene,
+    x: FloatArray,
+    normals: FloatArray,
+    uncertainty_m: FloatArray,
+    confidence: FloatArray,
+    leaf_size_m: float,
 ) -> Row:
     """What a map says of the points (N, 3) of its mesh, beside the truth.
 
@@ -128,7 +134,7 @@ def compared(
     of the uncertainty are those of the other points. The standard error of the truth is added to the prediction in
     quadrature. `core_m` is the deviation of the errors up to `TRUE_M` without a uniform background: points that by
     chance are near another surface raise the root mean square, but not this. A map that calls them surface is wrong in
-    its confidence, not in its uncertainty.
+    its confidence, not in its uncertainty. A confidence is right if a surface is within `leaf_size_m` of so many points.
 
     Raises
     ------
@@ -150,7 +156,8 @@ def compared(
         "by_range": _bands(range_m, _RANGES_M, error_m, predicted_m, is_true),
         "by_scans": _bands(scans, _SCANS, error_m, predicted_m, is_true),
     }
-    return row | {f"confidence_{key}": v for key, v in confidence_metrics(confidence, is_true).items()}
+    metrics = confidence_metrics(confidence, truth.distance_m <= leaf_size_m)
+    return row | {f"confidence_{key}": v for key, v in metrics.items()}
 
 
 def seen_from(scene: Scene, x: FloatArray) -> tuple[FloatArray, FloatArray]:

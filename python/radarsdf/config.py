@@ -28,8 +28,9 @@ _MAX_BRIDGE_CELLS = 8  # the time grows with the square, and longer bridges join
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
 _MAX_WIDTH = 4096  # units of a layer: far more than a map of a scene can use
 
-_NoiseM = Annotated[float, Field(gt=0, le=100)]
-_NoiseRad = Annotated[float, Field(gt=0, le=1)]
+_MAX_NOISE_M, _MAX_NOISE_RAD = 100, 1
+_NoiseM = Annotated[float, Field(gt=0, le=_MAX_NOISE_M)]
+_NoiseRad = Annotated[float, Field(gt=0, le=_MAX_NOISE_RAD)]
 _Positive = Annotated[float, Field(gt=0)]
 _NotNegative = Annotated[float, Field(ge=0)]
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
@@ -63,6 +64,11 @@ class ReturnsConfig:
     """The same in azimuth, rad. None: likewise."""
     elevation_noise_rad: _NoiseRad | None = None
     """The same in elevation, rad. None: likewise."""
+    pose_sigma_m: Annotated[float, Field(ge=0, le=_MAX_NOISE_M)] = 0.0
+    """Standard deviation of the position of a scan, m. It only makes the map's uncertainty larger: all returns
+    of a scan share the error, so that only more scans make it smaller."""
+    pose_sigma_rad: Annotated[float, Field(ge=0, le=_MAX_NOISE_RAD)] = 0.0
+    """The same of the orientation of a scan, rad. At a return it counts times the range."""
     onto_planes: bool = True
     """Whether each return is moved towards the surfel of its cell, a plane through the returns there, if there
     is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones;
@@ -329,7 +335,7 @@ class FitConfig:
     def paper(cls, **changes: Any) -> FitConfig:
         """The settings of 3QFPI as published. `changes`: as for :meth:`override`.
 
-        For a mesh as published, call ``mesh(min_support=0, max_uncertainty=math.inf, min_component_triangles=300)``.
+        For a mesh as published, call ``mesh(min_detection_rate=0, max_uncertainty=math.inf, min_component_triangles=300)``.
         """
         return cls(
             returns=ReturnsConfig(accumulate_scans=5, drop_ghosts=False, onto_planes=False),

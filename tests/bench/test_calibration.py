@@ -37,7 +37,7 @@ def surface(scene):
 
 def test_a_right_map_is_right(scene, surface):
     x, normals, sigma_m = surface
-    row = compared(scene, x, normals, sigma_m, np.ones(len(x)))
+    row = compared(scene, x, normals, sigma_m, np.ones(len(x)), 0.2)
     assert row["coverage_95"] == pytest.approx(0.95, abs=0.01)
     assert row["coverage_50"] == pytest.approx(0.5, abs=0.02)
     assert row["ence"] < 0.06
@@ -49,7 +49,7 @@ def test_a_right_map_is_right(scene, surface):
 
 def test_an_overconfident_map_is_found_out(scene, surface):
     x, normals, sigma_m = surface
-    row = compared(scene, x, normals, sigma_m / 2, np.full(len(x), 0.5))
+    row = compared(scene, x, normals, sigma_m / 2, np.full(len(x), 0.5), 0.2)
     assert row["coverage_95"] == pytest.approx(0.67, abs=0.02)
     assert row["ence"] == pytest.approx(1, abs=0.1)
     assert row["confidence_worst_gap"] == pytest.approx(0.5, abs=0.01)
@@ -65,7 +65,7 @@ def test_false_surface_and_unknown_points_are_shares(scene, surface):
     x, normals, sigma_m = (array.copy() for array in surface)
     x[:600, 0] += 2.0  # in free space
     sigma_m[600:900] = np.nan
-    row = compared(scene, x, normals, sigma_m, np.where(np.arange(6000) < 600, 0.05, 0.95))
+    row = compared(scene, x, normals, sigma_m, np.where(np.arange(6000) < 600, 0.05, 0.95), 0.2)
     assert row["false_share"] == pytest.approx(0.1, abs=0.02)  # some reach the ground or the reflector
     assert row["unobserved_share"] == pytest.approx(0.05)
     assert row["coverage_95"] == pytest.approx(0.95, abs=0.01)  # of the rest
@@ -77,7 +77,7 @@ def test_points_near_another_surface_by_chance_do_not_widen_the_core(scene, surf
     x, normals, sigma_m = surface
     x = x.copy()
     x[:1500, 0] = np.random.default_rng(1).uniform(-0.4, 0.4, 1500)
-    row = compared(scene, x, normals, sigma_m, np.ones(len(x)))
+    row = compared(scene, x, normals, sigma_m, np.ones(len(x)), 0.2)
     assert row["rmse_m"] > 0.1
     assert row["core_m"] == pytest.approx(np.sqrt(np.mean(sigma_m**2)), rel=0.15)
 

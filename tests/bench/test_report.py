@@ -55,7 +55,7 @@ def made_up():
             curve_row("radarsdf", "radarsdf, × 1", 2.0, 0.8),
             curve_row("radarsdf", "radarsdf, × 4", 8.0, 0.9),
             curve_row("radarsdf, intensities", "radarsdf, intensities, × 1", 4.0, 0.8, 5.0),
-            curve_row("lever", "mesh.min_support=0.0", 4.0, 0.7, 5.0),
+            curve_row("lever", "mesh.min_detection_rate=0.0", 4.0, 0.7, 5.0),
             curve_row("peer", "VDBFusion", 1.0, 0.4),
         ],
         "growth": [

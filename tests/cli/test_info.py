@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -20,3 +21,15 @@ def test_one_line_for_each_part():
         assert len(line) > 17
     assert _core.__version__ in done.stdout
     assert done.stderr == ""
+
+
+def test_an_unknown_instruction_set_is_said():
+    done = subprocess.run(
+        [sys.executable, "-m", "radarsdf", "info"],
+        env=os.environ | {"RADARSDF_ISA": "nonsense"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert "RADARSDF_ISA=nonsense is none of baseline" in done.stderr

@@ -29,13 +29,17 @@ def test_a_part_in_colour_with_a_picture(map_file, tmp_path, capsys):
     assert png.read_bytes().startswith(b"\x89PNG")
 
 
-def test_less_is_left_where_more_confidence_is_asked(map_file, tmp_path):
+def test_less_is_left_where_more_is_asked(map_file, tmp_path):
     def triangles(*words):
         path = tmp_path / "mesh.ply"
         assert call("mesh", map_file, "-o", path, "--voxel", 0.2, *BOX, "--quiet", *words) == 0
         return len(trimesh.load_mesh(path, process=False).faces)
 
-    assert 0 < triangles("--min-confidence", 0.2) < triangles()
+    everything = triangles()
+    assert 0 < triangles("--min-confidence", 0.99) < everything
+    assert 0 < triangles("--min-detection-rate", 0.3) < everything
+    assert 0 < triangles("--max-uncertainty", 0.015) < everything
+    assert triangles("--min-detection-rate", 0.028) == everything  # the default
 
 
 @pytest.mark.parametrize("viewpoint", [[], ["--viewpoint", 0, 0, 1]])
@@ -58,6 +62,8 @@ def test_a_viewpoint_for_a_map_without_intensities(scans_file, tmp_path, capsys)
         (["--voxel", 0], "voxel"),
         (["--box", 1, 1, 1, 0, 0, 0], "box must be a lower and an upper corner"),
         (["--min-confidence", 2], "min_confidence"),
+        (["--min-detection-rate", -0.1], "min_detection_rate"),
+        (["--min-detection-rate", "nan"], "min_detection_rate"),
     ],
 )
 def test_values_that_make_no_sense(map_file, tmp_path, capsys, words, said):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import prepare
 
 from ..conftest import SEED, pose
@@ -50,7 +51,7 @@ def finite(radar_map, sensor):
     if radar_map.has_intensity:
         assert np.isfinite(radar_map.intensity(x, sensor)).all()
     voxel_size = radar_map.config.leaf_size_m / 2
-    mesh = radar_map.mesh(voxel_size, min_support=0, min_component_triangles=0, progress=False)
+    mesh = radar_map.mesh(voxel_size, min_detection_rate=0, min_component_triangles=0, progress=False)
     assert np.isfinite(mesh.vertices).all()
     return x, mesh
 
@@ -210,12 +211,14 @@ def test_duplicates_weigh_but_add_nothing():
 def test_very_many_returns_in_one_cell():
     points = np.random.default_rng(0).uniform([5.0, 0.01, 0.01], [5.15, 0.19, 0.19], (1_000_000, 3))
     points = points.astype(np.float32)
-    radar_map = radarsdf.fit(
-        [points], np.eye(4)[None], config=QUICK.override(training={"sdf_iterations": 30})
-    )
+    config = QUICK.override(training={"sdf_iterations": 30})
+    radar_map = radarsdf.fit(np.split(points, 100), np.tile(np.eye(4), (100, 1, 1)), config=config)
     finite(radar_map, np.zeros(3))
     assert radar_map.report["leaf_cells"] < 60
-    assert radar_map.support.max() == 65535  # and not what is left of it in 16 bits
+    evidence = radar_map.evidence
+    variance_m2 = SensorNoise(**radar_map.report["noise"]).variances_m2(np.float32([5.08])).item()
+    assert evidence.information.max() == pytest.approx(len(points) / variance_m2, rel=0.01)
+    assert evidence.detections.max() == evidence.looks.max() == 100  # scans, and not returns
     assert radar_map.confidence(points[:10]).min() > 0.99
 
 

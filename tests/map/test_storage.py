@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pickle
 import stat
@@ -106,7 +107,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "4"
+    assert metadata["format_version"] == "5"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -151,7 +152,7 @@ def test_files_of_other_programs(tmp_path):
             radarsdf.load(tmp_path / "other.safetensors")
 
 
-@pytest.mark.parametrize("version", ["3", "5", "10", "", "1.5", "-1", "one"])
+@pytest.mark.parametrize("version", ["4", "6", "10", "", "1.5", "-1", "one"])
 def test_other_versions(saved, tmp_path, version):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "new.safetensors", tensors, metadata | {"format_version": version})
@@ -167,12 +168,40 @@ def test_confidence_survives_the_file(saved):
     assert confidence.max() > 0.3
 
 
-@pytest.mark.parametrize("support", [torch.zeros(3, dtype=torch.uint16), torch.zeros(3)])
-def test_support_of_another_shape_or_type(saved, tmp_path, support):
+@pytest.mark.parametrize("fault", ["missing", "longer", "flat", "float64", "int64", "int32"])
+@pytest.mark.parametrize("name", ["information", "detections", "looks"])
+def test_evidence_of_another_shape_or_type(saved, tmp_path, name, fault):
     _, _, tensors, metadata = saved
-    path = write(tmp_path / "wrong.safetensors", tensors | {"support": support}, metadata)
-    with pytest.raises(ValueError, match="support"):
+    changed = dict(tensors)
+    match fault:
+        case "missing":
+            del changed[name]
+        case "longer":
+            changed[name] = torch.cat([tensors[name], tensors[name][-1:]])
+        case "flat":
+            changed[name] = tensors[name].reshape(1, -1)
+        case _:
+            changed[name] = tensors[name].to(getattr(torch, fault))
+    with pytest.raises(ValueError, match=name):
+        radarsdf.load(write(tmp_path / "wrong.safetensors", changed, metadata))
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_information_that_cannot_be(saved, tmp_path, value):
+    _, _, tensors, metadata = saved
+    information = tensors["information"].clone()
+    information[5] = value
+    path = write(tmp_path / "wrong.safetensors", tensors | {"information": information}, metadata)
+    with pytest.raises(ValueError, match="information"):
         radarsdf.load(path)
+
+
+@pytest.mark.parametrize("value", [-0.01, 1.01, math.nan, math.inf, "much", None, [0.1]])
+def test_rough_shares_that_cannot_be(saved, tmp_path, value):
+    _, _, tensors, metadata = saved
+    spoilt = with_description(metadata, lambda d: d.update(rough_share=value))
+    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+        radarsdf.load(write(tmp_path / "wrong.safetensors", tensors, spoilt))
 
 
 def test_files_that_are_not_there(tmp_path):
@@ -243,6 +272,7 @@ DAMAGE = {
     "config a list": lambda d: d.update(config=[1, 2]),
     "no report": lambda d: d.pop("report"),
     "report a number": lambda d: d.update(report=3),
+    "no rough share": lambda d: d.pop("rough_share"),
     "no scale": lambda d: d.pop("intensity_scale"),
     "scale of one number": lambda d: d.update(intensity_scale=[1.0]),
     "scale a word": lambda d: d.update(intensity_scale=["low", "high"]),

@@ -4,17 +4,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
+from radarsdf.map.queries import _floor_m, max_uncertainty_m
+from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.noise import SensorNoise
 
 KNOWN = SensorNoise(range_m=0.1, azimuth_rad=0.006, elevation_rad=0.012)
 LEAF_M = 0.2
-FLOOR_M = 0.1 * LEAF_M
 CONFIG = FitConfig.quick().override(
     num_threads=2,
     returns={
@@ -26,6 +28,11 @@ CONFIG = FitConfig.quick().override(
     },
     encoding={"bridge_cells": 0},
 )
+
+
+def floor_m(radar_map):
+    """What repetition does not shrink, m."""
+    return _floor_m(radar_map._contents)
 
 
 def two_walls(scans=4, returns=400):
@@ -66,7 +73,7 @@ def test_it_is_the_standard_error_of_the_returns_round_a_cell(walls):
     centres = np.unique(cells, axis=0)[::29]
     variances = KNOWN.variances_m2(np.linalg.norm(returns, axis=1).astype(np.float32))
     expected = [
-        np.hypot(np.sum(1 / variances[(np.abs(cells - centre) <= 1).all(axis=1)]) ** -0.5, FLOOR_M)
+        np.hypot(np.sum(1 / variances[(np.abs(cells - centre) <= 1).all(axis=1)]) ** -0.5, floor_m(radar_map))
         for centre in centres
     ]
     found = radar_map.uncertainty((centres + 0.5) * LEAF_M + radar_map.origin)
@@ -77,7 +84,7 @@ def test_it_is_the_standard_error_of_the_returns_round_a_cell(walls):
 def test_far_returns_tell_less(walls):
     _, radar_map = walls
     near_m, far_m = (np.nanmedian(radar_map.uncertainty([[x, y, 0.0]])) for x, y in ((5, -2), (40, 2)))
-    near_m, far_m = (np.sqrt(sigma_m**2 - FLOOR_M**2) for sigma_m in (near_m, far_m))
+    near_m, far_m = (np.sqrt(sigma_m**2 - floor_m(radar_map) ** 2) for sigma_m in (near_m, far_m))
     # At 40 m a return has a deviation of 0.39 m, at 5 m of 0.11 m.
     assert far_m / near_m == pytest.approx(0.39 / 0.11, rel=0.25)
 
@@ -89,7 +96,7 @@ def test_nothing_is_known_where_nothing_was_observed(walls):
 
 def test_the_mesh_leaves_out_what_is_uncertain(walls):
     _, radar_map = walls
-    kept = {"min_support": 0, "min_component_triangles": 0}
+    kept = {"min_detection_rate": 0, "min_component_triangles": 0}
     everything = radar_map.mesh(max_uncertainty=math.inf, **kept)
     certain = radar_map.mesh(max_uncertainty=0.035, **kept)
     assert everything.vertices[:, 0].max() > 39
@@ -100,33 +107,50 @@ def test_the_mesh_leaves_out_what_is_uncertain(walls):
         certain.vertex_attributes["uncertainty_m"], radar_map.uncertainty(certain.vertices), rtol=1e-4
     )
     default = radar_map.mesh(**kept)
-    limit_m = 0.27 * LEAF_M / max(radar_map.report["rough_share"], 1e-3)
+    limit_m = max_uncertainty_m(radar_map._contents)
+    assert default.vertices[:, 0].max() > 39  # with a standard error of 0.06 m
     np.testing.assert_array_equal(default.faces, radar_map.mesh(max_uncertainty=limit_m, **kept).faces)
 
 
 def test_clutter_asks_for_more_evidence():
     """A wall among returns of nothing: the more of these, the surer a surface must be to be meshed."""
     rng = np.random.default_rng(1)
-    limits_m = []
+    errors_m = []
     for count in (0, 4000):
         points, poses = two_walls(scans=8)
         clutter = rng.uniform([8, -3, -2], [14, 3, 2], (8, count // 8, 3))
         points = [np.concatenate(pair) for pair in zip(points, clutter, strict=True)]
         radar_map = radarsdf.fit(points, poses, config=CONFIG, progress=False)
-        limits_m.append(radar_map._contents.max_uncertainty_m)
-    assert limits_m[0] > 1
-    assert limits_m[1] < 0.2
+        limit_m = max_uncertainty_m(radar_map._contents)
+        errors_m.append(math.sqrt(limit_m**2 - floor_m(radar_map) ** 2))
+    assert errors_m[0] >= LEAF_M
+    assert errors_m[1] < 0.85 * errors_m[0]
+
+
+def test_the_rougher_the_less_repetition_helps(walls):
+    """Where nothing is rough, many returns give the position to a twentieth of a leaf cell."""
+    _, radar_map = walls
+    contents = radar_map._contents
+    information = np.full_like(radar_map.evidence.information, 1e12)
+    without_noise = dataclasses.replace(radar_map.evidence, information=information)
+    limits_m, errors_m = [], []
+    for rough_share in (0.0, 0.02, 0.1, 0.25):
+        rough = dataclasses.replace(contents, evidence=without_noise, rough_share=rough_share)
+        errors_m.append(RadarMap(rough).uncertainty([[5.0, -2.0, 0.0]])[0])
+        limits_m.append(max_uncertainty_m(rough))
+        assert RadarMap(rough).mesh().vertices[:, 0].max() > 39  # the limit grows with it
+    assert errors_m[0] == pytest.approx(0.05 * LEAF_M, rel=1e-4)
+    assert (np.diff(errors_m) > 0).all()
+    assert (np.array(limits_m) > errors_m).all()
 
 
 def test_more_scans_make_it_certain():
     place = [[40.0, 2.0, 0.0]]
-    few, many, very_many = (
-        radarsdf.fit(*two_walls(scans), config=CONFIG, progress=False).uncertainty(place)[0]
-        for scans in (4, 16, 1024)
-    )
-    few, many = (np.sqrt(sigma_m**2 - FLOOR_M**2) for sigma_m in (few, many))
+    maps = [radarsdf.fit(*two_walls(scans), config=CONFIG, progress=False) for scans in (4, 16, 1024)]
+    few, many, very_many = (radar_map.uncertainty(place)[0] for radar_map in maps)
+    few, many = (np.sqrt(sigma_m**2 - floor_m(maps[0]) ** 2) for sigma_m in (few, many))
     assert many / few == pytest.approx(0.5, rel=0.15)
-    assert FLOOR_M < very_many < 1.2 * FLOOR_M
+    assert floor_m(maps[2]) < very_many < 1.2 * floor_m(maps[2])
 
 
 def test_the_file_keeps_it(walls, tmp_path):

@@ -96,7 +96,8 @@ def test_a_sparse_surface_has_fewer_holes():
     area = {}
     for cells in (0, 2):
         config = FitConfig(num_threads=1, encoding={"bridge_cells": cells})
-        mesh = radarsdf.fit(scene.points, scene.poses, config=config, progress=False).mesh(min_support=0)
+        radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
+        mesh = radar_map.mesh(min_detection_rate=0)
         area[cells] = mesh.area
         off_m = np.minimum(np.abs(mesh.vertices[:, 2]), np.abs(mesh.vertices[:, 0] - 20))
         assert np.percentile(off_m, 95) < 0.2

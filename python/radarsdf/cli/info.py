@@ -18,6 +18,7 @@ def run(_: argparse.Namespace) -> None:
     """Print one line for each part."""
     import torch
 
+    import radarsdf.threads  # noqa: F401 - warns of an unknown RADARSDF_ISA
     from radarsdf import _core
 
     openmp = _core.openmp_version()

@@ -36,17 +36,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="leave out the surface whose confidence is below C, 0 to 1; default: 0",
     )
     parser.add_argument(
-        "--min-support",
+        "--min-detection-rate",
         type=float,
-        metavar="SHARE",
-        help="leave out the surface that fewer returns support than this share of the map's median; "
-        "default: 0.12, for a quick map 0.15",
+        default=0.028,
+        metavar="RATE",
+        help="leave out the surface with returns in a smaller share of the scans that looked there; default: 0.028",
     )
     parser.add_argument(
         "--max-uncertainty",
         type=float,
         metavar="M",
-        help="leave out the surface whose standard error is above M, m; default: what the fit found",
+        help="leave out the surface whose standard error is above M, m; default: it follows from the returns",
     )
     parser.add_argument(
         "--min-component",
@@ -74,8 +74,8 @@ def run(options: argparse.Namespace) -> None:
         box=box_of(options),
         viewpoint=options.viewpoint,
         min_confidence=options.min_confidence,
-        min_support=options.min_support,
         max_uncertainty=options.max_uncertainty,
+        min_detection_rate=options.min_detection_rate,
         min_component_triangles=options.min_component,
         progress=progress_of(options),
     )

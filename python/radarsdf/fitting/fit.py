@@ -26,14 +26,10 @@ from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
+from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.rays import Rays, prepare
-from radarsdf.returns.surfels import Surfels
 from radarsdf.threads import Workers
-
-# Times the leaf size, over the share of rough returns. Measured: see docs/levers.md.
-_MAX_UNCERTAINTY_CELLS = 0.27
-_LEAST_ROUGH_SHARE = 1e-3  # to divide by. The limit is then far above all uncertainties.
 
 
 def fit(
@@ -116,8 +112,13 @@ def fit(
             if not all(parameter.isfinite().all() for parameter in field.parameters()):
                 msg = "what the training starts from is not finite: training.sigma_cells may be too small"
                 raise Diverged(msg)
-            leaf_keys = field.cells.table.leaf_keys()
-            support, information = start.support(leaf_keys), start.information(leaf_keys)
+            evidence = Evidence.of(
+                start.returns_of_cells(),
+                rays,
+                field.cells.table.leaf_keys(),
+                config.leaf_size_m,
+                workers.num_threads,
+            )
             clock.lap("start_s")
             scale = IntensityScale.of(rays.intensities)
             training = Training(field, surface.rays, rays, scale, config, workers)
@@ -130,7 +131,6 @@ def fit(
                 "returns_used": len(surface.rays),
                 "ghosts": len(rays) - len(surface.rays),
                 "noise": dataclasses.asdict(surface.noise),
-                "rough_share": surface.surfels.rough_share(),
             }
             radar_map = RadarMap(
                 MapContents(
@@ -138,9 +138,8 @@ def fit(
                     origin=rays.origin,
                     intensity_scale=scale,
                     config=config,
-                    support=support,
-                    information=information,
-                    max_uncertainty_m=_max_uncertainty_m(surface.surfels, config),
+                    evidence=evidence,
+                    rough_share=surface.surfels.rough_share(),
                     report=counts | _report(config, field, training, scale),
                 )
             )
@@ -162,15 +161,6 @@ def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, nu
     """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
     leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
     return Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
-
-
-def _max_uncertainty_m(surfels: Surfels, config: FitConfig) -> float:
-    """The standard error up to which a surface is meshed by default, m.
-
-    Where many returns lie on no surface, it takes more evidence to tell a surface from them.
-    """
-    rough = surfels.rough_share()
-    return config.leaf_size_m * _MAX_UNCERTAINTY_CELLS / max(rough, _LEAST_ROUGH_SHARE)
 
 
 def _report(

@@ -11,18 +11,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf._core import CellSet, cell_keys
+from radarsdf._core import CellSet, count_scans
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.fitting.surface import SurfaceReturns
+from radarsdf.returns.cells import ReturnCells
+from radarsdf.returns.evidence import ReturnsOfCells
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.support import information_of_cells, support_of_cells, support_of_points
 from radarsdf.returns.surfels import Surfels
 
 
 class Start(ABC):
-    """Decides which leaf cells the map has, what the field is at first, and the support of the cells."""
+    """Decides which leaf cells the map has, what the field is at first, and what the returns tell of the cells."""
 
     def __init__(self, surface: SurfaceReturns, config: FitConfig, num_threads: int) -> None:
         self._surface = surface
@@ -38,12 +39,8 @@ class Start(ABC):
         """Sets the parameters of the field."""
 
     @abstractmethod
-    def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
-        """(C,) uint16, support of the leaf cells: number of returns in each and the 26 cells round it."""
-
-    @abstractmethod
-    def information(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.float32]:
-        """(C,) float32, m⁻²: sum of 1 / variance over the returns in each leaf cell and the 26 cells round it."""
+    def returns_of_cells(self) -> ReturnsOfCells:
+        """What the returns in each leaf cell tell."""
 
 
 class FromNoise(Start):
@@ -55,15 +52,18 @@ class FromNoise(Start):
     def initialise(self, field: Field, generator: torch.Generator) -> None:
         field.initialise(generator)
 
-    def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
-        points, leaf_size_m = self._surface.rays.points, self._config.leaf_size_m
-        return support_of_points(points, leaf_keys, leaf_size_m, self._num_threads)
-
-    def information(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.float32]:
+    def returns_of_cells(self) -> ReturnsOfCells:
         rays = self._surface.rays
-        keys = cell_keys(np.ascontiguousarray(rays.points), self._config.leaf_size_m, self._num_threads)
-        information: NDArray[np.float32] = np.float32(1) / self._surface.noise.variances_m2(rays.ranges_m)
-        return information_of_cells(keys, information, leaf_keys, self._num_threads)
+        cells = ReturnCells.of(rays, self._config.leaf_size_m, self._num_threads)
+        information = 1 / self._surface.noise.variances_m2(rays.ranges_m)
+        found = ReturnsOfCells(
+            keys=cells.keys,
+            information=np.bincount(cells.cell_of_ray, information, len(cells.keys)).astype(np.float32),
+            scans=count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), self._num_threads),
+        )
+        ranges_m = np.zeros(len(cells.keys), np.float32)
+        ranges_m[cells.cell_of_ray] = rays.ranges_m  # any return of the cell
+        return found.with_uncertain_poses(ranges_m, self._config.returns)
 
 
 class FromAverage(Start):
@@ -80,14 +80,12 @@ class FromAverage(Start):
         field.initialise(generator, features=learns)
         average_rays(field, self._means, self._surface.surfels, self._config, self._num_threads)
 
-    def support(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint16]:
-        return support_of_cells(self._means.keys, self._means.counts, leaf_keys, self._num_threads)
-
-    def information(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.float32]:
+    def returns_of_cells(self) -> ReturnsOfCells:
         # The returns of a cell are at nearly the same range if they are of the same sensor position.
         means = self._means
         information = means.counts / self._surface.noise.variances_m2(means.ranges_m)
-        return information_of_cells(means.keys, information, leaf_keys, self._num_threads)
+        found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans)
+        return found.with_uncertain_poses(means.ranges_m, self._config.returns)
 
     @property
     def _means(self) -> MeanRays:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
+from radarsdf.returns.evidence import Evidence
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,9 @@ class MapContents:
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
     config: FitConfig
     """Settings of the fit."""
-    support: NDArray[np.uint16]
-    """(C,) number of returns in each leaf cell and the 26 round it, in the order of the cells' keys."""
-    information: NDArray[np.float32]
-    """(C,) sum of 1 / variance over the same returns, m⁻²."""
-    max_uncertainty_m: float
-    """Standard error up to which a surface is meshed by default, m."""
+    evidence: Evidence
+    """What the returns tell of each leaf cell."""
+    rough_share: float
+    """Share of the returns that lie on no thin surface, in [0, 1]."""
     report: dict[str, Any]
     """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""

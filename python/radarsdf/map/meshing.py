@@ -9,7 +9,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import MAX_POSITION_M, not_negative, number, positive, real_array, whole_number
-from radarsdf.config import FitConfig
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
@@ -21,11 +20,6 @@ with whole_import():
     import trimesh
 
 
-# Shares of the median support. Measured: see docs/levers.md.
-_MIN_SUPPORT = 0.12
-_MIN_SUPPORT_OF_AVERAGE = 0.15
-
-
 def extract_mesh(
     contents: MapContents,
     voxel_size: float = 0.1,
@@ -33,8 +27,8 @@ def extract_mesh(
     box: ArrayLike | None = None,
     viewpoint: ArrayLike | None = None,
     min_confidence: float = 0.0,
-    min_support: float | None = None,
     max_uncertainty: float | None = None,
+    min_detection_rate: float = 0.028,
     min_component_triangles: int = 30,
     progress: bool | None = None,
 ) -> trimesh.Trimesh:
@@ -42,11 +36,9 @@ def extract_mesh(
     if not 0 <= min_confidence <= 1:
         msg = f"min_confidence must be in [0, 1], not {min_confidence}"
         raise ValueError(msg)
-    if min_support is None:
-        min_support = _MIN_SUPPORT_OF_AVERAGE if _is_average(contents.config) else _MIN_SUPPORT
-    min_support = not_negative(min_support, "min_support")
+    min_detection_rate = not_negative(min_detection_rate, "min_detection_rate")
     if max_uncertainty is None:
-        max_uncertainty = contents.max_uncertainty_m
+        max_uncertainty = queries.max_uncertainty_m(contents)
     max_uncertainty = number(max_uncertainty, "max_uncertainty")
     if max_uncertainty < 0:
         msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
@@ -67,15 +59,16 @@ def extract_mesh(
         num_threads=torch.get_num_threads(),
     )
     points = _local(contents, vertices + contents.origin)
-    confidence = queries.confidence(contents, points).numpy()
-    uncertainty_m = queries.uncertainty(contents, points).numpy()
-    kept = confidence >= max(min_confidence, queries.confidence_of_median(contents, min_support))
+    evidence = queries.evidence(contents, points)
+    confidence = queries.confidence(contents, evidence).numpy()
+    uncertainty_m = queries.uncertainty(contents, evidence).numpy()
+    kept = (confidence >= min_confidence) & queries.answers(evidence, min_detection_rate).numpy()
     kept &= np.nan_to_num(uncertainty_m, nan=np.inf) <= max_uncertainty
     faces = faces[kept[faces].all(axis=1)]
     kept, faces = _without_small_components(len(vertices), faces, min_component_triangles)
     mesh = trimesh.Trimesh(vertices[kept] + contents.origin, faces, process=False)
     mesh.metadata |= {
-        "leaf_cells": len(contents.support),
+        "leaf_cells": len(contents.evidence.looks),
         "leaf_cells_searched": lattice.cells_searched,
     }
     mesh.vertex_attributes["confidence"] = confidence[kept]
@@ -83,11 +76,6 @@ def extract_mesh(
     if sensor_position is not None:
         _add_intensity(mesh, contents, sensor_position)
     return mesh
-
-
-def _is_average(config: FitConfig) -> bool:
-    """Whether the surface is the average of the rays, without training."""
-    return config.training.start == "average" and config.training.sdf_iterations == 0
 
 
 def _local(contents: MapContents, world: NDArray[np.float64]) -> torch.Tensor:

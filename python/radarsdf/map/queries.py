@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,12 +18,27 @@ from radarsdf._core import CellBlocks
 from radarsdf.map.contents import MapContents
 from radarsdf.progress import hides_bar
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
+from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
-_HALF_SUPPORT = 10.0  # returns round a point that give a confidence of one half
-# Of the uncertainty, leaf cells: the field does not resolve less, however many returns there are. Measured: 0.6 to 3 cm
-# on simulated scenes with cells of 0.2 m.
-_FLOOR_CELLS = 0.1
+# From this share of rough returns on, the errors are those of a rough scene. Measured: 0 to 0.07 on simulated scenes
+# without much clutter, 0.27 to 0.44 on five real drives.
+_ROUGH_SHARE = 0.27
+# The part of the uncertainty that repetition does not shrink, leaf cells: in smooth scenes, and what rough ones add.
+# Returns that agree there may share an error. Chosen with `python -m bench.paper calibration`: errors are within 95 %
+# intervals with 0.00 to 0.03 m on smooth simulated scenes, and with 0.20 to 0.29 m on the drives.
+_FLOOR_CELLS = 0.05
+_ROUGH_FLOOR_CELLS = 1.1
+# Up to this error, apart from that part, a surface is meshed, leaf cells: in smooth scenes, and over the rough share.
+_MAX_ERROR_CELLS = 2.0
+_ROUGH_MAX_ERROR_CELLS = 0.27
+# Of the confidence, found by `python -m bench.paper.confidence_model`: logit = the first number, and the others times
+# the logarithms of the error in leaf cells, of the detection rate, and of the rough share.
+_LOGIT = (-2.34, -0.99, 0.40, -1.16)
+_MIN_ROUGH_SHARE = 0.01
+# A place counts as answering too rarely if its detections are so many standard deviations of a chance count (Poisson)
+# below what is expected: ten scans cannot tell as much as a thousand.
+_RATE_DEVIATIONS = 0.5
 _CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
 _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
 
@@ -56,26 +73,69 @@ def occupied(contents: MapContents, points: Tensor) -> Tensor:
     return evaluate(contents.field.cells.occupied, points)
 
 
-def confidence(contents: MapContents, points: Tensor) -> Tensor:
-    """(N,) n / (n + 10) for the interpolated number n of returns in the 27 leaf cells round each point."""
-    returns = _interpolated(contents, contents.support.astype(np.float32), points)
-    return _confidence_of(returns)
+class EvidenceAt(NamedTuple):
+    """Evidence of a surface at N points, interpolated between the centres of leaf cells. 0 without cells."""
+
+    information: Tensor
+    """(N,) sum of 1 / variance over the returns round each point, m⁻²."""
+    detections: Tensor
+    """(N,) scans with returns round it."""
+    looks: Tensor
+    """(N,) scans that looked there."""
 
 
-def uncertainty(contents: MapContents, points: Tensor) -> Tensor:
-    """(N,) standard error of the surface's position at each point, m. NaN where there are no returns round it."""
-    information = _interpolated(contents, contents.information, points)
-    floor_m = _FLOOR_CELLS * contents.config.leaf_size_m
-    return torch.where(information > 0, (1 / information + floor_m**2).sqrt(), torch.nan)
+def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
+    """The evidence at each point."""
+    found = contents.evidence
+    columns = found.information, found.detections, found.looks
+    return EvidenceAt(*(_interpolated(contents, column.astype(np.float32), points) for column in columns))
 
 
-def confidence_of_median(contents: MapContents, share: float) -> float:
-    """The confidence of a support of `share` times the median over the leaf cells that have any."""
-    observed = contents.support[contents.support > 0]
-    if len(observed) == 0:
-        return 0.0
-    returns = share * float(np.median(observed))
-    return returns / (returns + _HALF_SUPPORT)
+def uncertainty(contents: MapContents, evidence: EvidenceAt) -> Tensor:
+    """(N,) standard error of the surface's position, m. NaN where there are no returns."""
+    variance_m2 = 1 / evidence.information + _floor_m(contents) ** 2
+    return variance_m2.sqrt().masked_fill(evidence.information <= 0, torch.nan)
+
+
+def max_uncertainty_m(contents: MapContents) -> float:
+    """The uncertainty up to which a surface is meshed by default, m. The rougher a scene, the more evidence it takes."""
+    error_cells = _ROUGH_MAX_ERROR_CELLS / max(
+        contents.rough_share, _ROUGH_MAX_ERROR_CELLS / _MAX_ERROR_CELLS
+    )
+    return math.hypot(error_cells * contents.config.leaf_size_m, _floor_m(contents))
+
+
+def _floor_m(contents: MapContents) -> float:
+    roughness: float = min(contents.rough_share / _ROUGH_SHARE, 1.0) ** 1.5
+    return (_FLOOR_CELLS + _ROUGH_FLOOR_CELLS * roughness) * contents.config.leaf_size_m
+
+
+def confidence(contents: MapContents, evidence: EvidenceAt) -> Tensor:
+    """(N,) probability that a surface is within a leaf cell's edge. 0 where there are no returns."""
+    terms = confidence_terms(contents, evidence)
+    probability = (terms @ torch.tensor(_LOGIT, dtype=torch.float64, device="cpu")).sigmoid()
+    # A surface is no nearer than its position is known: the share of a normal distribution within a cell's edge.
+    error_cells = terms[:, 1].exp()
+    return probability.minimum(torch.erf(math.sqrt(0.5) / error_cells)).float()
+
+
+def confidence_terms(contents: MapContents, evidence: EvidenceAt) -> Tensor:
+    """(N, 4) float64: 1, and the logarithms of what the confidence depends on. Infinite without returns."""
+    error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
+    rate = (evidence.detections + 0.5) / (evidence.looks + 2)  # finite and positive, whatever the counts
+    rough_share = torch.full_like(error_cells, max(contents.rough_share, _MIN_ROUGH_SHARE))
+    return torch.stack(
+        [torch.ones_like(error_cells), error_cells.log(), rate.double().log(), rough_share.log()], 1
+    )
+
+
+def answers(evidence: EvidenceAt, rate: float) -> Tensor:
+    """(N,) bool, whether scans that looked there had returns often enough for a surface.
+
+    `rate`: share of them with a return in a cell of the surface.
+    """
+    expected = CELLS_OF_SURFACE * rate * evidence.looks
+    return evidence.detections >= expected - _RATE_DEVIATIONS * expected.sqrt()
 
 
 @torch.inference_mode(mode=False)
@@ -122,10 +182,6 @@ def evaluate(
         return torch.cat(
             list(tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress)))
         )
-
-
-def _confidence_of(returns: Tensor) -> Tensor:
-    return returns / (returns + _HALF_SUPPORT)
 
 
 def _interpolated(contents: MapContents, of_cells: NDArray[np.float32], points: Tensor) -> Tensor:

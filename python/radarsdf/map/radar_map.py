@@ -19,6 +19,7 @@ from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
+from radarsdf.returns.evidence import Evidence
 
 if TYPE_CHECKING:
     import trimesh
@@ -38,7 +39,7 @@ class RadarMap:
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
-        return f"RadarMap({kind}, {len(self.support)} cells, {self.nbytes / 1e6:.1f} MB)"
+        return f"RadarMap({kind}, {len(self.evidence.looks)} cells, {self.nbytes / 1e6:.1f} MB)"
 
     def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
         return _from_pickle, storage.to_pickle(self._contents)
@@ -64,9 +65,14 @@ class RadarMap:
         return self._contents.report
 
     @property
-    def support(self) -> NDArray[np.uint16]:
-        """(C,) uint16, returns in each leaf cell and the 26 round it, in the order of the cells' keys."""
-        return self._contents.support
+    def evidence(self) -> Evidence:
+        """What the returns tell of each leaf cell, in the order of the cells' keys."""
+        return self._contents.evidence
+
+    @property
+    def rough_share(self) -> float:
+        """Share of the returns that lie on no thin surface, in [0, 1]: clutter, vegetation, rough ground."""
+        return self._contents.rough_share
 
     @property
     def has_intensity(self) -> bool:
@@ -140,7 +146,7 @@ class RadarMap:
     @overload
     def confidence(self, x: ArrayLike) -> NDArray[Any]: ...
     def confidence(self, x: Any) -> Any:
-        """Confidence in a surface at points, from the number of returns round them.
+        """Probability that there is a surface at points, from the returns round them and the scans that looked there.
 
         Parameters
         ----------
@@ -150,12 +156,16 @@ class RadarMap:
         Returns
         -------
         (N,) array or tensor
-            n / (n + 10) for the support n: the returns in the 27 leaf cells round the point, interpolated
-            between cells, without ghosts that the fit dropped. 0 without returns, 0.5 with ten. Where it is
-            higher, the surface is likely to be more accurate. It is not a probability.
+            Probability that a true surface is within the edge of a leaf cell, in [0, 1]. 0 without returns.
+            A logistic function of how precisely the returns agree (:meth:`uncertainty` without its floor), of
+            the share of scans with returns there among those that looked there, and of the share of the map's
+            returns that lie on no thin surface; at most the share of a normal distribution of that error within a
+            leaf cell's edge. It was fitted to simulated scenes and to three real drives.
+            Measured on others, on meshes with the defaults: mostly within 0.1 of the share of true surface, on
+            one of two real drives within 0.2.
         """
         points, answer = self._local(x)
-        return answer(queries.confidence(self._contents, points))
+        return answer(queries.confidence(self._contents, queries.evidence(self._contents, points)))
 
     @overload
     def uncertainty(self, x: Tensor) -> Tensor: ...
@@ -173,10 +183,11 @@ class RadarMap:
         -------
         (N,) array or tensor
             (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells round the point, interpolated between cells, and
-            a tenth of a leaf cell, which no number of returns makes better, added in quadrature; m.
-            The noise σ of a return is that along the beam and across it together; see ``report["noise"]``. It
-            grows with the range, so that far returns tell less than near ones. NaN where nothing was observed.
-            It does not know false returns, nor errors of the poses.
+            a floor that no number of returns makes smaller, added in quadrature; m. The noise σ of a return is
+            that along the beam and across it together; see ``report["noise"]``. It grows with the range, so that
+            far returns tell less than near ones. The floor is 0.05 leaf cells, and up to 1.1 more where much
+            of the returns lies on no thin surface (:attr:`rough_share`). NaN where nothing was observed. Errors of the poses count if
+            ``returns.pose_sigma_m`` and ``pose_sigma_rad`` in the :class:`FitConfig` state them.
 
         Raises
         ------
@@ -184,7 +195,7 @@ class RadarMap:
             If `x` does not have shape (N, 3).
         """
         points, answer = self._local(x)
-        return answer(queries.uncertainty(self._contents, points))
+        return answer(queries.uncertainty(self._contents, queries.evidence(self._contents, points)))
 
     @overload
     def intensity(self, x: Tensor, sensor_positions: Tensor) -> Tensor: ...
@@ -224,8 +235,8 @@ class RadarMap:
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
         min_confidence: float = 0.0,
-        min_support: float | None = None,
         max_uncertainty: float | None = None,
+        min_detection_rate: float = 0.028,
         min_component_triangles: int = 30,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
@@ -242,14 +253,14 @@ class RadarMap:
             units, as ``mesh.vertex_attributes["intensity"]``, and colours from dark (low) to bright (high).
         min_confidence : float
             In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out.
-        min_support : float, optional
-            Triangles with a vertex of less support are left out, as a share of the median support of the map,
-            because sensors differ in their number of returns (3QFP: 0). Default: 0.12, or 0.15 for an average
-            without training.
         max_uncertainty : float, optional
-            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. The default
-            follows from the share of returns that lie on no thin surface, ``report["rough_share"]``: 0.27 leaf
-            cells over that share. ``math.inf``: all are kept.
+            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. Default: without
+            its floor at most two leaf cells, and less where much of the returns lies on no thin surface.
+            ``math.inf``: all are kept (3QFP).
+        min_detection_rate : float
+            Share of the scans that looked at a cell of the surface and have a return in it. Triangles with a vertex
+            of a smaller share are left out, if it is smaller by half a standard deviation of chance (3QFP: 0).
+            Noise beside a surface, and clutter, have returns of few scans, however many scans there are.
         min_component_triangles : int
             Components of fewer triangles are then left out (3QFP: 300, which on sparse scans costs ten points
             of completion).
@@ -280,8 +291,8 @@ class RadarMap:
             box=box,
             viewpoint=viewpoint,
             min_confidence=min_confidence,
-            min_support=min_support,
             max_uncertainty=max_uncertainty,
+            min_detection_rate=min_detection_rate,
             min_component_triangles=min_component_triangles,
             progress=progress,
         )

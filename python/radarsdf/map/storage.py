@@ -21,10 +21,13 @@ from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.map.contents import MapContents
+from radarsdf.returns.evidence import Evidence
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
+# Types of the columns of `Evidence`.
+_EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
 
 
 def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
@@ -72,13 +75,12 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors["origin"] = torch.from_numpy(contents.origin)
     # Morton keys have 63 bits, so they fit into int64, which all readers of safetensors have.
     tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
-    tensors["support"] = torch.from_numpy(contents.support)
-    tensors["information"] = torch.from_numpy(contents.information)
+    tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
     scale = contents.intensity_scale
     description = {
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
-        "max_uncertainty_m": contents.max_uncertainty_m,
+        "rough_share": contents.rough_share,
         "report": contents.report,
     }
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
@@ -134,15 +136,12 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     if leaf_keys.ndim != 1 or leaf_keys.dtype != torch.int64:
         msg = "leaf_keys is not one key for each leaf cell"
         raise ValueError(msg)
-    support = tensors.pop("support")
-    if support.shape != leaf_keys.shape or support.dtype != torch.uint16:
-        msg = "support is not one count for each leaf cell"
-        raise ValueError(msg)
-    information = tensors.pop("information")
-    if information.shape != leaf_keys.shape or information.dtype != torch.float32:
-        msg = "information is not one number for each leaf cell"
-        raise ValueError(msg)
-    if not (information.isfinite() & (information >= 0)).all():
+    evidence = {name: tensors.pop(name) for name in _EVIDENCE}
+    for name, tensor in evidence.items():
+        if tensor.shape != leaf_keys.shape or tensor.dtype != _EVIDENCE[name]:
+            msg = f"{name} is not one number for each leaf cell"
+            raise ValueError(msg)
+    if not (evidence["information"].isfinite() & (evidence["information"] >= 0)).all():
         msg = "information holds something other than finite numbers of at least 0"
         raise ValueError(msg)
     scale = None
@@ -152,9 +151,9 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         if not -math.inf < scale.low < scale.high < math.inf:
             msg = f"the intensity scale must be finite and ascending, not {low} to {high}"
             raise ValueError(msg)
-    max_uncertainty_m = float(description["max_uncertainty_m"])
-    if not 0 < max_uncertainty_m < math.inf:
-        msg = f"max_uncertainty_m must be positive and finite, not {max_uncertainty_m}"
+    rough_share = float(description["rough_share"])
+    if not 0 <= rough_share <= 1:
+        msg = f"rough_share must be in [0, 1], not {rough_share}"
         raise ValueError(msg)
     # A damaged description could ask for networks of any size. So the number of layers is limited, and the
     # field is made without memory: it only serves to check the shapes of the tensors.
@@ -176,7 +175,6 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         intensity_scale=scale,
         config=config,
         report=dict(description["report"]),
-        support=support.numpy().copy(),
-        information=information.numpy().copy(),
-        max_uncertainty_m=max_uncertainty_m,
+        evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
+        rough_share=rough_share,
     )

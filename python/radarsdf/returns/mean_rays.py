@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellSet
+from radarsdf._core import CellSet, count_scans
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import Rays
 
@@ -34,6 +34,8 @@ class MeanRays:
     """(M, 3) mean direction of their rays, unit vectors."""
     counts: NDArray[np.float32]
     """(M,) number of returns in each cell."""
+    scans: NDArray[np.uint32]
+    """(M,) number of different scans that they are of."""
     ranges_m: NDArray[np.float32]
     """(M,) range of the first return in each cell."""
 
@@ -58,6 +60,7 @@ class MeanRays:
             points=(moments[:, 1:4] / moments[:, :1]).astype(np.float32),
             directions=directions.astype(np.float32),
             counts=moments[:, 0].astype(np.float32),
+            scans=count_scans(rows, rays.scans, len(cells.keys), num_threads),
             ranges_m=rays.ranges_m[first],
         )
 
@@ -69,6 +72,7 @@ class MeanRays:
             self.points[part],
             self.directions[part],
             self.counts[part],
+            self.scans[part],
             self.ranges_m[part],
         )
 

@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Evidence of a surface in each leaf cell: what the returns tell, and how many scans looked there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf._core import CellBlocks, count_looks
+from radarsdf.config import ReturnsConfig
+from radarsdf.returns.rays import Rays
+
+CELLS_OF_SURFACE = 9
+"""A plane crosses about so many of a cell and the 26 cells round it."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence of a surface in each leaf cell, in the order of the cells' keys.
+
+    `information` and `detections` are sums over a leaf cell and the 26 cells round it.
+    """
+
+    information: NDArray[np.float32]
+    """(C,) 1 / variance of the position that the returns give together, m⁻²."""
+    detections: NDArray[np.uint32]
+    """(C,) number of scans with returns, added up over the cells. A scan of many returns in a cell counts once
+    there: their errors have causes in common."""
+    looks: NDArray[np.uint32]
+    """(C,) number of scans with a ray through the cube of 8 × 8 × 8 leaf cells that the cell is in, or to there."""
+
+    @classmethod
+    def of(
+        cls,
+        returns: ReturnsOfCells,
+        rays: Rays,
+        leaf_keys: NDArray[np.uint64],
+        leaf_size_m: float,
+        num_threads: int = 0,
+    ) -> Evidence:
+        """Evidence in the leaf cells with these Morton keys (C,), ascending.
+
+        Parameters
+        ----------
+        returns : ReturnsOfCells
+            What the returns tell, cell by cell. Without those that are known to be false.
+        rays : Rays
+            All rays, scan by scan. A ray to a false return looked, too.
+        leaf_keys : ndarray
+            (C,) uint64.
+        leaf_size_m : float
+            Edge of a leaf cell, m.
+        num_threads : int
+            0: as many as OpenMP uses.
+        """
+        cells = CellBlocks(leaf_keys)
+        rows = cells.rows(returns.keys, num_threads)
+        inside = rows >= 0
+        columns = np.zeros((len(leaf_keys), 2))
+        columns[rows[inside], 0] = returns.information[inside]
+        columns[rows[inside], 1] = returns.scans[inside]
+        sums = cells.sum_round(leaf_keys, columns, 1.0, num_threads)
+        looks = count_looks(
+            leaf_keys,
+            leaf_size_m,
+            np.ascontiguousarray(rays.points),
+            np.ascontiguousarray(rays.directions),
+            np.ascontiguousarray(rays.ranges_m),
+            rays.scans,
+            num_threads,
+        )
+        return cls(sums[:, 0].astype(np.float32), sums[:, 1].astype(np.uint32), looks)
+
+
+@dataclass(frozen=True)
+class ReturnsOfCells:
+    """What the returns in each leaf cell tell, in the order of their keys."""
+
+    keys: NDArray[np.uint64]
+    """(M,) Morton keys of the leaf cells with returns, ascending."""
+    information: NDArray[np.float32]
+    """(M,) 1 / variance of the position that the returns of a cell give together, m⁻²."""
+    scans: NDArray[np.uint32]
+    """(M,) number of different scans with returns."""
+
+    def with_uncertain_poses(self, ranges_m: NDArray[np.float32], config: ReturnsConfig) -> ReturnsOfCells:
+        """The same with the errors of the poses in `config`. `ranges_m` (M,): of a return in each cell, m.
+
+        The error of a pose is common to the returns of a scan, in a cell and in those round it. So the variance
+        of a cell gets that of a pose over the number of scans, as many times as a surface has cells among 27.
+        """
+        if config.pose_sigma_m == 0 and config.pose_sigma_rad == 0:
+            return self
+        pose_m2 = config.pose_sigma_m**2 + np.square(np.float32(config.pose_sigma_rad) * ranges_m)
+        variances_m2 = 1 / self.information + CELLS_OF_SURFACE * pose_m2 / self.scans
+        return ReturnsOfCells(self.keys, (1 / variances_m2).astype(np.float32), self.scans)

@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The probability that a surface is where a map says: from information, detections, looks and the rough share."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import pickle
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
+from radarsdf.map import queries
+from radarsdf.map.queries import EvidenceAt
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.returns.evidence import Evidence
+
+from ..conftest import ground_and_wall
+
+LARGEST_COUNT = 2.0**32 - 1
+LARGEST = float(np.finfo(np.float32).max)
+SMALLEST = float(np.finfo(np.float32).tiny)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return ground_and_wall(scans=5, returns_per_scan=600)
+
+
+@pytest.fixture(scope="module")
+def radar_map(scene):
+    return radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(num_threads=2), progress=False)
+
+
+def confidence(radar_map, information, detections, looks, rough_share=0.1):
+    """Of places with this evidence, in a map with this rough share."""
+    contents = dataclasses.replace(radar_map._contents, rough_share=rough_share)
+    columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in (information, detections, looks)))
+    evidence = EvidenceAt(*(torch.from_numpy(np.atleast_1d(column).copy()) for column in columns))
+    found = queries.confidence(contents, evidence)
+    assert found.dtype == torch.float32
+    return found.numpy()
+
+
+@pytest.mark.parametrize("rough_share", [0.0, 1e-9, 0.1, 1.0])
+def test_it_is_a_probability_whatever_the_evidence(radar_map, rough_share):
+    counts = [0.0, 1e-6, 1.0, 20.0, LARGEST_COUNT]
+    evidence = itertools.product([0.0, SMALLEST, 1.0, 1e4, LARGEST], counts, counts)
+    information, detections, looks = np.array(list(evidence)).T
+    found = confidence(radar_map, information, detections, looks, rough_share)
+    assert np.isfinite(found).all()
+    assert ((found >= 0) & (found <= 1)).all()
+    assert (found[information == 0] == 0).all()
+    assert (found[information == 1e4] > 0).all()
+    assert found.max() > 0.99
+    # Hardly one of very many scans had a return.
+    assert (found[(information == 1) & (detections <= 1) & (looks == LARGEST_COUNT)] < 0.1).all()
+
+
+def test_it_is_0_where_nothing_was_observed(radar_map):
+    nowhere = radar_map.origin + [[300.0, 0, 0], [0, 0, 500], [1e9, 0, 0], [np.nan, 0, 0]]
+    assert radar_map.confidence(nowhere).tolist() == [0, 0, 0, 0]
+    # An open cell without returns in the 27 cells round it knows nothing, too.
+    unknown = Evidence(*(np.zeros_like(column) for column in dataclasses.astuple(radar_map.evidence)))
+    contents = dataclasses.replace(radar_map._contents, evidence=unknown)
+    cells = radar_map.field.cells.table.leaf_cells()[:100]
+    centres = (cells + 0.5) * radar_map.config.leaf_size_m + radar_map.origin
+    assert radar_map.observed(centres).all()
+    assert RadarMap(contents).confidence(centres).tolist() == [0] * 100
+
+
+ERROR_OF_A_CELL = 1 / 0.2**2
+"""Information of a standard error of a leaf cell's edge, m⁻²."""
+
+
+def test_what_raises_it_and_what_lowers_it(radar_map):
+    """Everything else the same: the information and the detections raise it, the looks and the rough share lower it."""
+    numbers = np.array([1.0, 2, 5, 20, 100, 1000])
+    for detections, looks in ((1, 1), (5, 20), (200, 1000)):
+        assert (np.diff(confidence(radar_map, numbers * ERROR_OF_A_CELL, detections, looks)) > 0).all()
+    for information in (10 * ERROR_OF_A_CELL, 30 * ERROR_OF_A_CELL):
+        assert (np.diff(confidence(radar_map, information, numbers, 500)) > 0).all()
+        assert (np.diff(confidence(radar_map, information, 20, numbers)) < 0).all()
+        by_share = [confidence(radar_map, information, 20, 100, share)[0] for share in (0.02, 0.1, 0.4, 1)]
+        assert (np.diff(by_share) < 0).all()
+
+
+@pytest.mark.parametrize(("error_cells", "most"), [(0.5, 0.9545), (1, 0.6827), (2, 0.3829), (10, 0.0797)])
+def test_it_is_at_most_the_share_of_the_errors_within_a_cell(radar_map, error_cells, most):
+    """However many scans saw it. The shares are those of a normal distribution."""
+    found = confidence(radar_map, ERROR_OF_A_CELL / error_cells**2, 1000, 10, rough_share=0.0)
+    assert found == pytest.approx(most, abs=1e-4)
+
+
+def test_it_spans_the_probabilities(radar_map):
+    """Of a surface that most scans see to a tenth of a cell, and of what one scan in a thousand saw once."""
+    sure = confidence(radar_map, 100 * ERROR_OF_A_CELL, 900, 1000, rough_share=0.02)
+    unsure = confidence(radar_map, ERROR_OF_A_CELL, 1, 1000, rough_share=0.4)
+    assert sure > 0.95
+    assert unsure < 0.1
+
+
+@pytest.mark.parametrize("rough_share", [0.0, 0.05, 0.3])
+def test_scans_given_twice_only_tell_where_more_precisely(radar_map, rough_share):
+    counts = [20.0, 50, 300, 4000]
+    for information in ERROR_OF_A_CELL * np.array([0.1, 1, 10, 100]):
+        detections, looks = np.array(list(itertools.product(counts, counts))).T
+        once = confidence(radar_map, information, detections, looks, rough_share)
+        twice = confidence(radar_map, information, 2 * detections, 2 * looks, rough_share)
+        assert np.abs(twice - once).max() < 0.01
+
+
+def test_a_fit_to_scans_given_twice_has_twice_the_evidence(scene):
+    # What is a gap, a ghost or noise is found from the number of returns.
+    noise = {"range_noise_m": 0.05, "azimuth_noise_rad": 0.01, "elevation_noise_rad": 0.01}
+    config = FitConfig.quick(
+        num_threads=2, encoding={"bridge_cells": 0}, returns={"drop_ghosts": False} | noise
+    )
+    once, twice = (
+        radarsdf.fit(
+            scene.points * n, np.tile(scene.poses, (n, 1, 1)), config=config, progress=False
+        ).evidence
+        for n in (1, 2)
+    )
+    np.testing.assert_allclose(twice.information, 2 * once.information, rtol=1e-5)
+    np.testing.assert_array_equal(twice.detections, 2 * once.detections)
+    np.testing.assert_array_equal(twice.looks, 2 * once.looks)
+
+
+def test_places_have_the_evidence_of_their_cells(radar_map):
+    """In the middle of a cell, none of its neighbours counts."""
+    contents, evidence = radar_map._contents, radar_map.evidence
+    centres = (radar_map.field.cells.table.leaf_cells() + 0.5) * radar_map.config.leaf_size_m
+    found = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
+    for column, expected in zip(found, dataclasses.astuple(evidence), strict=True):
+        assert expected.max() > 0
+        np.testing.assert_allclose(column, expected, rtol=1e-3, atol=1e-3 * expected.max())
+    known = evidence.information > 0  # elsewhere a rounded position has a little of the next cell's
+    assert 0.5 < known.mean() < 1
+    np.testing.assert_allclose(
+        radar_map.confidence(centres + radar_map.origin)[known],
+        confidence(radar_map, *dataclasses.astuple(evidence), radar_map.rough_share)[known],
+        atol=1e-3,
+    )
+
+
+def test_files_and_pickles_give_the_same_bits(radar_map, tmp_path):
+    radar_map.save(tmp_path / "map.safetensors")
+    x = np.random.default_rng(0).uniform([8, -6, -0.3], [20, 6, 0.3], (3000, 3))
+    rough = RadarMap(dataclasses.replace(radar_map._contents, rough_share=0.123))
+    rough.save(tmp_path / "rough.safetensors")
+    assert (rough.confidence(x) < radar_map.confidence(x)).mean() > 0.5
+    for before, name in ((radar_map, "map"), (rough, "rough")):
+        for after in (
+            radarsdf.load(tmp_path / f"{name}.safetensors"),
+            pickle.loads(pickle.dumps(before)),
+        ):
+            assert after.confidence(x).tobytes() == before.confidence(x).tobytes()
+            assert after.uncertainty(x).tobytes() == before.uncertainty(x).tobytes()
+            assert after.rough_share == before.rough_share
+            for a, b in zip(*(dataclasses.astuple(m.evidence) for m in (after, before)), strict=True):
+                assert (a.dtype, a.tobytes()) == (b.dtype, b.tobytes())
+            meshes = [m.mesh(0.2, progress=False) for m in (after, before)]
+            assert len(meshes[0].faces) > 0
+            for attribute in ("confidence", "uncertainty_m"):
+                np.testing.assert_array_equal(*(mesh.vertex_attributes[attribute] for mesh in meshes))

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What the returns tell of each leaf cell, and how many scans looked there."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf._core import cell_keys
+from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.evidence import Evidence, ReturnsOfCells
+from radarsdf.returns.mean_rays import MeanRays
+from radarsdf.returns.rays import prepare
+
+from ..reference_looks import looks_at
+
+LEAF_M = 0.2
+SCANS = 5
+CLUTTER = np.array([3.1, 0.1, 0.1])
+"""In the middle of a cell, before the wall. All scans look through it, one has returns there."""
+SIDE = np.array([5.1, 5.1, 0.1])
+"""A part of the wall that one scan sees."""
+BEHIND = np.array([10.1, 10.1, 0.1])
+"""A false return of another, which looked there. No other ray goes to it."""
+VARIANCE_M2 = 0.04
+
+
+def a_scene():
+    """Scans of a wall at x = 5.1: of one, six returns in a cell before it; of another, the last is false."""
+    rng = np.random.default_rng(0)
+    scans = []
+    for scan in range(SCANS):
+        wall = np.column_stack([np.full(150, 5.1), rng.uniform(-1, 1, (150, 2))])
+        wall[0, 1:] = 0.1  # through the clutter
+        clutter = CLUTTER + rng.uniform(-0.05, 0.05, (6 if scan == 2 else 0, 3))
+        beside = {3: BEHIND[None], 4: SIDE[None]}.get(scan, wall[:0])
+        scans.append(np.concatenate([wall, clutter, beside]))
+    positions = np.linspace(-0.04, 0.04, SCANS)[:, None] * [0, 1, 1]
+    poses = np.tile(np.eye(4), (SCANS, 1, 1))
+    poses[:, :3, 3] = positions
+    return [p - position for p, position in zip(scans, positions, strict=True)], poses
+
+
+@pytest.fixture(scope="module")
+def rays():
+    return prepare(*a_scene(), origin=np.zeros(3))
+
+
+def is_false(rays):
+    return np.linalg.norm(rays.points - BEHIND, axis=1) < 0.1
+
+
+def cells_of(points):
+    """(N, 3) lattice coordinates, as the core finds them."""
+    return lattice_of(cell_keys(np.ascontiguousarray(points), LEAF_M))
+
+
+def keys_of(cells):
+    return np.unique(cell_keys((cells + 0.5) * LEAF_M, LEAF_M))
+
+
+def keys_round(points):
+    """Keys of the cells of these points, and of all those within two cells."""
+    steps = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3), -1).reshape(-1, 3)
+    return keys_of((np.unique(cells_of(points), axis=0)[:, None] + steps).reshape(-1, 3))
+
+
+def returns_of(rays, variances_m2):
+    """What these returns tell, counted with dictionaries."""
+    keys = cell_keys(np.ascontiguousarray(rays.points), LEAF_M).tolist()
+    scans_of_cell, information = {}, {}
+    for key, scan, variance_m2 in zip(keys, rays.scans.tolist(), variances_m2.tolist(), strict=True):
+        scans_of_cell.setdefault(key, set()).add(scan)
+        information[key] = information.get(key, 0) + 1 / variance_m2
+    found = sorted(information)
+    return ReturnsOfCells(
+        keys=np.array(found, np.uint64),
+        information=np.array([information[key] for key in found], np.float32),
+        scans=np.array([len(scans_of_cell[key]) for key in found], np.uint32),
+    )
+
+
+def within_a_cell(points, leaf_keys):
+    """(C, N) bool, whether each point is in a leaf cell or in one of the 26 round it."""
+    return (np.abs(lattice_of(leaf_keys)[:, None] - cells_of(points)[None]) <= 1).all(axis=2)
+
+
+def scans_round(rays, leaf_keys):
+    """(C,) number of scans with returns, added up over each leaf cell and the 26 round it."""
+    pairs = np.unique(np.column_stack([cells_of(rays.points), rays.scans]), axis=0)
+    return within_a_cell((pairs[:, :3] + 0.5) * LEAF_M, leaf_keys).sum(axis=1)
+
+
+def looks(rays, leaf_keys):
+    return looks_at(lattice_of(leaf_keys), LEAF_M, rays.points, rays.directions, rays.ranges_m, rays.scans)
+
+
+def at(evidence, leaf_keys, point):
+    """Information, detections and looks of the leaf cell of a point."""
+    row = np.searchsorted(leaf_keys, cell_keys(point[None], LEAF_M)[0])
+    return tuple(column[row].item() for column in dataclasses.astuple(evidence))
+
+
+def test_sums_over_27_cells_and_scans_that_looked(rays):
+    variances_m2 = np.random.default_rng(1).uniform(0.01, 1, len(rays))
+    leaf_keys = keys_round(rays.points)
+    evidence = Evidence.of(returns_of(rays, variances_m2), rays, leaf_keys, LEAF_M)
+    near = within_a_cell(rays.points, leaf_keys)
+    np.testing.assert_allclose(evidence.information, near @ (1 / variances_m2), rtol=1e-5)
+    np.testing.assert_array_equal(evidence.detections, scans_round(rays, leaf_keys))
+    np.testing.assert_array_equal(evidence.looks, looks(rays, leaf_keys))
+    dtypes = [column.dtype for column in dataclasses.astuple(evidence)]
+    assert dtypes == [np.float32, np.uint32, np.uint32]
+    assert {0, 1, SCANS} <= set(evidence.looks.tolist())
+    for num_threads in (1, 2, 3):
+        again = Evidence.of(returns_of(rays, variances_m2), rays, leaf_keys, LEAF_M, num_threads)
+        for a, b in zip(dataclasses.astuple(again), dataclasses.astuple(evidence), strict=True):
+            assert a.tobytes() == b.tobytes()
+
+
+def test_many_returns_of_one_scan_are_one_detection(rays):
+    leaf_keys = keys_round(rays.points)
+    evidence = Evidence.of(returns_of(rays, np.full(len(rays), VARIANCE_M2)), rays, leaf_keys, LEAF_M)
+    assert at(evidence, leaf_keys, CLUTTER) == (pytest.approx(6 / VARIANCE_M2), 1, SCANS)
+    _, detections, looked = at(evidence, leaf_keys, np.array([5.1, 0.1, 0.1]))
+    assert looked == SCANS
+    assert detections > 5 * SCANS  # of nine cells of the wall
+
+
+def test_a_false_return_is_no_evidence_but_its_scan_looked(rays):
+    leaf_keys = keys_round(rays.points)
+    real = rays.select(~is_false(rays))
+    assert len(real) == len(rays) - 1
+    returns = returns_of(real, np.full(len(real), VARIANCE_M2))
+    assert at(Evidence.of(returns, rays, leaf_keys, LEAF_M), leaf_keys, BEHIND) == (0, 0, 1)
+    assert at(Evidence.of(returns, real, leaf_keys, LEAF_M), leaf_keys, BEHIND) == (0, 0, 0)
+
+
+def test_returns_beside_the_leaf_cells_count_nowhere(rays):
+    wall_keys = keys_of(np.array([[25, y, 0] for y in range(-4, 5)]))
+    inside = within_a_cell(rays.points, wall_keys).any(axis=0) & (cells_of(rays.points)[:, 2] == 0)
+    assert 0 < inside.sum() < 0.5 * len(rays)
+    evidence = Evidence.of(returns_of(rays, np.full(len(rays), VARIANCE_M2)), rays, wall_keys, LEAF_M)
+    own = rays.select(np.isin(cell_keys(np.ascontiguousarray(rays.points), LEAF_M), wall_keys))
+    np.testing.assert_allclose(
+        evidence.information, within_a_cell(own.points, wall_keys).sum(axis=1) / VARIANCE_M2, rtol=1e-5
+    )
+    np.testing.assert_array_equal(evidence.detections, scans_round(own, wall_keys))
+    np.testing.assert_array_equal(evidence.looks, looks(rays, wall_keys))
+
+
+def test_mean_rays_know_how_many_scans_they_are_of(rays):
+    means = MeanRays.of(rays, LEAF_M)
+    expected = returns_of(rays, np.ones(len(rays)))
+    np.testing.assert_array_equal(means.keys, expected.keys)
+    np.testing.assert_array_equal(means.scans, expected.scans)
+    assert means.scans.dtype == np.uint32
+    part = means.counts > 1
+    assert 0 < part.sum() < len(part)
+    np.testing.assert_array_equal(means.select(part).scans, expected.scans[part])
+
+
+STARTS = {
+    "average": FitConfig.quick(),
+    "noise": FitConfig(training={"start": "noise", "sdf_iterations": 2, "batch_size": 64}),
+}
+
+
+@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("drop_ghosts", [False, True])
+def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeypatch):
+    """With a noise that does not grow with the range: each return tells as much."""
+    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", lambda *_: is_false(rays))
+    config = STARTS[start].override(
+        num_threads=2,
+        returns={
+            "min_range_m": 0.0,
+            "drop_ghosts": drop_ghosts,
+            "onto_planes": False,
+            "range_noise_m": VARIANCE_M2**0.5,
+            "azimuth_noise_rad": 1e-6,
+            "elevation_noise_rad": 1e-6,
+        },
+        encoding={"bridge_cells": 0},
+    )
+    radar_map = radarsdf.fit(*a_scene(), config=config, progress=False)
+    np.testing.assert_allclose(radar_map.origin, 0, atol=1e-12)
+    assert radar_map.report["ghosts"] == drop_ghosts
+    leaf_keys = radar_map.field.cells.table.leaf_keys()
+    own = rays.select(~is_false(rays)) if drop_ghosts else rays
+    evidence = radar_map.evidence
+    np.testing.assert_allclose(
+        evidence.information, within_a_cell(own.points, leaf_keys).sum(axis=1) / VARIANCE_M2, rtol=1e-4
+    )
+    np.testing.assert_array_equal(evidence.detections, scans_round(own, leaf_keys))
+    np.testing.assert_array_equal(evidence.looks, looks(rays, leaf_keys))
+    assert at(evidence, leaf_keys, CLUTTER)[1:] == (1, SCANS)
+    assert at(evidence, leaf_keys, SIDE)[1:] == (1, 2)
