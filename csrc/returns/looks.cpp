@@ -35,8 +35,8 @@ class ScanCounter {
   std::vector<std::int32_t> last_;  // scan that was counted last
 };
 
-// Calls count(begin, end, counter) for parts of the returns that hold whole scans, and adds the counts up. Integers: the
-// sums do not depend on the number of threads.
+// Calls count(begin, end, counter) for parts of the returns that hold whole scans, and adds the counts up. Integers:
+// the sums do not depend on the number of threads.
 template <typename Count>
 std::vector<std::uint32_t> count_by_scans(const std::int32_t* scans, std::int64_t size, std::int64_t places,
                                           int num_threads, const Count& count) {
