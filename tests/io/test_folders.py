@@ -357,7 +357,8 @@ def test_pcd_cut_short(data, tmp_path):
         ({"SIZE": "4 2 8"}, "not a whole"),
         ({"SIZE": "4 2 8 3"}, "fit together"),
         ({"TYPE": "F U F O"}, "fit together"),
-        ({"DATA": "binary_compressed"}, "pcl_convert_pcd_ascii_binary"),
+        ({"DATA": "binary_compressed"}, "compressed bytes do not fit"),
+        ({"DATA": "zipped"}, "is not known"),
         ({"FIELDS": "x \xff t i"}, "not a whole"),
     ],
 )

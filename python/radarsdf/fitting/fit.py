@@ -24,6 +24,7 @@ from radarsdf.fitting.start import STARTS
 from radarsdf.fitting.stopping import Diverged, Interrupted
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
+from radarsdf.io.sequence import Scans
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence
@@ -33,8 +34,8 @@ from radarsdf.threads import Workers
 
 
 def fit(
-    points: Sequence[ArrayLike],
-    poses: ArrayLike,
+    points: Sequence[ArrayLike] | Scans,
+    poses: ArrayLike | None = None,
     intensities: Sequence[ArrayLike] | None = None,
     *,
     config: FitConfig | None = None,
@@ -45,10 +46,11 @@ def fit(
 
     Parameters
     ----------
-    points : sequence of F arrays
-        (N_i, 3) each: the returns of one scan, sensor frame, m.
-    poses : array_like
-        (F, 4, 4) T_world_sensor, m, one for each scan.
+    points : sequence of F arrays, or Scans
+        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, as they are, their poses
+        and intensities are used where none are given here.
+    poses : array_like, optional
+        (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
     intensities : sequence of F arrays, optional
         (N_i,) each, sensor units. Without them the map has no intensity network.
     config : FitConfig, optional
@@ -95,6 +97,13 @@ def fit(
     clock = _Clock()
     radar_map = None
     try:
+        if isinstance(points, Scans):
+            scans, points = points, points.points  # first: it reads all there is, in one pass
+            poses = scans.poses if poses is None else poses
+            intensities = scans.intensities if intensities is None else intensities
+        if poses is None:
+            msg = "poses are missing: T_world_sensor (4, 4) of each scan"
+            raise ValueError(msg)
         points = list(points)  # which may be a generator
         rays = prepare(points, poses, intensities, **config.returns.preparation)
         check_extent(rays, config)

@@ -9,6 +9,7 @@ matrix in a file `a_T_b.txt`. There is no other transformation: if the poses are
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from radarsdf._core import cell_keys
 from radarsdf.checks import check_poses
 from radarsdf.io.pcd import read_pcd
-from radarsdf.io.scans import Scans
+from radarsdf.io.sequence import Scans
 from radarsdf.io.trajectory import Trajectory, read_table, read_trajectory
 
 MAX_GAP_S = 0.5
@@ -99,9 +100,9 @@ def read_posed_folder(folder: Path, frames: int | None = None) -> Scans:
         If a file cannot be read.
     """
     trajectory = read_trajectory(folder / "poses.txt")
-    T_base_radar = _transform(folder / "base_T_radar.txt", np.eye(4))
+    T_base_radar = base_T_radar(folder)
     scans, _ = _read_radar(folder / "radar", trajectory, T_base_radar, frames)
-    return Scans(scans.points, scans.poses, scans.intensities, _read_lidar_map(folder))
+    return Scans(scans.points, scans.poses, scans.intensities, lidar_map(folder))
 
 
 def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
@@ -137,18 +138,56 @@ def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
     ValueError, OSError
         As :func:`read_posed_folder`.
     """
-    if not (folder / "utm50r_T_xt32.txt").is_file():
-        msg = f"{folder} lacks utm50r_T_xt32.txt: copy it from full_trajs/<date>/<sequence> of the data set"
-        raise ValueError(msg)
-    trajectory = read_trajectory(folder / "utm50r_T_xt32.txt")
-    T_body_xt32 = _transform(folder / "body_T_xt32.txt", _BODY_T_XT32)
-    T_body_oculii = _transform(folder / "body_T_oculii.txt", _BODY_T_OCULII)
-    radar = folder / "eagleg7" / "enhanced"
-    scans, times_s = _read_radar(radar, trajectory, np.linalg.inv(T_body_xt32) @ T_body_oculii, frames)
-    ground_truth = _read_lidar_map(folder)
-    if ground_truth is None and (folder / "xt32").is_dir():
-        ground_truth = _read_lidar_scans(folder / "xt32", trajectory, times_s[0], times_s[-1])
-    return Scans(scans.points, scans.poses, scans.intensities, ground_truth)
+    snail = SnailRadar.of(folder)
+    scans, times_s = _read_radar(snail.radar, snail.trajectory, snail.T_base_radar, frames)
+    return Scans(scans.points, scans.poses, scans.intensities, snail.ground_truth(times_s))
+
+
+@dataclass(frozen=True, eq=False)
+class SnailRadar:
+    """A sequence of SNAIL-Radar, as far as it is read at once; see :func:`read_snail_radar`."""
+
+    folder: Path
+    radar: Path
+    """The folder of the clouds of the radar."""
+    trajectory: Trajectory
+    """Of the lidar, in UTM zone 50R."""
+    T_base_radar: NDArray[np.float64]
+    """The radar in the frame of the lidar."""
+
+    @classmethod
+    def of(cls, folder: Path) -> SnailRadar:
+        """The sequence in a folder. Raises as :func:`read_snail_radar`."""
+        if not (folder / "utm50r_T_xt32.txt").is_file():
+            msg = (
+                f"{folder} lacks utm50r_T_xt32.txt: copy it from full_trajs/<date>/<sequence> of the data set"
+            )
+            raise ValueError(msg)
+        trajectory = read_trajectory(folder / "utm50r_T_xt32.txt")
+        T_body_xt32 = _transform(folder / "body_T_xt32.txt", _BODY_T_XT32)
+        T_body_oculii = _transform(folder / "body_T_oculii.txt", _BODY_T_OCULII)
+        T_xt32_oculii: NDArray[np.float64] = np.linalg.inv(T_body_xt32) @ T_body_oculii
+        return cls(folder, folder / "eagleg7" / "enhanced", trajectory, T_xt32_oculii)
+
+    def files(self) -> list[tuple[float, Path]]:
+        """Times, s, and files of the clouds of the radar."""
+        return _stamped_files(self.radar)
+
+    def ground_truth(self, times_s: NDArray[np.float64] | None = None) -> NDArray[np.float64] | None:
+        """Lidar points (M, 3), UTM zone 50R, m, from the first to the last of these times, or of all scans."""
+        points = lidar_map(self.folder)
+        if points is None and (self.folder / "xt32").is_dir():
+            if times_s is None:
+                times_s = np.array([time_s for time_s, _ in self.files()])
+                times_s = times_s[self.trajectory.covers(times_s)]
+            if len(times_s):
+                points = _read_lidar_scans(self.folder / "xt32", self.trajectory, times_s[0], times_s[-1])
+        return points
+
+
+def base_T_radar(folder: Path) -> NDArray[np.float64]:
+    """T_base_radar (4, 4) of ``base_T_radar.txt`` in a folder; the identity if there is none."""
+    return _transform(folder / "base_T_radar.txt", np.eye(4))
 
 
 def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
@@ -212,7 +251,7 @@ def _read_radar(
     return Scans(points, poses, None if field is None else intensities), times
 
 
-def _read_lidar_map(folder: Path) -> NDArray[np.float64] | None:
+def lidar_map(folder: Path) -> NDArray[np.float64] | None:
     """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``. None if there is neither."""
     if (path := folder / "lidar.pcd").is_file():
         points = _xyz(read_pcd(path), path)

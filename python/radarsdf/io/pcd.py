@@ -4,19 +4,23 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.io.lzf import unpack_lzf
+
 _TYPES = {f"{kind}{size}" for kind, sizes in {"F": "48", "I": "1248", "U": "1248"}.items() for size in sizes}
 _MAX_HEADER_LINES = 64  # a header has eleven
 _MAX_LINE = 1 << 16
+_MAX_COMPRESSION = 100  # LZF reaches at most 88: three bytes for 264
 
 
 def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
-    """Reads a point cloud, ASCII or binary.
+    """Reads a point cloud: ascii, binary, or binary_compressed.
 
     Parameters
     ----------
@@ -32,7 +36,7 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        If the file is not a PCD file, is cut off, or is compressed.
+        If the file is not a PCD file, or is cut off.
     OSError
         If the file cannot be read.
     """
@@ -72,8 +76,10 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         columns = _binary(body, types, counts, points)
     elif header["DATA"] == ["ascii"]:
         columns = _ascii(body, counts, points)
+    elif header["DATA"] == ["binary_compressed"]:
+        columns = _compressed(body, types, counts, points)
     else:
-        msg = f"DATA {' '.join(header['DATA'])} cannot be read: convert it by pcl_convert_pcd_ascii_binary"
+        msg = f"DATA {' '.join(header['DATA'])} is not known: it is ascii, binary or binary_compressed"
         raise ValueError(msg)
     # The name _ means padding, and several fields may have it.
     return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
@@ -92,11 +98,31 @@ def _binary(body: bytes, types: list[str], counts: list[int], points: int) -> li
     return [cloud[f"f{i}"][:, 0] for i in range(len(types))]
 
 
-def _ascii(body: bytes, counts: list[int], points: int) -> list[NDArray[Any]]:
-    rows = [line.split() for line in body.decode("ascii").splitlines() if line.strip()]
-    if len(rows) != points or any(len(row) != sum(counts) for row in rows):
-        msg = f"the file does not hold {points} rows of {sum(counts)} values, as its header says"
+def _compressed(body: bytes, types: list[str], counts: list[int], points: int) -> list[NDArray[Any]]:
+    """Compressed by LZF, one field after another."""
+    packed, unpacked = (int(size) for size in np.frombuffer(body[:8], "<u4"))
+    sizes = [int(kind[1]) * count * points for kind, count in zip(types, counts, strict=True)]
+    if unpacked != sum(sizes) or len(body) < 8 + packed or unpacked > _MAX_COMPRESSION * packed:
+        msg = f"its {packed} compressed bytes do not fit to {points} points of {sum(sizes)} bytes"
         raise ValueError(msg)
-    table = np.array(rows, np.float64).reshape(points, sum(counts))
+    data = unpack_lzf(body[8 : 8 + packed], unpacked)
+    starts = np.cumsum([0, *sizes[:-1]])
+    return [
+        np.frombuffer(data, f"<{kind.lower()}", points * count, int(start)).reshape(points, count)[:, 0]
+        for kind, count, start in zip(types, counts, starts, strict=True)
+    ]
+
+
+def _ascii(body: bytes, counts: list[int], points: int) -> list[NDArray[Any]]:
+    text = body.decode("ascii")
+    wrong = f"the file does not hold {points} rows of {sum(counts)} values, as its header says"
+    table = np.zeros((0, sum(counts)))
+    if text and not text.isspace():  # of no rows, NumPy warns
+        try:
+            table = np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2)
+        except ValueError as error:
+            raise ValueError(wrong) from error
+    if table.shape != (points, sum(counts)):
+        raise ValueError(wrong)
     first = np.cumsum([0, *counts[:-1]])
     return [table[:, i] for i in first]

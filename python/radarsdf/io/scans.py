@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans and their ``.npz`` files."""
+"""Scans in ``.npz`` files. The classes of scans are in `sequence`."""
 
 from __future__ import annotations
 
 import io
 import zipfile
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,30 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.sequence import Scan, Scans
 
-_ARRAYS = ("points", "frame", "poses", "intensity", "static", "lidar_points")
+__all__ = ["Scan", "Scans", "read_scans", "write_scans"]
+
+_ARRAYS = ("points", "frame", "poses", "intensity", "static", "lidar_points", "doppler", "times", "sigma")
 # A few megabytes of zeros can unpack to gigabytes. Measurements are mostly noise and compress by a factor of 2 to 5.
 _MAX_COMPRESSION = 100
 _ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are unpacked at any compression
-
-
-@dataclass(frozen=True)
-class Scans:
-    """F scans with poses, and lidar points as ground truth where there are any."""
-
-    points: list[NDArray[Any]]
-    """F arrays (N_i, 3), sensor frame, m."""
-    poses: NDArray[np.float64]
-    """(F, 4, 4) T_world_sensor, m."""
-    intensities: list[NDArray[Any]] | None
-    """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
-    ground_truth: NDArray[Any] | None = None
-    """(M, 3) lidar points, world frame, m."""
-
-    def select(self, frames: NDArray[np.int64]) -> Scans:
-        """The scans with the numbers `frames`, (K,), in this order."""
-        intensities = None if self.intensities is None else [self.intensities[i] for i in frames]
-        return Scans([self.points[i] for i in frames], self.poses[frames], intensities, self.ground_truth)
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:
@@ -54,7 +37,10 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         - ``frame`` (N,): row of ``poses`` for each return;
         - ``intensity`` (N,), optional: sensor units;
         - ``static`` (N,) bool, optional: only returns with True are used;
-        - ``lidar_points`` (M, 3), optional: ground truth, world frame, m.
+        - ``lidar_points`` (M, 3), optional: ground truth, world frame, m;
+        - ``doppler`` (N,), optional: m/s;
+        - ``times`` (F,), optional: when each scan was taken, s;
+        - ``sigma`` (N, 3), optional: the sensor's own deviations of range, azimuth and elevation, m, rad, rad.
 
     Returns
     -------
@@ -83,7 +69,8 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     points, frame, poses = arrays["points"], arrays["frame"], arrays["poses"]
     count, num_poses = points.shape[:1], poses.shape[:1]
     for name, shape in {
-        "points": (*count, 3), "poses": (*num_poses, 4, 4), "frame": count, "intensity": count, "static": count
+        "points": (*count, 3), "poses": (*num_poses, 4, 4), "frame": count, "intensity": count, "static": count,
+        "doppler": count, "times": num_poses, "sigma": (*count, 3),
     }.items():  # fmt: skip
         if name in arrays and arrays[name].shape != shape:
             msg = f"{path}: {name} must have shape {shape}, not {arrays[name].shape}"
@@ -108,11 +95,18 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     order = order[np.argsort(frame[order], kind="stable")]
     frames, first = np.unique(frame[order], return_index=True)
     rows = np.split(order, first)[1:]  # the part before the first scan is empty
+    per_return = {
+        name: [arrays[name][r] for r in rows] if name in arrays else None
+        for name in ("intensity", "doppler", "sigma")
+    }
     return Scans(
         points=[points[r] for r in rows],
         poses=poses[frames].astype(np.float64),
-        intensities=[arrays["intensity"][r] for r in rows] if "intensity" in arrays else None,
+        intensities=per_return["intensity"],
         ground_truth=arrays.get("lidar_points"),
+        doppler_mps=per_return["doppler"],
+        times_s=arrays["times"][frames].astype(np.float64) if "times" in arrays else None,
+        sigmas=per_return["sigma"],
     )
 
 
@@ -139,7 +133,7 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     path : path-like
         Where the file goes. ``.npz`` is appended where it is missing.
     scans : Scans
-        At least one scan. Where `intensities` or `ground_truth` is None, the file lacks its array.
+        At least one scan. What is None of it, the file lacks.
 
     Raises
     ------
@@ -151,8 +145,13 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
         "frame": np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points]),
         "poses": scans.poses,
     }
-    if scans.intensities is not None:
-        arrays["intensity"] = np.concatenate(scans.intensities)
+    for name, values in (
+        ("intensity", scans.intensities), ("doppler", scans.doppler_mps), ("sigma", scans.sigmas)
+    ):  # fmt: skip
+        if values is not None:
+            arrays[name] = np.concatenate(values)
+    if scans.times_s is not None:
+        arrays["times"] = scans.times_s
     if scans.ground_truth is not None:
         arrays["lidar_points"] = scans.ground_truth
     file = io.BytesIO()

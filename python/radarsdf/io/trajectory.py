@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 _MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
+_ROUNDED_S = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,28 @@ class Trajectory:
         poses[:, :3, :3] = rotations.as_matrix()
         poses[:, :3, 3] = positions
         return poses
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+        """Pose T_world_base (4, 4) at one time, s. None where `poses` would raise. Fast for one time of many poses.
+
+        A millisecond before the first pose or after the last one is at that pose: times in files are rounded.
+        """
+        nearest_s = min(max(time_s, self.times_s[0]), self.times_s[-1])
+        time_s = nearest_s if abs(nearest_s - time_s) <= _ROUNDED_S else time_s
+        if not self.times_s[0] <= time_s <= self.times_s[-1]:
+            return None
+        after = int(np.searchsorted(self.times_s, time_s))
+        before = after if self.times_s[after] == time_s else after - 1
+        gap_s = self.times_s[after] - self.times_s[before]
+        if gap_s > max_gap_s:
+            return None
+        share = 0.0 if before == after else (time_s - self.times_s[before]) / gap_s
+        first = self.rotations[before]
+        turn = (first.inv() * self.rotations[after]).as_rotvec()
+        pose = np.eye(4)
+        pose[:3, :3] = (first * Rotation.from_rotvec(share * turn)).as_matrix()
+        pose[:3, 3] = (1 - share) * self.positions[before] + share * self.positions[after]
+        return pose
 
     def move(
         self, points: NDArray[np.float64], times_s: NDArray[np.float64], max_gap_s: float
@@ -98,7 +121,11 @@ def read_trajectory(path: Path) -> Trajectory:
     OSError
         If the file cannot be read.
     """
-    table = read_table(path, 8)
+    return trajectory_of_table(read_table(path, 8), path)
+
+
+def trajectory_of_table(table: NDArray[np.float64], path: Path) -> Trajectory:
+    """The trajectory in the rows (P, 8) of a TUM file; see :func:`read_trajectory`."""
     if len(table) < 2 or not (np.diff(table[:, 0]) > 0).all():
         msg = f"{path} must hold at least two poses, in the order of their times"
         raise ValueError(msg)

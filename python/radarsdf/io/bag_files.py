@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Bags of ROS 1 and ROS 2 as streams of messages, without ROS."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from radarsdf.io.files import check_regular_file
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+_ROS1_SUFFIX = ".bag"
+_METADATA = "metadata.yaml"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of bags."""
+
+    name: str
+    message_type: str
+    count: int
+    """Number of its messages."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """The bytes of a message."""
+
+    topic: str
+    message_type: str
+    recorded_s: float
+    raw: bytes
+    cdr: bool
+    """Whether it is of ROS 2."""
+    bag: Path
+
+
+def is_bag(path: Path) -> bool:
+    """Whether the path is a bag by its name, or a folder that is a ROS 2 bag."""
+    return path.suffix.lower() in BAG_SUFFIXES or (path / _METADATA).is_file()
+
+
+def bags_in(folder: Path) -> list[Path]:
+    """The bags in a folder, by name."""
+    return sorted(path for path in folder.iterdir() if is_bag(path) and not path.name.startswith("."))
+
+
+def topics_of(paths: list[Path]) -> dict[str, Topic]:
+    """The topics of bags, by name.
+
+    Raises
+    ------
+    ValueError, OSError, ImportError
+        If a bag cannot be read.
+    """
+    topics: dict[str, Topic] = {}
+    with ExitStack() as stack:
+        for path in paths:
+            reader = stack.enter_context(_opened(path))
+            for connection in reader.connections:
+                before = topics[connection.topic].count if connection.topic in topics else 0
+                topics[connection.topic] = Topic(
+                    connection.topic, connection.msgtype, before + connection.msgcount
+                )
+    return topics
+
+
+def messages_of(paths: list[Path], names: set[str]) -> Iterator[Message]:
+    """The messages of some topics of bags, in the order in which they were recorded, one after another.
+
+    Raises
+    ------
+    ValueError, OSError, ImportError
+        If a bag cannot be read.
+    """
+    with ExitStack() as stack:
+        streams = [stack.enter_context(closing(_stream(path, names))) for path in paths]
+        yield from heapq.merge(*streams, key=lambda message: message.recorded_s)
+
+
+def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
+    cdr = path.suffix.lower() != _ROS1_SUFFIX
+    with _opened(path) as reader:
+        connections = [c for c in reader.connections if c.topic in names]
+        if not connections:  # of none, rosbags would give all messages
+            return
+        messages = reader.messages(connections=connections)
+        while True:
+            try:
+                connection, recorded_ns, raw = next(messages)
+            except StopIteration:
+                return
+            except MemoryError:
+                raise
+            except Exception as error:  # damaged bags raise exceptions of many kinds
+                raise _damaged(path, error) from error
+            yield Message(connection.topic, connection.msgtype, 1e-9 * recorded_ns, raw, cdr, path)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A reader of rosbags."""
+    check_regular_file(path if path.is_file() or not (path / _METADATA).is_file() else path / _METADATA)
+    try:
+        from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        msg = f'{path}: bags are read by rosbags: pip install "radarsdf[ros]"'
+        raise ImportError(msg) from error
+    ros1 = path.suffix.lower() == _ROS1_SUFFIX
+    try:
+        reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
+        reader.open()
+    except MemoryError:
+        raise
+    except PermissionError:
+        raise
+    except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
+        raise _damaged(path, error) from error
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def _damaged(path: Path, error: Exception) -> ValueError:
+    why = str(error) or type(error).__name__
+    way_out = ""
+    if path.suffix.lower() == _ROS1_SUFFIX and "index" in why.lower():
+        way_out = f"; if its recording was cut off, rosbag reindex {path.name} may mend it"
+    return ValueError(f"{path} is not a whole bag: {why}{way_out}")

@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans with poses from bags: which topics, which clock, and the first message to the last in bounded memory."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.io.bag_files import Message, Topic, bags_in, is_bag, messages_of, topics_of
+from radarsdf.io.bag_poses import poses_in_bags
+from radarsdf.io.clouds import Columns
+from radarsdf.io.messages import CLOUD_TYPES, POINT_A_MESSAGE, CloudMessage, read_cloud
+from radarsdf.io.poses import ScanPoses, poses_of
+from radarsdf.io.sequence import Scans
+from radarsdf.io.sources import RawScan, Request, posed, scan_poses
+
+__all__ = ["bags_in", "is_bag", "read_bags"]
+
+KNOWN_TOPICS = {
+    "/hugin_raf_1/radar_data": "/icp_odom",  # Viking Hill
+    "/radar_enhanced_pcl": None,  # NTU4DRadLM and others with an Oculii Eagle
+    "/ti_mmwave/radar_scan_pcl": None,
+}
+"""Topics of radars in data sets, and of the poses there. They are preferred to others."""
+
+_PEEKED = 400  # messages that are looked at for the clock, several scans even of one message a point
+
+
+def read_bags(
+    paths: list[Path], request: Request, truth: Callable[[], NDArray[np.float64] | None] | None = None
+) -> Scans:
+    """Scans of one drive in one or several bags; see :func:`radarsdf.io.read`."""
+    if not paths:
+        msg = "there is no bag to read: the list is empty"
+        raise ValueError(msg)
+    for path in paths:
+        if not is_bag(path):
+            msg = f"{path} is no bag: only bags can be read together"
+            raise ValueError(msg)
+    topics = topics_of(paths)
+    topic = _scan_topic(topics, request.topic, paths)
+    first = _first(paths, topic)
+    by_record = _by_record(paths, topic, request)
+    poses: Any = request.poses
+    T_base_sensor = request.extrinsic
+    if poses is None or _is_bag_of_poses(poses):
+        pose_paths = paths if poses is None else [Path(poses)]
+        poses, T_base_sensor = poses_in_bags(
+            pose_paths, request, first.header.frame, KNOWN_TOPICS.get(topic.name)
+        )
+    else:
+        poses = poses_of(poses, request.notes)
+
+    def raw_scans() -> Iterator[RawScan]:
+        return _raw_scans(paths, topic, by_record)
+
+    if isinstance(poses, np.ndarray):
+        count = sum(1 for _ in raw_scans()) if topic.message_type == POINT_A_MESSAGE else topic.count
+        matched, _ = scan_poses(poses, count, None, T_base_sensor, request)
+    else:
+        matched = ScanPoses(poses, np.eye(4) if T_base_sensor is None else T_base_sensor, request.max_gap_s)
+    return Scans.of_source(posed(raw_scans, matched, request), request.notes, truth or (lambda: None))
+
+
+def _is_bag_of_poses(poses: Any) -> bool:
+    return isinstance(poses, (str, PathLike)) and is_bag(Path(poses))
+
+
+def _scan_topic(topics: dict[str, Topic], wanted: str | None, paths: list[Path]) -> Topic:
+    """The topic of the scans: the wanted one, or the only one that can be meant."""
+    where = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+    fitting = {name: t for name, t in topics.items() if t.message_type in CLOUD_TYPES and t.count}
+    listed = ", ".join(f"{name} ({t.message_type})" for name, t in sorted(fitting.items()))
+    if wanted is not None:
+        if wanted in fitting:
+            return fitting[wanted]
+        if wanted in topics:
+            msg = f"{where}: {wanted} has messages {topics[wanted].message_type}, or none; scans are {', '.join(CLOUD_TYPES)}"
+        else:
+            msg = f"{where} has no topic {wanted}: topics with points are {listed or 'none'}"
+        raise ValueError(msg)
+    if not fitting:
+        found = ", ".join(f"{name} ({t.message_type})" for name, t in sorted(topics.items()))
+        msg = f"{where} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {found or 'no topics'}"
+        raise ValueError(msg)
+    choices: tuple[list[Topic], ...] = (
+        list(fitting.values()),
+        [t for name, t in fitting.items() if name in KNOWN_TOPICS],
+        [t for name, t in fitting.items() if "radar" in name.lower() or "radar" in t.message_type.lower()],
+    )
+    for choice in choices:
+        if len(choice) == 1:
+            return choice[0]
+    msg = f"{where} has several topics with points: say by topic which is the radar's, of {listed}"
+    raise ValueError(msg)
+
+
+def _first(paths: list[Path], topic: Topic) -> CloudMessage:
+    """The first message of a topic."""
+    for message in messages_of(paths, {topic.name}):
+        return _read(message)
+    msg = f"{paths[0]}: the topic {topic.name} has no messages"
+    raise ValueError(msg)
+
+
+def _by_record(paths: list[Path], topic: Topic, request: Request) -> bool:
+    """Whether the times of scans are when they were recorded: as wanted, or where stamps are zero or stand still."""
+    if request.stamps is not None:
+        return request.stamps == "record"
+    stamps = [_read(m).header.stamp_s for m in itertools.islice(messages_of(paths, {topic.name}), _PEEKED)]
+    if not any(stamps):
+        request.notes.add(f"the header stamps of {topic.name} are zero: the record time is used instead")
+        return True
+    if len(stamps) > 1 and len(set(stamps)) == 1:
+        request.notes.add(f"the header stamps of {topic.name} stand still: the record time is used instead")
+        return True
+    return False
+
+
+def _raw_scans(paths: list[Path], topic: Topic, by_record: bool) -> Iterator[RawScan]:
+    if topic.message_type == POINT_A_MESSAGE:
+        yield from _grouped(paths, topic, by_record)
+        return
+    for number, message in enumerate(messages_of(paths, {topic.name})):
+        cloud = _read(message)
+        time_s = message.recorded_s if by_record else cloud.header.stamp_s
+        yield RawScan(cloud.columns, time_s, f"{message.bag}: message {number} of {topic.name}")
+
+
+def _grouped(paths: list[Path], topic: Topic, by_record: bool) -> Iterator[RawScan]:
+    """Scans of messages of one point each. A scan begins where the number of the point does not grow."""
+    points: list[CloudMessage] = []
+    last, start_s, number = -1, 0.0, 0
+    for message in messages_of(paths, {topic.name}):
+        cloud = _read(message)
+        point_id = -1 if cloud.point_id is None else cloud.point_id
+        if points and point_id <= last:
+            yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}")
+            points, number = [], number + 1
+        if not points:
+            start_s = message.recorded_s if by_record else cloud.header.stamp_s
+        points.append(cloud)
+        last = point_id
+    if points:
+        yield _joined(points, start_s, f"{paths[-1]}: scan {number} of {topic.name}")
+
+
+def _joined(points: list[CloudMessage], time_s: float, name: str) -> RawScan:
+    def columns() -> Columns:
+        rows = [point.columns() for point in points]
+        return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}
+
+    return RawScan(columns, time_s, name)
+
+
+def _read(message: Message) -> CloudMessage:
+    try:
+        return read_cloud(message.raw, message.message_type, message.cdr)
+    except ValueError as error:
+        msg = f"{message.bag}: a message of {message.topic} is not a whole {message.message_type}: {error}"
+        raise ValueError(msg) from error

@@ -1,0 +1,222 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Files of one point cloud each: PCD, PLY, KITTI's .bin, NumPy, text, LAS. All of them become named columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.io.fields import COLUMNS, Fields
+from radarsdf.io.files import check_regular_file
+from radarsdf.io.pcd import read_pcd
+
+TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
+CLOUD_SUFFIXES = (".pcd", ".ply", ".bin", ".npy", *TEXT_SUFFIXES, ".las", ".laz")
+"""What :func:`read_columns` reads."""
+
+_KITTI_COLUMNS = 4
+_MAX_LAZ_COMPRESSION = 200  # LAZ packs lidar points to a tenth; more is an attack
+_SEPARATORS = (",", ";", "\t", None)  # None: any white space
+
+Columns = dict[str, NDArray[Any]]
+
+
+def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Columns:
+    """The columns of a file of points, (N,) each, by name.
+
+    Parameters
+    ----------
+    path : Path
+        A file of `CLOUD_SUFFIXES`.
+    columns : int or sequence of str, optional
+        Of files without names: how many numbers a point has, or their names. A ``.bin`` file has four by default: x, y,
+        z, intensity.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged, or of another kind.
+    OSError
+        If it cannot be read.
+    ImportError
+        If it takes a library that is not installed.
+    """
+    check_regular_file(path)
+    suffix = path.suffix.lower()
+    if suffix == ".pcd":
+        return read_pcd(path)
+    reader = {".ply": _ply, ".las": _las, ".laz": _las}.get(suffix)
+    try:
+        if reader is not None:
+            return reader(path)
+        if suffix == ".bin":
+            return _bin(path, columns)
+        if suffix == ".npy":
+            return _npy(path, columns)
+        if suffix in TEXT_SUFFIXES:
+            return _text(path, columns)
+    except (OSError, ImportError, MemoryError):
+        raise
+    except Exception as error:  # libraries raise exceptions of many kinds for damaged files
+        msg = f"{path} is not a whole {suffix} file of points: {error}"
+        raise ValueError(msg) from error
+    msg = f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}"
+    raise ValueError(msg)
+
+
+def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
+    """Reads points, such as the ground truth of a lidar, from a file of any format that :func:`read` reads.
+
+    Parameters
+    ----------
+    path : path-like
+        A PCD, PLY, LAS, LAZ, ``.bin``, ``.npy`` or text file.
+
+    Returns
+    -------
+    ndarray
+        (M, 3) float64, frame of the file, m. Points that are not finite are left out.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged, of another kind, or holds no points.
+    OSError
+        If it cannot be read.
+    ImportError
+        If it takes a library that is not installed; the message says which.
+    """
+    columns = read_columns(Path(path))
+    fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
+    points = fields.read(columns, str(path)).points.astype(np.float64)
+    if len(points) == 0:
+        msg = f"{path} holds no points"
+        raise ValueError(msg)
+    return points
+
+
+def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
+    """Names of `width` columns that have none in their file."""
+    if columns is not None and not isinstance(columns, int):
+        if len(columns) != width:
+            msg = f"there are {width} columns, but {len(columns)} names"
+            raise ValueError(msg)
+        return list(columns)
+    if width in COLUMNS:
+        return list(COLUMNS[width])
+    if width < 3:
+        msg = f"there are {width} columns; points have three or more"
+        raise ValueError(msg)
+    return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
+
+
+def _bin(path: Path, columns: int | Sequence[str] | None) -> Columns:
+    width = _KITTI_COLUMNS if columns is None else columns if isinstance(columns, int) else len(columns)
+    if width < 3:
+        msg = f"a point has three numbers or more, not {width}"
+        raise ValueError(msg)
+    size = path.stat().st_size
+    if size % (4 * width):
+        msg = (
+            f"its {size} bytes are no whole number of points of {width} float32 each: "
+            "say by columns how many there are, or their names"
+        )
+        raise ValueError(msg)
+    table = np.fromfile(path, "<f4").reshape(-1, width)
+    return dict(zip(names_of(width, columns), table.T, strict=True))
+
+
+def _npy(path: Path, columns: int | Sequence[str] | None) -> Columns:
+    # A memory map: a header that claims more than the file holds is refused before anything is allocated.
+    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    if array.dtype.names is not None and array.ndim == 1:
+        return {name: array[name] for name in array.dtype.names}
+    if array.ndim != 2 or array.dtype.kind not in "iuf":
+        msg = f"it holds an array {array.shape} of {array.dtype}, not one row of numbers a point"
+        raise ValueError(msg)
+    return dict(zip(names_of(array.shape[1], columns), np.array(array).T, strict=True))
+
+
+def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
+    with path.open(encoding="utf-8") as file:
+        skipped, first = 0, ""
+        for line in file:
+            first = line.strip()
+            if first and not _is_comment(first):
+                break
+            skipped, first = skipped + 1, ""
+    if not first:
+        return {name: np.zeros(0) for name in names_of(3, None)}
+    separator = next(s for s in _SEPARATORS if s is None or s in first)
+    words = [word.strip().strip('"') for word in first.split(separator)]
+    header = not all(_is_number(word) for word in words)
+    table = np.loadtxt(path, delimiter=separator, skiprows=skipped + header, ndmin=2, comments=("#", "//"))
+    if header:
+        words = [word.lstrip("/#").strip() for word in words]
+        if table.size == 0:
+            return {name: np.zeros(0) for name in words}
+        if table.shape[1] != len(words) or len(set(words)) != len(words):
+            msg = f"its header has {len(words)} names for {table.shape[1]} columns, or a name twice"
+            raise ValueError(msg)
+        return dict(zip(words, table.T, strict=True))
+    return dict(zip(names_of(table.shape[1], columns), table.T, strict=True))
+
+
+def _is_comment(line: str) -> bool:
+    """Whether a line is a comment. Names of columns after a comment sign, as CloudCompare writes them, are a header."""
+    if not line.startswith(("#", "//")):
+        return False
+    return not {"x", "y", "z"} <= set(re.split(r"[\s,;]+", line.lstrip("/#").strip().lower()))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _ply(path: Path) -> Columns:
+    import trimesh  # noqa: PLC0415 - takes long, and few files need it
+
+    with path.open("rb") as file:
+        # Of an open file, and without materials: a PLY file may name an image, which is then not looked for.
+        loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
+    vertex = loaded.metadata.get("_ply_raw", {}).get("vertex")
+    if vertex is None or not vertex["length"]:
+        return {axis: np.zeros(0) for axis in "xyz"}
+    data = vertex["data"]
+    names = data.keys() if isinstance(data, dict) else data.dtype.names
+    columns = {str(name): np.asarray(data[name]).reshape(-1) for name in names}
+    if any(len(column) != vertex["length"] for column in columns.values()):
+        msg = f"its header says {vertex['length']} points, which it does not hold"
+        raise ValueError(msg)
+    return columns
+
+
+def _las(path: Path) -> Columns:
+    try:
+        import laspy  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        msg = f'{path}: LAS and LAZ files are read by laspy: pip install "radarsdf[las]"'
+        raise ImportError(msg) from error
+    with laspy.open(path) as file:
+        header = file.header
+        unpacked = header.point_count * header.point_format.size
+        if unpacked > path.stat().st_size * (_MAX_LAZ_COMPRESSION if header.are_points_compressed else 1):
+            msg = f"its header says {header.point_count} points, for which the file is too small"
+            raise ValueError(msg)
+        cloud = file.read()
+    # Scaled and shifted, in double precision: the integers in the file are no metres.
+    columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
+    if "intensity" in header.point_format.dimension_names:
+        columns["intensity"] = np.asarray(cloud.intensity)
+    return columns

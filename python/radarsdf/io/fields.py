@@ -1,0 +1,243 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What the fields of a radar's point cloud mean: one table of the dialects, and the reading of a cloud by it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
+         "sigma_range", "sigma_azimuth", "sigma_elevation")  # fmt: skip
+"""What a field can be. Positions are x, y and z, or else range, azimuth and elevation."""
+
+_XYZ = ("x", "y", "z")
+_POLAR = ("range", "azimuth", "elevation")
+_SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How one kind of sensor or data set names its fields. Case does not matter."""
+
+    name: str
+    position: tuple[str, str, str]
+    """x, y and z, m, or range, azimuth and elevation, m and rad."""
+    doppler: str | None
+    intensity: str | None
+    sigma: tuple[str, str, str] | None = None
+    """Standard deviations of range, azimuth and elevation."""
+    sigma_in_degrees: bool = False
+    polar: bool = False
+    note: str = ""
+    """What a user must know of the numbers, one sentence."""
+
+
+DIALECTS = (
+    Dialect("Sensrad Hugin", _XYZ, "doppler", "power"),
+    Dialect(
+        "Oculii Eagle", _XYZ, "doppler", "power", ("rangeaccu", "aziaccu", "eleaccu"), sigma_in_degrees=True
+    ),
+    Dialect("Oculii, NTU4DRadLM", _XYZ, "doppler", "power"),  # a sensor_msgs/PointCloud with channels
+    Dialect("ARS548, nebula", _XYZ, "range_rate", "rcs", ("range_std", "azimuth_std", "elevation_std")),
+    Dialect(
+        "ARS548, SNAIL-Radar", _XYZ, "doppler", "intensity", ("range_std", "azimuth_std", "elevation_std"),
+        note="the intensities of ARS548 clouds with these fields are RCS + 128",
+    ),
+    Dialect(
+        "ARS548, HKUST RIO", _POLAR, "velocity", "rcs", ("rangestd", "azimuthstd", "elevationstd"), polar=True
+    ),
+    Dialect("smartmicro", _XYZ, "radial_speed", "power"),
+    Dialect("TI ti_mmwave", _XYZ, "velocity", "intensity"),  # of ti_mmwave_rospkg/RadarScan too
+    Dialect("TI reve", _XYZ, "v_doppler_mps", "snr_db"),
+    Dialect("radar_msgs/RadarScan", _POLAR, "doppler_velocity", "amplitude", polar=True),
+    Dialect("View-of-Delft", _XYZ, "v_r", "rcs"),
+    Dialect("TJ4DRadSet", _XYZ, "v_r", "power"),
+)  # fmt: skip
+"""The twelve dialects. A cloud is read by the one of which it has the most fields, all of them."""
+
+_ALIASES: dict[str, tuple[str, ...]] = {
+    # For clouds of no dialect: the first name that a cloud has. Existing files of ours come first.
+    "intensity": ("power", "intensity", "rcs", "snr", "snr_db", "amplitude", "reflectivity"),
+    "doppler": ("doppler", "velocity", "doppler_velocity", "v_doppler_mps", "radial_speed", "radial_velocity",
+                "range_rate", "v_r", "vr", "speed"),
+    "range": ("range", "distance"),
+    "azimuth": ("azimuth", "azimuth_angle"),
+    "elevation": ("elevation", "elevation_angle"),
+    "sigma_range": ("sigma_range", "range_std", "rangestd"),
+    "sigma_azimuth": ("sigma_azimuth", "azimuth_std", "azimuthstd"),
+    "sigma_elevation": ("sigma_elevation", "elevation_std", "elevationstd"),
+}  # fmt: skip
+
+COLUMNS: dict[int, tuple[str, ...]] = {
+    3: ("x", "y", "z"),
+    4: ("x", "y", "z", "intensity"),  # KITTI
+    5: ("x", "y", "z", "intensity", "doppler"),  # ColoRadar
+    7: ("x", "y", "z", "rcs", "v_r", "v_r_compensated", "time"),  # View-of-Delft
+    8: ("x", "y", "z", "v_r", "range", "power", "alpha", "beta"),  # TJ4DRadSet
+}
+"""Names of columns without names, by their number."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The returns of one scan of a file, by what they mean."""
+
+    points: NDArray[Any]
+    """(N, 3) sensor frame, m. float64 if the file has it, else float32."""
+    intensities: NDArray[np.float32] | None
+    doppler_mps: NDArray[np.float32] | None
+    sigma: NDArray[np.float32] | None
+    dropped: int
+    """Returns that were left out, since a coordinate or the intensity was not finite."""
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Which field of a cloud plays which role."""
+
+    names: dict[str, str]
+    """Field by role, of `ROLES`."""
+    dialect: Dialect | None = None
+    """The dialect that was recognised."""
+
+    @classmethod
+    def of(
+        cls, names: list[str], overrides: Mapping[str, Any] | None = None, what: str = "the cloud"
+    ) -> Fields:
+        """The roles of the fields with these names.
+
+        Parameters
+        ----------
+        names : list of str
+            The fields of a cloud.
+        overrides : mapping, optional
+            Field by role; None leaves a role out. A number means a column. Other roles are found by the table.
+        what : str
+            The file, for errors.
+
+        Raises
+        ------
+        ValueError
+            If a role or a field does not exist, or there are no positions.
+        """
+        lower = {name.lower(): name for name in reversed(names)}
+        found: dict[str, str] = {}
+        dialect = _dialect(lower)
+        if dialect is not None:
+            found = {role: lower[name] for role, name in _roles(dialect).items()}
+        for role, aliases in ({axis: (axis,) for axis in _XYZ} | _ALIASES).items():
+            name = next((lower[alias] for alias in aliases if alias in lower), None)
+            if role not in found and name is not None and name not in found.values():
+                found[role] = name
+        for role, field in (overrides or {}).items():
+            if role not in ROLES:
+                msg = f"fields has no role {role!r}: roles are {', '.join(ROLES)}"
+                raise ValueError(msg)
+            found.pop(role, None)
+            if field is not None:
+                found[role] = _field(field, names, lower, role, what)
+        if not set(_XYZ) <= set(found) and not set(_POLAR) <= set(found):
+            missing = ", ".join(axis for axis in _XYZ if axis not in found)
+            msg = f"{what} lacks the fields {missing}: it has {', '.join(names) or 'none'}"
+            raise ValueError(msg)
+        return cls(found, dialect)
+
+    def read(self, columns: Mapping[str, NDArray[Any]], what: str) -> Cloud:
+        """The cloud in these columns, (N,) each, without returns that are not finite.
+
+        Raises
+        ------
+        ValueError
+            If a field is missing that other scans have, or does not hold numbers.
+        """
+        for name in self.names.values():
+            if name not in columns:
+                msg = f"{what} lacks the field {name}, which other scans have: it has {', '.join(columns)}"
+                raise ValueError(msg)
+            if columns[name].dtype.kind not in "biuf":
+                msg = f"{what}: the field {name} holds no numbers"
+                raise ValueError(msg)
+        points = self._positions(columns)
+        with np.errstate(over="ignore"):  # too large a number becomes infinite, and is dropped
+            intensities = self._column(columns, "intensity")
+            doppler = self._column(columns, "doppler")
+            sigma = self._sigma(columns)
+        with np.errstate(invalid="ignore"):
+            finite = np.isfinite(points).all(axis=1)
+        if intensities is not None:
+            finite &= np.isfinite(intensities)
+        if finite.all():
+            return Cloud(points, intensities, doppler, sigma, 0)
+        return Cloud(
+            points[finite],
+            None if intensities is None else intensities[finite],
+            None if doppler is None else doppler[finite],
+            None if sigma is None else sigma[finite],
+            int((~finite).sum()),
+        )
+
+    def _column(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[np.float32] | None:
+        if role not in self.names:
+            return None
+        return np.ascontiguousarray(columns[self.names[role]], np.float32)
+
+    def _positions(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        if set(_XYZ) <= set(self.names):
+            parts = [columns[self.names[axis]] for axis in _XYZ]
+            dtype = np.float64 if any(part.dtype.itemsize > 4 for part in parts) else np.float32
+            points = np.zeros((len(parts[0]), 3), dtype)
+            for axis, part in enumerate(parts):
+                points[:, axis] = part
+            return points
+        ranges, azimuth, elevation = (columns[self.names[role]].astype(np.float64) for role in _POLAR)
+        with np.errstate(invalid="ignore"):  # what is not finite is dropped later
+            flat = ranges * np.cos(elevation)
+            xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
+        return np.stack(xyz, axis=1).astype(np.float32)
+
+    def _sigma(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32] | None:
+        if not set(_SIGMA) <= set(self.names):
+            return None
+        sigma = np.stack([columns[self.names[role]] for role in _SIGMA], axis=1).astype(np.float32)
+        if self.dialect is not None and self.dialect.sigma_in_degrees:
+            sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
+        return sigma
+
+
+def _roles(dialect: Dialect) -> dict[str, str]:
+    """Field by role."""
+    roles = dict(zip(_POLAR if dialect.polar else _XYZ, dialect.position, strict=True))
+    if dialect.doppler is not None:
+        roles["doppler"] = dialect.doppler
+    if dialect.intensity is not None:
+        roles["intensity"] = dialect.intensity
+    if dialect.sigma is not None:
+        roles |= dict(zip(_SIGMA, dialect.sigma, strict=True))
+    return roles
+
+
+def _dialect(lower: Mapping[str, str]) -> Dialect | None:
+    """The dialect with the most fields among those of which the cloud has all. Polar ones only without x, y and z."""
+    polar = not set(_XYZ) <= set(lower)
+    fitting = [d for d in DIALECTS if set(_roles(d).values()) <= set(lower) and d.polar == polar]
+    return max(fitting, key=lambda dialect: len(_roles(dialect)), default=None)
+
+
+def _field(field: Any, names: list[str], lower: Mapping[str, str], role: str, what: str) -> str:
+    """The name of the field that a user names, by its name or by the number of its column."""
+    if isinstance(field, (int, np.integer)) and not isinstance(field, bool):
+        if not 0 <= field < len(names):
+            msg = f"{what} has no column {field} for {role}: it has {len(names)}, counted from 0"
+            raise ValueError(msg)
+        return names[int(field)]
+    if field in names:
+        return str(field)
+    if str(field).lower() in lower:
+        return lower[str(field).lower()]
+    msg = f"{what} has no field {field} for {role}: it has {', '.join(names)}"
+    raise ValueError(msg)

@@ -1,0 +1,285 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The few ROS messages that scans and poses are in, read from their bytes.
+
+Without a type system: it would build Python code from the definitions in a bag, makes an object of each point, and old
+ROS 2 bags have no definitions. The definitions below have not changed for many years. Each message must be read to its
+last byte; one with another layout is an error.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_RADAR_RETURN = np.dtype(
+    [(n, "<f4") for n in ("range", "azimuth", "elevation", "doppler_velocity", "amplitude")]
+)
+_CDR_HEADER = 4
+_MAX_CDR_PADDING = 7
+
+
+@dataclass(frozen=True)
+class Header:
+    """Stamp and frame of a message."""
+
+    stamp_s: float
+    frame: str
+
+
+@dataclass(frozen=True, eq=False)
+class CloudMessage:
+    """A message with points."""
+
+    header: Header
+    columns: Callable[[], dict[str, NDArray[Any]]]
+    """Reads the points: (N,) each by field, most of them views of the message."""
+    point_id: int | None = None
+    """Number of the point, of messages of one point each."""
+
+
+@dataclass(frozen=True)
+class PoseMessage:
+    """A pose T_frame_child."""
+
+    header: Header
+    child: str
+    """The frame that has the pose. Empty where the message does not say."""
+    values: tuple[float, ...]
+    """x, y, z, m; qx, qy, qz, qw."""
+
+
+class _Cursor:
+    """Reads the fields of a message, one after another: of ROS 1, or of ROS 2 (CDR), where they are aligned."""
+
+    def __init__(self, raw: bytes | memoryview, cdr: bool) -> None:
+        self.raw = memoryview(raw)
+        self.cdr = cdr
+        self.at = 0
+        if cdr:
+            if len(self.raw) < _CDR_HEADER or self.raw[1] != 1:
+                msg = "it is not little-endian CDR"
+                raise ValueError(msg)
+            self.raw = self.raw[_CDR_HEADER:]
+
+    def take(self, kind: str) -> Any:
+        size = struct.calcsize(kind)
+        self._align(size)
+        (value,) = struct.unpack_from("<" + kind, self.raw, self.at)
+        self.at += size
+        return value
+
+    def string(self) -> str:
+        text = bytes(self._bytes(self.take("I")))
+        return (text[:-1] if self.cdr else text).decode("utf-8", "replace")
+
+    def array(self, dtype: Any, count: int, alignment: int) -> NDArray[Any]:
+        dtype = np.dtype(dtype)
+        if count:
+            self._align(alignment)
+        return np.frombuffer(self._bytes(count * dtype.itemsize), dtype)
+
+    def doubles(self, count: int) -> tuple[float, ...]:
+        self._align(8)
+        values = struct.unpack_from(f"<{count}d", self.raw, self.at)
+        self.at += 8 * count
+        return values
+
+    def data(self) -> memoryview:
+        return self._bytes(self.take("I"))
+
+    def header(self) -> Header:
+        if not self.cdr:
+            self.take("I")  # the sequence number, which ROS 2 has not
+        seconds, nanoseconds = self.take("i" if self.cdr else "I"), self.take("I")
+        return Header(seconds + 1e-9 * nanoseconds, self.string().lstrip("/"))
+
+    def end(self) -> None:
+        left = len(self.raw) - self.at
+        if not 0 <= left <= (_MAX_CDR_PADDING if self.cdr else 0):
+            msg = f"{left} bytes are left over: its layout is another"
+            raise ValueError(msg)
+
+    def _align(self, size: int) -> None:
+        if self.cdr and size > 1:
+            self.at += -self.at % size
+
+    def _bytes(self, size: int) -> memoryview:
+        if self.at + size > len(self.raw):  # before anything is allocated
+            msg = f"it needs {size} bytes, of which {max(0, len(self.raw) - self.at)} are there"
+            raise ValueError(msg)
+        part = self.raw[self.at : self.at + size]
+        self.at += size
+        return part
+
+
+def _point_cloud2(cursor: _Cursor) -> CloudMessage:
+    header = cursor.header()
+    height, width = cursor.take("I"), cursor.take("I")
+    fields = []
+    for _ in range(cursor.take("I")):
+        name = cursor.string()
+        offset, datatype, count = cursor.take("I"), cursor.take("B"), cursor.take("I")
+        fields.append((name, offset, datatype, count))
+    big_endian = cursor.take("B")
+    point_step, row_step = cursor.take("I"), cursor.take("I")
+    data = cursor.data()
+    cursor.take("B")  # is_dense; what is not finite is looked for anyway
+    row_step = row_step if height > 1 else point_step * width  # of one row, some drivers leave it 0
+    if point_step * width > row_step or row_step * height > len(data):
+        msg = f"{height} x {width} points of {point_step} bytes do not fit into its {len(data)} bytes"
+        raise ValueError(msg)
+    columns: dict[str, tuple[int, str]] = {}
+    for name, offset, datatype, count in fields:
+        kind = _POINT_FIELD_TYPES.get(datatype)
+        if kind is None or offset + int(kind[1]) > point_step:
+            msg = f"its field {name} has an unknown type, or lies outside of a point"
+            raise ValueError(msg)
+        if count <= 1 and name:  # 0 is what some drivers write for 1
+            columns.setdefault(name, (offset, (">" if big_endian else "<") + kind))
+
+    def read() -> dict[str, NDArray[Any]]:
+        if not height * width:
+            return {name: np.zeros(0, kind) for name, (_, kind) in columns.items()}
+        record = np.dtype(
+            {
+                "names": list(columns),
+                "formats": [kind for _, kind in columns.values()],
+                "offsets": [offset for offset, _ in columns.values()],
+                "itemsize": point_step,
+            }
+        )
+        # One view of the message: no loop over points, and no copy.
+        cloud: NDArray[Any] = np.ndarray((height, width), record, data, strides=(row_step, point_step))
+        return {name: cloud[name].reshape(-1) for name in columns}
+
+    return CloudMessage(header, read)
+
+
+def _point_cloud(cursor: _Cursor) -> CloudMessage:
+    header = cursor.header()
+    xyz = cursor.array("<f4", 3 * cursor.take("I"), 4).reshape(-1, 3)
+    columns = dict(zip("xyz", xyz.T, strict=True))
+    for _ in range(cursor.take("I")):
+        name = cursor.string()
+        values = cursor.array("<f4", cursor.take("I"), 4)
+        if len(values) == len(xyz):
+            columns.setdefault(name, values)
+    return CloudMessage(header, lambda: columns)
+
+
+def _radar_scan(cursor: _Cursor) -> CloudMessage:
+    header = cursor.header()
+    returns = cursor.array(_RADAR_RETURN, cursor.take("I"), 4)
+    return CloudMessage(header, lambda: {name: returns[name] for name in _RADAR_RETURN.names or ()})
+
+
+def _ti_radar_scan(cursor: _Cursor) -> CloudMessage:
+    """One point a message."""
+    header = cursor.header()
+    point_id = cursor.take("H")
+    x, y, z, _range, velocity = (cursor.take("f") for _ in range(5))
+    cursor.take("H")  # doppler_bin
+    cursor.take("f")  # bearing
+    intensity = cursor.take("f")
+    values = {"x": x, "y": y, "z": z, "velocity": velocity, "intensity": intensity}
+    return CloudMessage(
+        header, lambda: {n: np.array([v], np.float32) for n, v in values.items()}, int(point_id)
+    )
+
+
+def _odometry(cursor: _Cursor) -> list[PoseMessage]:
+    header, child = cursor.header(), cursor.string().lstrip("/")
+    values = cursor.doubles(7)
+    cursor.doubles(36 + 6 + 36)  # covariance, twist, covariance
+    return [PoseMessage(header, child, values)]
+
+
+def _pose_stamped(cursor: _Cursor) -> list[PoseMessage]:
+    return [PoseMessage(cursor.header(), "", cursor.doubles(7))]
+
+
+def _pose_with_covariance(cursor: _Cursor) -> list[PoseMessage]:
+    pose = PoseMessage(cursor.header(), "", cursor.doubles(7))
+    cursor.doubles(36)
+    return [pose]
+
+
+def _path(cursor: _Cursor) -> list[PoseMessage]:
+    cursor.header()
+    return [PoseMessage(cursor.header(), "", cursor.doubles(7)) for _ in range(cursor.take("I"))]
+
+
+def _transform_stamped(cursor: _Cursor) -> list[PoseMessage]:
+    header, child = cursor.header(), cursor.string().lstrip("/")
+    return [PoseMessage(header, child, cursor.doubles(7))]
+
+
+def _transforms(cursor: _Cursor) -> list[PoseMessage]:
+    return [_transform_stamped(cursor)[0] for _ in range(cursor.take("I"))]
+
+
+POINT_A_MESSAGE = "ti_mmwave_rospkg/msg/RadarScan"
+PATH = "nav_msgs/msg/Path"
+
+_CLOUDS: dict[str, Callable[[_Cursor], CloudMessage]] = {
+    "sensor_msgs/msg/PointCloud2": _point_cloud2,
+    "sensor_msgs/msg/PointCloud": _point_cloud,
+    "radar_msgs/msg/RadarScan": _radar_scan,
+    POINT_A_MESSAGE: _ti_radar_scan,
+}
+_POSES: dict[str, Callable[[_Cursor], list[PoseMessage]]] = {
+    "nav_msgs/msg/Odometry": _odometry,
+    "geometry_msgs/msg/PoseStamped": _pose_stamped,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_with_covariance,
+    "geometry_msgs/msg/TransformStamped": _transform_stamped,
+    PATH: _path,
+}
+_TRANSFORMS: dict[str, Callable[[_Cursor], list[PoseMessage]]] = {
+    "tf2_msgs/msg/TFMessage": _transforms,
+    "tf/msg/tfMessage": _transforms,
+}
+CLOUD_TYPES = tuple(_CLOUDS)
+POSE_TYPES = tuple(_POSES)
+TRANSFORM_TYPES = tuple(_TRANSFORMS)
+
+
+def read_cloud(raw: bytes | memoryview, message_type: str, cdr: bool) -> CloudMessage:
+    """A message with points, of `CLOUD_TYPES`.
+
+    Raises
+    ------
+    ValueError
+        If its bytes do not have the layout of its type.
+    """
+    cloud: CloudMessage = _read(raw, _CLOUDS[message_type], cdr)
+    return cloud
+
+
+def read_pose_messages(raw: bytes | memoryview, message_type: str, cdr: bool) -> list[PoseMessage]:
+    """The poses of a message of `POSE_TYPES` or `TRANSFORM_TYPES`.
+
+    Raises
+    ------
+    ValueError
+        If its bytes do not have the layout of its type.
+    """
+    poses: list[PoseMessage] = _read(raw, (_POSES | _TRANSFORMS)[message_type], cdr)
+    return poses
+
+
+def _read(raw: bytes | memoryview, parse: Callable[[_Cursor], Any], cdr: bool) -> Any:
+    try:
+        cursor = _Cursor(raw, cdr)
+        message = parse(cursor)
+        cursor.end()
+    except struct.error as error:
+        msg = "it is cut off"
+        raise ValueError(msg) from error
+    return message

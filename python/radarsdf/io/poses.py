@@ -1,0 +1,282 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Poses from files, and which scan has which: by time stamp, or in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from radarsdf.checks import check_poses, real_array
+from radarsdf.io.files import check_regular_file
+from radarsdf.io.sequence import Notes
+from radarsdf.io.trajectory import Trajectory, trajectory_of_table
+
+MAX_GAP_S = 0.5
+"""Longest time between two poses over which poses are interpolated, by default."""
+
+POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
+"""Names of files of poses that are found beside scans."""
+
+_TUM_COLUMNS, _KITTI_COLUMNS, _MATRIX_COLUMNS = 8, 12, 16
+_CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam")
+
+
+class StampedPoses(Protocol):
+    """Poses by time."""
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+        """T_world_base (4, 4) at a time, s; None if there is none near enough."""
+
+    def span(self) -> str:
+        """First and last time, for messages."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransformChain:
+    """A product of transforms, each of which is constant or moves: T_world_a · T_a_b · … of a tree of frames."""
+
+    links: tuple[Trajectory | NDArray[np.float64], ...]
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+        """T_world_base (4, 4) at a time, s; None if a link has none near enough."""
+        pose = np.eye(4)
+        for link in self.links:
+            part = link.pose_at(time_s, max_gap_s) if isinstance(link, Trajectory) else link
+            if part is None:
+                return None
+            pose = pose @ part
+        return pose
+
+    def span(self) -> str:
+        """First and last time of its moving links, for messages."""
+        return ", ".join(link.span() for link in self.links if isinstance(link, Trajectory))
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPoses:
+    """The pose of the radar for each scan: of its time, or of its number."""
+
+    poses: StampedPoses | NDArray[np.float64]
+    """T_world_base by time, or (F, 4, 4) in the order of the scans."""
+    T_base_sensor: NDArray[np.float64]
+    max_gap_s: float
+
+    def of(self, number: int, time_s: float | None) -> NDArray[np.float64] | None:
+        """T_world_sensor (4, 4) of scan `number`, which was taken at `time_s`; None if it has none."""
+        if isinstance(self.poses, np.ndarray):
+            T_world_base = self.poses[number] if number < len(self.poses) else None
+        elif time_s is None:
+            return None
+        else:
+            T_world_base = self.poses.pose_at(time_s, self.max_gap_s)
+        if T_world_base is None:
+            return None
+        T_world_sensor: NDArray[np.float64] = T_world_base @ self.T_base_sensor
+        return T_world_sensor
+
+
+def extrinsic_of(extrinsic: Any) -> NDArray[np.float64] | None:
+    """`extrinsic` as a checked T_base_sensor (4, 4), or None.
+
+    Raises
+    ------
+    ValueError
+        If it is not a rigid transform.
+    """
+    if extrinsic is None:
+        return None
+    matrix = real_array(extrinsic, "extrinsic")
+    if matrix.shape != (4, 4):
+        msg = f"extrinsic must be T_base_sensor (4, 4), not {matrix.shape}"
+        raise ValueError(msg)
+    try:
+        checked: NDArray[np.float64] = check_poses(matrix[None], 1)[0]
+    except ValueError as error:
+        msg = "extrinsic is not a rigid transform T_base_sensor (rotation, translation, last row 0 0 0 1)"
+        raise ValueError(msg) from error
+    return checked
+
+
+def poses_of(
+    poses: Any, notes: Notes, calibration: Sequence[Path] = ()
+) -> StampedPoses | NDArray[np.float64]:
+    """Poses as a user gives them: an array (F, 4, 4), poses by time, or a file for :func:`read_poses`."""
+    if isinstance(poses, (str, PathLike)):
+        return read_poses(Path(poses), notes, calibration)
+    if hasattr(poses, "pose_at"):
+        stamped: StampedPoses = poses
+        return stamped
+    matrices = real_array(poses, "poses")
+    if matrices.ndim != 3:
+        msg = f"poses must be (F, 4, 4) T_world_sensor, or a file of poses, not an array {matrices.shape}"
+        raise ValueError(msg)
+    return check_poses(matrices, len(matrices))
+
+
+def read_poses(
+    path: Path, notes: Notes, calibration: Sequence[Path] = ()
+) -> StampedPoses | NDArray[np.float64]:
+    """Reads a file of poses.
+
+    Parameters
+    ----------
+    path : Path
+        One of
+
+        - TUM: lines of ``time x y z qx qy qz qw``, s and m: T_world_base by time;
+        - KITTI: lines of twelve numbers, the first three rows of a matrix. With a calibration ``Tr``, the transform from
+          the sensor to the camera, T_world_sensor = inv(Tr) · P · Tr, so that the world is the first scan's sensor frame;
+          without one, the lines are taken as T_world_base;
+        - our own: 4 x 4 matrices T_world_base, as lines of sixteen numbers or blocks of four lines, or an array
+          (F, 4, 4) in an ``.npy`` file.
+
+        Text may have commas, and comments after ``#``.
+    notes : Notes
+        Is told what was assumed.
+    calibration : sequence of Path
+        Files in which the ``Tr`` of a KITTI calibration is looked for.
+
+    Returns
+    -------
+    Trajectory or ndarray
+        Poses by time, or (F, 4, 4) float64 in their order.
+
+    Raises
+    ------
+    ValueError
+        If the file has another format, or a pose is not rigid.
+    OSError
+        If it cannot be read.
+    """
+    check_regular_file(path)
+    if path.suffix.lower() == ".npy":
+        return _checked(_npy(path), path)
+    table = _table(path)
+    if table.shape[1] == _TUM_COLUMNS:
+        return trajectory_of_table(table, path)
+    if table.shape[1] == _KITTI_COLUMNS:
+        poses = np.tile(np.eye(4), (len(table), 1, 1))
+        poses[:, :3] = table.reshape(-1, 3, 4)
+        checked = _checked(poses, path)
+        for file in calibration:
+            if file.is_file() and (T_camera_sensor := read_calibration(file)) is not None:
+                notes.add(
+                    f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr, the world is the first scan"
+                )
+                moved: NDArray[np.float64] = np.linalg.inv(T_camera_sensor) @ checked @ T_camera_sensor
+                return moved
+        notes.add(
+            f"{path.name} has KITTI poses and there is no calibration Tr: they are taken as T_world_sensor"
+        )
+        return checked
+    if table.shape[1] == _MATRIX_COLUMNS:
+        return _checked(table.reshape(-1, 4, 4), path)
+    if table.shape[1] == 4 and len(table) % 4 == 0:
+        return _checked(table.reshape(-1, 4, 4), path)
+    msg = (
+        f"{path} has {table.shape[1]} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four "
+        "in blocks of four lines"
+    )
+    raise ValueError(msg)
+
+
+def read_calibration(path: Path) -> NDArray[np.float64] | None:
+    """``Tr``, or ``Tr_velo_to_cam``, of a KITTI calibration, as T_camera_sensor (4, 4); None if the file has neither.
+
+    Raises
+    ------
+    ValueError
+        If it does not hold twelve numbers, or they are no rigid transform.
+    OSError
+        If the file cannot be read.
+    """
+    check_regular_file(path)
+    try:
+        lines = [line.partition(":") for line in path.read_text("utf-8").splitlines()]
+        found = {key.strip(): values.split() for key, _, values in lines}
+        key = next((key for key in _CALIBRATION_KEYS if key in found), None)
+        if key is None:
+            return None
+        T_camera_sensor = np.eye(4)
+        T_camera_sensor[:3] = np.array(found[key], np.float64).reshape(3, 4)
+    except ValueError as error:
+        msg = f"{path} is not a KITTI calibration: {error}"
+        raise ValueError(msg) from error
+    checked: NDArray[np.float64] = _checked(T_camera_sensor[None], path)[0]
+    return checked
+
+
+def trajectory_of(
+    times_s: Sequence[float] | NDArray[np.float64], positions: Any, quaternions: Any, name: str
+) -> Trajectory:
+    """A trajectory of poses in any order, such as of a bag. Of several at one time, the first counts.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two poses, or they are no poses.
+    """
+    times, first = np.unique(np.asarray(times_s, np.float64), return_index=True)
+    if len(times) < 2:
+        msg = f"{name} holds {len(times)} poses at different times; at least two are needed"
+        raise ValueError(msg)
+    xyz = np.asarray(positions, np.float64).reshape(-1, 3)[first]
+    quats = np.asarray(quaternions, np.float64).reshape(-1, 4)[first]
+    if not (
+        np.isfinite(xyz).all() and np.isfinite(quats).all() and (np.linalg.norm(quats, axis=1) > 0.5).all()
+    ):
+        msg = f"{name} holds poses that are not finite, or without a rotation"
+        raise ValueError(msg)
+    return Trajectory(times, xyz, Rotation.from_quat(quats), name)
+
+
+def _table(path: Path) -> NDArray[np.float64]:
+    """(R, columns) float64 of a text file of numbers."""
+    try:
+        lines = [line.partition("#")[0].replace(",", " ") for line in path.read_text("utf-8").splitlines()]
+        rows = [line.split() for line in lines if line.strip()]
+        if rows and not _numbers(rows[0]):
+            rows = rows[1:]  # a header
+        table = np.array(rows, np.float64)
+    except ValueError as error:
+        msg = f"{path} is not a table of poses: {error}"
+        raise ValueError(msg) from error
+    if table.ndim != 2 or len(table) == 0 or not np.isfinite(table).all():
+        msg = f"{path} is not a table of poses, of finite numbers in rows of one length"
+        raise ValueError(msg)
+    return table
+
+
+def _numbers(words: list[str]) -> bool:
+    try:
+        [float(word) for word in words]
+    except ValueError:
+        return False
+    return True
+
+
+def _npy(path: Path) -> NDArray[Any]:
+    try:
+        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+    except (ValueError, EOFError) as error:
+        msg = f"{path} is not a whole .npy file: {error}"
+        raise ValueError(msg) from error
+
+
+def _checked(poses: NDArray[Any], path: Path) -> NDArray[np.float64]:
+    if poses.ndim != 3 or poses.dtype.kind not in "iuf":
+        msg = f"{path} must hold poses (F, 4, 4), not {poses.dtype} {poses.shape}"
+        raise ValueError(msg)
+    try:
+        return check_poses(poses, len(poses))
+    except ValueError as error:
+        msg = f"{path}: {error}"
+        raise ValueError(msg) from error

@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""One door for scans in files, folders and bags of any kind."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf.checks import positions, positive
+from radarsdf.io import bags, datasets
+from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
+from radarsdf.io.folders import base_T_radar, lidar_map
+from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, extrinsic_of, poses_of
+from radarsdf.io.scans import read_scans
+from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.sources import Request, cloud_files, files_source, posed, scan_poses, times_of
+
+_STAMPS = (None, "header", "record")
+_CALIBRATIONS = ("calib.txt", "calibration.txt")
+
+
+def read(
+    path: str | PathLike[str] | Sequence[str | PathLike[str]],
+    poses: str | PathLike[str] | ArrayLike | None = None,
+    *,
+    extrinsic: ArrayLike | None = None,
+    topic: str | None = None,
+    pose_topic: str | None = None,
+    world_frame: str | None = None,
+    stamps: str | None = None,
+    fields: Mapping[str, Any] | None = None,
+    columns: int | Sequence[str] | None = None,
+    max_gap_s: float = MAX_GAP_S,
+    ground_truth: str | PathLike[str] | ArrayLike | None = None,
+) -> Scans:
+    """Reads scans with poses from a file, a folder or bags.
+
+    What was assumed and what was left out is logged as a warning of the logger ``radarsdf.io``, a line each, and kept in
+    ``notes`` of the scans. Returns with a coordinate or an intensity that is not finite are left out, and counted.
+
+    Parameters
+    ----------
+    path : path-like, or a sequence of them
+        One of
+
+        - our ``.npz`` (see :func:`read_scans`);
+        - a folder with a file a scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
+          file. Files are read in natural order, or in the order of the times in their names. Ground truth is
+          ``lidar.pcd`` or ``lidar.ply`` in the folder;
+        - a folder of a data set that :mod:`radarsdf.io.datasets` knows by its shape;
+        - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
+    poses : path-like, array_like or poses by time, optional
+        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.read_poses`: TUM, KITTI, 4 x 4 matrices. By
+        default what the data set says; in a folder, a file of `radarsdf.io.poses.POSE_FILES`; in a bag, `pose_topic`.
+    extrinsic : (4, 4) array_like, optional
+        T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
+    topic, pose_topic : str, optional
+        In a bag, the topic of the scans, and of the poses (Odometry, PoseStamped, Path or TF). By default the only ones.
+    world_frame : str, optional
+        With poses of TF, the frame of the world. By default the root of its tree.
+    stamps : {"header", "record"}, optional
+        In a bag, the time of a scan: of its header, or when it was recorded. By default of the header, unless its stamps
+        are zero or stand still.
+    fields : mapping, optional
+        Field of the file by role, if the table of :mod:`radarsdf.io.fields` is wrong: ``{"intensity": "Power"}``. Numbers
+        mean columns, None leaves a role out. Roles are those of `radarsdf.io.fields.ROLES`.
+    columns : int or sequence of str, optional
+        Of files without names of columns: how many a point has, or their names.
+    max_gap_s : float
+        Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
+    ground_truth : path-like or (M, 3) array_like, optional
+        Lidar points, world frame, m.
+
+    Returns
+    -------
+    Scans
+        They are read while they are iterated, in memory bounded by a scan; see :class:`Scans`. Points keep the precision
+        of the file; intensities, Doppler and deviations are float32.
+
+    Raises
+    ------
+    ValueError
+        If files are damaged or do not fit together, something is missing, or a choice is not clear.
+    OSError
+        If a file cannot be read.
+    ImportError
+        If it takes a library that is not installed; the message says which.
+
+    Examples
+    --------
+    >>> import numpy as np, radarsdf
+    >>> np.save("0.npy", [[5.0, 0.0, 0.0, 70.0], [6.0, 1.0, np.nan, 80.0]])
+    >>> scans = radarsdf.io.read("0.npy", [np.eye(4)])
+    >>> [(scan.points.tolist(), scan.intensities.tolist()) for scan in scans]
+    [([[5.0, 0.0, 0.0]], [70.0])]
+    >>> scans.notes
+    ['1 returns left out: a coordinate or the intensity is not a finite number']
+    """
+    if stamps not in _STAMPS:
+        msg = f'stamps must be "header" or "record", not {stamps!r:.50}'
+        raise ValueError(msg)
+    request = Request(
+        poses=poses,
+        extrinsic=extrinsic_of(extrinsic),
+        topic=topic,
+        pose_topic=pose_topic,
+        world_frame=world_frame,
+        stamps=stamps,
+        fields=fields,
+        columns=columns,
+        max_gap_s=positive(max_gap_s, "max_gap_s"),
+    )
+    truth = _truth(ground_truth)
+    if isinstance(poses, (str, PathLike)):
+        _check_exists(Path(poses))
+    if not isinstance(path, (str, PathLike)):
+        paths = [Path(part) for part in path]
+        for part in paths:
+            _check_exists(part)
+        return bags.read_bags(paths, request, truth)
+    return _read(Path(path), request, truth)
+
+
+def _read(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
+    _check_exists(path)
+    if bags.is_bag(path):
+        return bags.read_bags([path], request, truth)
+    if path.is_dir():
+        dataset = datasets.find(path)
+        if dataset is not None:
+            return dataset.read(path, request, truth)
+        if found := bags.bags_in(path):
+            beside = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
+            if request.poses is None and request.pose_topic is None and beside is not None:
+                request.notes.add(f"poses: of {beside.name}")
+                request = dataclasses.replace(request, poses=beside)
+            return bags.read_bags(found, request, truth)
+        return _folder(path, request, truth)
+    if path.suffix.lower() == ".npz":
+        return _npz(path, request, truth)
+    if path.suffix.lower() in CLOUD_SUFFIXES:
+        return _files([path], path.parent, request, truth or (lambda: None))
+    msg = f"{path} is of no kind that can be read: .npz, .bag, .mcap, .db3, {', '.join(CLOUD_SUFFIXES)}, or a folder of them"
+    raise ValueError(msg)
+
+
+def _folder(folder: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
+    files = cloud_files(folder)
+    if not files:
+        msg = f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}"
+        raise ValueError(msg)
+    return _files(files, folder, request, truth or (lambda: lidar_map(folder)))
+
+
+def _files(
+    files: list[Path], folder: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None]
+) -> Scans:
+    """Scans of files with poses."""
+    places = dict.fromkeys((folder, files[0].parent, files[0].parent.parent))
+    poses = request.poses
+    if poses is None:
+        poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
+        if poses is None:
+            msg = f"{folder} has no poses: give them by poses, as a file (TUM, KITTI, 4 x 4) or an array (F, 4, 4)"
+            raise ValueError(msg)
+    if isinstance(poses, (str, PathLike)):
+        places = dict.fromkeys((Path(poses).parent, *places))
+    calibrations = [place / name for place in places for name in _CALIBRATIONS]
+    times_s: Sequence[float] | None = times_of(files)
+    if times_s is not None:
+        order = np.argsort(times_s, kind="stable")
+        files, times_s = [files[i] for i in order], [times_s[i] for i in order]
+    T_base_sensor = request.extrinsic if request.extrinsic is not None else base_T_radar(folder)
+    matched, times_s = scan_poses(
+        poses_of(poses, request.notes, calibrations), len(files), times_s, T_base_sensor, request
+    )
+    source = posed(files_source(files, times_s, request), matched, request)
+    return Scans.of_source(source, request.notes, truth)
+
+
+def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
+    if request.poses is not None or request.extrinsic is not None:
+        msg = f"{path} has its own poses T_world_sensor: poses and extrinsic are not used for .npz files"
+        raise ValueError(msg)
+    scans = read_scans(path)
+
+    def source() -> Iterator[Scan]:
+        for scan in scans:
+            finite = np.isfinite(scan.points).all(axis=1)
+            if scan.intensities is not None:
+                finite &= np.isfinite(scan.intensities)
+            request.notes.count(
+                "returns left out: a coordinate or the intensity is not a finite number", int((~finite).sum())
+            )
+            if finite.all():
+                yield scan
+            elif finite.any():
+                parts = (scan.intensities, scan.doppler_mps, scan.sigma)
+                values, doppler, sigma = (None if part is None else part[finite] for part in parts)
+                yield Scan(scan.points[finite], scan.T_world_sensor, values, doppler, scan.time_s, sigma)
+
+    return Scans.of_source(source, request.notes, truth or (lambda: scans.ground_truth))
+
+
+def _truth(ground_truth: Any) -> Callable[[], NDArray[np.float64] | None] | None:
+    if ground_truth is None:
+        return None
+    if isinstance(ground_truth, (str, PathLike)):
+        file = Path(ground_truth)
+        _check_exists(file)
+        return lambda: read_points(file)
+    points = positions(ground_truth, "ground_truth")
+    return lambda: points
+
+
+def _check_exists(path: Path) -> None:
+    """Raises an OSError in plain words: many readers would say less."""
+    try:
+        path.stat()
+    except FileNotFoundError as error:
+        msg = f"{path} does not exist"
+        raise FileNotFoundError(msg) from error
+    except NotADirectoryError as error:
+        msg = f"{path} does not exist: a part of it is a file, not a folder"
+        raise FileNotFoundError(msg) from error

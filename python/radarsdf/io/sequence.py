@@ -1,0 +1,270 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans with poses: one after another from files of any size, or all in memory."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LOG = logging.getLogger("radarsdf.io")
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One scan of N returns, with its pose."""
+
+    points: NDArray[Any]
+    """(N, 3) sensor frame, m."""
+    T_world_sensor: NDArray[np.float64]
+    """(4, 4) m."""
+    intensities: NDArray[Any] | None = None
+    """(N,) sensor units. None if the sensor does not measure them."""
+    doppler_mps: NDArray[Any] | None = None
+    """(N,) radial velocity as the sensor gives it, m/s; most give negative values for what comes nearer. NaN where it
+    was not measured."""
+    time_s: float | None = None
+    """When the scan was taken, s, by the clock of the file."""
+    sigma: NDArray[Any] | None = None
+    """(N, 3) the sensor's own standard deviations of range, azimuth and elevation of each return: m, rad, rad."""
+
+    def __len__(self) -> int:
+        """Number of returns."""
+        return len(self.points)
+
+
+class Notes:
+    """Sentences on what was assumed or left out. Each is logged once, as a warning of the logger ``radarsdf.io``."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self._counts: dict[str, int] = {}
+
+    def add(self, line: str) -> None:
+        """Keep a sentence, and log it if it is new."""
+        if line not in self.lines:
+            self.lines.append(line)
+            _LOG.warning(line)
+
+    def start_counts(self) -> None:
+        """Forget the counts: the files are read again."""
+        self._counts = {}
+
+    def count(self, what: str, number: int) -> None:
+        """Add to the count of what was left out."""
+        if number:
+            self._counts[what] = self._counts.get(what, 0) + number
+
+    def counted(self) -> None:
+        """Turn the counts into sentences, in the end of a pass through the files."""
+        for what, number in self._counts.items():
+            self.add(f"{number} {what}")
+
+
+class Scans:
+    """F scans with poses, and lidar points as ground truth where there are any.
+
+    Iterating gives one :class:`Scan` after another, as often as wanted. Scans of :func:`radarsdf.io.read` are read from
+    their files while they are iterated, so that memory is bounded by a scan; `points`, `intensities`, `doppler_mps` and
+    `sigmas` read all of them and keep them. `poses`, `times_s` and ``len()`` read the files once, if nobody did so
+    before, and keep no points.
+
+    Parameters
+    ----------
+    points : sequence of F arrays
+        (N_i, 3) each, sensor frame, m.
+    poses : (F, 4, 4) ndarray
+        T_world_sensor, m.
+    intensities : sequence of F arrays, optional
+        (N_i,) each, sensor units. None if the sensor does not measure them.
+    ground_truth : (M, 3) ndarray, optional
+        Lidar points, world frame, m.
+    doppler_mps, sigmas : sequence of F arrays, optional
+        As `Scan.doppler_mps` and `Scan.sigma`.
+    times_s : (F,) ndarray, optional
+        When the scans were taken, s.
+    """
+
+    def __init__(
+        self,
+        points: Sequence[NDArray[Any]],
+        poses: NDArray[np.float64],
+        intensities: Sequence[NDArray[Any]] | None = None,
+        ground_truth: NDArray[Any] | None = None,
+        *,
+        doppler_mps: Sequence[NDArray[Any]] | None = None,
+        times_s: NDArray[np.float64] | None = None,
+        sigmas: Sequence[NDArray[Any]] | None = None,
+    ) -> None:
+        self._source: Callable[[], Iterator[Scan]] | None = None
+        self._notes = Notes()
+        self._points: list[NDArray[Any]] | None = list(points)
+        self._poses: NDArray[np.float64] | None = poses
+        self._intensities = _listed(intensities)
+        self._doppler_mps = _listed(doppler_mps)
+        self._sigmas = _listed(sigmas)
+        self._times_s = times_s
+        self._ground_truth: Callable[[], NDArray[Any] | None] = lambda: ground_truth
+        self._truth_known = False
+        self._truth: NDArray[Any] | None = None
+
+    @classmethod
+    def of_source(
+        cls,
+        source: Callable[[], Iterator[Scan]],
+        notes: Notes,
+        ground_truth: Callable[[], NDArray[Any] | None] = lambda: None,
+    ) -> Scans:
+        """Scans that are read while they are iterated.
+
+        Parameters
+        ----------
+        source : callable
+            Gives a new iterator over the scans, which have at least one return each.
+        notes : Notes
+            What the source says of its files.
+        ground_truth : callable
+            Reads the ground truth, when it is asked for.
+        """
+        scans = cls([], np.zeros((0, 4, 4)))
+        scans._source = source
+        scans._notes = notes
+        scans._points = scans._poses = None
+        scans._ground_truth = ground_truth
+        return scans
+
+    def __iter__(self) -> Iterator[Scan]:
+        """One scan after another."""
+        if self._points is None:
+            return self._read()
+        return (self._scan(i) for i in range(len(self._points)))
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self.poses)
+
+    def __repr__(self) -> str:
+        """What is known without reading files."""
+        known = f"{len(self._poses)} scans" if self._poses is not None else "scans that are not yet read"
+        return f"<Scans: {known}>"
+
+    @property
+    def points(self) -> list[NDArray[Any]]:
+        """F arrays (N_i, 3), sensor frame, m."""
+        self._load()
+        assert self._points is not None
+        return self._points
+
+    @property
+    def poses(self) -> NDArray[np.float64]:
+        """(F, 4, 4) T_world_sensor, m."""
+        if self._poses is None:
+            for _ in self._read():  # which keeps the poses in its end
+                pass
+        assert self._poses is not None
+        return self._poses
+
+    @property
+    def intensities(self) -> list[NDArray[Any]] | None:
+        """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
+        self._load()
+        return self._intensities
+
+    @property
+    def doppler_mps(self) -> list[NDArray[Any]] | None:
+        """F arrays (N_i,), m/s: see `Scan.doppler_mps`. None if there is none."""
+        self._load()
+        return self._doppler_mps
+
+    @property
+    def sigmas(self) -> list[NDArray[Any]] | None:
+        """F arrays (N_i, 3), m, rad, rad: see `Scan.sigma`. None if there are none."""
+        self._load()
+        return self._sigmas
+
+    @property
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(F,) when the scans were taken, s. None if that is not known."""
+        _ = self.poses
+        return self._times_s
+
+    @property
+    def ground_truth(self) -> NDArray[Any] | None:
+        """(M, 3) lidar points, world frame, m. None if there are none."""
+        if not self._truth_known:
+            self._truth, self._truth_known = self._ground_truth(), True
+        return self._truth
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on what was assumed, and after the files were read, on what was left out."""
+        return list(self._notes.lines)
+
+    def select(self, frames: NDArray[np.int64]) -> Scans:
+        """The scans with the numbers `frames`, (K,), in this order. All scans are read."""
+
+        def chosen(arrays: list[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
+            return None if arrays is None else [arrays[i] for i in frames]
+
+        return Scans(
+            [self.points[i] for i in frames],
+            self.poses[frames],
+            chosen(self.intensities),
+            self.ground_truth,
+            doppler_mps=chosen(self.doppler_mps),
+            times_s=None if self.times_s is None else self.times_s[frames],
+            sigmas=chosen(self.sigmas),
+        )
+
+    def _scan(self, i: int) -> Scan:
+        assert self._points is not None
+        return Scan(
+            self._points[i],
+            self.poses[i],
+            None if self._intensities is None else self._intensities[i],
+            None if self._doppler_mps is None else self._doppler_mps[i],
+            None if self._times_s is None else float(self._times_s[i]),
+            None if self._sigmas is None else self._sigmas[i],
+        )
+
+    def _read(self) -> Iterator[Scan]:
+        """Reads the files, and keeps what is small once they are read to the end."""
+        assert self._source is not None
+        poses: list[NDArray[np.float64]] = []
+        times_s: list[float | None] = []
+        self._notes.start_counts()
+        for scan in self._source():
+            poses.append(scan.T_world_sensor)
+            times_s.append(scan.time_s)
+            yield scan
+        self._notes.counted()
+        if not poses:
+            why = "".join(f"; {line}" for line in self._notes.lines)
+            msg = f"there is no scan with a return and a pose{why}"
+            raise ValueError(msg)
+        self._poses = np.stack(poses)
+        self._times_s = None if None in times_s else np.array(times_s, np.float64)
+
+    def _load(self) -> None:
+        """Reads all scans, and keeps them."""
+        if self._points is not None:
+            return
+        scans = list(self._read())
+        self._intensities = _all_or_none([scan.intensities for scan in scans])
+        self._doppler_mps = _all_or_none([scan.doppler_mps for scan in scans])
+        self._sigmas = _all_or_none([scan.sigma for scan in scans])
+        self._points = [scan.points for scan in scans]
+
+
+def _listed(arrays: Sequence[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
+    return None if arrays is None else list(arrays)
+
+
+def _all_or_none(arrays: list[NDArray[Any] | None]) -> list[NDArray[Any]] | None:
+    given = [array for array in arrays if array is not None]
+    return given if given and len(given) == len(arrays) else None

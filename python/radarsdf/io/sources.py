@@ -1,0 +1,233 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""From clouds of files, one after another, to scans with poses."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_columns
+from radarsdf.io.fields import Fields
+from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, ScanPoses, StampedPoses
+from radarsdf.io.sequence import Notes, Scan
+from radarsdf.io.trajectory import Trajectory
+
+TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
+"""Names of files with a time, s, for each scan, one a line."""
+
+SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
+"""Names of folders of scans that are found within the folder that is read."""
+
+_NOT_SCANS = {
+    *POSE_FILES,
+    *TIME_FILES,
+    "calib.txt",
+    "calibration.txt",
+    "base_T_radar.txt",
+    "readme.txt",
+    "license.txt",
+}
+_TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply beside the scans is their ground truth
+_SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
+_TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
+_UNITS = ((17, 1e-9), (14, 1e-6), (11, 1e-3))  # more digits than this: the unit of a time without a point, s
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """How a user wants scans to be read; see :func:`radarsdf.io.read`."""
+
+    poses: Any = None
+    extrinsic: NDArray[np.float64] | None = None
+    topic: str | None = None
+    pose_topic: str | None = None
+    fields: Mapping[str, Any] | None = None
+    columns: int | Sequence[str] | None = None
+    max_gap_s: float = MAX_GAP_S
+    stamps: str | None = None
+    world_frame: str | None = None
+    notes: Notes = field(default_factory=Notes)
+
+
+@dataclass(frozen=True, eq=False)
+class RawScan:
+    """A scan of a file, whose points are not yet read."""
+
+    read: Callable[[], Columns]
+    time_s: float | None
+    name: str
+    """For errors."""
+
+
+def posed(
+    raw_scans: Callable[[], Iterable[RawScan]], poses: ScanPoses, request: Request
+) -> Callable[[], Iterator[Scan]]:
+    """What :meth:`Scans.of_source` takes: scans with poses and at least one return, in the order of the files."""
+    notes = request.notes
+
+    def source() -> Iterator[Scan]:
+        fields: Fields | None = None
+        first_s: float | None = None
+        taken = 0
+        for number, raw in enumerate(raw_scans()):
+            T_world_sensor = poses.of(number, raw.time_s)
+            if T_world_sensor is None:
+                first_s = raw.time_s if first_s is None else first_s
+                notes.count(
+                    f"scans left out: no poses within {poses.max_gap_s} s of each other around them", 1
+                )
+                continue
+            taken += 1
+            columns = raw.read()
+            if not columns or len(next(iter(columns.values()))) == 0:
+                notes.count("scans left out: they hold no returns", 1)
+                continue
+            if fields is None:
+                fields = Fields.of(list(columns), request.fields, raw.name)
+                if fields.dialect is not None and fields.dialect.note:
+                    notes.add(fields.dialect.note)
+            cloud = fields.read(columns, raw.name)
+            notes.count(
+                "returns left out: a coordinate or the intensity is not a finite number", cloud.dropped
+            )
+            if len(cloud.points) == 0:
+                notes.count("scans left out: they hold no returns", 1)
+                continue
+            yield Scan(
+                cloud.points, T_world_sensor, cloud.intensities, cloud.doppler_mps, raw.time_s, cloud.sigma
+            )
+        if not taken and first_s is not None and not isinstance(poses.poses, np.ndarray):
+            msg = (
+                f"no scan has a pose: the first scan is at {first_s:.3f} s, the poses are from {poses.poses.span()}, "
+                f"and a gap between poses may be {poses.max_gap_s} s: are both of one clock?"
+            )
+            raise ValueError(msg)
+
+    return source
+
+
+def cloud_files(folder: Path) -> list[Path]:
+    """The scans of a folder, or of a folder of `SCAN_FOLDERS` in it, in natural order: of the kind with most files."""
+    for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
+        if not inner.is_dir():
+            continue
+        kinds: dict[str, list[Path]] = {}
+        for path in inner.iterdir():
+            suffix = path.suffix.lower()
+            if suffix not in CLOUD_SUFFIXES or path.name.startswith(".") or not path.is_file():
+                continue
+            if path.name.lower() in _NOT_SCANS or path.name in POSE_FILES or path.stem == _TRUTH_STEM:
+                continue
+            kinds.setdefault("text" if suffix in TEXT_SUFFIXES else suffix, []).append(path)
+        if kinds:
+            most = max(kinds.values(), key=len)
+            return sorted(most, key=natural)
+    return []
+
+
+def natural(path: Path) -> tuple[Any, ...]:
+    """To sort names as people do: scan_9 before scan_10."""
+    parts = re.split(r"(\d+)", path.name)
+    return tuple((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts))
+
+
+def times_of(files: list[Path]) -> list[float] | None:
+    """Times of scans, s, by their names, or by a file of times beside them; None if there are none.
+
+    A name that ends in a number with a point is a time in s; in 12, 15 or 18 digits or more, in ms, µs or ns. Shorter
+    ones are numbers of scans.
+    """
+    named = [_time_of(path.stem) for path in files]
+    times = [time for time in named if time is not None]
+    if len(times) == len(files) and len(set(times)) == len(files):
+        return times
+    for folder in (files[0].parent, files[0].parent.parent):
+        for name in TIME_FILES:
+            if (path := folder / name).is_file():
+                return _listed_times(path, len(files))
+    return None
+
+
+def _time_of(stem: str) -> float | None:
+    if parts := _SECONDS_AND_NANOSECONDS.search(stem):
+        return int(parts[1]) + 1e-9 * int(parts[2])
+    found = _TIME.search(stem)
+    if found is None:
+        return None
+    if "." in found[1]:
+        return float(found[1])
+    unit = next((unit for digits, unit in _UNITS if len(found[1]) > digits), 1.0)
+    return int(found[1]) * unit
+
+
+def _listed_times(path: Path, count: int) -> list[float]:
+    try:
+        times = [float(line.split()[-1]) for line in path.read_text("utf-8").splitlines() if line.strip()]
+    except ValueError as error:
+        msg = f"{path} does not hold a time in seconds in each line: {error}"
+        raise ValueError(msg) from error
+    if len(times) != count:
+        msg = f"{path} has {len(times)} times for {count} scans"
+        raise ValueError(msg)
+    return times
+
+
+def scan_poses(
+    poses: StampedPoses | NDArray[np.float64],
+    count: int,
+    times_s: Sequence[float] | None,
+    T_base_sensor: NDArray[np.float64] | None,
+    request: Request,
+) -> tuple[ScanPoses, Sequence[float] | None]:
+    """Which pose each of `count` scans has, and the times of the scans as far as they are then known.
+
+    Raises
+    ------
+    ValueError
+        If poses in order are not as many as the scans, or scans without time stamps meet poses that have them.
+    """
+    T = np.eye(4) if T_base_sensor is None else T_base_sensor
+    if isinstance(poses, np.ndarray):
+        if len(poses) != count:
+            msg = (
+                f"there are {count} scans but {len(poses)} poses: give as many poses as scans, or poses with time "
+                "stamps (TUM: time x y z qx qy qz qw) for scans with time stamps"
+            )
+            raise ValueError(msg)
+        return ScanPoses(poses, T, request.max_gap_s), times_s
+    if times_s is not None:
+        return ScanPoses(poses, T, request.max_gap_s), times_s
+    if isinstance(poses, Trajectory) and len(poses.times_s) == count:
+        request.notes.add(
+            f"the scans have no time stamps: they are matched to the {count} poses in their order"
+        )
+        matrices = poses.poses(poses.times_s, np.inf)
+        return ScanPoses(matrices, T, request.max_gap_s), [float(time_s) for time_s in poses.times_s]
+    msg = (
+        f"the {count} scans have no time stamps in their names or in {' or '.join(TIME_FILES)}, and the poses "
+        f"({poses.span()}) are not as many"
+    )
+    raise ValueError(msg)
+
+
+def files_source(
+    files: list[Path], times_s: Sequence[float] | None, request: Request
+) -> Callable[[], Iterator[RawScan]]:
+    """The scans in these files, one a file."""
+
+    def raw_scans() -> Iterator[RawScan]:
+        for i, path in enumerate(files):
+            yield RawScan(
+                lambda path=path: read_columns(path, request.columns),  # type: ignore[misc]
+                None if times_s is None else times_s[i],
+                str(path),
+            )
+
+    return raw_scans

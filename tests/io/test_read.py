@@ -1,0 +1,233 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The one door for files and folders: what comes out, in which order, with which poses, and what is said."""
+
+from __future__ import annotations
+
+import logging
+import tracemalloc
+
+import numpy as np
+import pytest
+import radarsdf
+from numpy.testing import assert_allclose, assert_array_equal
+from radarsdf.io import Scan, Scans, read, write_scans
+
+from ..conftest import pose
+from .test_folders import radar_cloud, write_pcd
+
+POSES = np.stack([pose([float(i), 2.0, 3.0], 0.1 * i) for i in range(11)])
+
+
+def clouds(folder, count=11, name="scan_{}.pcd"):
+    """Scan i holds i + 1 returns at x = i, with Power and Doppler."""
+    for i in range(count):
+        xyz = np.column_stack([np.full(i + 1, i), np.arange(i + 1), np.ones(i + 1)])
+        write_pcd(
+            folder / name.format(i), radar_cloud(xyz, Doppler=np.full(i + 1, -i), Power=np.arange(i + 1))
+        )
+    return folder
+
+
+def test_a_folder_in_natural_order(tmp_path):
+    scans = read(clouds(tmp_path), POSES)
+    for _ in range(2):  # it can be iterated again
+        seen = list(scans)
+        assert [len(scan) for scan in seen] == list(range(1, 12))
+    assert isinstance(seen[0], Scan)
+    scan = seen[10]
+    assert_array_equal(scan.points[:, 0], 10)
+    assert scan.points.dtype == np.float32
+    assert_array_equal(scan.T_world_sensor, POSES[10])
+    assert_array_equal(scan.intensities, np.arange(11))
+    assert_array_equal(scan.doppler_mps, -10)
+    assert scan.time_s is None
+    assert scan.sigma is None
+    assert len(scans) == 11
+    assert scans.notes == []
+
+
+def test_it_is_what_scans_always_were(tmp_path):
+    scans = read(clouds(tmp_path), POSES)
+    assert [len(p) for p in scans.points] == list(range(1, 12))
+    assert_array_equal(scans.poses, POSES)
+    assert_array_equal(scans.intensities[3], [0, 1, 2, 3])
+    assert_array_equal(scans.doppler_mps[3], -3)
+    assert scans.times_s is None
+    assert scans.sigmas is None
+    assert scans.ground_truth is None
+    assert [len(p) for p in scans.select(np.array([4, 2])).points] == [5, 3]
+    write_scans(tmp_path / "scans.npz", scans)
+    again = read(tmp_path / "scans.npz")
+    assert [len(s) for s in again] == list(range(1, 12))
+    assert_array_equal(np.concatenate(again.doppler_mps), np.concatenate(scans.doppler_mps))
+
+
+def test_reading_is_lazy(tmp_path):
+    clouds(tmp_path)
+    (tmp_path / "scan_5.pcd").write_bytes(b"damaged")
+    scans = read(tmp_path, POSES)
+    stream = iter(scans)
+    assert [len(next(stream)) for _ in range(5)] == [1, 2, 3, 4, 5]
+    with pytest.raises(ValueError, match=r"scan_5\.pcd is not a whole PCD file"):
+        next(stream)
+
+
+def test_memory_is_that_of_a_scan(tmp_path):
+    for i in range(30):
+        np.save(tmp_path / f"{i}.npy", np.ones((50_000, 4), np.float32))  # 0.8 MB
+    scans = read(tmp_path, np.tile(np.eye(4), (30, 1, 1)))
+    tracemalloc.start()
+    assert sum(len(scan) for scan in scans) == 30 * 50_000
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 6e6  # of 24 MB in all
+
+
+def test_fit_takes_scans_as_they_are(tmp_path):
+    rng = np.random.default_rng(0)
+    for i in range(3):
+        wall = np.column_stack([np.full(300, 8.0), rng.uniform(-3, 3, 300), rng.uniform(-1, 1, 300)])
+        np.save(tmp_path / f"{i}.npy", np.column_stack([wall, rng.uniform(50, 60, 300)]))
+    scans = read(tmp_path, POSES[:3])
+    config = radarsdf.FitConfig(training={"sdf_iterations": 5, "intensity_iterations": 5}, num_threads=1)
+    one = radarsdf.fit(scans, config=config)
+    other = radarsdf.fit(scans.points, scans.poses, scans.intensities, config=config)
+    x = np.array([[7.0, 2, 3], [8.5, 2, 3]])
+    assert_array_equal(one.sdf(x), other.sdf(x))
+    with pytest.raises(ValueError, match="poses are missing"):
+        radarsdf.fit(scans.points)
+
+
+def test_times_in_names_and_tum_poses(tmp_path):
+    clouds(tmp_path / "radar", 3, "cloud_1700000000.{}.pcd")
+    rows = ["1700000000.0 0 0 0 0 0 0 1", "1700000000.2 2 0 0 0 0 0.70710678 0.70710678"]
+    (tmp_path / "poses.tum").write_text("\n".join(rows))
+    scans = read(tmp_path)
+    assert_allclose(scans.times_s - 1.7e9, [0, 0.1, 0.2], atol=1e-6)
+    c = np.sqrt(0.5)
+    assert_allclose(scans.poses[1], [[c, -c, 0, 1], [c, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "time_s"),
+    [
+        ("1700000000123.pcd", 1700000000.123),
+        ("1700000000123456.pcd", 1700000000.123456),
+        ("1700000000123456789.pcd", 1700000000.123456789),
+        ("1700000000_123456789.pcd", 1700000000.123456789),
+        ("1700000000.pcd", 1700000000),
+    ],
+)
+def test_units_of_times(tmp_path, name, time_s):
+    write_pcd(tmp_path / name, radar_cloud([[1, 2, 3]]))
+    assert read(tmp_path, POSES[:1]).times_s == pytest.approx([time_s], abs=1e-6)
+
+
+def test_times_in_a_file(tmp_path):
+    clouds(tmp_path, 3, "{:06d}.pcd")
+    (tmp_path / "times.txt").write_text("0.5\n0.6\n0.7\n")
+    assert read(tmp_path, POSES[:3]).times_s.tolist() == [0.5, 0.6, 0.7]
+    (tmp_path / "times.txt").write_text("0.5\n0.6\n")
+    with pytest.raises(ValueError, match="2 times for 3 scans"):
+        read(tmp_path, POSES[:3])
+
+
+def test_scans_outside_of_the_poses_and_in_gaps_are_counted(tmp_path):
+    clouds(tmp_path, 8, "{}.0.pcd")
+    rows = [f"{t} {t} 0 0 0 0 0 1" for t in (1, 2, 3, 6, 7)]
+    (tmp_path / "poses.txt").write_text("\n".join(rows))
+    scans = read(tmp_path, max_gap_s=1.5)
+    assert scans.times_s.tolist() == [1, 2, 3, 6, 7]
+    assert scans.notes == ["3 scans left out: no poses within 1.5 s of each other around them"]
+    assert [len(s) for s in scans] == [2, 3, 4, 7, 8]
+    assert len(scans.notes) == 1
+    assert read(tmp_path, max_gap_s=3).times_s.tolist() == [1, 2, 3, 4, 5, 6, 7]
+    (tmp_path / "poses.txt").write_text("100 0 0 0 0 0 0 1\n101 0 0 0 0 0 0 1\n")
+    with pytest.raises(ValueError, match=r"first scan is at 0\.000 s, the poses are from 100\.0 to 101\.0 s"):
+        len(read(tmp_path))
+
+
+def test_what_is_not_finite_is_dropped_and_counted(tmp_path, caplog):
+    nan, inf = np.nan, np.inf
+    np.save(tmp_path / "0.npy", [[1, 2, 3, 4], [nan, 2, 3, 4], [1, inf, 3, 4], [1, 2, 3, nan]])
+    np.save(tmp_path / "1.npy", [[nan, 2, 3, 4.0]])
+    np.save(tmp_path / "2.npy", np.zeros((0, 4)))
+    np.save(tmp_path / "3.npy", [[5, 6, 7, 8.0]])
+    scans = read(tmp_path, POSES[:4])
+    with caplog.at_level(logging.WARNING, "radarsdf.io"):
+        assert [scan.points.tolist() for scan in scans] == [[[1, 2, 3]], [[5, 6, 7]]]
+    assert caplog.messages == scans.notes
+    assert scans.notes == [
+        "4 returns left out: a coordinate or the intensity is not a finite number",
+        "2 scans left out: they hold no returns",
+    ]
+    assert_array_equal(scans.poses, POSES[[0, 3]])
+
+
+def test_nothing_at_all(tmp_path):
+    np.save(tmp_path / "0.npy", np.full((3, 4), np.nan))
+    with pytest.raises(ValueError, match="no scan with a return and a pose; 3 returns left out"):
+        list(read(tmp_path, POSES[:1]))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="holds no scans"):
+        read(tmp_path / "empty", POSES[:1])
+
+
+def test_an_npz_of_ours_loses_what_is_not_finite(tmp_path):
+    points = [np.array([[1.0, 2, 3], [np.nan, 2, 3]]), np.array([[4.0, 5, 6]])]
+    scans = Scans(points, POSES[:2], [np.array([1.0, 2]), np.array([3.0])], times_s=np.array([5.0, 6]))
+    write_scans(tmp_path / "scans.npz", scans)
+    again = read(tmp_path / "scans.npz")
+    assert [scan.points.tolist() for scan in again] == [[[1, 2, 3]], [[4, 5, 6]]]
+    assert again.times_s.tolist() == [5, 6]
+    assert again.notes == ["1 returns left out: a coordinate or the intensity is not a finite number"]
+    with pytest.raises(ValueError, match="its own poses"):
+        read(tmp_path / "scans.npz", POSES[:2])
+
+
+def test_extrinsic(tmp_path):
+    clouds(tmp_path, 2)
+    mounting = pose([0.5, 0, 1], np.pi / 2)
+    assert_allclose(read(tmp_path, POSES[:2], extrinsic=mounting).poses, POSES[:2] @ mounting)
+    (tmp_path / "base_T_radar.txt").write_text(
+        "\n".join(" ".join(map(repr, row)) for row in mounting.tolist())
+    )
+    assert_allclose(read(tmp_path, POSES[:2]).poses, POSES[:2] @ mounting)
+    for wrong, message in ((np.eye(3), r"T_base_sensor \(4, 4\)"), (2 * np.eye(4), "not a rigid transform")):
+        with pytest.raises(ValueError, match=message):
+            read(tmp_path, POSES[:2], extrinsic=wrong)
+
+
+def test_ground_truth(tmp_path):
+    clouds(tmp_path, 2)
+    assert read(tmp_path, POSES[:2], ground_truth=[[1.0, 2, 3]]).ground_truth.tolist() == [[1, 2, 3]]
+    np.save(tmp_path / "lidar.npy", np.ones((4, 3)))
+    assert read(tmp_path, POSES[:2], ground_truth=tmp_path / "lidar.npy").ground_truth.shape == (4, 3)
+    write_pcd(tmp_path / "lidar.pcd", radar_cloud(np.zeros((5, 3))))
+    assert read(tmp_path, POSES[:2]).ground_truth.shape == (5, 3)
+
+
+def test_sentences(tmp_path):
+    clouds(tmp_path / "scans", 3)
+    with pytest.raises(ValueError, match=r"has no poses: give them by poses"):
+        read(tmp_path)
+    with pytest.raises(ValueError, match=r"3 scans but 2 poses: give as many poses as scans"):
+        read(tmp_path, POSES[:2])
+    with pytest.raises(FileNotFoundError, match=r"nowhere does not exist"):
+        read(tmp_path / "nowhere", POSES[:2])
+    with pytest.raises(FileNotFoundError, match=r"poses\.txt does not exist"):
+        read(tmp_path, tmp_path / "poses.txt")
+    (tmp_path / "scans.h5").write_bytes(b"HDF")
+    with pytest.raises(ValueError, match=r"scans\.h5 is of no kind that can be read"):
+        read(tmp_path / "scans.h5", POSES[:2])
+    with pytest.raises(ValueError, match='stamps must be "header" or "record"'):
+        read(tmp_path, POSES[:3], stamps="both")
+    rows = [f"{t} 0 0 0 0 0 0 1" for t in range(5)]
+    (tmp_path / "poses.tum").write_text("\n".join(rows))
+    with pytest.raises(ValueError, match=r"3 scans have no time stamps in their names"):
+        read(tmp_path)
+    (tmp_path / "poses.tum").write_text("\n".join(rows[:3]))
+    scans = read(tmp_path)
+    assert scans.notes == ["the scans have no time stamps: they are matched to the 3 poses in their order"]
+    assert scans.times_s.tolist() == [0, 1, 2]
