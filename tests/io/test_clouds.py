@@ -1,0 +1,256 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Files of one point cloud, in each format, and damaged ones."""
+
+from __future__ import annotations
+
+import builtins
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
+from radarsdf.io import read, read_points
+from radarsdf.io.clouds import read_columns
+from radarsdf.io.lzf import unpack_lzf
+from radarsdf.io.pcd import read_pcd
+
+from .test_folders import write_pcd
+
+TABLE = np.array([[1.5, -2, 3, 40.5], [4, 5, 6, 70]])
+IDENTITY = np.eye(4)[None]
+
+
+def one(path, **options):
+    (scan,) = read(path, IDENTITY, **options)
+    return scan
+
+
+def check(path, **options):
+    scan = one(path, **options)
+    assert_array_equal(scan.points, TABLE[:, :3])
+    assert_array_equal(scan.intensities, TABLE[:, 3])
+
+
+def packed_pcd(path, columns, packed, **header):
+    """A PCD file that is compressed; `packed` is made from its bytes, field by field."""
+    write_pcd(path, columns, DATA="binary_compressed", **header)
+    text = path.read_bytes().partition(b"DATA binary_compressed\n")
+    raw = b"".join(np.asarray(c).tobytes() for c in columns.values())
+    data = packed(raw)
+    path.write_bytes(text[0] + text[1] + struct.pack("<II", len(data), len(raw)) + data)
+
+
+def as_literals(raw):
+    """LZF without any reference."""
+    return b"".join(bytes([len(raw[i : i + 32]) - 1]) + raw[i : i + 32] for i in range(0, len(raw), 32))
+
+
+COLUMNS = {
+    "x": np.array([1.5, 4], np.float32),
+    "y": np.array([-2, 5], np.float32),
+    "z": np.array([3, 6], np.float32),
+    "power": np.array([40.5, 70]),
+}
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_pcd(tmp_path, data):
+    write_pcd(tmp_path / "a.pcd", COLUMNS, data)
+    check(tmp_path / "a.pcd")
+
+
+def test_compressed_pcd(tmp_path):
+    packed_pcd(tmp_path / "a.pcd", COLUMNS, as_literals)
+    assert {n: c.dtype for n, c in read_pcd(tmp_path / "a.pcd").items()} == {
+        n: c.dtype for n, c in COLUMNS.items()
+    }
+    check(tmp_path / "a.pcd")
+
+
+def test_compressed_pcd_of_many_points(tmp_path):
+    pypcd4 = pytest.importorskip(
+        "pypcd4", reason="pypcd4, whose compression is a reference, is not installed"
+    )
+    rng = np.random.default_rng(0)
+    table = np.round(rng.normal(size=(3000, 4)), 1).astype(np.float32)
+    table[1000:2000] = 7  # long references
+    cloud = pypcd4.PointCloud.from_points(table, ("x", "y", "z", "power"), (np.float32,) * 4)
+    cloud.save(tmp_path / "a.pcd", encoding=pypcd4.Encoding.BINARY_COMPRESSED)
+    columns = read_pcd(tmp_path / "a.pcd")
+    assert_array_equal(np.stack(list(columns.values()), axis=1), table)
+
+
+@pytest.mark.parametrize(
+    ("data", "unpacked"),
+    [
+        (b"\x02abc", b"abc"),
+        (b"\x00a\x20\x00", b"aaaa"),  # three from one byte back: it overlaps with itself
+        (b"\x01ab\xe0\x09\x01", b"ab" * 10),
+        (b"\x02abc\x20\x02", b"abcabc"),
+    ],
+)
+def test_lzf(data, unpacked):
+    assert unpack_lzf(data, len(unpacked)) == unpacked
+
+
+@pytest.mark.parametrize("data", [b"", b"\x02ab", b"\x00a\x20", b"\x00a\xe0", b"\x00a\x20\x05", b"\x03abcd"])
+def test_damaged_lzf(data):
+    with pytest.raises(ValueError, match=r"compressed data|before the beginning"):
+        unpack_lzf(data, 3)
+
+
+def test_a_compressed_pcd_that_would_unpack_to_gigabytes(tmp_path):
+    def bomb(_):
+        return b"\x00a" + b"\xe0\xff\x00" * 10
+
+    packed_pcd(tmp_path / "a.pcd", COLUMNS, bomb)
+    with pytest.raises(ValueError, match=r"a\.pcd is not a whole PCD file"):
+        read_pcd(tmp_path / "a.pcd")
+    data = (tmp_path / "a.pcd").read_bytes()
+    head, _, _ = data.partition(b"DATA binary_compressed\n")
+    head = head.replace(b"WIDTH 2", b"WIDTH 100000000")
+    (tmp_path / "a.pcd").write_bytes(
+        head + b"DATA binary_compressed\n" + struct.pack("<II", 32, 2_000_000_000) + bytes(32)
+    )
+    with pytest.raises(ValueError, match="do not fit"):
+        read_pcd(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("width", [4, 5, 7])
+def test_bin(tmp_path, width):
+    table = np.zeros((2, width), "<f4")
+    table[:, :4] = TABLE
+    if width >= 5:
+        table[:, 4] = [1, -2]
+    table.tofile(tmp_path / "a.bin")
+    check(tmp_path / "a.bin", columns=None if width == 4 else width)
+    scan = one(tmp_path / "a.bin", columns=width)
+    assert (scan.doppler_mps is None) == (width == 4)
+    if width > 4:
+        assert_array_equal(scan.doppler_mps, [1, -2])
+
+
+def test_bin_with_names(tmp_path):
+    np.column_stack([TABLE[:, 3], TABLE[:, :3], TABLE[:, :1]]).astype("<f4").tofile(tmp_path / "a.bin")
+    check(tmp_path / "a.bin", columns=["power", "x", "y", "z", "other"])
+    check(tmp_path / "a.bin", columns=5, fields={"x": 1, "y": 2, "z": 3, "intensity": 0, "doppler": None})
+    with pytest.raises(ValueError, match="no column 5 for intensity: it has 5"):
+        one(tmp_path / "a.bin", columns=5, fields={"intensity": 5})
+    with pytest.raises(ValueError, match=r"a\.bin.*no whole number of points of 4 float32.*columns"):
+        one(tmp_path / "a.bin")
+    with pytest.raises(ValueError, match="three numbers or more"):
+        one(tmp_path / "a.bin", columns=2)
+
+
+def test_npy(tmp_path):
+    np.save(tmp_path / "a.npy", TABLE)
+    check(tmp_path / "a.npy")
+    assert one(tmp_path / "a.npy").points.dtype == np.float64
+    records = np.zeros(2, [("Power", "f4"), ("X", "f8"), ("Y", "f8"), ("Z", "f8")])
+    for name, column in zip("XYZ", TABLE.T, strict=False):
+        records[name] = column
+    records["Power"] = TABLE[:, 3]
+    np.save(tmp_path / "a.npy", records)
+    check(tmp_path / "a.npy")
+    for wrong in (np.zeros(3), np.zeros((2, 2)), np.array([["a"] * 3])):
+        np.save(tmp_path / "a.npy", wrong)
+        with pytest.raises(ValueError, match=r"a\.npy is not a whole \.npy file of points"):
+            one(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y,z,intensity\n1.5,-2,3,40.5\n4,5,6,70\n",
+        "X;Y;Z;RCS\n1.5;-2;3;40.5\n4;5;6;70",
+        "1.5 -2 3 40.5\n4 5 6 70\n",
+        "# made by hand\n\n1.5\t-2\t3\t40.5\n4\t5\t6\t70\n",
+        '"power","x","y","z"\n40.5,1.5,-2,3\n70,4,5,6\n',
+        "//X Y Z Intensity\n1.5 -2 3 40.5\n4 5 6 70\n",
+    ],
+)
+def test_text(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text)
+    check(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    "text", ["x,y,z\n1,2\n", "1 2 3\n4 five 6\n", "x,y,x\n1,2,3\n", "1 2\n3 4\n", "\xff\xfe"]
+)
+def test_damaged_text(tmp_path, text):
+    (tmp_path / "a.txt").write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match=r"a\.txt"):
+        one(tmp_path / "a.txt")
+
+
+def test_ply(tmp_path):
+    header = "".join(
+        f"property {kind} {name}\n"
+        for kind, name in zip(["double"] * 3 + ["float"], ["x", "y", "z", "power"], strict=True)
+    )
+    rows = "".join(" ".join(map(repr, row)) + "\n" for row in (TABLE + [3380553.0, 0, 0, 0]).tolist())
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{header}end_header\n{rows}")
+    scan = one(tmp_path / "a.ply")
+    assert_array_equal(scan.points, TABLE[:, :3] + [3380553.0, 0, 0])  # in double precision
+    assert_array_equal(scan.intensities, TABLE[:, 3])
+    data = trimesh.PointCloud(TABLE[:, :3]).export(file_type="ply")
+    (tmp_path / "a.ply").write_bytes(data)
+    assert_array_equal(read_points(tmp_path / "a.ply"), TABLE[:, :3])
+    for size in (0, 20, len(data) - 5):
+        (tmp_path / "a.ply").write_bytes(data[:size])
+        with pytest.raises(ValueError, match=r"a\.ply"):
+            read_points(tmp_path / "a.ply")
+    rows = "1 2 3 4\n"
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 2000000000\n{header}end_header\n{rows}"
+    )
+    with pytest.raises(ValueError, match="2000000000"):
+        read_points(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_las(tmp_path, suffix):
+    laspy = pytest.importorskip("laspy", reason="the extra las is not installed")
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales, header.offsets = [0.001] * 3, [3380000, 0, 0]
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = (TABLE[:, :3] + [3380553, 0, 0]).T
+    path = tmp_path / f"a.{suffix}"
+    cloud.write(path)
+    assert_allclose(read_points(path), TABLE[:, :3] + [3380553, 0, 0], rtol=0, atol=1e-6)
+    data = bytearray(path.read_bytes())
+    data[107:111] = struct.pack("<I", 2**31)  # the number of points
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"2147483648 points, for which the file is too small"):
+        read_points(path)
+    path.write_bytes(data[:50])
+    with pytest.raises(ValueError, match=rf"a\.{suffix} is not a whole"):
+        read_points(path)
+
+
+def test_a_missing_extra_is_named(tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name.partition(".")[0] in ("laspy", "rosbags"):
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    (tmp_path / "a.las").touch()
+    with pytest.raises(ImportError, match=r'pip install "radarsdf\[las\]"'):
+        read_points(tmp_path / "a.las")
+    (tmp_path / "a.bag").touch()
+    with pytest.raises(ImportError, match=r'pip install "radarsdf\[ros\]"'):
+        read(tmp_path / "a.bag")
+
+
+def test_other_files(tmp_path):
+    (tmp_path / "a.doc").touch()
+    with pytest.raises(ValueError, match="no file of points: those end in"):
+        read_columns(tmp_path / "a.doc")
+    (tmp_path / "a.csv").touch()
+    with pytest.raises(ValueError, match="holds no points"):
+        read_points(tmp_path / "a.csv")

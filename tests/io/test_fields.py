@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The dialects of radar fields: each is recognised, whatever its case and order, and can be overridden."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from radarsdf.io import read
+from radarsdf.io.fields import DIALECTS, Fields
+
+from .test_folders import write_pcd
+
+CLOUDS = {
+    "Sensrad Hugin": ["x", "y", "z", "range", "doppler", "power"],
+    "Oculii Eagle": ["Doppler", "Range", "Power", "Alpha", "Beta", "x", "y", "z", "rangeAccu", "aziAccu", "eleAccu",
+                     "dopplerAccu", "recoveredSpeed", "denoiseFlag"],
+    "ARS548, nebula": ["x", "y", "z", "azimuth", "azimuth_std", "elevation", "elevation_std", "range", "range_std",
+                       "range_rate", "range_rate_std", "rcs", "ambiguity_flag"],
+    "ARS548, SNAIL-Radar": ["x", "y", "z", "doppler", "intensity", "range_std", "azimuth_std", "elevation_std",
+                            "doppler_std"],
+    "ARS548, HKUST RIO": ["range", "azimuth", "elevation", "velocity", "rcs", "rangeSTD", "azimuthSTD", "elevationSTD",
+                          "velocitySTD"],
+    "smartmicro": ["x", "y", "z", "radial_speed", "power", "rcs", "noise", "snr", "azimuth_angle", "elevation_angle",
+                   "range"],
+    "TI ti_mmwave": ["x", "y", "z", "intensity", "velocity"],
+    "TI reve": ["x", "y", "z", "snr_db", "noise_db", "v_doppler_mps"],
+    "radar_msgs/RadarScan": ["range", "azimuth", "elevation", "doppler_velocity", "amplitude"],
+    "View-of-Delft": ["x", "y", "z", "RCS", "v_r", "v_r_compensated", "time"],
+    "TJ4DRadSet": ["X", "Y", "Z", "V_r", "Range", "Power", "Alpha", "Beta"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_dialects(name):
+    for names in (CLOUDS[name], CLOUDS[name][::-1], [n.upper() for n in CLOUDS[name]]):
+        fields = Fields.of(names)
+        assert fields.dialect.name == name
+        by_role = {role: field.lower() for role, field in fields.names.items()}
+        assert by_role["doppler"] == fields.dialect.doppler
+        assert by_role["intensity"] == fields.dialect.intensity
+        assert ("sigma_range" in by_role) == (fields.dialect.sigma is not None)
+
+
+def test_there_are_twelve_dialects():
+    # One has the fields of another: as channels of another kind of message.
+    assert set(CLOUDS) | {"Oculii, NTU4DRadLM"} == {dialect.name for dialect in DIALECTS}
+    assert len(DIALECTS) == 12
+
+
+def test_fields_of_no_dialect():
+    fields = Fields.of(["z", "y", "x", "SNR"])
+    assert fields.dialect is None
+    assert fields.names == {"x": "x", "y": "y", "z": "z", "intensity": "SNR"}
+    assert Fields.of(["x", "y", "z"]).names.keys() == set("xyz")
+
+
+def test_overrides():
+    names = ["x", "y", "z", "doppler", "power", "rcs"]
+    assert Fields.of(names, {"intensity": "RCS"}).names["intensity"] == "rcs"
+    without_doppler = {"x": "x", "y": "y", "z": "z", "intensity": "rcs"}
+    assert Fields.of(names, {"intensity": 5, "doppler": None}).names == without_doppler
+    letters = {"x": "a", "y": "b", "z": "c"}
+    assert Fields.of(["a", "b", "c"], letters).names == letters
+    with pytest.raises(ValueError, match=r"no field snr for intensity: it has x, y, z, doppler, power, rcs"):
+        Fields.of(names, {"intensity": "snr"}, "a.pcd")
+    with pytest.raises(ValueError, match=r"no role 'strength': roles are x, y, z, range"):
+        Fields.of(names, {"strength": "power"})
+    with pytest.raises(ValueError, match=r"a\.pcd lacks the fields y, z: it has x, power"):
+        Fields.of(["x", "power"], None, "a.pcd")
+
+
+def test_polar_clouds():
+    columns = {
+        "range": np.array([10.0, 10, 10, np.nan]),
+        "azimuth": np.array([0, np.pi / 2, 0, 0]),
+        "elevation": np.array([0, 0, np.pi / 2, 0]),
+        "doppler_velocity": np.array([-1.0, 2, 3, 4]),
+        "amplitude": np.array([50.0, 60, 70, 80]),
+    }
+    cloud = Fields.of(list(columns)).read(columns, "the scan")
+    assert_allclose(cloud.points, [[10, 0, 0], [0, 10, 0], [0, 0, 10]], atol=1e-6)  # forward, left, up
+    assert_array_equal(cloud.doppler_mps, [-1, 2, 3])
+    assert_array_equal(cloud.intensities, [50, 60, 70])
+    assert cloud.dropped == 1
+
+
+def test_deviations():
+    ones = np.ones(2)
+    names = CLOUDS["Oculii Eagle"]
+    cloud = Fields.of(names).read(dict.fromkeys(names, ones), "the scan")
+    assert_allclose(
+        cloud.sigma, [[1, np.deg2rad(1), np.deg2rad(1)]] * 2, rtol=1e-6
+    )  # in degrees, like its angles
+    names = CLOUDS["ARS548, nebula"]
+    assert_array_equal(Fields.of(names).read(dict.fromkeys(names, ones), "the scan").sigma, np.ones((2, 3)))
+
+
+def test_precision_is_that_of_the_file():
+    for dtype in (np.float32, np.float64):
+        columns = {name: np.array([245821.25], dtype) for name in "xyz"}
+        assert Fields.of(list(columns)).read(columns, "the scan").points.dtype == dtype
+
+
+def test_a_later_scan_without_a_field():
+    fields = Fields.of(["x", "y", "z", "power"])
+    with pytest.raises(ValueError, match="b lacks the field power, which other scans have: it has x, y, z"):
+        fields.read({name: np.zeros(1) for name in "xyz"}, "b")
+    with pytest.raises(ValueError, match="b: the field power holds no numbers"):
+        fields.read({name: np.zeros(1) for name in "xyz"} | {"power": np.array(["a"])}, "b")
+
+
+def test_what_must_be_known_of_the_numbers(tmp_path):
+    names = CLOUDS["ARS548, SNAIL-Radar"]
+    write_pcd(tmp_path / "0.pcd", {name: np.ones(1, np.float32) for name in names})
+    scans = read(tmp_path, np.eye(4)[None])
+    assert len(scans) == 1
+    assert scans.notes == ["the intensities of ARS548 clouds with these fields are RCS + 128"]
