@@ -35,7 +35,7 @@ class Message:
     topic: str
     message_type: str
     recorded_s: float
-    raw: bytes
+    raw: bytes | memoryview
     cdr: bool
     """Whether it is of ROS 2."""
     bag: Path
@@ -64,6 +64,8 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
         for path in paths:
             reader = stack.enter_context(_opened(path))
             for connection in reader.connections:
+                if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+                    raise _damaged(path, ValueError("a topic has no name or no type"))
                 before = topics[connection.topic].count if connection.topic in topics else 0
                 topics[connection.topic] = Topic(
                     connection.topic, connection.msgtype, before + connection.msgcount
@@ -96,10 +98,11 @@ def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
                 connection, recorded_ns, raw = next(messages)
             except StopIteration:
                 return
-            except MemoryError:
-                raise
             except Exception as error:  # damaged bags raise exceptions of many kinds
                 raise _damaged(path, error) from error
+            # A database of SQLite may hold values of any type.
+            if not (isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))):
+                raise _damaged(path, ValueError("a message has no time or no bytes"))
             yield Message(connection.topic, connection.msgtype, 1e-9 * recorded_ns, raw, cdr, path)
 
 
@@ -116,8 +119,6 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
         reader.open()
-    except MemoryError:
-        raise
     except PermissionError:
         raise
     except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
@@ -130,6 +131,8 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _damaged(path: Path, error: Exception) -> ValueError:
     why = str(error) or type(error).__name__
+    if isinstance(error, MemoryError):  # rosbags reads as many bytes as a damaged size says
+        why = "a size in it is larger than the memory"
     way_out = ""
     if path.suffix.lower() == _ROS1_SUFFIX and "index" in why.lower():
         way_out = f"; if its recording was cut off, rosbag reindex {path.name} may mend it"

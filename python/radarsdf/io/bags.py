@@ -30,6 +30,7 @@ KNOWN_TOPICS = {
 }
 """Topics of radars in data sets, and of the poses there. They are preferred to others."""
 
+_PAUSE_S = 0.02  # the points of a scan are sent at once; scans are 30 ms apart or more
 _PEEKED = 400  # messages that are looked at for the clock, several scans even of one message a point
 
 
@@ -135,19 +136,19 @@ def _raw_scans(paths: list[Path], topic: Topic, by_record: bool) -> Iterator[Raw
 
 
 def _grouped(paths: list[Path], topic: Topic, by_record: bool) -> Iterator[RawScan]:
-    """Scans of messages of one point each. A scan begins where the number of the point does not grow."""
+    """Scans of messages of one point each. A scan begins where the number of the point does not grow, or after a pause."""
     points: list[CloudMessage] = []
-    last, start_s, number = -1, 0.0, 0
+    last, last_s, start_s, number = -1, 0.0, 0.0, 0
     for message in messages_of(paths, {topic.name}):
         cloud = _read(message)
         point_id = -1 if cloud.point_id is None else cloud.point_id
-        if points and point_id <= last:
+        if points and (point_id <= last or message.recorded_s > last_s + _PAUSE_S):
             yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}")
             points, number = [], number + 1
         if not points:
             start_s = message.recorded_s if by_record else cloud.header.stamp_s
         points.append(cloud)
-        last = point_id
+        last, last_s = point_id, message.recorded_s
     if points:
         yield _joined(points, start_s, f"{paths[-1]}: scan {number} of {topic.name}")
 

@@ -26,6 +26,7 @@ POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.tx
 """Names of files of poses that are found beside scans."""
 
 _TUM_COLUMNS, _KITTI_COLUMNS, _MATRIX_COLUMNS = 8, 12, 16
+_MIN_QUATERNION, _MAX_QUATERNION = 0.49, 1.01  # largest of the four numbers of a unit quaternion
 _CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam")
 
 
@@ -230,10 +231,9 @@ def trajectory_of(
         raise ValueError(msg)
     xyz = np.asarray(positions, np.float64).reshape(-1, 3)[first]
     quats = np.asarray(quaternions, np.float64).reshape(-1, 4)[first]
-    if not (
-        np.isfinite(xyz).all() and np.isfinite(quats).all() and (np.linalg.norm(quats, axis=1) > 0.5).all()
-    ):
-        msg = f"{name} holds poses that are not finite, or without a rotation"
+    largest = np.abs(quats).max(axis=1)  # not the length, whose square overflows for damaged numbers
+    if not (np.isfinite(xyz).all() and ((largest >= _MIN_QUATERNION) & (largest <= _MAX_QUATERNION)).all()):
+        msg = f"{name} holds poses that are not finite, or without a unit quaternion"
         raise ValueError(msg)
     return Trajectory(times, xyz, Rotation.from_quat(quats), name)
 

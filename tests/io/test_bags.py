@@ -1,0 +1,392 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Bags of ROS 1 and ROS 2: each kind of message, each source of poses, clocks, several bags, and damaged ones."""
+
+from __future__ import annotations
+
+import contextlib
+import tracemalloc
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from radarsdf.io import read
+
+from ..conftest import pose
+
+pytest.importorskip("rosbags", reason="the extra ros is not installed")
+
+from bench.bag_writing import KINDS, BagWriter
+
+START_S = 1_700_000_000.0
+TIMES_S = START_S + np.arange(5) * 0.1
+NO_EXTRINSIC = (
+    "no extrinsic is known between the frame of /odom, base_link, and that of the scans, radar: the poses are taken as "
+    "those of the radar; give extrinsic if they are not"
+)
+MOUNTING = pose([0.5, 0.0, 1.0], np.pi / 2)
+
+
+def moved(time_s):
+    """The pose of the base: 1 m/s along x, 0.5 rad/s to the left."""
+    return pose([time_s - START_S, 0, 0], 0.5 * (time_s - START_S))
+
+
+MOVED = np.stack([moved(t) for t in TIMES_S])
+
+
+def columns(i):
+    """i + 1 returns of scan i."""
+    ones = np.ones(i + 1, np.float32)
+    return {
+        "x": i * ones,
+        "y": 2 * ones,
+        "z": 3 * ones,
+        "doppler": -ones,
+        "power": 50 + np.arange(i + 1, dtype=np.float32),
+    }
+
+
+def name(folder, kind, stem="drive"):
+    return folder / (f"{stem}.bag" if kind == "ros1" else stem)
+
+
+def scans_and(folder, kind, write_poses, cloud=BagWriter.cloud2, times_s=TIMES_S, **options):
+    """A bag of scans in the frame radar, and what `write_poses(bag)` adds. It was recorded 0.02 s after the stamps."""
+    path = name(folder, kind)
+    with BagWriter(path, kind) as bag:
+        write_poses(bag)
+        for i, time_s in enumerate(times_s):
+            bag.write("/radar", cloud(bag, time_s, columns(i), **options), time_s + 0.02)
+    return path
+
+
+def odometry(bag):
+    for time_s in START_S + np.arange(-1, 12) * 0.05:
+        bag.write("/odom", bag.odometry(time_s, moved(time_s)), time_s + 0.001)
+
+
+def check(scans, poses=MOVED, notes=None):
+    for _ in range(2):
+        seen = list(scans)
+        assert len(seen) == 5
+        for i, scan in enumerate(seen):
+            assert_array_equal(scan.points, np.column_stack([columns(i)[axis] for axis in "xyz"]))
+            assert_array_equal(scan.intensities, columns(i)["power"])
+            assert_array_equal(scan.doppler_mps, -1)
+    assert_allclose(scans.times_s, TIMES_S, rtol=0, atol=1e-6)
+    assert_allclose(scans.poses, poses, rtol=0, atol=1e-4)  # 1 m/s interpolated on a bend
+    if notes is not None:
+        assert scans.notes == notes
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cloud2_and_odometry(tmp_path, kind):
+    path = scans_and(tmp_path, kind, odometry)
+    notes = ["poses: 13 of /odom", NO_EXTRINSIC]
+    check(read(path), notes=notes)
+    check(read(path, extrinsic=MOUNTING), MOVED @ MOUNTING, notes[:1])
+    check(read(path, topic="/radar", pose_topic="/odom"))
+    if kind != "ros1":  # the file in the folder too
+        (file,) = [p for p in path.iterdir() if p.suffix in (".db3", ".mcap")]
+        check(read(file))
+    check(read(path, fields={"intensity": "Power"}))
+    no_doppler = read(path, fields={"doppler": None})
+    assert no_doppler.doppler_mps is None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "options",
+    [{"padding": 7}, {"height": 1, "big_endian": True}],
+    ids=["padding", "big-endian"],
+)
+def test_layouts_of_cloud2(tmp_path, kind, options):
+    check(read(scans_and(tmp_path, kind, odometry, **options)))
+
+
+def test_cloud2_in_rows_with_other_types(tmp_path):
+    cloud = {
+        "rcs": np.array([-3, 4, 5, 6, 7, 8], np.int8), "x": np.arange(6.0), "y": np.arange(6.0), "z": np.arange(6.0),
+        "ring": np.arange(6, dtype=np.uint16),
+    }  # fmt: skip
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        odometry(bag)
+        message = bag.cloud2(START_S, cloud, height=2, padding=3)
+        rows = np.asarray(message.data).reshape(2, -1)
+        message.data = np.concatenate([np.pad(row, (0, 10)) for row in rows])  # space after each row
+        message.row_step += 10
+        bag.write("/radar", message, START_S)
+    (scan,) = read(tmp_path / "a.bag")
+    assert_array_equal(scan.points, np.stack([np.arange(6.0)] * 3, axis=1))
+    assert_array_equal(scan.intensities, [-3, 4, 5, 6, 7, 8])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cloud_with_channels(tmp_path, kind):
+    check(read(scans_and(tmp_path, kind, odometry, BagWriter.cloud)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_radar_msgs(tmp_path, kind):
+    with BagWriter(name(tmp_path, kind), kind) as bag:
+        odometry(bag)
+        for i, time_s in enumerate(TIMES_S):
+            bag.write(
+                "/scan",
+                bag.radar_scan(time_s, [[10, 0, 0, -1, 50], [10, np.pi / 2, 0, 2, 60]][: 1 + i % 2]),
+                time_s,
+            )
+    scans = list(read(name(tmp_path, kind)))
+    assert [len(scan) for scan in scans] == [1, 2, 1, 2, 1]
+    assert_allclose(scans[1].points, [[10, 0, 0], [0, 10, 0]], atol=1e-5)
+    assert_array_equal(scans[1].doppler_mps, [-1, 2])
+    assert_array_equal(scans[1].intensities, [50, 60])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_point_a_message(tmp_path, kind):
+    """The number of the point restarts with each scan; of the third, the first point was lost."""
+    with BagWriter(name(tmp_path, kind), kind) as bag:
+        odometry(bag)
+        for i, ids in enumerate(([0, 1, 2], [0], [1, 2], [0, 1])):
+            for n in ids:
+                message = bag.ti_point(TIMES_S[i], n, [i, n, 1], -2.0, 7.0 + n)
+                bag.write("/ti_mmwave/radar_scan", message, TIMES_S[i] + 0.001 * n)
+    scans = read(name(tmp_path, kind))
+    assert [scan.points.tolist() for scan in scans] == [
+        [[0, 0, 1], [0, 1, 1], [0, 2, 1]], [[1, 0, 1]], [[2, 1, 1], [2, 2, 1]], [[3, 0, 1], [3, 1, 1]],
+    ]  # fmt: skip
+    assert_allclose(scans.times_s, TIMES_S[:4], rtol=0, atol=1e-6)
+    assert_array_equal(scans.intensities[0], [7, 8, 9])
+    assert_array_equal(scans.doppler_mps[0], -2)
+    by_order = read(name(tmp_path, kind), MOVED[:4])
+    assert_allclose(by_order.poses, MOVED[:4])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stamped_poses(tmp_path, kind):
+    def write(bag):
+        for time_s in TIMES_S:
+            bag.write("/pose", bag.pose_stamped(time_s, moved(time_s)), time_s)
+
+    check(read(scans_and(tmp_path, kind, write)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_paths_the_last_counts(tmp_path, kind):
+    def write(bag):
+        for count in (2, 5):  # the second one is corrected
+            poses = {t: moved(t) @ pose([5.0 - count, 0, 0]) for t in TIMES_S[:count]}
+            bag.write("/path", bag.path(poses), TIMES_S[count - 1])
+
+    check(read(scans_and(tmp_path, kind, write)))
+
+
+def tree(bag, static_topic="/tf_static", base="base_link"):
+    """map -> odom -> base_link -> mast -> radar: the first is constant but published again and again."""
+    mast = {(base, "mast"): pose([0, 0, 1.0]), ("mast", "radar"): pose([0.5, 0, 0], np.pi / 2)}
+    bag.write(static_topic, bag.transforms(START_S - 3, mast), START_S - 3)
+    for time_s in START_S + np.arange(-1, 12) * 0.05:
+        edges = {("odom", base): moved(time_s), ("map", "odom"): pose([100.0, 0, 0])}
+        bag.write("/tf", bag.transforms(time_s, edges), time_s)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_tree_of_transforms(tmp_path, kind):
+    path = scans_and(tmp_path, kind, tree)
+    world = pose([100.0, 0, 0])
+    check(read(path), world @ MOVED @ MOUNTING, ["poses: TF, map -> odom -> base_link -> mast -> radar"])
+    check(read(path, world_frame="odom"), MOVED @ MOUNTING)
+    check(read(path, pose_topic="/tf", extrinsic=pose([0, 0, 2.0])), world @ MOVED @ pose([0, 0, 2.0]))
+    with pytest.raises(
+        ValueError, match="world_frame earth is not above radar, whose frames are radar -> mast"
+    ):
+        read(path, world_frame="earth")
+
+
+def test_tree_without_the_radar(tmp_path):
+    path = scans_and(tmp_path, "mcap", tree, frame="hugin")
+    with pytest.raises(
+        ValueError, match="do not lead to the frame of the scans, hugin: they have base_link, mast"
+    ):
+        read(path)
+    check(read(path, extrinsic=MOUNTING), pose([100.0, 0, 0]) @ MOVED @ MOUNTING)
+
+
+def test_the_extrinsic_is_in_the_static_transforms(tmp_path):
+    def write(bag):
+        odometry(bag)
+        mast = {("base_link", "mast"): pose([0, 0, 1.0]), ("mast", "radar"): pose([0.5, 0, 0], np.pi / 2)}
+        bag.write("/tf_static", bag.transforms(START_S, mast), START_S)
+
+    notes = ["poses: 13 of /odom", "extrinsic: of the static transforms, base_link -> radar"]
+    check(read(scans_and(tmp_path, "mcap", write)), MOVED @ MOUNTING, notes)
+
+
+def test_a_tree_that_does_not_move_or_runs_in_a_circle(tmp_path):
+    def still(bag):
+        bag.write("/tf", bag.transforms(START_S, {("map", "radar"): np.eye(4)}), START_S)
+
+    def circle(bag):
+        edges = {("a", "radar"): np.eye(4), ("radar", "a"): np.eye(4)}
+        bag.write("/tf", bag.transforms(START_S, edges), START_S)
+
+    for write, message in ((still, "no transform between map and radar moves"), (circle, "run in a circle")):
+        folder = tmp_path / write.__name__
+        folder.mkdir()
+        with pytest.raises(ValueError, match=message):
+            read(scans_and(folder, "mcap", write))
+
+
+@pytest.mark.parametrize("stamp_s", [0.0, 12.0])
+def test_stamps_that_are_zero_or_stand_still(tmp_path, stamp_s):
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        odometry(bag)
+        for i, time_s in enumerate(TIMES_S):
+            bag.write("/radar", bag.cloud2(stamp_s, columns(i), "base_link"), time_s)
+    why = "stand still" if stamp_s else "are zero"
+    scans = read(tmp_path / "a.bag")
+    assert scans.notes[0] == f"the header stamps of /radar {why}: the record time is used instead"
+    check(scans)
+    with pytest.raises(ValueError, match="no scan has a pose: the first scan is at"):
+        list(read(tmp_path / "a.bag", stamps="header"))
+
+
+def test_the_record_time_when_wanted(tmp_path):
+    path = scans_and(tmp_path, "mcap", odometry)
+    scans = read(path, stamps="record")
+    assert_allclose(scans.times_s, TIMES_S + 0.02, rtol=0, atol=1e-6)
+
+
+def test_poses_of_a_file(tmp_path):
+    path = scans_and(tmp_path, "mcap", lambda _: None)
+    with pytest.raises(
+        ValueError, match=r"has no poses \(Odometry, PoseStamped, Path or TF\): give them by poses"
+    ):
+        read(path)
+    rows = [
+        f"{t:.6f} {t - START_S:.6f} 0 0 0 0 {np.sin((t - START_S) / 4):.9f} {np.cos((t - START_S) / 4):.9f}"
+        for t in TIMES_S
+    ]
+    (tmp_path / "poses.tum").write_text("\n".join(rows))
+    check(read(path, tmp_path / "poses.tum"))
+    check(read(path, MOVED))
+    with pytest.raises(ValueError, match="5 scans but 3 poses"):
+        read(path, MOVED[:3])
+    check(read(tmp_path))  # a folder of bags, with a file of poses
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_several_bags(tmp_path, kind):
+    """Poses in one, scans in two others; given in any order."""
+    paths = [name(tmp_path, kind, stem) for stem in ("b", "c", "a")]
+    with BagWriter(paths[0], kind) as bag:
+        odometry(bag)
+    for path, part in ((paths[1], range(3, 5)), (paths[2], range(3))):
+        with BagWriter(path, kind) as bag:
+            for i in part:
+                bag.write("/radar", bag.cloud2(TIMES_S[i], columns(i)), TIMES_S[i])
+    check(read(paths))
+    check(read(tmp_path))
+    check(read(paths[1:], poses=paths[0]))
+
+
+def test_choices_that_are_not_clear(tmp_path):
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        odometry(bag)
+        for topic in ("/left/points", "/right/points"):
+            bag.write(topic, bag.cloud2(START_S, columns(1)), START_S)
+    with pytest.raises(ValueError, match=r"say by topic which is the radar's, of /left/points \(sensor_msgs"):
+        read(tmp_path / "a.bag")
+    assert len(read(tmp_path / "a.bag", topic="/right/points")) == 1
+    with pytest.raises(ValueError, match="has no topic /up: topics with points are /left/points"):
+        read(tmp_path / "a.bag", topic="/up")
+    with pytest.raises(ValueError, match="/odom has messages nav_msgs/msg/Odometry"):
+        read(tmp_path / "a.bag", topic="/odom")
+    with pytest.raises(ValueError, match="has no poses in /left/points: topics with poses are /odom"):
+        read(tmp_path / "a.bag", topic="/left/points", pose_topic="/left/points")
+    with BagWriter(tmp_path / "b.bag", "ros1") as bag:
+        for topic in ("/gps", "/slam"):
+            bag.write(topic, bag.pose_stamped(START_S, np.eye(4)), START_S)
+        bag.write("/lidar", bag.cloud2(START_S, columns(1)), START_S)
+        bag.write("/front_radar", bag.cloud2(START_S, columns(1)), START_S)  # the radar, by its name
+    with pytest.raises(ValueError, match="say by pose_topic which one counts, of /gps, /slam"):
+        read(tmp_path / "b.bag")
+    with pytest.raises(ValueError, match="/gps holds 1 poses at different times"):
+        read(tmp_path / "b.bag", pose_topic="/gps")
+    with BagWriter(tmp_path / "c.bag", "ros1") as bag:
+        odometry(bag)
+    with pytest.raises(
+        ValueError, match=r"has no topic with points .*: it has /odom \(nav_msgs/msg/Odometry\)"
+    ):
+        read(tmp_path / "c.bag")
+    with pytest.raises(ValueError, match="is no bag: only bags can be read together"):
+        read([tmp_path / "a.bag", tmp_path])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_bags(tmp_path, kind):
+    path = scans_and(tmp_path, kind, odometry)
+    file = path if kind == "ros1" else next(p for p in path.iterdir() if p.suffix in (".db3", ".mcap"))
+    whole = file.read_bytes()
+    sizes = (0, 10, len(whole) // 3, len(whole) - 200)
+    for size in sizes[:-1] if kind == "sqlite3" else sizes:  # whose last page is empty
+        file.write_bytes(whole[:size])
+        for target in {path, file}:
+            with pytest.raises(ValueError, match="is not a whole") as error:
+                list(read(target))
+            assert str(tmp_path) in str(error.value)
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        data = bytearray(whole)
+        for at in rng.integers(len(data), size=8):
+            data[at] = rng.integers(256)
+        file.write_bytes(data)
+        with contextlib.suppress(ValueError, OSError):  # read or refused; nothing else
+            list(read(file, max_gap_s=1e9))
+    if kind != "ros1":
+        file.unlink()
+        with pytest.raises(ValueError, match="is not a whole bag"):
+            read(path)
+        (path / "metadata.yaml").write_text(
+            "rosbag2_bagfile_information: !!python/object/apply:os.getcwd []\n"
+        )
+        with pytest.raises(ValueError, match="is not a whole bag"):
+            read(path)
+
+
+def test_a_message_that_claims_more_than_it_holds(tmp_path):
+    for change in (
+        {"width": 2**31},
+        {"height": 2**31},
+        {"point_step": 2**31},
+        {"row_step": 2**31, "height": 2},
+    ):
+        path = tmp_path / f"{next(iter(change))}.bag"
+        with BagWriter(path, "ros1") as bag:
+            odometry(bag)
+            message = bag.cloud2(START_S, columns(3))
+            for field, value in change.items():
+                setattr(message, field, value)
+            bag.write("/radar", message, START_S)
+        with pytest.raises(ValueError, match=r"is not a whole sensor_msgs/msg/PointCloud2: .*do not fit"):
+            list(read(path))
+
+
+def test_memory_is_that_of_a_message(tmp_path):
+    """A bag of 60 MB, mostly of another sensor, is read in less than a sixth of that."""
+    rng = np.random.default_rng(0)
+    cloud = {axis: rng.normal(size=20_000).astype(np.float32) for axis in "xyz"}
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        odometry(bag)
+        for i in range(250):
+            time_s = START_S + 0.002 * i
+            bag.write("/radar" if i % 5 == 0 else "/lidar", bag.cloud2(time_s, cloud), time_s)
+    assert (tmp_path / "a.bag").stat().st_size > 60e6
+    scans = read(tmp_path / "a.bag", topic="/radar")
+    tracemalloc.start()
+    assert sum(len(scan) for scan in scans) == 50 * 20_000
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10e6
