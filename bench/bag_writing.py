@@ -125,7 +125,7 @@ class BagWriter:
 
     def cloud(self, stamp_s: float, columns: Mapping[str, ArrayLike], frame: str = "radar") -> Any:
         """A PointCloud: x, y and z, and the others as channels."""
-        arrays = {name: np.asarray(column, np.float32) for name, column in columns.items()}
+        arrays = {name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}
         points = [
             self.make("geometry_msgs/msg/Point32", *map(float, row))
             for row in zip(*(arrays.pop(axis) for axis in "xyz"), strict=True)

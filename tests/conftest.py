@@ -25,17 +25,22 @@ class Scene:
 
 
 def recorded_scans(name):
-    """The file of a recorded drive; without it the test is skipped, for its licence keeps it out of the repository.
+    """The file of a recorded drive; without it the test is skipped."""
+    return recorded_file(f"astyx/{name}.npz")
+
+
+def recorded_file(name):
+    """A file of recorded data; without it the test is skipped, for its licence keeps it out of the repository.
 
     It is looked for in the folder that RADARSDF_DATA names, else in shared/data of a folder above this one.
     """
     above = [folder / "shared" / "data" for folder in Path(__file__).resolve().parents]
     named = os.environ.get("RADARSDF_DATA")
     for folder in above if named is None else [Path(named)]:
-        if (path := folder / "astyx" / f"{name}.npz").exists():
+        if (path := folder / name).exists():
             return path
     where = "in shared/data of a folder above" if named is None else "where RADARSDF_DATA says"
-    return pytest.skip(f"no astyx/{name}.npz {where}")
+    return pytest.skip(f"no {name} {where}")
 
 
 def pose(position, yaw_rad=0.0):

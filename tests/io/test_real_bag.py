@@ -1,0 +1,59 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A real ROS 1 bag of a handheld radar, whose header stamps are all zero, becomes the scans that it holds."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from radarsdf.io import read
+
+from ..conftest import recorded_file
+
+pytest.importorskip("rosbags", reason="the extra ros is not installed")
+
+
+def bag_and_poses():
+    return recorded_file("ti_iwr6843/ti_mmwave_rospkg_demo.bag"), recorded_file("ti_iwr6843/poses.tum")
+
+
+def test_it_becomes_the_scans_that_it_holds():
+    bag, poses = bag_and_poses()
+    scans = read(bag, poses)
+    with np.load(recorded_file("ti_iwr6843/ti_scene.npz")) as expected:
+        assert_array_equal(np.concatenate(scans.points), expected["points"])
+        assert_array_equal(np.concatenate(scans.intensities), expected["intensity"])
+        assert_array_equal(np.concatenate(scans.doppler_mps), expected["doppler"])
+        assert_array_equal([len(p) for p in scans.points], np.bincount(expected["frame"]))
+        # The expected poses were not rounded as those of the text file, and not interpolated.
+        assert_allclose(scans.poses, expected["poses"], rtol=0, atol=2e-6)
+        # Of the record time, the expected times are a smooth version.
+        assert_allclose(np.diff(scans.times_s), np.diff(expected["times"]), rtol=0, atol=0.02)
+    assert scans.notes == [
+        "the header stamps of /ti_mmwave/radar_scan_pcl are zero: the record time is used instead",
+        "197 scans left out: no poses within 0.5 s of each other around them",
+    ]
+
+
+def test_its_way_out_without_poses():
+    bag, poses = bag_and_poses()
+    with pytest.raises(
+        ValueError, match=r"has no poses \(Odometry, PoseStamped, Path or TF\): give them by poses"
+    ):
+        read(bag)
+    with pytest.raises(ValueError, match="are both of one clock"):
+        list(read(bag, poses, stamps="header"))
+
+
+def test_it_is_said_on_standard_error_by_default():
+    bag, poses = bag_and_poses()
+    code = "import sys; from radarsdf.io import read; print(sum(map(len, read(*sys.argv[1:]))))"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(bag), str(poses)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "10403\n"
+    assert done.stderr.splitlines()[0].startswith("the header stamps of /ti_mmwave/radar_scan_pcl are zero")
