@@ -73,7 +73,7 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
     return topics
 
 
-def messages_of(paths: list[Path], names: set[str]) -> Iterator[Message]:
+def messages_of(paths: list[Path], names: set[str]) -> Generator[Message, None, None]:
     """The messages of some topics of bags, in the order in which they were recorded, one after another.
 
     Raises

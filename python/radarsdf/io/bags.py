@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ KNOWN_TOPICS = {
 """Topics of radars in data sets, and of the poses there. They are preferred to others."""
 
 _PAUSE_S = 0.02  # the points of a scan are sent at once; scans are 30 ms apart or more
-_PEEKED = 400  # messages that are looked at for the clock, several scans even of one message a point
+_PEEKED_SCANS, _PEEKED_POINTS = 10, 400  # messages that are looked at for the clock: several scans
 
 
 def read_bags(
@@ -47,14 +48,14 @@ def read_bags(
             raise ValueError(msg)
     topics = topics_of(paths)
     topic = _scan_topic(topics, request.topic, paths)
-    first = _first(paths, topic)
-    by_record = _by_record(paths, topic, request)
+    peeked = _peek(paths, topic)
+    by_record = _by_record(peeked, topic, request)
     poses: Any = request.poses
     T_base_sensor = request.extrinsic
     if poses is None or _is_bag_of_poses(poses):
         pose_paths = paths if poses is None else [Path(poses)]
         poses, T_base_sensor = poses_in_bags(
-            pose_paths, request, first.header.frame, KNOWN_TOPICS.get(topic.name)
+            pose_paths, request, peeked[0].header.frame, KNOWN_TOPICS.get(topic.name)
         )
     else:
         poses = poses_of(poses, request.notes)
@@ -103,19 +104,22 @@ def _scan_topic(topics: dict[str, Topic], wanted: str | None, paths: list[Path])
     raise ValueError(msg)
 
 
-def _first(paths: list[Path], topic: Topic) -> CloudMessage:
-    """The first message of a topic."""
-    for message in messages_of(paths, {topic.name}):
-        return _read(message)
-    msg = f"{paths[0]}: the topic {topic.name} has no messages"
-    raise ValueError(msg)
+def _peek(paths: list[Path], topic: Topic) -> list[CloudMessage]:
+    """The first messages of a topic, as many as it takes to know its clock."""
+    count = _PEEKED_POINTS if topic.message_type == POINT_A_MESSAGE else _PEEKED_SCANS
+    with closing(messages_of(paths, {topic.name})) as messages:
+        peeked = [_read(message) for message in itertools.islice(messages, count)]
+    if not peeked:
+        msg = f"{paths[0]}: the topic {topic.name} has no messages"
+        raise ValueError(msg)
+    return peeked
 
 
-def _by_record(paths: list[Path], topic: Topic, request: Request) -> bool:
+def _by_record(peeked: list[CloudMessage], topic: Topic, request: Request) -> bool:
     """Whether the times of scans are when they were recorded: as wanted, or where stamps are zero or stand still."""
     if request.stamps is not None:
         return request.stamps == "record"
-    stamps = [_read(m).header.stamp_s for m in itertools.islice(messages_of(paths, {topic.name}), _PEEKED)]
+    stamps = [cloud.header.stamp_s for cloud in peeked]
     if not any(stamps):
         request.notes.add(f"the header stamps of {topic.name} are zero: the record time is used instead")
         return True

@@ -167,12 +167,12 @@ class Fields:
             intensities = self._column(columns, "intensity")
             doppler = self._column(columns, "doppler")
             sigma = self._sigma(columns)
-        with np.errstate(invalid="ignore"):
-            finite = np.isfinite(points).all(axis=1)
+        # All at once first: that is usual, and row by row takes ten times as long.
+        if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
+            return Cloud(points, intensities, doppler, sigma, 0)
+        finite = np.isfinite(points).all(axis=1)
         if intensities is not None:
             finite &= np.isfinite(intensities)
-        if finite.all():
-            return Cloud(points, intensities, doppler, sigma, 0)
         return Cloud(
             points[finite],
             None if intensities is None else intensities[finite],

@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 _MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
 _ROUNDED_S = 1e-3
+_NEARLY_SAME = 1 - 1e-9  # cosine of half an angle so small that its sine and itself are equal to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +71,16 @@ class Trajectory:
         if gap_s > max_gap_s:
             return None
         share = 0.0 if before == after else (time_s - self.times_s[before]) / gap_s
-        first = self.rotations[before]
-        turn = (first.inv() * self.rotations[after]).as_rotvec()
         pose = np.eye(4)
-        pose[:3, :3] = (first * Rotation.from_rotvec(share * turn)).as_matrix()
+        pose[:3, :3] = _matrix(_slerp(self._quaternions[before], self._quaternions[after], share))
         pose[:3, 3] = (1 - share) * self.positions[before] + share * self.positions[after]
         return pose
+
+    @cached_property
+    def _quaternions(self) -> NDArray[np.float64]:
+        """(P, 4) qx, qy, qz, qw of `rotations`."""
+        quaternions: NDArray[np.float64] = self.rotations.as_quat()
+        return quaternions
 
     def move(
         self, points: NDArray[np.float64], times_s: NDArray[np.float64], max_gap_s: float
@@ -108,6 +115,30 @@ class Trajectory:
             raise ValueError(msg)
         positions = [np.interp(times_s, self.times_s, self.positions[:, axis]) for axis in range(3)]
         return Slerp(self.times_s, self.rotations)(times_s), np.stack(positions, axis=1)
+
+
+def _slerp(first: NDArray[np.float64], last: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    """The unit quaternion (4,) between two, on the shorter way. SciPy's takes ten times as long for one."""
+    cosine = float(first @ last)
+    if cosine < 0:
+        last, cosine = -last, -cosine
+    if cosine > _NEARLY_SAME:
+        mixed = (1 - share) * first + share * last
+    else:
+        angle = math.acos(cosine)
+        mixed = (math.sin((1 - share) * angle) * first + math.sin(share * angle) * last) / math.sin(angle)
+    unit: NDArray[np.float64] = mixed / math.sqrt(mixed @ mixed)
+    return unit
+
+
+def _matrix(quaternion: NDArray[np.float64]) -> list[list[float]]:
+    """The rotation matrix (3, 3) of a unit quaternion."""
+    x, y, z, w = quaternion.tolist()
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 def read_trajectory(path: Path) -> Trajectory:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,7 +98,7 @@ class BagWriter:
     ) -> Any:
         """A PointCloud2 of these columns, each in its own type, with `padding` bytes before each point's end."""
         arrays = {name: np.asarray(column) for name, column in columns.items()}
-        order = ">" if big_endian else "<"
+        order: Literal[">", "<"] = ">" if big_endian else "<"
         record = np.dtype(
             [(n, a.dtype.newbyteorder(order)) for n, a in arrays.items()]
             + [("", f"V{padding}")] * bool(padding)
@@ -106,15 +106,10 @@ class BagWriter:
         cloud = np.zeros(len(next(iter(arrays.values()))), record)
         for name, array in arrays.items():
             cloud[name] = array
+        offsets = {name: offset for name, (_, offset, *_) in (record.fields or {}).items()}
         fields = [
-            self.make(
-                "sensor_msgs/msg/PointField",
-                name,
-                record.fields[name][1],
-                _POINT_FIELD_TYPES[array.dtype.str[1:]],
-                1,
-            )  # type: ignore[index]
-            for name, array in arrays.items()
+            self.make("sensor_msgs/msg/PointField", n, offsets[n], _POINT_FIELD_TYPES[a.dtype.str[1:]], 1)
+            for n, a in arrays.items()
         ]
         step, width = record.itemsize, len(cloud) // height
         data = np.frombuffer(cloud.tobytes(), np.uint8)
