@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from bench.paper.report import markdown
 
-from . import samples
+from . import readers, samples
 from .mutations import boundaries, mutate
 
 MAX_GROWTH_BYTES = 1 << 29  # of the peak memory over all files, each of which is below 100 kB
@@ -111,6 +111,16 @@ READERS = {
     "folder: poses": Reader(_folder, "poses.txt", samples.trajectories),
     "folder: mounting": Reader(_folder, "base_T_radar.txt", samples.transforms),
     "folder: lidar": Reader(_folder, "lidar.ply", samples.meshes),
+    "read: compressed": Reader(readers.read_one, "scan.pcd", readers.compressed),
+    "read: array": Reader(readers.read_one, "scan.npy", readers.arrays),
+    "read: KITTI": Reader(readers.read_one, "scan.bin", readers.kitti),
+    "read: text": Reader(readers.read_one, "scan.csv", readers.text),
+    "read: PLY": Reader(readers.read_one, "scan.ply", readers.plys),
+    "read: LAS": Reader(readers.read_one, "scan.las", readers.las("las")),
+    "read: ROS 1": Reader(readers.read_bag, "drive.bag", readers.bags("ros1")),
+    "read: sqlite3": Reader(readers.read_bag, "drive.db3", readers.bags("sqlite3")),
+    "read: mcap": Reader(readers.read_bag, "drive.mcap", readers.bags("mcap")),
+    "read_poses": Reader(readers.read_pose_file, "poses.txt", readers.poses),
 }
 
 

@@ -190,7 +190,7 @@ def _of_tree(
         lowest = [child for child in moving if child not in above]
         if request.extrinsic is None or len(lowest) != 1:
             msg = (
-                f"the transforms do not lead to the frame of the scans, {sensor_frame or '(unnamed)'}: they have "
+                f"{request.notes.about}: the transforms do not lead to the frame of the scans, {sensor_frame or '(unnamed)'}: they have "
                 f"{', '.join(sorted(tree)) or 'no frames'}; give extrinsic, the pose of the radar in the frame that moves"
             )
             raise ValueError(msg)
@@ -203,7 +203,7 @@ def _of_tree(
             raise ValueError(msg)
         chain = chain[: chain.index(wanted) + 1]
     if not set(chain[:-1]) & set(moving):
-        msg = f"no transform between {chain[-1]} and {base} moves: TF has no poses of the radar"
+        msg = f"{request.notes.about}: no transform between {chain[-1]} and {base} moves: TF has no poses of the radar"
         raise ValueError(msg)
     links = [
         tree[child].matrix()

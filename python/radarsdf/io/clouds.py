@@ -23,6 +23,12 @@ CLOUD_SUFFIXES = (".pcd", ".ply", ".bin", ".npy", *TEXT_SUFFIXES, ".las", ".laz"
 
 _KITTI_COLUMNS = 4
 _MAX_LAZ_COMPRESSION = 200  # LAZ packs lidar points to a tenth; more is an attack
+_PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
+_LAS_HEADER, _VLR, _EVLR = (
+    375,
+    54,
+    60,
+)  # bytes, of a header and of the least record before or behind the points
 _SEPARATORS = (",", ";", "\t", None)  # None: any white space
 
 Columns = dict[str, NDArray[Any]]
@@ -64,7 +70,9 @@ def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Colu
             return _text(path, columns)
     except (OSError, ImportError, MemoryError):
         raise
-    except Exception as error:  # libraries raise exceptions of many kinds for damaged files
+    except BaseException as error:  # libraries raise exceptions of many kinds for damaged files
+        if not isinstance(error, Exception) and type(error).__name__ != _PANIC:
+            raise
         msg = f"{path} is not a whole {suffix} file of points: {error}"
         raise ValueError(msg) from error
     msg = f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}"
@@ -202,12 +210,26 @@ def _ply(path: Path) -> Columns:
     return columns
 
 
+def _check_las_header(path: Path) -> None:
+    """Raises unless the file can hold as many records before and behind its points as its header says: laspy would
+    count to four billion."""
+    with path.open("rb") as file:
+        header = file.read(_LAS_HEADER)
+    counts = [(100, _VLR)] + [(243, _EVLR)] * (len(header) == _LAS_HEADER and header[24:26] == b"\x01\x04")
+    for offset, least in counts:
+        count = int.from_bytes(header[offset : offset + 4], "little")
+        if count * least > path.stat().st_size:
+            msg = f"its header says {count} records, for which the file is too small"
+            raise ValueError(msg)
+
+
 def _las(path: Path) -> Columns:
     try:
         import laspy  # noqa: PLC0415 - an extra
     except ImportError as error:
         msg = f'{path}: LAS and LAZ files are read by laspy: pip install "radarsdf[las]"'
         raise ImportError(msg) from error
+    _check_las_header(path)
     with laspy.open(path) as file:
         header = file.header
         unpacked = header.point_count * header.point_format.size

@@ -167,7 +167,7 @@ class Fields:
             intensities = self._column(columns, "intensity")
             doppler = self._column(columns, "doppler")
             sigma = self._sigma(columns)
-        # All at once first: that is usual, and row by row takes ten times as long.
+        # All at once first: that is usual, and row by row takes twenty times as long.
         if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
             return Cloud(points, intensities, doppler, sigma, 0)
         finite = np.isfinite(points).all(axis=1)

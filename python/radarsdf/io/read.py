@@ -19,7 +19,7 @@ from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
 from radarsdf.io.folders import base_T_radar, lidar_map
 from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, extrinsic_of, poses_of
 from radarsdf.io.scans import read_scans
-from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.sequence import Notes, Scan, Scans
 from radarsdf.io.sources import Request, cloud_files, files_source, posed, scan_poses, times_of
 
 _STAMPS = (None, "header", "record")
@@ -116,6 +116,7 @@ def read(
         fields=fields,
         columns=columns,
         max_gap_s=positive(max_gap_s, "max_gap_s"),
+        notes=Notes(str(path) if isinstance(path, (str, PathLike)) else "the bags"),
     )
     truth = _truth(ground_truth)
     if isinstance(poses, (str, PathLike)):

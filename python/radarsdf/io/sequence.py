@@ -39,9 +39,16 @@ class Scan:
 
 
 class Notes:
-    """Sentences on what was assumed or left out. Each is logged once, as a warning of the logger ``radarsdf.io``."""
+    """Sentences on what was assumed or left out. Each is logged once, as a warning of the logger ``radarsdf.io``.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    about : str
+        What is read, for errors.
+    """
+
+    def __init__(self, about: str = "the scans") -> None:
+        self.about = about
         self.lines: list[str] = []
         self._counts: dict[str, int] = {}
 
@@ -245,7 +252,7 @@ class Scans:
         self._notes.counted()
         if not poses:
             why = "".join(f"; {line}" for line in self._notes.lines)
-            msg = f"there is no scan with a return and a pose{why}"
+            msg = f"{self._notes.about}: there is no scan with a return and a pose{why}"
             raise ValueError(msg)
         self._poses = np.stack(poses)
         self._times_s = None if None in times_s else np.array(times_s, np.float64)

@@ -105,7 +105,7 @@ def posed(
             )
         if not taken and first_s is not None and not isinstance(poses.poses, np.ndarray):
             msg = (
-                f"no scan has a pose: the first scan is at {first_s:.3f} s, the poses are from {poses.poses.span()}, "
+                f"{notes.about}: no scan has a pose: the first scan is at {first_s:.3f} s, the poses are from {poses.poses.span()}, "
                 f"and a gap between poses may be {poses.max_gap_s} s: are both of one clock?"
             )
             raise ValueError(msg)
@@ -197,7 +197,7 @@ def scan_poses(
     if isinstance(poses, np.ndarray):
         if len(poses) != count:
             msg = (
-                f"there are {count} scans but {len(poses)} poses: give as many poses as scans, or poses with time "
+                f"{request.notes.about}: there are {count} scans but {len(poses)} poses: give as many poses as scans, or poses with time "
                 "stamps (TUM: time x y z qx qy qz qw) for scans with time stamps"
             )
             raise ValueError(msg)
@@ -211,7 +211,7 @@ def scan_poses(
         matrices = poses.poses(poses.times_s, np.inf)
         return ScanPoses(matrices, T, request.max_gap_s), [float(time_s) for time_s in poses.times_s]
     msg = (
-        f"the {count} scans have no time stamps in their names or in {' or '.join(TIME_FILES)}, and the poses "
+        f"{request.notes.about}: the {count} scans have no time stamps in their names or in {' or '.join(TIME_FILES)}, and the poses "
         f"({poses.span()}) are not as many"
     )
     raise ValueError(msg)
