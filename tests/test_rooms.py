@@ -23,6 +23,7 @@ ROOMS = (
     ("returns",),
     ("field",),
     ("budget",),
+    ("checking",),
     ("map",),
     ("fitting",),
     ("render",),

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from radarsdf import evaluation, io, simulate
     from radarsdf.budget.estimate import Estimate, estimate
+    from radarsdf.checking.check import check
+    from radarsdf.checking.finding import Finding
     from radarsdf.config import FitConfig
     from radarsdf.fitting.fit import fit
     from radarsdf.fitting.stopping import Diverged, Interrupted
@@ -21,9 +23,11 @@ if TYPE_CHECKING:
 __all__ = [
     "Diverged",
     "Estimate",
+    "Finding",
     "FitConfig",
     "Interrupted",
     "RadarMap",
+    "check",
     "estimate",
     "evaluation",
     "fit",
@@ -33,13 +37,26 @@ __all__ = [
     "simulate",
 ]
 
-_PACKAGES = ("budget", "evaluation", "field", "fitting", "io", "map", "render", "returns", "simulate")
+_PACKAGES = (
+    "budget",
+    "checking",
+    "evaluation",
+    "field",
+    "fitting",
+    "io",
+    "map",
+    "render",
+    "returns",
+    "simulate",
+)
 _MODULES = {
     "Diverged": "radarsdf.fitting.stopping",
     "Estimate": "radarsdf.budget.estimate",
+    "Finding": "radarsdf.checking.finding",
     "FitConfig": "radarsdf.config",
     "Interrupted": "radarsdf.fitting.stopping",
     "RadarMap": "radarsdf.map.radar_map",
+    "check": "radarsdf.checking.check",
     "estimate": "radarsdf.budget.estimate",
     "fit": "radarsdf.fitting.fit",
     "load": "radarsdf.map.radar_map",

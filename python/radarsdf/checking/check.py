@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The check of scans and poses before a fit: all findings, the worst first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from radarsdf.checking import frames, trajectory
+from radarsdf.checking.finding import SEVERITIES, Finding
+from radarsdf.checking.recording import Recording
+from radarsdf.config import FitConfig
+
+
+def check(
+    points: Sequence[ArrayLike],
+    poses: ArrayLike,
+    intensities: Sequence[ArrayLike] | None = None,
+    *,
+    doppler_mps: Sequence[ArrayLike] | None = None,
+    times_s: ArrayLike | None = None,
+    config: FitConfig | None = None,
+) -> list[Finding]:
+    """Tells what is wrong with scans and poses, and what a fit of them will cost.
+
+    Most of it is decided by how well returns of different scans agree when the poses move them into one frame: as the
+    data are given, and as they would be if one common mistake were mended. Samples are taken at equal steps, so the
+    same data give the same findings.
+
+    Parameters
+    ----------
+    points : sequence of F arrays
+        (N_i, 3) each: the returns of one scan, sensor frame, m.
+    poses : array_like
+        (F, 4, 4) T_world_sensor, m, one for each scan.
+    intensities : sequence of F arrays, optional
+        (N_i,) each, sensor units.
+    doppler_mps : sequence of F arrays, optional
+        (N_i,) each: speed of each return along its ray, m/s, positive away from the sensor.
+    times_s : array_like, optional
+        (F,) time of each scan, s.
+    config : FitConfig, optional
+        Settings of the fit to come.
+
+    Returns
+    -------
+    list of Finding
+        The worst first. Empty lists do not happen: what a fit will cost is a finding too.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the arrays are not numbers, or their shapes do not fit together. Wrong numbers are findings.
+
+    Examples
+    --------
+    >>> import numpy as np, radarsdf
+    >>> scans = radarsdf.simulate.wall(frames=6)
+    >>> findings = radarsdf.check(scans.points, np.linalg.inv(scans.poses))
+    >>> findings[0].name, findings[0].severity
+    ('poses_inverted', 'error')
+    """
+    config = FitConfig() if config is None else config
+    recording = Recording.of(points, poses, intensities, doppler_mps, times_s)
+    return _sorted(_find(recording, config, frames.FULL))
+
+
+def check_cheaply(
+    points: Sequence[ArrayLike], poses: ArrayLike, intensities: Sequence[ArrayLike] | None = None
+) -> list[Finding]:
+    """The findings of :func:`check` that take little time beside a fit, on a smaller sample."""
+    recording = Recording.of(points, poses, intensities, None, None)
+    return _sorted(_find(recording, None, frames.CHEAP))
+
+
+def _sorted(findings: list[Finding]) -> list[Finding]:
+    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+
+
+def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
+    """All findings. `config` None: only the cheap ones."""
+    found, recording = _usable(recording)
+    found += trajectory.check_rigid(recording)
+    found += trajectory.check_times(recording)
+    if any(finding.name != "times" for finding in found if finding.severity == "error"):
+        return found  # nothing below can be computed
+    found += trajectory.check_duplicates(recording)
+    wrong = frames.check_frames(recording, effort) or trajectory.check_lengths(recording)
+    if not wrong:  # else the scans do not agree, whatever the clock
+        wrong = trajectory.check_jumps(recording, effort)
+        wrong += frames.check_clock(recording, effort) if not wrong else []
+    return found + wrong
+
+
+def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
+    """Findings about returns that are no numbers and scans without returns, and the recording without them."""
+    found = []
+    bad = [~np.isfinite(scan).all(axis=1) for scan in recording.points]
+    count, total = sum(int(mask.sum()) for mask in bad), sum(map(len, bad))
+    if count:
+        found.append(
+            Finding(
+                "returns_not_finite",
+                "error",
+                f"{count} of {total} returns have coordinates that are not finite.",
+                "Leave out these returns.",
+            )
+        )
+        recording = _without(recording, bad)
+    empty = np.array([len(scan) == 0 for scan in recording.points])
+    if empty.any():
+        if not count:
+            found.append(
+                Finding(
+                    "empty_scans",
+                    "error",
+                    f"{int(empty.sum())} of {len(recording)} scans have no returns, the first is scan {int(np.argmax(empty))}.",
+                    "Leave out these scans and their poses.",
+                )
+            )
+        recording = recording.select(np.flatnonzero(~empty))
+    return found, recording
+
+
+def _without(recording: Recording, bad: list[np.ndarray]) -> Recording:
+    def kept(arrays: list[np.ndarray] | None) -> list[np.ndarray] | None:
+        return None if arrays is None else [a[~mask] for a, mask in zip(arrays, bad, strict=True)]
+
+    return Recording(
+        [scan[~mask] for scan, mask in zip(recording.points, bad, strict=True)],
+        recording.poses,
+        kept(recording.intensities),
+        kept(recording.doppler_mps),
+        recording.times_s,
+    )

@@ -1,0 +1,219 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Frames, axes, units and clocks: what the scans say of them by agreeing with each other, or not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from radarsdf.checking.agreement import LAGS, Agreement, Comparison, choose_pairs, relative
+from radarsdf.checking.finding import Finding
+from radarsdf.checking.hypotheses import Hypothesis, hypotheses
+from radarsdf.checking.recording import FloatArray, Recording
+
+# A hypothesis is right if the scans agree better by this: of the mean logarithm of distances, and of its standard
+# error. Of a hundred wrong ones, with good data of twelve simulated scenes and six real drives, none reached a gain
+# of 0.01. The right one, with broken data, mostly has 0.1 to 0.9.
+_MIN_GAIN = 0.05
+_MIN_SIGNIFICANCE = 4.0
+_EQUAL = 0.8  # of the best gain: mistakes that agree about as well cannot be told apart. The most common one is named
+_NOT_BEHIND = 2.5  # standard errors
+_FIELD_OF_VIEW_STAYS = (
+    -1.5
+)  # standard errors. Measured: below -2.3 in the sensor's frame, above -0.5 in the world's
+_AFAR = 10.0  # distance of the returns from the origin, over their spread
+_MIN_PAIRS = 3
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much of the data a check looks at."""
+
+    pairs: int
+    """Pairs of scans."""
+    returns: int
+    """Largest number of returns of a scan that others are compared with."""
+    queries: int
+    """Returns of a scan that are compared with another one."""
+    all_axes: bool
+    """Whether all ways to swap axes are tried."""
+    lags: tuple[int, ...] = LAGS
+    """How far apart the scans of a pair are."""
+
+
+FULL = Effort(pairs=48, returns=1000, queries=80, all_axes=True)
+CHEAP = Effort(pairs=20, returns=400, queries=40, all_axes=False, lags=(1, 2))
+
+
+def check_frames(recording: Recording, effort: Effort = FULL) -> list[Finding]:
+    """Tells what is wrong with frames, axes and units, if the scans then agree much better than as given.
+
+    Poses must be rigid transforms.
+    """
+    poses = _near_origin(recording.poses)
+    pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
+    if len(pairs) < _MIN_PAIRS:
+        return []
+    agreement = Agreement(recording.points, effort.returns, effort.queries)
+    # Inverted poses, and points in the world frame, need the poses as they are, not moved to the origin.
+    guesses = hypotheses(recording.poses, pairs, all_axes=effort.all_axes)
+    given = relative(poses, pairs)
+    scores = agreement.scores(pairs, np.stack([given, *(guess.T_j_i for guess in guesses)]))
+    best = _best(recording, pairs, guesses, scores)
+    if best is None:
+        return []
+    guess, gain, significance = best
+    return [
+        Finding(
+            guess.finding,
+            "error",
+            f"{guess.what[0].upper()}{guess.what[1:]}: then returns of different scans are {np.exp(gain):.2f} times "
+            f"closer to each other ({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
+            guess.mend,
+        )
+    ]
+
+
+def check_clock(recording: Recording, effort: Effort = FULL) -> list[Finding]:
+    """Tells whether the scans agree better with the poses of an earlier or a later time."""
+    count = len(recording)
+    if count < 2 * _MIN_PAIRS:
+        return []
+    poses = _near_origin(recording.poses)
+    times, unit = (np.arange(count, dtype=np.float64), "steps between scans")
+    if recording.times_s is not None and (np.diff(recording.times_s) > 0).all():
+        times, unit = recording.times_s, "s"
+    step = float(np.median(np.diff(times)))
+    shifts = step * np.array([-8.0, -4, -2, -1, -0.5, 0.5, 1, 2, 4, 8])
+    shifts = shifts[np.abs(shifts) <= (times[-1] - times[0]) / 4]
+    pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
+    # Beyond the first and the last pose nothing is known.
+    far = float(np.abs(shifts).max(initial=0))
+    inside = ((times[pairs] - far >= times[0]) & (times[pairs] + far <= times[-1])).all(axis=1)
+    pairs = pairs[inside]
+    if len(pairs) < _MIN_PAIRS or not len(shifts):
+        return []
+    agreement = Agreement(recording.points, effort.returns, effort.queries)
+    shifted = [relative(_at(poses, times, times + shift), pairs) for shift in shifts]
+    scores = agreement.scores(pairs, np.stack([relative(poses, pairs), *shifted]))
+    comparison = Comparison.of(scores[0], scores[1:])
+    best = int(np.argmax(comparison.gains))
+    if comparison.gains[best] < _MIN_GAIN or comparison.significance[best] < _MIN_SIGNIFICANCE:
+        return []
+    shift = shifts[best]
+    return [
+        Finding(
+            "clock_offset",
+            "error",
+            f"With the poses of a time about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
+            f"different scans are {np.exp(comparison.gains[best]):.2f} times closer to each other "
+            f"({len(pairs)} pairs of scans, {comparison.significance[best]:.0f} standard errors).",
+            "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
+        )
+    ]
+
+
+def _best(
+    recording: Recording, pairs: NDArray[np.int64], guesses: list[Hypothesis], scores: FloatArray
+) -> tuple[Hypothesis, float, float] | None:
+    """The hypothesis that is clearly better than the data as given, its gain and its significance."""
+    lags = pairs[:, 1] - pairs[:, 0]
+    possible = np.ones(len(guesses), bool)
+    for k, guess in enumerate(guesses):
+        if guess.finding == "points_in_world_frame" and _looks_out_of_its_frame(recording, pairs):
+            possible[k] = False
+    # Neighbours first: scans far apart see different things, and agree best where a wrong motion makes their fields
+    # of view overlap. What is clearly worse than the data as given for neighbours is not tried on scans farther apart.
+    for lag in np.unique(lags):
+        used = lags <= lag
+        if used.sum() < _MIN_PAIRS:
+            continue
+        best = _best_of(guesses, scores[:, used], possible)
+        if best is not None:
+            return best
+        comparison = Comparison.of(scores[0, used], scores[1:, used])
+        possible &= (comparison.gains > -_MIN_GAIN) | (comparison.significance > -_MIN_SIGNIFICANCE)
+    return None
+
+
+def _best_of(
+    guesses: list[Hypothesis], scores: FloatArray, possible: NDArray[np.bool_]
+) -> tuple[Hypothesis, float, float] | None:
+    """:func:`_best` for pairs of scans that are about equally far apart."""
+    comparison = Comparison.of(scores[0], scores[1:])
+    good = (comparison.gains >= _MIN_GAIN) & (comparison.significance >= _MIN_SIGNIFICANCE) & possible
+    if not good.any():
+        return None
+    top = int(np.argmax(np.where(good, comparison.gains, -np.inf)))
+    kinds = [guess.finding for guess in guesses]
+    behind = Comparison.of(scores[1:], scores[1 + top])
+    near = good & (comparison.gains >= _EQUAL * comparison.gains[top])
+    near &= (behind.significance < _NOT_BEHIND) | (np.arange(len(guesses)) == top)
+    # The most common kind of mistake among those that are about equal; of its variants, the one that agrees best.
+    kind = kinds[int(np.argmax(near))]
+    of_kind = near & np.array([name == kind for name in kinds])
+    chosen = int(np.argmax(np.where(of_kind, comparison.gains, -np.inf)))
+    return guesses[chosen], float(comparison.gains[chosen]), float(comparison.significance[chosen])
+
+
+def _looks_out_of_its_frame(recording: Recording, pairs: NDArray[np.int64]) -> bool:
+    """Whether the returns stay in one place of the frame that they came in, but not in the sensor's by the poses.
+
+    Where each scan sees other things, because the sensor moves far between them, the scans agree best as if the sensor
+    stood still: its field of view then is the same. So what is said to be in the world frame must not look like points
+    of a sensor's frame: in that one, their centre and the mean direction to them hardly move.
+    """
+    rows = np.unique(pairs)
+    given = [np.asarray(recording.points[i], np.float64) for i in rows.tolist()]
+    if (
+        np.median(
+            [
+                np.linalg.norm(np.median(scan, axis=0)) / max(float(scan.std(axis=0).max()), 1e-9)
+                for scan in given
+            ]
+        )
+        > _AFAR
+    ):
+        return False  # no sensor sees all its returns in one direction, such as those of UTM coordinates
+    moved = [
+        (scan - pose[:3, 3]) @ pose[:3, :3] for scan, pose in zip(given, recording.poses[rows], strict=True)
+    ]
+    first, second = np.searchsorted(rows, pairs.T)
+    significances = []
+    for of_scan in (_centre, _mean_direction):
+        before, after = (np.array([of_scan(scan) for scan in scans]) for scans in (given, moved))
+        steadier = np.linalg.norm(before[first] - before[second], axis=1)
+        steadier -= np.linalg.norm(after[first] - after[second], axis=1)
+        significances.append(steadier.mean() / (steadier.std(ddof=1) / np.sqrt(len(steadier)) + 1e-12))
+    return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
+
+
+def _centre(scan: FloatArray) -> FloatArray:
+    centre: FloatArray = np.median(scan, axis=0)
+    return centre
+
+
+def _mean_direction(scan: FloatArray) -> FloatArray:
+    direction: FloatArray = (scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]).mean(axis=0)
+    return direction
+
+
+def _near_origin(T_world_sensor: FloatArray) -> FloatArray:
+    """Poses moved so that the first sensor is at the origin: UTM coordinates would cost digits."""
+    moved = T_world_sensor.copy()
+    moved[:, :3, 3] -= T_world_sensor[0, :3, 3]
+    return moved
+
+
+def _at(T_world_sensor: FloatArray, times: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Poses (F, 4, 4) at the wanted times (F,), interpolated. Beyond the ends: the first and the last pose."""
+    wanted = np.clip(wanted, times[0], times[-1])
+    poses = np.tile(np.eye(4), (len(wanted), 1, 1))
+    poses[:, :3, :3] = Slerp(times, Rotation.from_matrix(T_world_sensor[:, :3, :3]))(wanted).as_matrix()
+    for axis in range(3):
+        poses[:, axis, 3] = np.interp(wanted, times, T_world_sensor[:, axis, 3])
+    return poses

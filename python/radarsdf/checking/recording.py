@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The scans, poses and other arrays of a check. Only their shapes are right: their values are what is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf.checks import real_array, refuse_masked
+
+FloatArray = NDArray[np.float64]
+
+_ENOUGH = 40  # scans tell what returns of this sensor are like
+
+
+@dataclass(frozen=True)
+class Recording:
+    """F scans with N_i returns each."""
+
+    points: list[NDArray[Any]]
+    """F arrays (N_i, 3), as given: sensor frame, m, if nothing is wrong."""
+    poses: FloatArray
+    """(F, 4, 4), as given: T_world_sensor, m, if nothing is wrong."""
+    intensities: list[NDArray[Any]] | None
+    """F arrays (N_i,), sensor units."""
+    doppler_mps: list[NDArray[Any]] | None
+    """F arrays (N_i,), m/s."""
+    times_s: FloatArray | None
+    """(F,) time of each scan, s."""
+
+    @classmethod
+    def of(
+        cls,
+        points: Sequence[ArrayLike],
+        poses: ArrayLike,
+        intensities: Sequence[ArrayLike] | None,
+        doppler_mps: Sequence[ArrayLike] | None,
+        times_s: ArrayLike | None,
+    ) -> Recording:
+        """The arrays, if their shapes fit together. Else a TypeError or a ValueError that names the argument."""
+        scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(points)]
+        if not scans:
+            msg = "points holds no scans"
+            raise ValueError(msg)
+        for i, scan in enumerate(scans):
+            if scan.ndim != 2 or scan.shape[1] != 3:
+                msg = f"scan {i} must have shape (N, 3), not {scan.shape}"
+                raise ValueError(msg)
+        T_world_sensor = real_array(poses, "poses")
+        if T_world_sensor.shape != (len(scans), 4, 4):
+            msg = f"poses must have shape ({len(scans)}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
+            raise ValueError(msg)
+        times = None if times_s is None else real_array(times_s, "times_s")
+        if times is not None and times.shape != (len(scans),):
+            msg = f"times_s must have shape ({len(scans)},), not {times.shape}"
+            raise ValueError(msg)
+        values = [
+            None if given is None else _values_of(given, scans, name)
+            for given, name in ((intensities, "intensities"), (doppler_mps, "doppler_mps"))
+        ]
+        return cls(scans, T_world_sensor, values[0], values[1], times)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def select(self, scans: NDArray[np.int64]) -> Recording:
+        """The scans with these numbers (K,), in this order."""
+
+        def chosen(arrays: list[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
+            return None if arrays is None else [arrays[i] for i in scans]
+
+        return Recording(
+            [self.points[i] for i in scans],
+            self.poses[scans],
+            chosen(self.intensities),
+            chosen(self.doppler_mps),
+            None if self.times_s is None else self.times_s[scans],
+        )
+
+    def some_scans(self, count: int = _ENOUGH) -> NDArray[np.int64]:
+        """Numbers of at most about `count` scans, at equal steps."""
+        return np.arange(0, len(self), -(-len(self) // count))
+
+
+def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
+    """`values` as an array of real numbers. float32 stays float32: only samples are computed with."""
+    if isinstance(values, np.ndarray) and values.dtype.kind == "f":
+        refuse_masked(values, name)
+        return values
+    return real_array(values, name)
+
+
+def _values_of(given: Sequence[ArrayLike], scans: list[NDArray[Any]], name: str) -> list[NDArray[Any]]:
+    values = [_numbers(value, f"{name} of scan {i}") for i, value in enumerate(given)]
+    if len(values) != len(scans):
+        msg = f"{name} holds {len(values)} scans, points {len(scans)}"
+        raise ValueError(msg)
+    for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
+        if value.shape != (len(scan),):
+            msg = f"{name} of scan {i} must have shape ({len(scan)},), not {value.shape}"
+            raise ValueError(msg)
+    return values

@@ -1,0 +1,324 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What poses tell alone: whether they are rigid transforms, jumps, duplicates, and lengths that are no metres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
+from radarsdf.checking.finding import Finding, Severity
+from radarsdf.checking.frames import FULL, Effort
+from radarsdf.checking.recording import FloatArray, Recording
+
+_MAX_ROTATION_ERROR = 1e-3  # as of the poses that a fit accepts
+# No radar that gives points sees most of them from farther away, and none has most of them at its own housing.
+_FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
+_FAST_MPS = 100.0  # faster than cars and drones
+_JUMP = 3.0  # times the steps round it
+_ROUND = 3  # steps before and after
+_JUMPS_TRIED = 12
+_MIN_GAIN, _MIN_SIGNIFICANCE = 0.1, 3.0  # as in frames.py; few pairs lie across a jump
+_CLOSES = 0.5  # of the difference to scans beside the jump
+_CAUGHT_UP = 1.5  # times the median step
+
+
+def check_rigid(recording: Recording) -> list[Finding]:  # noqa: PLR0911 - one for each thing they may be
+    """Tells whether the matrices are rigid transforms, and what they may be if not."""
+    poses = recording.poses
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    if not finite.all():
+        return [
+            _not_rigid(
+                f"{int((~finite).sum())} of {len(poses)} poses are not finite, the first is pose {int(np.argmin(finite))}.",
+                "Leave out these poses and their scans.",
+            )
+        ]
+    last = np.array([0.0, 0, 0, 1])
+    if (poses[:, :, 3] == last).all() and not (poses[:, 3] == last).all():
+        return [
+            Finding(
+                "poses_transposed",
+                "error",
+                "The translations are in the last row of the poses, and the last column is 0 0 0 1.",
+                "Transpose each pose: poses.transpose(0, 2, 1).",
+            )
+        ]
+    rotation = poses[:, :3, :3]
+    products = rotation @ rotation.transpose(0, 2, 1)
+    scales = np.sqrt(np.trace(products, axis1=1, axis2=2) / 3)
+    determinants = np.linalg.det(rotation)
+    orthogonal = np.abs(products - np.eye(3)).max(axis=(1, 2)) < _MAX_ROTATION_ERROR
+    if orthogonal.all() and (determinants < 0).any():
+        return [
+            Finding(
+                "mirrored",
+                "error",
+                f"{int((determinants < 0).sum())} of {len(poses)} poses are left-handed: their rotations have determinant -1.",
+                "Use right-handed frames: x forward, y left, z up.",
+            )
+        ]
+    off = ~orthogonal | ~(poses[:, 3] == last).all(axis=1)
+    if not off.any():
+        return []
+    first = int(np.argmax(off))
+    evidence = f"{int(off.sum())} of {len(poses)} poses are no rigid transforms, the first is pose {first}:"
+    if not (poses[first, 3] == last).all():
+        return [
+            _not_rigid(
+                f"{evidence} its last row is not 0 0 0 1.", "Make each pose of a rotation and a position."
+            )
+        ]
+    if np.abs(products[first] / max(scales[first] ** 2, 1e-300) - np.eye(3)).max() < _MAX_ROTATION_ERROR:
+        return [
+            _not_rigid(
+                f"{evidence} its rotation is multiplied by {scales[first]:.4g}.",
+                "Divide the rotations by this factor; a scaled map has positions without a metre.",
+            )
+        ]
+    return [
+        _not_rigid(
+            f"{evidence} the rows of its rotation are not orthogonal, with numbers up to {np.abs(rotation[first]).max():.3g}.",
+            "Make rotations from unit quaternions in the order x y z w, or from angles in rad.",
+        )
+    ]
+
+
+def _not_rigid(evidence: str, mend: str) -> Finding:
+    return Finding("poses_not_rigid", "error", evidence, mend)
+
+
+def check_lengths(recording: Recording) -> list[Finding]:
+    """Tells whether ranges and speeds can be in metres. The poses must be finite."""
+    medians = []
+    for i in recording.some_scans().tolist():
+        ranges = np.linalg.norm(np.asarray(recording.points[i], np.float64), axis=1)
+        if len(ranges):
+            medians.append(float(np.median(ranges)))
+    median = float(np.median(medians)) if medians else 1.0
+    mend = "Pass points and positions in metres."
+    if median > _FAR_M or median < _NEAR_M:
+        # Points of a world frame far from its origin, such as UTM, have no ranges. Their distances to the sensor do.
+        severity: Severity = "error" if median > _VERY_FAR_M or median < _NEAR_M / 10 else "warning"
+        return [
+            Finding(
+                "units", severity, f"Half of the returns are {median:.4g} m or more from the sensor.", mend
+            )
+        ]
+    if recording.times_s is not None and len(recording) > 2 and (np.diff(recording.times_s) > 0).all():
+        speeds = _steps_m(recording) / np.diff(recording.times_s)
+        speed = float(np.median(speeds))
+        if speed > _FAST_MPS:
+            return [Finding("units", "error", f"By its poses, the sensor moves at {speed:.4g} m/s.", mend)]
+    return []
+
+
+def check_times(recording: Recording) -> list[Finding]:
+    """Tells whether the times can be those of the scans."""
+    times = recording.times_s
+    if times is None or len(times) < 2:
+        return []
+    if not np.isfinite(times).all():
+        return [Finding("times", "error", "Some times are not finite.", "Leave out these scans.")]
+    steps = np.diff(times)
+    if (steps > 0).all():
+        return []
+    if (steps == 0).all():
+        return [
+            Finding(
+                "times",
+                "warning",
+                f"All scans have the time {times[0]:g} s.",
+                "Use the times of record, if those of the messages were never set.",
+            )
+        ]
+    return [
+        Finding(
+            "times",
+            "warning",
+            f"{int((steps <= 0).sum())} of {len(steps)} times are not later than the one before.",
+            "Sort scans, poses and times together, and leave out scans that come twice.",
+        )
+    ]
+
+
+def check_duplicates(recording: Recording) -> list[Finding]:
+    """Tells whether scans, or the poses of different scans, are the same."""
+    found = []
+    first_of: dict[tuple[object, ...], int] = {}
+    repeated = []
+    for i, scan in enumerate(recording.points):
+        if len(scan) < MIN_RETURNS:
+            continue
+        key = (len(scan), *scan[0].tolist(), *scan[-1].tolist())
+        same = first_of.setdefault(key, i)
+        if same != i and np.array_equal(recording.points[same], scan):
+            repeated.append((same, i))
+    if repeated:
+        found.append(
+            Finding(
+                "duplicate_scans",
+                "warning",
+                f"{len(repeated)} of {len(recording)} scans are copies of another one, such as scan {repeated[0][1]} of "
+                f"scan {repeated[0][0]}.",
+                "Leave out the copies: they count as measurements that never were.",
+            )
+        )
+    if len(recording) < 3:
+        return found
+    same_pose = (recording.poses[1:] == recording.poses[:-1]).all(axis=(1, 2))
+    same_pose[[later - 1 for earlier, later in repeated if later == earlier + 1]] = False
+    steps = _steps_m(recording)
+    moving = steps[~same_pose]
+    if not same_pose.any() or not len(moving):
+        return found
+    # A sensor that stands still has such poses too. One whose poses are held catches up with a leap.
+    after = steps[1:][same_pose[:-1] & ~same_pose[1:]]
+    plain = steps[1:][~same_pose[:-1] & ~same_pose[1:]]
+    usual = float(np.median(plain)) if len(plain) >= _ROUND else float(np.median(moving)) / 2
+    held = len(after) >= 2 and float(np.median(after)) > _CAUGHT_UP * usual > 0
+    found.append(
+        Finding(
+            "duplicate_poses",
+            "warning" if held else "note",
+            f"{int(same_pose.sum())} of {len(recording)} scans have exactly the pose of the scan before"
+            + (
+                f", and the step after is {np.median(after) / usual:.1f} times the usual one."
+                if held
+                else "."
+            ),
+            "Interpolate the poses at the times of the scans."
+            if held
+            else "Nothing needs to be done where the sensor stood still.",
+        )
+    )
+    return found
+
+
+def check_jumps(recording: Recording, effort: Effort = FULL) -> list[Finding]:
+    """Tells where the trajectory jumps: a step far longer than those round it, without which the scans agree better.
+
+    A recording that pauses while the sensor moves has long steps too; then the scans agree with them.
+    """
+    count = len(recording)
+    if count < 2 * _ROUND:
+        return []
+    poses = recording.poses
+    durations = np.ones(count - 1)
+    if recording.times_s is not None and (np.diff(recording.times_s) > 0).all():
+        durations = np.diff(recording.times_s)
+    sizes = _sizes(poses, recording) / durations
+    changes = _changes(poses, recording, durations)
+    usual = float(np.median(changes))
+    suspects = np.flatnonzero(changes > _JUMP * max(usual, 0.1 * float(np.median(sizes)))).tolist()
+    suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
+    agreement = Agreement(recording.points, effort.returns, 2 * effort.queries)
+    confirmed = [k for k in suspects if _agree_without(recording, agreement, k, suspects, durations)]
+    if not confirmed:
+        return []
+    worst = max(confirmed, key=lambda k: changes[k])
+    step = float(np.linalg.norm(poses[worst + 1, :3, 3] - poses[worst, :3, 3]))
+    turn = float(np.degrees(_turns(poses)[worst]))
+    return [
+        Finding(
+            "pose_jumps",
+            "error" if len(confirmed) > count // 10 else "warning",
+            f"{len(confirmed)} of {count - 1} steps are jumps, the largest after scan {worst}: {step:.3g} m and "
+            f"{turn:.3g} degrees, off the motion round it by {changes[worst] / max(usual, 1e-9):.0f} times the usual; without it the scans agree better.",
+            "Use poses that were smoothed over the whole drive, or leave out the scans at the jumps.",
+        )
+    ]
+
+
+def _agree_without(
+    recording: Recording, agreement: Agreement, jump: int, suspects: list[int], durations: FloatArray
+) -> bool:
+    """Whether the scans round a step agree clearly better if it is replaced by the motion of the steps round it.
+
+    If that mends the poses, the scans then agree about as well as those beside the step do. Without that condition,
+    scans that see different things would agree better wherever the replaced motion makes their fields of view overlap.
+    """
+    poses = recording.poses
+    near = [
+        k for k in range(max(0, jump - _ROUND), min(len(poses) - 1, jump + 1 + _ROUND)) if k not in suspects
+    ]
+    if not near:
+        return False
+    motions = np.linalg.inv(poses[:-1]) @ poses[1:]
+    replaced = motions.copy()
+    for k in {jump, *(s for s in suspects if abs(s - jump) <= 1)}:
+        nearest = min(near, key=lambda n: abs(n - k))
+        factor = durations[k] / durations[nearest]
+        replaced[k] = np.eye(4)
+        vector = Rotation.from_matrix(motions[nearest, :3, :3]).as_rotvec()
+        replaced[k, :3, :3] = Rotation.from_rotvec(factor * vector).as_matrix()
+        replaced[k, :3, 3] = factor * motions[nearest, :3, 3]
+    scans = [i for i in range(jump - _ROUND + 1, jump + _ROUND + 1) if 0 <= i < len(poses)]
+    scans = [i for i in scans if len(recording.points[i]) >= MIN_RETURNS]
+    all_pairs = [(i, j) for i in scans for j in scans if i < j]
+    beside = [(i, j) for i, j in all_pairs if not any(i <= k < j for k in suspects)]
+    across = [(i, j) for i, j in all_pairs if i <= jump < j]
+    # Either all is displaced from here on, or one pose is, and the step after takes it back.
+    choices = [across] + [[(i, j) for i, j in all_pairs if k in {i, j}] for k in (jump, jump + 1)]
+    regular = np.array(beside or all_pairs, np.int64)
+    usual = float(agreement.scores(regular, relative(poses, regular)[None]).mean())
+    for chosen in choices:
+        if len(chosen) < 2:
+            continue
+        pairs = np.array(chosen, np.int64)
+        other = np.stack([_chain(replaced[i:j]) for i, j in chosen])
+        scores = agreement.scores(pairs, np.stack([relative(poses, pairs), np.linalg.inv(other)]))
+        comparison = Comparison.of(scores[0], scores[1:])
+        gain = float(comparison.gains[0])
+        closes = gain > _CLOSES * (float(scores[0].mean()) - usual)
+        if gain > _MIN_GAIN and comparison.significance[0] > _MIN_SIGNIFICANCE and closes:
+            return True
+    return False
+
+
+def _changes(T_world_sensor: FloatArray, recording: Recording, durations: FloatArray) -> FloatArray:
+    """(F - 1,) how far each motion is off the median of those round it, for one unit of time, m.
+
+    Turns count as ways of the returns at a typical range.
+    """
+    motions = np.linalg.inv(T_world_sensor[:-1]) @ T_world_sensor[1:]
+    turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec() * _typical_range_m(recording)
+    vectors = np.concatenate([motions[:, :3, 3], turns], axis=1) / durations[:, None]
+    changes = np.zeros(len(vectors))
+    for k in range(len(vectors)):
+        others = np.concatenate([vectors[max(0, k - _ROUND) : k], vectors[k + 1 : k + 1 + _ROUND]])
+        changes[k] = np.linalg.norm(vectors[k] - np.median(others, axis=0))
+    return changes
+
+
+def _chain(motions: FloatArray) -> FloatArray:
+    """The product (4, 4) of motions (K, 4, 4)."""
+    product = np.eye(4)
+    for motion in motions:
+        product = product @ motion
+    return product
+
+
+def _steps_m(recording: Recording) -> FloatArray:
+    """(F - 1,) lengths of the steps between poses."""
+    lengths: FloatArray = np.linalg.norm(np.diff(recording.poses[:, :3, 3], axis=0), axis=1)
+    return lengths
+
+
+def _turns(T_world_sensor: FloatArray) -> NDArray[np.float64]:
+    """(F - 1,) angles between poses, rad."""
+    rotations = Rotation.from_matrix(T_world_sensor[:, :3, :3])
+    angles: NDArray[np.float64] = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    return angles
+
+
+def _sizes(T_world_sensor: FloatArray, recording: Recording) -> FloatArray:
+    """(F - 1,) lengths of the steps, with turns as ways of the returns at a typical range, m."""
+    return np.hypot(_steps_m(recording), _typical_range_m(recording) * _turns(T_world_sensor))
+
+
+def _typical_range_m(recording: Recording) -> float:
+    some = [np.asarray(recording.points[i], np.float64) for i in recording.some_scans(10)]
+    return float(np.median([np.median(np.linalg.norm(scan, axis=1)) for scan in some]))

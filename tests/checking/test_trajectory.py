@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Findings about the poses alone, about copies, and about numbers that are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+
+
+@pytest.fixture(scope="module")
+def good():
+    scans = radarsdf.simulate.oculii(frames=60)
+    return scans.points, scans.poses
+
+
+def names(findings):
+    return [finding.name for finding in findings if finding.severity != "note"]
+
+
+def test_a_displacement_from_one_scan_on_is_a_jump(good):
+    points, poses = good
+    poses = poses.copy()
+    poses[30:, :3, 3] += poses[30, :3, 1] * 4
+    found = radarsdf.check(points, poses)
+    assert names(found) == ["pose_jumps"]
+    assert "after scan 29" in found[0].evidence
+
+
+def test_one_pose_beside_the_others_is_a_jump(good):
+    points, poses = good
+    poses = poses.copy()
+    poses[30, :3, 3] += poses[30, :3, 1] * 4
+    assert names(radarsdf.check(points, poses)) == ["pose_jumps"]
+
+
+def test_a_pause_of_the_recording_is_no_jump(good):
+    points, poses = good
+    kept = [i for i in range(60) if not 25 <= i < 31]
+    assert names(radarsdf.check([points[i] for i in kept], poses[kept])) == []
+
+
+def test_poses_that_are_held_are_named(good):
+    points, poses = good
+    assert names(radarsdf.check(points, np.repeat(poses[::2], 2, axis=0)))[:1] == ["duplicate_poses"]
+
+
+def test_a_sensor_that_stands_still_is_a_note(good):
+    points, poses = good
+    still = [0] * 3 + list(range(57))
+    found = radarsdf.check(
+        [p + np.float32(1e-3 * i) for i, p in enumerate(points[j] for j in still)], poses[still]
+    )
+    assert names(found) == []
+    assert "duplicate_poses" in [finding.name for finding in found]
+
+
+def test_copies_of_scans_are_named(good):
+    points, poses = good
+    points = [*points[:5], points[4], *points[6:]]
+    found = radarsdf.check(points, poses)
+    assert names(found) == ["duplicate_scans"]
+    assert found[0].evidence.startswith("1 of 60 scans")
+
+
+@pytest.mark.parametrize(
+    ("name", "broken"),
+    [
+        ("poses_transposed", lambda poses: poses.transpose(0, 2, 1)),
+        ("mirrored", lambda poses: poses @ np.diag([1.0, -1, 1, 1])),
+        ("poses_not_rigid", lambda poses: poses * [2.0, 2, 2, 1]),
+        ("poses_not_rigid", lambda poses: poses * np.nan),
+        ("poses_not_rigid", lambda poses: poses + 1e-2 * np.eye(4)[3]),
+    ],
+)
+def test_matrices_that_are_no_poses_are_named(good, name, broken):
+    points, poses = good
+    found = radarsdf.check(points, broken(poses))
+    assert [(finding.name, finding.severity) for finding in found] == [(name, "error")]
+
+
+def test_returns_and_scans_that_are_none_are_named(good):
+    points, poses = good
+    hole = points[3].copy()
+    hole[::2] = np.nan
+    assert names(radarsdf.check([*points[:3], hole, *points[4:]], poses)) == ["returns_not_finite"]
+    assert names(radarsdf.check([*points[:3], hole[:0], *points[4:]], poses)) == ["empty_scans"]
+
+
+def test_times_of_nothing_are_named(good):
+    assert names(radarsdf.check(*good, times_s=np.zeros(60))) == ["times"]
+
+
+def test_shapes_that_do_not_fit_are_refused(good):
+    points, poses = good
+    with pytest.raises(ValueError, match=r"poses must have shape \(60, 4, 4\)"):
+        radarsdf.check(points, poses[1:])
+    with pytest.raises(ValueError, match="intensities of scan 0 must have shape"):
+        radarsdf.check(points, poses, [p[:, :2] for p in points])
