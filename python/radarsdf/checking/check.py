@@ -9,8 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checking import frames, trajectory
+from radarsdf.checking import before_fit, frames, trajectory
+from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.finding import SEVERITIES, Finding
+from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
 from radarsdf.config import FitConfig
 
@@ -48,7 +50,7 @@ def check(
     Returns
     -------
     list of Finding
-        The worst first. Empty lists do not happen: what a fit will cost is a finding too.
+        The worst first. Without an error among them, the last is what a fit will cost.
 
     Raises
     ------
@@ -87,12 +89,19 @@ def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort)
     found += trajectory.check_times(recording)
     if any(finding.name != "times" for finding in found if finding.severity == "error"):
         return found  # nothing below can be computed
+    found += check_intensities(recording)
     found += trajectory.check_duplicates(recording)
     wrong = frames.check_frames(recording, effort) or trajectory.check_lengths(recording)
     if not wrong:  # else the scans do not agree, whatever the clock
         wrong = trajectory.check_jumps(recording, effort)
-        wrong += frames.check_clock(recording, effort) if not wrong else []
-    return found + wrong
+        wrong += check_doppler(recording)
+        if config is not None and not any(finding.severity != "note" for finding in wrong):
+            wrong += frames.check_clock(recording, effort)
+        wrong += before_fit.check_ground(recording)
+    found += wrong
+    if config is not None and not any(finding.severity == "error" for finding in found):
+        found += before_fit.check_fit(recording, config)
+    return found
 
 
 def _usable(recording: Recording) -> tuple[list[Finding], Recording]:

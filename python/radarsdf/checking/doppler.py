@@ -9,7 +9,9 @@ C. Doer and G. Trommer, "An EKF Based Approach to Radar Inertial Odometry", MFI 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,9 @@ from scipy.spatial.transform import Rotation
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import FloatArray, Recording
 
-_DRAWS = 64  # of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999
+_DRAWS = (
+    64  # of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999
+)
 _SIGMA_MPS = 0.15  # a return is off if its Doppler differs by three times the noise, and by at least this
 _ROUNDS = 4
 _MIN_RETURNS = 10
@@ -51,7 +55,7 @@ class SensorVelocity:
 
 
 def sensor_velocity(
-    points: NDArray[np.floating], doppler_mps: NDArray[np.floating], *, interval_mps: float | None = None
+    points: NDArray[Any], doppler_mps: NDArray[Any], *, interval_mps: float | None = None
 ) -> SensorVelocity:
     """Finds the velocity of the sensor from one scan. The same scan gives the same bits.
 
@@ -82,8 +86,8 @@ def sensor_velocity(
 
     def residuals(velocities: FloatArray) -> FloatArray:
         """(K, M) differences of the measured speeds from those of velocities (K, 3)."""
-        found = measured - velocities @ away.T
-        return found if interval_mps is None else found - interval_mps * np.round(found / interval_mps)
+        off: FloatArray = measured - velocities @ away.T
+        return off if interval_mps is None else off - interval_mps * np.round(off / interval_mps)
 
     velocity = _most_agreed(away, measured, residuals, interval_mps)
     if velocity is None:
@@ -107,7 +111,13 @@ def sensor_velocity(
     return SensorVelocity(velocity, spread * np.linalg.inv(normal), static)
 
 
-def _most_agreed(away, measured, residuals, interval_mps):  # type: ignore[no-untyped-def]
+def _most_agreed(
+    away: FloatArray,
+    measured: FloatArray,
+    residuals: Callable[[FloatArray], FloatArray],
+    interval_mps: float | None,
+) -> FloatArray | None:
+    """The velocity (3,) of those of random draws of three returns with which most returns agree."""
     rng = np.random.default_rng(0)
     drawn = rng.integers(0, len(measured), (_DRAWS, 3))
     speeds = measured[drawn]
@@ -120,10 +130,11 @@ def _most_agreed(away, measured, residuals, interval_mps):  # type: ignore[no-un
         return None
     velocities = np.linalg.solve(matrices[solvable], speeds[solvable, :, None])[:, :, 0]
     counts = (np.abs(residuals(velocities)) < _SIGMA_MPS).sum(axis=1)
-    return velocities[int(np.argmax(counts))]
+    best: FloatArray = velocities[int(np.argmax(counts))]
+    return best
 
 
-def folding_interval_mps(doppler_mps: list[NDArray[np.floating]]) -> float | None:
+def folding_interval_mps(doppler_mps: list[NDArray[Any]]) -> float | None:
     """Width of the interval into which the sensor seems to fold speeds, m/s: None if the speeds do not fill one.
 
     Folded speeds reach both ends of the interval, which lie about as far from 0.
@@ -158,7 +169,7 @@ class Velocities:
     """Number of scans that were tried."""
 
 
-def velocities_of(recording: Recording, values: list[NDArray[np.floating]], count: int = 40) -> Velocities:
+def velocities_of(recording: Recording, values: list[NDArray[Any]], count: int = 40) -> Velocities:
     """Velocities of about `count` scans from `values`, which may be Doppler."""
     scans = recording.some_scans(count)
     scans = np.array([i for i in scans.tolist() if len(recording.points[i]) >= _MIN_RETURNS], np.int64)
@@ -219,7 +230,7 @@ def check_doppler(recording: Recording) -> list[Finding]:
     return found + _beside_poses(recording, velocities)
 
 
-def _are_speeds(recording: Recording, values: list[NDArray[np.floating]]) -> bool:
+def _are_speeds(recording: Recording, values: list[NDArray[Any]]) -> bool:
     """Whether values (N_i,) of the scans are Doppler: most scans agree on a velocity, which is not zero in all."""
     if min(float(np.min(value, initial=0)) for value in values) >= 0:
         return False  # Doppler has both signs, or a minus where the sensor comes nearer
@@ -235,25 +246,28 @@ def _beside_poses(recording: Recording, velocities: Velocities) -> list[Finding]
     timed = times is not None and bool((np.diff(times) > 0).all())
     knots = times if timed and times is not None else np.arange(len(recording), dtype=np.float64)
     inner = (velocities.scans > 0) & (velocities.scans < len(recording) - 1)
+    found: list[Finding] = []
     if inner.sum() < _MIN_SCANS:
-        return []
+        return found
     scans, by_doppler = velocities.scans[inner], velocities.of_doppler_mps[inner]
     by_poses = velocity_of_poses(recording.poses, knots)[scans]
     moving = (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
     if moving.sum() < _MIN_SCANS:
-        return []
+        return found
     a, b = by_doppler[moving], by_poses[moving]
     units = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (a, b)]
     cosines = np.einsum("na,na->n", *units)
     if np.median(cosines) < -0.8:
-        return [
+        # Sensors differ in it, and what moves is found all the same: so this is no fault of the data.
+        found.append(
             Finding(
                 "doppler_sign",
-                "warning",
+                "note",
                 f"By its Doppler the sensor moves backwards where its poses move forwards (median cosine {np.median(cosines):.2f}).",
                 "Change the sign of the Doppler, so that it is negative where the sensor comes nearer.",
             )
-        ]
+        )
+        by_doppler, units[0] = -by_doppler, -units[0]
     # Yaw that turns one onto the other, in each scan.
     cross = units[0][:, 0] * units[1][:, 1] - units[0][:, 1] * units[1][:, 0]
     yaws = np.arctan2(cross, np.einsum("na,na->n", units[0][:, :2], units[1][:, :2]))
@@ -261,15 +275,16 @@ def _beside_poses(recording: Recording, velocities: Velocities) -> list[Finding]
     spread = 1.4826 * float(np.median(np.abs(yaws - yaw))) * np.sqrt(np.pi / 2 / len(yaws))
     if abs(yaw) > max(_MIN_YAW_RAD, _MIN_SIGNIFICANCE * spread):
         return [
+            *found,
             Finding(
                 "sensor_turned",
                 "warning",
                 f"The poses move {np.degrees(yaw):+.1f} degrees to the left of the velocity by Doppler, in the median of "
                 f"{len(yaws)} scans.",
                 "Multiply the poses by the calibration of the sensor, or turn the points by this yaw.",
-            )
+            ),
         ]
-    return _clock(recording.poses, knots, scans, by_doppler) if timed else []
+    return found + (_clock(recording.poses, knots, scans, by_doppler) if timed else [])
 
 
 def _clock(

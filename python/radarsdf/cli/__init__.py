@@ -3,8 +3,8 @@
 """The command line: ``radarsdf COMMAND``.
 
 Each command is a module of this package with two functions: ``add_arguments(parser)`` declares the arguments and
-``run(options)`` does the work. The module is imported only if its command is on the command line, and it imports
-PyTorch, NumPy and trimesh only in ``run``. So help and usage errors are printed at once.
+``run(options)`` does the work, and may return the exit status. The module is imported only if its command is on the
+command line, and it imports PyTorch, NumPy and trimesh only in ``run``. So help and usage errors are printed at once.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from radarsdf.cli.saying import complain, say
 
 COMMANDS = {
     "demo": "simulate a drive, fit it, write scans, map, mesh and picture, print the errors",
+    "check": "say what is wrong with scans and poses, before a fit",
     "fit": "fit a map to scans",
     "mesh": "extract the surface of a map as a triangle mesh",
     "eval": "print the errors of a mesh or a map",
@@ -45,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        The exit status: 0 if the command succeeded, 1 if it failed, 130 if Ctrl-C stopped it.
+        The exit status: 0 if the command succeeded, 1 if it failed or a check found an error, 130 if Ctrl-C stopped it.
 
     Raises
     ------
@@ -66,12 +67,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _failed("", str(error), 1)
         raise
     try:
-        _module(options.command).run(options)
+        status: int | None = _module(options.command).run(options)
     except _ERRORS as error:
         return _failed(options.command, str(error) or type(error).__name__, 1)
     except KeyboardInterrupt as interruption:
         return _interrupted(options.command, interruption)
-    return 0
+    return status or 0
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:

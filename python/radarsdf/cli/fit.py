@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from pathlib import Path
 
@@ -28,6 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="leave out the first scan and then every N-th scan, for radarsdf eval --holdout N",
     )
+    parser.add_argument(
+        "--no-check", action="store_true", help="fit the scans even if radarsdf check would find an error"
+    )
     parser.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
     parser.add_argument(
         "--checkpoint",
@@ -44,6 +48,7 @@ def run(options: argparse.Namespace) -> None:
     config = config_of(options)
 
     from radarsdf import Interrupted, estimate, fit
+    from radarsdf.cli.check import warn_or_refuse
     from radarsdf.cli.saving import save_map
     from radarsdf.io.files import check_outputs
     from radarsdf.io.scans import read_scans
@@ -58,6 +63,8 @@ def run(options: argparse.Namespace) -> None:
     if options.dry_run:
         say(str(estimate(scans.points, scans.poses, intensities, config=config)))
         return
+    if not options.no_check:
+        warn_or_refuse(dataclasses.replace(scans, intensities=intensities))
     started_s = time.perf_counter()
     try:
         radar_map = fit(

@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a fit will meet: returns below the ground, the noise of the sensor, memory and time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from radarsdf.budget.estimate import estimate_rays
+from radarsdf.budget.extent import check_extent
+from radarsdf.checking.finding import Finding
+from radarsdf.checking.recording import Recording
+from radarsdf.config import FitConfig
+from radarsdf.returns.noise import sensor_noise
+from radarsdf.returns.rays import prepare
+from radarsdf.returns.surfels import Surfels
+
+_CLOSE_M = 25.0  # farther returns are below the ground by their noise in elevation
+_BIN_M = 0.25
+_DEPTH_M, _DEPTH_PER_M = 1.0, 0.1  # below the ground by this, and by this share of the range
+_SOME, _MANY = 0.01, 0.1  # share of the close returns. Six real drives have up to 0.063
+_FEW_RETURNS = 100
+
+
+def check_ground(recording: Recording) -> list[Finding]:
+    """Tells how many returns lie below the ground, as reflections in it do. The z axis of the world must be up.
+
+    The ground is where most close returns below the sensor lie.
+    """
+    heights, ranges = [], []
+    for i in recording.some_scans().tolist():
+        scan = np.asarray(recording.points[i], np.float64)
+        distance = np.linalg.norm(scan, axis=1)
+        close = distance < _CLOSE_M
+        heights.append(scan[close] @ recording.poses[i, 2, :3])
+        ranges.append(distance[close])
+    height, distance = np.concatenate(heights), np.concatenate(ranges)
+    below = height[height < -_BIN_M]
+    if len(below) < _FEW_RETURNS:
+        return []
+    counts, edges = np.histogram(below, np.arange(-5, 0, _BIN_M))
+    ground = float(edges[np.argmax(counts)]) + _BIN_M / 2
+    share = float((height < ground - _DEPTH_M - _DEPTH_PER_M * distance).mean())
+    if share < _SOME:
+        return []
+    return [
+        Finding(
+            "below_ground",
+            "warning" if share > _MANY else "note",
+            f"{share:.1%} of the returns closer than {_CLOSE_M:g} m lie clearly below the ground, which is {-ground:.1f} m "
+            "below the sensor.",
+            "Leave them out if they are reflections in the ground.",
+        )
+    ]
+
+
+def check_fit(recording: Recording, config: FitConfig) -> list[Finding]:
+    """Tells the noise of the sensor, and what a fit will cost, or why it would refuse."""
+    try:
+        rays = prepare(recording.points, recording.poses, recording.intensities, **config.returns.preparation)
+        check_extent(rays, config)
+    except ValueError as error:
+        return [
+            Finding("fit_refuses", "error", f"A fit would refuse these scans: {error}.", "See the message.")
+        ]
+    cost = estimate_rays(rays, config)
+    surfels = Surfels.of(rays, config.leaf_size_m)
+    noise = sensor_noise(surfels, rays, surfels.cells.cell_of_ray, config.returns)
+    return [
+        Finding(
+            "noise",
+            "note",
+            f"The noise of the sensor is about {noise.range_m:.3f} m along the beam, {np.degrees(noise.azimuth_rad):.2f} "
+            f"degrees in azimuth and {np.degrees(noise.elevation_rad):.2f} degrees in elevation.",
+            "Nothing needs to be done: a fit finds it anew.",
+        ),
+        Finding("cost", "note", f"A fit has {cost}.", "Lower effort if that is too much."),
+    ]

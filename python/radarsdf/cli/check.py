@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``radarsdf check``: what is wrong with scans and poses, before a fit."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from radarsdf.cli.options import add_config_options, config_of
+from radarsdf.cli.saying import complain, say
+
+if TYPE_CHECKING:
+    from radarsdf.io.scans import Scans
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument("scans", type=Path, help="the scans, as for radarsdf fit")
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    add_config_options(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the findings, the worst first, and the command to run next. The status is 1 if one is an error."""
+    import dataclasses
+    import json
+
+    from radarsdf import check
+    from radarsdf.io.scans import read_scans
+
+    config = config_of(options)
+    scans = read_scans(options.scans)
+    findings = check(scans.points, scans.poses, scans.intensities, config=config)
+    failed = any(finding.severity == "error" for finding in findings)
+    again = f"radarsdf check {shlex.quote(str(options.scans))}"
+    target = shlex.quote(str(options.scans.with_suffix(".safetensors")))
+    following = again if failed else f"radarsdf fit {shlex.quote(str(options.scans))} -o {target}"
+    if options.json:
+        say(json.dumps({"findings": [dataclasses.asdict(f) for f in findings], "next": following}, indent=2))
+    else:
+        for finding in findings:
+            say(str(finding))
+        say(f"next: {'mend the errors, then ' if failed else ''}{following}")
+    return int(failed)
+
+
+def warn_or_refuse(scans: Scans) -> None:
+    """Say what the cheap checks find in scans, before they are fitted.
+
+    Raises
+    ------
+    ValueError
+        If a map of them would be nonsense.
+    """
+    from radarsdf.checking.check import check_cheaply
+
+    for finding in check_cheaply(scans.points, scans.poses, scans.intensities):
+        if finding.severity == "error":
+            msg = f"{finding.name}: {finding.evidence} {finding.mend} --no-check fits the scans as they are"
+            raise ValueError(msg)
+        if finding.severity == "warning":
+            complain(f"radarsdf fit: {finding}")

@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The sensor's velocity from Doppler, against the truth of a simulation and the flags of recorded drives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf.checking.doppler import folding_interval_mps, sensor_velocity, velocity_of_poses
+
+from tests.conftest import recorded_scans
+
+STEP_S = 0.1
+VELOCITY_MPS = np.array([7.0, 0.4, -0.2])
+
+
+def directions(count, seed=0):
+    rng = np.random.default_rng(seed)
+    azimuth, elevation = rng.uniform(-1, 1, count), rng.uniform(-0.3, 0.3, count)
+    return np.stack(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], 1
+    )
+
+
+def one_scan(moving=0.3, sigma=0.08, count=2000):
+    """Points, Doppler, and which of the returns move."""
+    rng = np.random.default_rng(1)
+    points = directions(count) * rng.uniform(3, 60, (count, 1))
+    doppler = -directions(count) @ VELOCITY_MPS + rng.normal(0, sigma, count)
+    moves = rng.random(count) < moving
+    doppler[moves] += rng.uniform(1, 8, moves.sum()) * rng.choice([-1, 1], moves.sum())
+    return points, doppler, moves
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Scans along a turn, with Doppler from their poses and a tenth of the returns moving."""
+    every = radarsdf.simulate.wall(frames=90)
+    # Uneven speed: else no clock could be told from another.
+    chosen = np.cumsum(np.round(2 + 1.2 * np.sin(np.arange(40) / 4)).astype(int))
+    chosen = chosen[chosen < 90]
+    points, poses = [every.points[i] for i in chosen], every.poses[chosen]
+    rng = np.random.default_rng(2)
+    times = STEP_S * np.arange(len(chosen))
+    velocities = velocity_of_poses(poses, times)
+    doppler = []
+    for scan, velocity in zip(points, velocities, strict=True):
+        away = scan / np.linalg.norm(scan, axis=1, keepdims=True)
+        speeds = -away @ velocity + rng.normal(0, 0.05, len(scan))
+        moves = rng.random(len(scan)) < 0.1
+        doppler.append((speeds + np.where(moves, 3.0, 0.0)).astype(np.float32))
+    return points, poses, doppler, times
+
+
+def named(findings):
+    return {finding.name: finding.severity for finding in findings}
+
+
+def test_the_velocity_is_found_among_moving_returns():
+    points, doppler, moves = one_scan()
+    found = sensor_velocity(points, doppler)
+    error = found.velocity_mps - VELOCITY_MPS
+    assert (np.abs(error) < 4 * np.sqrt(np.diag(found.covariance))).all()
+    assert np.linalg.norm(error[:2]) < 0.02
+    assert (~found.static[moves]).mean() > 0.99
+    assert found.static[~moves].mean() > 0.95
+
+
+def test_the_covariance_is_that_of_the_errors():
+    points = directions(300, seed=3)
+    errors, sigmas = [], []
+    for seed in range(60):
+        doppler = -points @ VELOCITY_MPS + np.random.default_rng(seed).normal(0, 0.04, len(points))
+        found = sensor_velocity(points, doppler)
+        errors.append(found.velocity_mps - VELOCITY_MPS)
+        sigmas.append(np.diag(found.covariance))
+    ratio = np.mean(np.square(errors), axis=0) / np.mean(sigmas, axis=0)
+    # A mean of 60 squares is off by a factor of 1.2, and the cut at three deviations costs a few per cent.
+    assert ((ratio > 0.5) & (ratio < 1.8)).all()
+
+
+def test_folded_speeds_are_unfolded():
+    points, doppler, moves = one_scan(moving=0.1)
+    folded = (doppler + 5) % 10 - 5
+    found = sensor_velocity(points, folded, interval_mps=10.0)
+    assert np.linalg.norm(found.velocity_mps - VELOCITY_MPS) < 0.05
+    assert found.static[~moves].mean() > 0.95
+    assert folding_interval_mps([folded]) == pytest.approx(10.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "doppler",
+    [np.random.default_rng(5).uniform(-20, 20, 500), np.full(500, np.nan)],
+    ids=["random", "not finite"],
+)
+def test_speeds_of_no_sensor_have_no_velocity(doppler):
+    found = sensor_velocity(directions(500), doppler)
+    assert not found.found
+    assert not found.static.any()
+
+
+def test_returns_in_one_direction_have_no_velocity():
+    points = np.outer(np.linspace(3, 30, 100), [1.0, 0, 0])
+    assert not sensor_velocity(points, np.full(100, -7.0)).found
+
+
+def test_good_doppler_says_only_what_moves(drive):
+    points, poses, doppler, times = drive
+    found = radarsdf.check(points, poses, doppler_mps=doppler, times_s=times)
+    assert set(named(found).values()) == {"note"}
+    moving = next(finding for finding in found if finding.name == "moving_share")
+    share = float(moving.evidence.split("%")[0].split()[-1])
+    assert 9 < share < 12
+
+
+def test_the_other_sign_is_noted(drive):
+    points, poses, doppler, times = drive
+    found = named(radarsdf.check(points, poses, doppler_mps=[-d for d in doppler], times_s=times))
+    assert found["doppler_sign"] == "note"
+    assert set(found.values()) == {"note"}
+
+
+def test_a_turned_sensor_is_named(drive):
+    points, poses, doppler, times = drive
+    turn = np.array([[np.cos(0.12), -np.sin(0.12), 0], [np.sin(0.12), np.cos(0.12), 0], [0, 0, 1]])
+    turned = [(scan @ turn.T).astype(np.float32) for scan in points]
+    found = radarsdf.check(turned, poses, doppler_mps=doppler, times_s=times)
+    assert "sensor_turned" in named(found)
+
+
+def test_a_clock_that_is_off_is_named(drive):
+    points, poses, doppler, times = drive
+    found = named(radarsdf.check(points[2:], poses[:-2], doppler_mps=doppler[2:], times_s=times[2:]))
+    assert found.get("clock_offset") == "error"
+
+
+def test_doppler_as_intensity_is_named(drive):
+    points, poses, doppler, _ = drive
+    assert named(radarsdf.check(points, poses, doppler))["intensity_is_doppler"] == "error"
+
+
+def test_intensity_as_doppler_is_named(drive):
+    points, poses, _, times = drive
+    intensities = [100 - 20 * np.log10(np.linalg.norm(scan, axis=1)) for scan in points]
+    found = named(radarsdf.check(points, poses, doppler_mps=intensities, times_s=times))
+    assert found["doppler_without_velocity"] == "warning"
+
+
+@pytest.mark.parametrize("name", ["r0009_0024", "r0057_0068", "r0133_0142", "r0144_0167", "r0309_0320"])
+def test_what_moves_is_what_the_flags_of_recorded_drives_say(name):
+    with np.load(recorded_scans(name)) as file:
+        points, doppler, static, frame = (file[k] for k in ("points", "doppler", "static", "frame"))
+    rows = [np.flatnonzero(frame == i) for i in range(frame.max() + 1)]
+    interval = folding_interval_mps([doppler])
+    found = [sensor_velocity(points[r], doppler[r], interval_mps=interval).static for r in rows]
+    agrees = np.concatenate([flags == static[r] for flags, r in zip(found, rows, strict=True)])
+    assert agrees.mean() > 0.95
