@@ -292,11 +292,12 @@ def _clock(
 ) -> list[Finding]:
     """Tells whether the velocities by Doppler fit those by poses of another time clearly better."""
     step = float(np.median(np.diff(times_s)))
-    shifts = step * np.linspace(-8, 8, 65)
+    most = float(np.clip(np.floor((times_s[-1] - times_s[0]) / step / 5), 1, 8))
+    shifts = step * np.linspace(-most, most, 8 * int(most) + 1)
     knots = (times_s[1:] + times_s[:-1]) / 2
     by_poses = _between(T_world_sensor, times_s)
     at = times_s[scans]
-    inside = (at - 8 * step > knots[0]) & (at + 8 * step < knots[-1])
+    inside = (at - most * step > knots[0]) & (at + most * step < knots[-1])
     if inside.sum() < 2 * _MIN_SCANS:
         return []
     errors = []

@@ -37,6 +37,8 @@ class Hypothesis:
     """What to do, if this is right."""
     T_j_i: FloatArray
     """(P, 4, 4) motions of the pairs of scans, between the frames of the points as given."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """The axis of the points as given that is up then."""
 
 
 def hypotheses(
@@ -141,6 +143,7 @@ def _axes(T_world_sensor: FloatArray, pairs: NDArray[np.int64], all_axes: bool) 
                 f"the points are read as ({words})",
                 f"Pass points with the columns ({words}): x forward, y left, z up.",
                 turned.T @ motions @ turned,
+                up=(float(matrix[2, 0]), float(matrix[2, 1]), float(matrix[2, 2])),
             )
         )
         moved = T_world_sensor.copy()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
+from radarsdf.checking.doppler import folding_interval_mps, sensor_velocity
 from radarsdf.checking.finding import Finding, Severity
 from radarsdf.checking.frames import FULL, Effort
 from radarsdf.checking.recording import FloatArray, Recording
@@ -22,6 +23,7 @@ _ROUND = 3  # steps before and after
 _JUMPS_TRIED = 12
 _MIN_GAIN, _MIN_SIGNIFICANCE = 0.1, 3.0  # as in frames.py; few pairs lie across a jump
 _CLOSES = 0.5  # of the difference to scans beside the jump
+_DOPPLER_SLACK_M = 1.0  # a step may be longer by this than the speed allows twice
 _CAUGHT_UP = 1.5  # times the median step
 
 
@@ -215,7 +217,13 @@ def check_jumps(recording: Recording, effort: Effort = FULL) -> list[Finding]:
     suspects = np.flatnonzero(changes > _JUMP * max(usual, 0.1 * float(np.median(sizes)))).tolist()
     suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
     agreement = Agreement(recording.points, effort.returns, 2 * effort.queries)
-    confirmed = [k for k in suspects if _agree_without(recording, agreement, k, suspects, durations)]
+    interval = None if recording.doppler_mps is None else folding_interval_mps(recording.doppler_mps)
+    confirmed = [
+        k
+        for k in suspects
+        if _faster_than_doppler(recording, k, interval)
+        or _agree_without(recording, agreement, k, suspects, durations)
+    ]
     if not confirmed:
         return []
     worst = max(confirmed, key=lambda k: changes[k])
@@ -226,10 +234,23 @@ def check_jumps(recording: Recording, effort: Effort = FULL) -> list[Finding]:
             "pose_jumps",
             "error" if len(confirmed) > count // 10 else "warning",
             f"{len(confirmed)} of {count - 1} steps are jumps, the largest after scan {worst}: {step:.3g} m and "
-            f"{turn:.3g} degrees, off the motion round it by {changes[worst] / max(usual, 1e-9):.0f} times the usual; without it the scans agree better.",
+            f"{turn:.3g} degrees, off the motion round it by {changes[worst] / max(usual, 1e-9):.0f} times the usual; Doppler or the agreement of the scans denies it.",
             "Use poses that were smoothed over the whole drive, or leave out the scans at the jumps.",
         )
     ]
+
+
+def _faster_than_doppler(recording: Recording, jump: int, interval_mps: float | None) -> bool:
+    """Whether a step is far longer than the speeds by the Doppler of the scans before and after it allow."""
+    times = recording.times_s
+    if recording.doppler_mps is None or times is None or not times[jump + 1] > times[jump]:
+        return False
+    velocities = [
+        sensor_velocity(recording.points[i], recording.doppler_mps[i], interval_mps=interval_mps).velocity_mps
+        for i in (jump, jump + 1)
+    ]
+    way = float(np.linalg.norm(velocities, axis=1).max() * (times[jump + 1] - times[jump]))
+    return bool(_steps_m(recording)[jump] > 2 * way + _DOPPLER_SLACK_M)  # False for NaN: no velocity
 
 
 def _agree_without(

@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``python -m bench.breakages [FILE.npz ...]``: a table of breakages and scenes, simulated and the given ones."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import radarsdf
+from radarsdf.checking.check import check_cheaply
+from radarsdf.checking.doppler import velocity_of_poses
+
+from bench.breakages.ways import NEED_DOPPLER, WAYS, Data
+
+SCENES = (
+    ("hugin", 120),
+    ("hugin", 12),
+    ("oculii", 120),
+    ("oculii", 24),
+    ("wall", 30),
+    ("astyx", 20),
+    ("astyx", 8),
+)
+_STEP_S = 0.1
+_GOOD_SEEDS = range(1, 4)
+
+
+def simulated(name: str, frames: int, seed: int = 0) -> Data:
+    """A simulated scene, with Doppler of its poses and a tenth of the returns moving at 3 m/s."""
+    scans = getattr(radarsdf.simulate, name)(seed=seed, frames=frames)
+    rng = np.random.default_rng(seed)
+    times_s = _STEP_S * np.arange(frames)
+    doppler = []
+    for scan, velocity_mps in zip(scans.points, velocity_of_poses(scans.poses, times_s), strict=True):
+        away = scan / np.linalg.norm(scan, axis=1, keepdims=True)
+        speeds = -away @ velocity_mps + rng.normal(0, 0.05, len(scan))
+        doppler.append(speeds + np.where(rng.random(len(scan)) < 0.1, 3.0, 0.0))
+    return Data(scans.points, scans.poses, scans.intensities, doppler, times_s)
+
+
+def recorded(path: Path) -> Data:
+    """A file of scans; with the arrays doppler and times if it has them."""
+    with np.load(path) as file:
+        frame, count = file["frame"], len(file["poses"])
+
+        def split(name: str) -> list[np.ndarray]:
+            values = file[name]
+            return [values[frame == i] for i in range(count)]
+
+        doppler = split("doppler") if "doppler" in file else None
+        times_s = file.get("times")
+        return Data(split("points"), file["poses"].astype(np.float64), split("intensity"), doppler, times_s)
+
+
+def main() -> None:
+    """Print the table, the share of breakages that are named, and the false alarms in good data."""
+    parser = argparse.ArgumentParser(prog="python -m bench.breakages", description=__doc__)
+    parser.add_argument("files", nargs="*", type=Path, help="recorded scans, .npz")
+    parser.add_argument("--quick", action="store_true", help="two small scenes")
+    parser.add_argument(
+        "--cheap", action="store_true", help="the checks of radarsdf fit, without Doppler and times"
+    )
+    options = parser.parse_args()
+    chosen = (("wall", 12), ("astyx", 8)) if options.quick else SCENES
+    scenes = {f"{name} {frames}": simulated(name, frames) for name, frames in chosen}
+    scenes |= {path.stem: recorded(path) for path in options.files}
+    columns = list(scenes)
+    print("| breakage | " + " | ".join(columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
+    named = tried = 0
+    for words, (finding, broken) in WAYS.items():
+        cells = []
+        for data in scenes.values():
+            if finding in NEED_DOPPLER and (data.doppler_mps is None or options.cheap):
+                cells.append("–")
+                continue
+            findings = found_in(broken(data), options.cheap)
+            worse = [name for name, severity in findings if severity != "note"]
+            hit = finding in [name for name, _ in findings]
+            tried += 1
+            named += hit
+            cells.append("named" if hit else ", ".join(worse) or "no")
+        print(f"| {words} | " + " | ".join(cells) + " |", flush=True)
+    print(f"\n{named} of {tried} breakages are named: {named / tried:.1%}")
+    good = dict(scenes)
+    if not options.quick:
+        good |= {f"{n} {f} seed {s}": simulated(n, f, s) for s in _GOOD_SEEDS for n, f in SCENES if f < 100}
+    alarms = {}
+    started_s = time.perf_counter()
+    for name, data in good.items():
+        if worse := [(n, severity) for n, severity in found_in(data, options.cheap) if severity != "note"]:
+            alarms[name] = worse
+    seconds = (time.perf_counter() - started_s) / len(good)
+    print(
+        f"{len(alarms)} of {len(good)} good recordings have a finding worse than a note: {alarms}; {seconds:.2f} s each"
+    )
+
+
+def found_in(data: Data, cheap: bool) -> list[tuple[str, str]]:
+    """Names and severities of the findings."""
+    if cheap:
+        findings = check_cheaply(data.points, data.poses, data.intensities)
+    else:
+        findings = radarsdf.check(**data.arguments())
+    return [(finding.name, finding.severity) for finding in findings]
+
+
+if __name__ == "__main__":
+    main()

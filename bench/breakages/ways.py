@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Ways to break good data, each with the finding that should name it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+_CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+_QUARTER_TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+_TIMES_OF_STEP = 2  # scans by which a clock is off
+
+
+@dataclass(frozen=True)
+class Data:
+    """The arguments of `radarsdf.check`."""
+
+    points: list[NDArray[Any]]
+    poses: FloatArray
+    intensities: list[NDArray[Any]]
+    doppler_mps: list[NDArray[Any]] | None = None
+    times_s: FloatArray | None = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Names and values of the arguments."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+
+Way = Callable[[Data], Data]
+
+
+def _points(change: Callable[[FloatArray], FloatArray]) -> Way:
+    return lambda data: dataclasses.replace(
+        data, points=[change(scan.astype(np.float64)) for scan in data.points]
+    )
+
+
+def _positions(change: Callable[[FloatArray], FloatArray]) -> Way:
+    def broken(data: Data) -> Data:
+        poses = data.poses.copy()
+        poses[:, :3, 3] = change(poses[:, :3, 3])
+        return dataclasses.replace(data, poses=poses)
+
+    return broken
+
+
+def _poses(change: Callable[[FloatArray], FloatArray]) -> Way:
+    return lambda data: dataclasses.replace(data, poses=change(data.poses))
+
+
+def _intensities(change: Callable[[NDArray[Any]], NDArray[Any]]) -> Way:
+    return lambda data: dataclasses.replace(data, intensities=[change(values) for values in data.intensities])
+
+
+def _in_world(data: Data) -> Data:
+    moved = [scan @ pose[:3, :3].T + pose[:3, 3] for scan, pose in zip(data.points, data.poses, strict=True)]
+    return dataclasses.replace(data, points=moved)
+
+
+def _all_millimetres(data: Data) -> Data:
+    return _positions(lambda t: 1000 * t)(_points(lambda p: 1000 * p)(data))
+
+
+def _degrees_for_rad(poses: FloatArray) -> FloatArray:
+    broken = poses.copy()
+    degrees = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX", degrees=True)
+    broken[:, :3, :3] = Rotation.from_euler("ZYX", degrees).as_matrix()
+    return broken
+
+
+def _rad_for_degrees(poses: FloatArray) -> FloatArray:
+    broken = poses.copy()
+    rad = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX")
+    broken[:, :3, :3] = Rotation.from_euler("ZYX", rad, degrees=True).as_matrix()
+    return broken
+
+
+def _turned(poses: FloatArray) -> FloatArray:
+    """The drive turns by 25 degrees on the spot, halfway."""
+    broken, middle = poses.copy(), len(poses) // 2
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("z", 25, degrees=True).as_matrix()
+    broken[middle:] = poses[middle] @ turn @ np.linalg.inv(poses[middle]) @ poses[middle:]
+    return broken
+
+
+def _moved_on(poses: FloatArray) -> FloatArray:
+    """From halfway on, all is 4 m to the side."""
+    broken, middle = poses.copy(), len(poses) // 2
+    broken[middle:, :3, 3] += 4 * poses[middle, :3, 1]
+    return broken
+
+
+def _one_off(poses: FloatArray) -> FloatArray:
+    """One pose is 4 m to the side."""
+    broken, middle = poses.copy(), len(poses) // 2
+    broken[middle, :3, 3] += 4 * poses[middle, :3, 1]
+    return broken
+
+
+def _copied(data: Data) -> Data:
+    def copied(arrays: list[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
+        middle = 0 if arrays is None else len(arrays) // 2
+        return None if arrays is None else [*arrays[:middle], arrays[middle - 1], *arrays[middle + 1 :]]
+
+    return dataclasses.replace(
+        data,
+        points=copied(data.points),
+        intensities=copied(data.intensities),
+        doppler_mps=copied(data.doppler_mps),
+    )
+
+
+def _late(data: Data) -> Data:
+    """Each scan has the pose of two scans before."""
+    return dataclasses.replace(
+        data,
+        points=data.points[_TIMES_OF_STEP:],
+        poses=data.poses[:-_TIMES_OF_STEP],
+        intensities=data.intensities[_TIMES_OF_STEP:],
+        doppler_mps=None if data.doppler_mps is None else data.doppler_mps[_TIMES_OF_STEP:],
+        times_s=None if data.times_s is None else data.times_s[:-_TIMES_OF_STEP],
+    )
+
+
+def _clipped(data: Data) -> Data:
+    highest = np.percentile(np.concatenate(data.intensities), 85)
+    return _intensities(lambda values: np.minimum(values, highest))(data)
+
+
+def _below_ground(data: Data) -> Data:
+    def mirrored(scan: FloatArray) -> FloatArray:
+        lower = scan.copy()
+        lower[::4, 2] = -3.6 - np.abs(lower[::4, 2] + 1.2)
+        lower[::4, 2] -= 0.1 * np.linalg.norm(scan[::4], axis=1)
+        return lower
+
+    return _points(mirrored)(data)
+
+
+def _doppler_as_intensity(data: Data) -> Data:
+    return data if data.doppler_mps is None else dataclasses.replace(data, intensities=data.doppler_mps)
+
+
+def _sign(data: Data) -> Data:
+    return (
+        data
+        if data.doppler_mps is None
+        else dataclasses.replace(data, doppler_mps=[-d for d in data.doppler_mps])
+    )
+
+
+def _sensor_turned(data: Data) -> Data:
+    turn = Rotation.from_euler("z", 8, degrees=True).as_matrix()
+    return _points(lambda p: p @ turn.T)(data)
+
+
+WAYS: dict[str, tuple[str, Way]] = {
+    "points in the world frame": ("points_in_world_frame", _in_world),
+    "poses inverted": ("poses_inverted", _poses(np.linalg.inv)),
+    "poses transposed": ("poses_transposed", _poses(lambda T: T.transpose(0, 2, 1))),
+    "poses scaled": ("poses_not_rigid", _poses(lambda T: T * [1.1, 1.1, 1.1, 1])),
+    "points in mm": ("units", _points(lambda p: 1000 * p)),
+    "positions in mm": ("units", _positions(lambda t: 1000 * t)),
+    "positions in cm": ("units", _positions(lambda t: 100 * t)),
+    "all in mm": ("units", _all_millimetres),
+    "degrees taken for rad": ("angles_in_degrees", _poses(_degrees_for_rad)),
+    "rad taken for degrees": ("angles_in_degrees", _poses(_rad_for_degrees)),
+    "points in a camera frame": ("camera_frame", _points(lambda p: p @ _CAMERA_OF_RADAR.T)),
+    "x and y swapped": ("axes_swapped", _points(lambda p: p[:, [1, 0, 2]])),
+    "points turned by 90 degrees": ("axes_swapped", _points(lambda p: p @ _QUARTER_TURN.T)),
+    "points with y right, z down": ("axes_swapped", _points(lambda p: p * [1, -1, -1])),
+    "positions turned by 90 degrees": ("axes_swapped", _positions(lambda t: t @ _QUARTER_TURN.T)),
+    "points mirrored": ("mirrored", _points(lambda p: p * [1, -1, 1])),
+    "positions mirrored": ("mirrored", _positions(lambda t: t * [1, -1, 1])),
+    "poses left-handed": ("mirrored", _poses(lambda T: T @ np.diag([1.0, -1, 1, 1]))),
+    "4 m to the side from halfway": ("pose_jumps", _poses(_moved_on)),
+    "one pose 4 m to the side": ("pose_jumps", _poses(_one_off)),
+    "25 degrees to the side from halfway": ("pose_jumps", _poses(_turned)),
+    "every pose held for two scans": (
+        "duplicate_poses",
+        _poses(lambda T: np.repeat(T[::2], 2, axis=0)[: len(T)]),
+    ),
+    "a scan twice": ("duplicate_scans", _copied),
+    "poses of two scans before": ("clock_offset", _late),
+    "intensity constant": ("intensity_constant", _intensities(lambda v: np.full_like(v, 7))),
+    "intensity constant in each scan": (
+        "intensity_constant_in_scans",
+        _intensities(lambda v: np.full_like(v, v[0])),
+    ),
+    "intensity in steps of 0.5": ("intensity_steps", _intensities(lambda v: np.round(2 * v) / 2)),
+    "intensity clipped": ("intensity_clipped", _clipped),
+    "intensity is RCS + 128": ("intensity_offset", _intensities(lambda v: np.round(v - np.median(v)) + 128)),
+    "Doppler as intensity": ("intensity_is_doppler", _doppler_as_intensity),
+    "Doppler with the other sign": ("doppler_sign", _sign),
+    "sensor turned by 8 degrees": ("sensor_turned", _sensor_turned),
+    "reflections below the ground": ("below_ground", _below_ground),
+}
+"""What is broken, and the name of its finding and how to break it."""
+
+NEED_DOPPLER = {"intensity_is_doppler", "doppler_sign", "sensor_turned"}
+"""Findings that need Doppler."""

@@ -1,0 +1,39 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The ways to break good data do what they say, and the check names them on a small scene."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bench.breakages.__main__ import found_in, simulated
+from bench.breakages.ways import WAYS
+
+
+@pytest.fixture(scope="module")
+def good():
+    return simulated("wall", 20)
+
+
+def differs(a, b):
+    pairs = ((getattr(a, field.name), getattr(b, field.name)) for field in dataclasses.fields(a))
+    return any(
+        len(x) != len(y) or any(not np.array_equal(u, v) for u, v in zip(x, y, strict=True)) for x, y in pairs
+    )
+
+
+def test_good_data_have_nothing_worse_than_notes(good):
+    assert [name for name, severity in found_in(good, cheap=False) if severity != "note"] == []
+    assert [name for name, severity in found_in(good, cheap=True) if severity != "note"] == []
+
+
+# A steady motion is the same at any time: tests/checking has clocks that are off where the motion changes.
+@pytest.mark.parametrize("way", sorted(set(WAYS) - {"poses of two scans before"}))
+def test_a_way_breaks_the_data_and_is_named(good, way):
+    finding, broken = WAYS[way]
+    data = broken(good)
+    assert differs(good, data)
+    assert finding in [name for name, _ in found_in(data, cheap=False)]
