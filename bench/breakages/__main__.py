@@ -32,7 +32,7 @@ def simulated(name: str, frames: int, seed: int = 0) -> Data:
     """A simulated scene, with Doppler of its poses and a tenth of the returns moving at 3 m/s."""
     scans = getattr(radarsdf.simulate, name)(seed=seed, frames=frames)
     rng = np.random.default_rng(seed)
-    times_s = _STEP_S * np.arange(frames)
+    times_s = _STEP_S * np.arange(frames, dtype=np.float64)
     doppler = []
     for scan, velocity_mps in zip(scans.points, velocity_of_poses(scans.poses, times_s), strict=True):
         away = scan / np.linalg.norm(scan, axis=1, keepdims=True)
@@ -91,8 +91,8 @@ def main() -> None:
     alarms = {}
     started_s = time.perf_counter()
     for name, data in good.items():
-        if worse := [(n, severity) for n, severity in found_in(data, options.cheap) if severity != "note"]:
-            alarms[name] = worse
+        if alarm := [found for found in found_in(data, options.cheap) if found[1] != "note"]:
+            alarms[name] = alarm
     seconds = (time.perf_counter() - started_s) / len(good)
     print(
         f"{len(alarms)} of {len(good)} good recordings have a finding worse than a note: {alarms}; {seconds:.2f} s each"

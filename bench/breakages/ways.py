@@ -108,15 +108,17 @@ def _one_off(poses: FloatArray) -> FloatArray:
 
 
 def _copied(data: Data) -> Data:
-    def copied(arrays: list[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
-        middle = 0 if arrays is None else len(arrays) // 2
-        return None if arrays is None else [*arrays[:middle], arrays[middle - 1], *arrays[middle + 1 :]]
+    """A scan in the middle is replaced by the one before."""
+
+    def copied(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
+        middle = len(arrays) // 2
+        return [*arrays[:middle], arrays[middle - 1], *arrays[middle + 1 :]]
 
     return dataclasses.replace(
         data,
         points=copied(data.points),
         intensities=copied(data.intensities),
-        doppler_mps=copied(data.doppler_mps),
+        doppler_mps=None if data.doppler_mps is None else copied(data.doppler_mps),
     )
 
 
@@ -166,7 +168,7 @@ def _sensor_turned(data: Data) -> Data:
 
 WAYS: dict[str, tuple[str, Way]] = {
     "points in the world frame": ("points_in_world_frame", _in_world),
-    "poses inverted": ("poses_inverted", _poses(np.linalg.inv)),
+    "poses inverted": ("poses_inverted", _poses(lambda T: np.asarray(np.linalg.inv(T)))),
     "poses transposed": ("poses_transposed", _poses(lambda T: T.transpose(0, 2, 1))),
     "poses scaled": ("poses_not_rigid", _poses(lambda T: T * [1.1, 1.1, 1.1, 1])),
     "points in mm": ("units", _points(lambda p: 1000 * p)),
