@@ -6,19 +6,21 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from radarsdf.cli.options import add_config_options, config_of
 from radarsdf.cli.saying import complain, say
+from radarsdf.cli.scans_in import add_scans, scans_of, words_of
 
 if TYPE_CHECKING:
-    from radarsdf.io.scans import Scans
+    from numpy.typing import NDArray
+
+    from radarsdf.io.sequence import Scans
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument("scans", type=Path, help="the scans, as for radarsdf fit")
+    add_scans(parser)
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     add_config_options(parser)
 
@@ -29,15 +31,22 @@ def run(options: argparse.Namespace) -> int:
     import json
 
     from radarsdf import check
-    from radarsdf.io.scans import read_scans
 
     config = config_of(options)
-    scans = read_scans(options.scans)
-    findings = check(scans.points, scans.poses, scans.intensities, config=config)
+    scans = scans_of(options)
+    points = scans.points  # first: it reads all there is, in one pass
+    findings = check(
+        points,
+        scans.poses,
+        scans.intensities,
+        doppler_mps=scans.doppler_mps,
+        times_s=scans.times_s,
+        config=config,
+    )
     failed = any(finding.severity == "error" for finding in findings)
-    again = f"radarsdf check {shlex.quote(str(options.scans))}"
     target = shlex.quote(str(options.scans.with_suffix(".safetensors")))
-    following = again if failed else f"radarsdf fit {shlex.quote(str(options.scans))} -o {target}"
+    words = words_of(options)
+    following = f"radarsdf check {words}" if failed else f"radarsdf fit {words} -o {target}"
     if options.json:
         say(json.dumps({"findings": [dataclasses.asdict(f) for f in findings], "next": following}, indent=2))
     else:
@@ -47,8 +56,8 @@ def run(options: argparse.Namespace) -> int:
     return int(failed)
 
 
-def warn_or_refuse(scans: Scans) -> None:
-    """Say what the cheap checks find in scans, before they are fitted.
+def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None:
+    """Say what the cheap checks find in scans, before they are fitted with these intensities.
 
     Raises
     ------
@@ -57,7 +66,7 @@ def warn_or_refuse(scans: Scans) -> None:
     """
     from radarsdf.checking.check import check_cheaply
 
-    for finding in check_cheaply(scans.points, scans.poses, scans.intensities):
+    for finding in check_cheaply(scans.points, scans.poses, intensities):
         if finding.severity == "error":
             msg = f"{finding.name}: {finding.evidence} {finding.mend} --no-check fits the scans as they are"
             raise ValueError(msg)

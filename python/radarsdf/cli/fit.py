@@ -5,21 +5,17 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
 from pathlib import Path
 
 from radarsdf.cli.options import add_fit_options, config_of, progress_of
 from radarsdf.cli.saying import say
+from radarsdf.cli.scans_in import add_scans, scans_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument(
-        "scans",
-        type=Path,
-        help="the scans, .npz, with the arrays points, frame and poses, and optionally intensity, static and lidar_points",
-    )
+    add_scans(parser)
     out = parser.add_mutually_exclusive_group(required=True)
     out.add_argument("-o", "--out", type=Path, help="the map to write, .safetensors")
     out.add_argument("--dry-run", action="store_true", help="only estimate memory and time")
@@ -51,10 +47,10 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.cli.check import warn_or_refuse
     from radarsdf.cli.saving import save_map
     from radarsdf.io.files import check_outputs
-    from radarsdf.io.scans import read_scans
 
-    check_outputs([options.out, options.checkpoint], [options.scans])
-    scans = read_scans(options.scans)
+    inputs = [path for path in (options.scans, options.poses, options.extrinsic) if path is not None]
+    check_outputs([options.out, options.checkpoint], inputs)
+    scans = scans_of(options)
     if options.holdout is not None:
         from radarsdf.evaluation import holdout
 
@@ -64,7 +60,7 @@ def run(options: argparse.Namespace) -> None:
         say(str(estimate(scans.points, scans.poses, intensities, config=config)))
         return
     if not options.no_check:
-        warn_or_refuse(dataclasses.replace(scans, intensities=intensities))
+        warn_or_refuse(scans, intensities)
     started_s = time.perf_counter()
     try:
         radar_map = fit(

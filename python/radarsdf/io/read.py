@@ -169,7 +169,8 @@ def _files(
     if poses is None:
         poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
         if poses is None:
-            msg = f"{folder} has no poses: give them by poses, as a file (TUM, KITTI, 4 x 4) or an array (F, 4, 4)"
+            what = files[0] if len(files) == 1 else folder
+            msg = f"{what} has no poses: give them by poses, as a file (TUM, KITTI, 4 x 4) or an array (F, 4, 4)"
             raise ValueError(msg)
     if isinstance(poses, (str, PathLike)):
         places = dict.fromkeys((Path(poses).parent, *places))

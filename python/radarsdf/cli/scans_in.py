@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans on the command line: the same arguments for every command that reads some."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from radarsdf.io.sequence import Scans
+
+
+def add_scans(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that :func:`scans_of` reads."""
+    parser.add_argument(
+        "scans",
+        type=Path,
+        help="the scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set",
+    )
+    parser.add_argument(
+        "poses",
+        type=Path,
+        nargs="?",
+        help="their poses, where the scans have none: a file in TUM or KITTI format, or of 4 x 4 matrices",
+    )
+    parser.add_argument(
+        "--extrinsic",
+        type=Path,
+        metavar="FILE",
+        help="4 x 4 matrix from the sensor's frame to that of the poses, T_base_sensor, if they differ",
+    )
+    parser.add_argument("--topic", metavar="NAME", help="in a bag: the topic of the scans")
+    parser.add_argument("--pose-topic", metavar="NAME", help="in a bag: the topic of the poses")
+    parser.add_argument(
+        "--field",
+        action="append",
+        default=[],
+        metavar="ROLE=NAME",
+        help="the field of the file for x, y, z, intensity or doppler, such as intensity=Power; may be repeated",
+    )
+
+
+def scans_of(options: argparse.Namespace) -> Scans:
+    """The scans of the command. What was assumed or left out is said on standard error."""
+    import numpy as np
+
+    from radarsdf.io.read import read
+
+    extrinsic = None
+    if options.extrinsic is not None:
+        try:
+            extrinsic = np.loadtxt(options.extrinsic)
+        except ValueError as error:
+            msg = f"{options.extrinsic} is not a 4 x 4 matrix: {error}"
+            raise ValueError(msg) from error
+    return read(
+        options.scans,
+        options.poses,
+        extrinsic=extrinsic,
+        topic=options.topic,
+        pose_topic=options.pose_topic,
+        fields=dict(_field(text) for text in options.field) or None,
+    )
+
+
+def _field(text: str) -> tuple[str, str]:
+    role, equals, name = text.partition("=")
+    if not equals or not role or not name:
+        msg = f"--field takes ROLE=NAME, not {text!r:.50}"
+        raise ValueError(msg)
+    return role, name
+
+
+def words_of(options: argparse.Namespace) -> str:
+    """The same arguments, as one would type them again."""
+    words = [options.scans, options.poses]
+    for name in ("extrinsic", "topic", "pose_topic"):
+        value = getattr(options, name)
+        words += [f"--{name.replace('_', '-')}", value] if value is not None else []
+    for text in options.field:
+        words += ["--field", text]
+    return shlex.join(str(word) for word in words if word is not None)

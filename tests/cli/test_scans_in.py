@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans of other formats on the command line: a folder of point clouds with a file of poses, fields and mountings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf.io.scans import read_scans
+from scipy.spatial.transform import Rotation
+
+from .calls import FAST, call, refusal
+
+
+@pytest.fixture
+def folder(scans_file, tmp_path):
+    """The scans as point clouds in text files, and their poses as a file in TUM format."""
+    scans = read_scans(scans_file)
+    (tmp_path / "clouds").mkdir()
+    lines = []
+    for i, (points, pose, power) in enumerate(zip(scans.points, scans.poses, scans.intensities, strict=True)):
+        np.savetxt(
+            tmp_path / "clouds" / f"{100 + i}.0.csv",
+            np.column_stack([points, power]),
+            delimiter=",",
+            header="x,y,z,echo",
+            comments="",
+        )
+        numbers = [100 + i, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        lines.append(" ".join(f"{number:.9f}" for number in numbers))
+    (tmp_path / "poses.tum").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def fit_of(folder, *words):
+    out = folder / "map.safetensors"
+    assert call("fit", folder / "clouds", folder / "poses.tum", "-o", out, *FAST, *words) == 0
+    return radarsdf.load(out)
+
+
+def test_a_folder_with_a_file_of_poses(folder, scans_file):
+    radar_map = fit_of(folder, "--field", "intensity=echo")
+    expected = read_scans(scans_file)
+    assert radar_map.report["returns"] == sum(map(len, expected.points))
+    assert radar_map.intensity_scale.high == pytest.approx(
+        max(v.max() for v in expected.intensities), rel=1e-6
+    )
+    np.testing.assert_allclose(radar_map.origin, expected.poses[:, :3, 3].mean(axis=0), atol=1e-6)
+
+
+def test_a_mounting_moves_the_sensor(folder):
+    mounting = np.eye(4)
+    mounting[:3, 3] = [0.0, 0.0, 2.0]
+    np.savetxt(folder / "mounting.txt", mounting)
+    plain, moved = fit_of(folder), fit_of(folder, "--extrinsic", folder / "mounting.txt")
+    np.testing.assert_allclose(moved.origin - plain.origin, [0, 0, 2], atol=1e-6)
+
+
+def test_poses_that_are_missing(folder, capsys):
+    (folder / "poses.tum").unlink()  # which would be found beside the folder
+    said = refusal(capsys, folder, "fit", folder / "clouds", "-o", folder / "map.safetensors")
+    assert f"{folder / 'clouds'} has no poses" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--field", "intensity"], "--field takes ROLE=NAME, not 'intensity'"),
+        (["--field", "intensity=nothing"], "nothing"),
+        (["--extrinsic", "poses.tum"], "extrinsic must be T_base_sensor (4, 4), not (6, 8)"),
+    ],
+)
+def test_words_that_are_wrong(folder, capsys, words, said):
+    words = [folder / word if word.endswith(".tum") else word for word in words]
+    arguments = ["fit", folder / "clouds", folder / "poses.tum", "-o", folder / "map.safetensors", *words]
+    assert said in refusal(capsys, folder, *arguments)
