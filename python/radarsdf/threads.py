@@ -36,7 +36,7 @@ _users = 0
 _threads_before = 0
 _blocks = threading.local()  # .depth: number of `with Workers` blocks that this thread is in
 _vector_library_started = False
-_TRANSCENDENTAL = ("cos", "exp", "log", "log10", "log1p", "log2", "pow", "sigmoid", "sin", "tanh")
+_TRANSCENDENTAL = ("cos", "erf", "exp", "log", "log10", "log1p", "log2", "pow", "sigmoid", "sin", "tanh")
 _AT_ONCE = 1024  # numbers: enough for vectors, too few for PyTorch to share them among threads
 
 
