@@ -58,4 +58,28 @@ class CellBlocks {
   std::vector<Occupancy> regions_, blocks_;
 };
 
+// Rows of keys of which most lie in the block, or at least in the region, of the one before.
+class NearbyRows {
+ public:
+  explicit NearbyRows(const CellBlocks& cells) : cells_(&cells) {}
+
+  // The row of a key, -1 where it has none.
+  std::int32_t row(std::uint64_t key) {
+    if (CellBlocks::block_key(key) != block_key_) {
+      block_key_ = CellBlocks::block_key(key);
+      if (CellBlocks::region_key(key) != region_key_) {
+        region_key_ = CellBlocks::region_key(key);
+        region_ = cells_->region(region_key_);
+      }
+      block_ = region_ != nullptr ? cells_->block(*region_, block_key_) : nullptr;
+    }
+    return block_ != nullptr ? block_->row(key) : -1;
+  }
+
+ private:
+  const CellBlocks* cells_;
+  std::uint64_t block_key_ = kEmptyKey, region_key_ = kEmptyKey;
+  const Occupancy *block_ = nullptr, *region_ = nullptr;
+};
+
 }  // namespace radarsdf

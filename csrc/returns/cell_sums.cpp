@@ -159,8 +159,7 @@ void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float*
   const auto size_m = static_cast<float>(cell_size_m);
   std::atomic<bool> inside{true};
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    std::uint64_t block_key = kEmptyKey;  // neighbours are often of the same block
-    const Occupancy* block = nullptr;
+    NearbyRows rows(cells);
     for (std::int64_t i = begin; i < end; ++i) {
       float share[3];
       std::int32_t lower[3];
@@ -187,12 +186,7 @@ void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float*
           weight *= step != 0 ? share[axis] : 1 - share[axis];
           key |= parts[axis][step];
         }
-        if (CellBlocks::block_key(key) != block_key) {
-          block_key = CellBlocks::block_key(key);
-          const Occupancy* region = cells.region(CellBlocks::region_key(key));
-          block = region != nullptr ? cells.block(*region, block_key) : nullptr;
-        }
-        const std::int32_t row = block != nullptr ? block->row(key) : -1;
+        const std::int32_t row = rows.row(key);
         if (row >= 0) sum += weight * values[row];
       }
       interpolated[i] = sum;

@@ -55,7 +55,7 @@ std::vector<std::uint32_t> count_by_scans(const std::int32_t* scans, std::int64_
   for (std::size_t part = 1; part < counts.size(); ++part) {
     std::transform(counts[0].begin(), counts[0].end(), counts[part].begin(), counts[0].begin(), std::plus<>());
   }
-  return counts[0];
+  return std::move(counts[0]);
 }
 
 void check_scans(const std::int32_t* scans, std::int64_t count) {
@@ -76,32 +76,6 @@ void check_whole_rays(const float* points, const float* directions, const float*
   if (!inside) throw std::invalid_argument("rays must be finite and within a million cells of the origin");
 }
 
-// Rows of the cubes along a ray: most of them have the region and often the block of the one before.
-class CubeRows {
- public:
-  explicit CubeRows(const CellBlocks& cubes) : cubes_(&cubes) {}
-
-  std::int32_t row(std::uint64_t key) {
-    if (CellBlocks::region_key(key) != region_key_) {
-      region_key_ = CellBlocks::region_key(key);
-      region_ = cubes_->region(region_key_);
-    }
-    if (region_ == nullptr) return -1;
-    if (CellBlocks::block_key(key) != block_key_) {
-      block_key_ = CellBlocks::block_key(key);
-      block_ = cubes_->block(*region_, block_key_);
-    }
-    return block_ != nullptr ? block_->row(key) : -1;
-  }
-
- private:
-  static constexpr std::uint64_t kNone = ~std::uint64_t{0};
-
-  const CellBlocks* cubes_;
-  std::uint64_t region_key_ = kNone, block_key_ = kNone;
-  const Occupancy *region_ = nullptr, *block_ = nullptr;
-};
-
 }  // namespace
 
 void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double leaf_size_m, const float* points,
@@ -117,7 +91,7 @@ void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double
   const CellBlocks cubes(keys.data(), static_cast<std::int64_t>(keys.size()));
   check_whole_rays(points, directions, ranges_m, count, leaf_size_m);
   const auto of_rays = [&](std::int64_t begin, std::int64_t end, ScanCounter& counter) {
-    CubeRows rows(cubes);
+    NearbyRows rows(cubes);
     for (std::int64_t i = begin; i < end; ++i) {
       if (i % (1 << 12) == 0) check_interrupt();
       walk_cells(points + 3 * i, directions + 3 * i, -double{ranges_m[i]}, 0, 1 / (kCube * leaf_size_m),
