@@ -8,6 +8,7 @@
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <memory>
 #include <stdexcept>
@@ -47,6 +48,22 @@ std::int64_t row_stride(const Rows<T>& array, const char* name) {
 inline std::int64_t check_points(const py::array& points) {
   if (points.ndim() != 2 || points.shape(1) != 3) throw std::invalid_argument("points must have shape (N, 3)");
   return points.shape(0);
+}
+
+template <typename T>
+std::int64_t check_column(const Array<T>& array, const char* name) {
+  if (array.ndim() != 1) throw std::invalid_argument(std::string(name) + " must have shape (N,)");
+  return array.shape(0);
+}
+
+// Number of returns; `cells` (N,) is the row of each one's cell.
+inline std::int64_t check_cells_of_returns(const Array<std::int32_t>& cells, std::int64_t num_cells) {
+  const std::int64_t count = check_column(cells, "cells");
+  const std::int32_t* c = cells.data();
+  if (std::any_of(c, c + count, [&](std::int32_t cell) { return cell < 0 || cell >= num_cells; })) {
+    throw std::invalid_argument("cells must lie in [0, num_cells)");
+  }
+  return count;
 }
 
 // Hands a vector's memory to NumPy without a copy.

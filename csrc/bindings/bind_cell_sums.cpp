@@ -1,6 +1,5 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
-#include <algorithm>
 #include <memory>
 
 #include "bindings/arrays.hpp"
@@ -10,16 +9,6 @@
 #include "returns/principal_axes.hpp"
 
 namespace radarsdf {
-namespace {
-
-template <typename T>
-std::int64_t check_column(const Array<T>& array, const char* name) {
-  if (array.ndim() != 1) throw std::invalid_argument(std::string(name) + " must have shape (N,)");
-  return array.shape(0);
-}
-
-}  // namespace
-
 void bind_cell_sums(py::module_& m) {
   using namespace py::literals;
   py::class_<CellBlocks>(m, "CellBlocks", "From the keys of cells to their rows, and sums over the cells round a key.")
@@ -71,32 +60,29 @@ void bind_cell_sums(py::module_& m) {
              int num_threads) {
             const py::ssize_t count = points.ndim() == 2 ? points.shape(0) : 0;
             check_shape(points, count, 3, "points");
-            if (check_column(values, "values") != cells.size()) {
-              throw std::invalid_argument("values must be one for each cell");
-            }
-            py::array_t<float> interpolated(count);
+            const py::ssize_t columns = values.ndim() == 2 ? values.shape(1) : 0;
+            check_shape(values, cells.size(), columns, "values");
+            py::array_t<float> interpolated({count, columns});
             const float *v = values.data(), *p = points.data();
             float* result = interpolated.mutable_data();
             {
               const py::gil_scoped_release release;
-              interpolate_cells(cells, cell_size_m, v, p, count, result, num_threads);
+              interpolate_cells(cells, cell_size_m, v, static_cast<int>(columns), p, count, result, num_threads);
             }
             return interpolated;
           },
           "cell_size_m"_a, "values"_a.noconvert(), "points"_a.noconvert(), "num_threads"_a = 0,
-          "`values` (C,) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 where "
-          "there is no cell: (N,).");
+          "`values` (C, K) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 "
+          "where "
+          "there is no cell: (N, K).");
   m.def(
       "sum_moments",
       [](const Array<float>& points, const Array<float>& directions, const Array<std::int32_t>& cells,
          std::int64_t num_cells, int num_threads) {
-        const std::int64_t count = check_column(cells, "cells");
+        const std::int64_t count = check_cells_of_returns(cells, num_cells);
         check_shape(points, count, 3, "points");
         check_shape(directions, count, 3, "directions");
         const std::int32_t* c = cells.data();
-        if (std::any_of(c, c + count, [&](std::int32_t cell) { return cell < 0 || cell >= num_cells; })) {
-          throw std::invalid_argument("cells must lie in [0, num_cells)");
-        }
         py::array_t<double> moments({static_cast<py::ssize_t>(num_cells), py::ssize_t{kMoments}});
         const float *p = points.data(), *d = directions.data();
         double* result = moments.mutable_data();

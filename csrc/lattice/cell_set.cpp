@@ -98,8 +98,8 @@ void CellSet::insert_rays(const float* points, const float* directions, std::int
     parallel_tasks(num_parts, num_threads, [&](std::int64_t part) {
       std::vector<std::uint64_t>& keys = parts[static_cast<std::size_t>(part)];
       for (std::int64_t i = first + size * part / num_parts; i < first + size * (part + 1) / num_parts; ++i) {
-        walk_cells(points + 3 * i, directions + 3 * i, -reach_m, reach_m, 1 / leaf_size_m_,
-                   [&](const std::int32_t* cell) { keys.push_back(lattice_key(cell)); });
+        CellWalk cell(points + 3 * i, directions + 3 * i, -reach_m, reach_m, leaf_size_m_);
+        for (; cell.inside(); cell.next()) keys.push_back(cell.key());
       }
     });
     insert_keys(parts, num_threads);

@@ -15,43 +15,53 @@
 
 namespace radarsdf {
 
-// Calls visit(cell) with the lattice coordinates of each cell that point + t * direction is in for a t in [from_m,
-// to_m]. check_rays comes first.
-template <typename Visit>
-void walk_cells(const float* point, const float* direction, double from_m, double to_m, double inverse_size,
-                const Visit& visit) {
-  double position[3], m_per_cell[3], next_m[3];
-  std::int32_t cell[3], forward[3];
-  const auto look_ahead = [&](int axis) {
-    next_m[axis] = (cell[axis] + forward[axis] - position[axis]) * m_per_cell[axis];
-  };
-  for (int axis = 0; axis < 3; ++axis) {
-    position[axis] = point[axis] * inverse_size;
-    const double cells_per_m = direction[axis] * inverse_size;
-    forward[axis] = cells_per_m >= 0 ? 1 : 0;
-    cell[axis] = static_cast<std::int32_t>(std::floor(position[axis] + from_m * cells_per_m));
-    m_per_cell[axis] = cells_per_m != 0 ? 1 / cells_per_m : std::numeric_limits<double>::infinity();
-    look_ahead(axis);
-    // Rounding may have put the beginning one cell too far back.
-    while (next_m[axis] < from_m) {
-      cell[axis] += 2 * forward[axis] - 1;
+// Cells that point + t * direction is in for a t in [from_m, to_m]: for (CellWalk cell(...); cell.inside();
+// cell.next()). check_rays comes first.
+class CellWalk {
+ public:
+  // bias: of the keys, as kAxisBias is that of leaf cells.
+  CellWalk(const float* point, const float* direction, double from_m, double to_m, double cell_size_m,
+           std::int32_t bias = kAxisBias)
+      : to_m_(to_m) {
+    for (int axis = 0; axis < 3; ++axis) {
+      position_[axis] = point[axis] / cell_size_m;
+      const double cells_per_m = direction[axis] / cell_size_m;
+      step_[axis] = cells_per_m >= 0 ? 1 : -1;
+      cell_[axis] = static_cast<std::int32_t>(std::floor(position_[axis] + from_m * cells_per_m));
+      m_per_cell_[axis] = cells_per_m != 0 ? 1 / cells_per_m : std::numeric_limits<double>::infinity();
       look_ahead(axis);
+      // Rounding may have put the beginning one cell too far back.
+      while (next_m_[axis] < from_m) {
+        cell_[axis] += step_[axis];
+        look_ahead(axis);
+      }
     }
+    key_ = lattice_key(cell_, bias);
   }
-  while (true) {
-    visit(static_cast<const std::int32_t*>(cell));
-    int axis = next_m[1] < next_m[0] ? 1 : 0;
-    axis = next_m[2] < next_m[axis] ? 2 : axis;
-    if (!(next_m[axis] <= to_m)) return;
-    cell[axis] += 2 * forward[axis] - 1;
+
+  bool inside() const { return inside_; }
+  std::int32_t coordinate(int axis) const { return cell_[axis]; }
+  std::uint64_t key() const { return key_; }
+
+  void next() {
+    int axis = next_m_[1] < next_m_[0] ? 1 : 0;
+    axis = next_m_[2] < next_m_[axis] ? 2 : axis;
+    inside_ = next_m_[axis] <= to_m_;
+    cell_[axis] += step_[axis];
+    key_ = morton_neighbour(key_, axis, step_[axis]);
     look_ahead(axis);
   }
-}
 
-inline std::uint64_t lattice_key(const std::int32_t* cell) {
-  return morton_key(static_cast<std::uint32_t>(cell[0] + kAxisBias), static_cast<std::uint32_t>(cell[1] + kAxisBias),
-                    static_cast<std::uint32_t>(cell[2] + kAxisBias));
-}
+ private:
+  void look_ahead(int axis) {
+    next_m_[axis] = (cell_[axis] + (step_[axis] > 0 ? 1 : 0) - position_[axis]) * m_per_cell_[axis];
+  }
+
+  double to_m_, position_[3], m_per_cell_[3], next_m_[3];
+  std::int32_t cell_[3], step_[3];
+  std::uint64_t key_;
+  bool inside_ = true;
+};
 
 // Throws std::invalid_argument unless all rays, reach_m before and behind their points, lie within a million cells of
 // the origin.

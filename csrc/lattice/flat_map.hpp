@@ -5,6 +5,7 @@
 // full, no deletion. Exact: keys are compared whole, so two keys never share a value.
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 
@@ -46,6 +47,12 @@ class FlatMap {
   FlatMapView view() const { return {slots_.data(), slots_.size() - 1, shift_}; }
   std::int32_t find(std::uint64_t key) const { return view().find(key); }
   const LargeVector<Slot>& slots() const { return slots_; }
+
+  // Keeps its memory.
+  void clear() {
+    std::fill(slots_.begin(), slots_.end(), Slot{});
+    size_ = 0;
+  }
 
   // Returns false, and leaves the old value, where the key is present.
   bool insert(std::uint64_t key, std::int32_t value) {

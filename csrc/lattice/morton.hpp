@@ -40,6 +40,20 @@ inline std::uint64_t morton_key(std::uint32_t x, std::uint32_t y, std::uint32_t 
   return spread_bits(x) | spread_bits(y) << 1 | spread_bits(z) << 2;
 }
 
+// Of lattice coordinates, which may be negative. Of leaf cells the bias is kAxisBias.
+inline std::uint64_t lattice_key(const std::int32_t* cell, std::int32_t bias = kAxisBias) {
+  return morton_key(static_cast<std::uint32_t>(cell[0] + bias), static_cast<std::uint32_t>(cell[1] + bias),
+                    static_cast<std::uint32_t>(cell[2] + bias));
+}
+
+// The key of the cell one step (1 or -1) further on an axis. Spreading the bits of all axes takes four times as long.
+inline std::uint64_t morton_neighbour(std::uint64_t key, int axis, std::int32_t step) {
+  const std::uint64_t unit = std::uint64_t{1} << axis, bits = std::uint64_t{0x1249249249249249} << axis;
+  // With the bits of other axes set, a carry passes through them; without, a borrow does.
+  const std::uint64_t moved = step > 0 ? (key | ~bits) + unit : (key & bits) - unit;
+  return (key & ~bits) | (moved & bits);
+}
+
 inline std::uint32_t morton_coordinate(std::uint64_t key, int axis) { return compact_bits(key >> axis); }
 
 }  // namespace radarsdf

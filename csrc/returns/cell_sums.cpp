@@ -154,8 +154,8 @@ void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t 
   });
 }
 
-void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, const float* points,
-                       std::int64_t count, float* interpolated, int num_threads) {
+void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, int columns,
+                       const float* points, std::int64_t count, float* interpolated, int num_threads) {
   const auto size_m = static_cast<float>(cell_size_m);
   std::atomic<bool> inside{true};
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
@@ -177,7 +177,8 @@ void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float*
           parts[axis][step] = spread_bits(static_cast<std::uint32_t>(lower[axis]) + step) << axis;
         }
       }
-      float sum = 0;
+      float* sums = interpolated + columns * i;
+      std::fill(sums, sums + columns, 0.0F);
       for (int corner = 0; corner < 8; ++corner) {
         float weight = 1;
         std::uint64_t key = 0;
@@ -187,9 +188,9 @@ void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float*
           key |= parts[axis][step];
         }
         const std::int32_t row = rows.row(key);
-        if (row >= 0) sum += weight * values[row];
+        if (row < 0) continue;
+        for (int k = 0; k < columns; ++k) sums[k] += weight * values[columns * std::int64_t{row} + k];
       }
-      interpolated[i] = sum;
     }
   });
   if (!inside) throw std::invalid_argument("points must be finite and within a million cells of the origin");

@@ -24,9 +24,10 @@ void sum_moments(const float* points, const float* directions, const std::int32_
 void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t count, const double* values,
                int columns, double weight, double* sums, int num_threads);
 
-// interpolated: (count), of values (cells.size()) that belong to the centres of cells of this size, trilinear at points
-// (count, 3), local frame, m; 0 where there is no cell. Throws std::invalid_argument for points without a key.
-void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, const float* points,
-                       std::int64_t count, float* interpolated, int num_threads);
+// interpolated: (count, columns), of values (cells.size(), columns) that belong to the centres of cells of this size,
+// trilinear at points (count, 3), local frame, m; 0 where there is no cell. Throws std::invalid_argument for points
+// without a key.
+void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, int columns,
+                       const float* points, std::int64_t count, float* interpolated, int num_threads);
 
 }  // namespace radarsdf

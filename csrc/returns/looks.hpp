@@ -12,7 +12,8 @@ namespace radarsdf {
 // rays of a scan, so that a place between two rays counts as looked at.
 constexpr int kLookLevels = 3;
 
-// looks: (num_leaves), for each leaf cell the number of scans with a ray that goes through its cube or ends there.
+// looks: (num_leaves), for each leaf cell the number of scans with a ray that goes through its cube or ends there. The
+// rays of a scan begin at one sensor: of those that come together on the way there, one is followed on.
 // leaf_keys: (num_leaves) Morton keys, ascending, each once; points, directions: (count, 3), ranges_m: (count), local
 // frame, m; scans: (count), ascending, the scan of each ray. Throws std::invalid_argument for rays without keys.
 void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double leaf_size_m, const float* points,

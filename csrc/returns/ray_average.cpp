@@ -28,35 +28,26 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   check_rays(rays.points, rays.directions, rays.count, table.leaf_size_m(), truncation_m);
   const CellBlocks leaves(table.leaf_keys().data(), static_cast<std::int64_t>(table.leaf_keys().size()));
   const auto size_m = static_cast<float>(table.leaf_size_m()), limit_m = static_cast<float>(truncation_m);
-  const double inverse_size = 1 / table.leaf_size_m();
 
   const auto add_ray = [&](std::int64_t i, std::vector<Sum>& sums) {
-    std::uint64_t block_key = kEmptyKey, region_key = kEmptyKey;  // neighbours along the ray mostly share them
-    const Occupancy *block = nullptr, *region = nullptr;
+    NearbyRows leaf_rows(leaves);
     const float *n = rays.normals + 3 * i, *p = rays.points + 3 * i, weight = rays.weights[i];
     const float dx = size_m * n[0], dy = size_m * n[1], dz = size_m * n[2];
-    walk_cells(p, rays.directions + 3 * i, -truncation_m, truncation_m, inverse_size, [&](const std::int32_t* cell) {
-      const std::uint64_t key = lattice_key(cell);
-      if (CellBlocks::block_key(key) != block_key) {
-        block_key = CellBlocks::block_key(key);
-        if (CellBlocks::region_key(key) != region_key) {
-          region_key = CellBlocks::region_key(key);
-          region = leaves.region(region_key);
-        }
-        block = region != nullptr ? leaves.block(*region, block_key) : nullptr;
-      }
-      const std::int32_t leaf = block != nullptr ? block->row(key) : -1;
-      if (leaf < 0) return;
+    CellWalk cell(p, rays.directions + 3 * i, -truncation_m, truncation_m, table.leaf_size_m());
+    for (; cell.inside(); cell.next()) {
+      const std::int32_t leaf = leaf_rows.row(cell.key());
+      if (leaf < 0) continue;
       const std::int32_t* rows = table.cells()[static_cast<std::size_t>(leaf)].rows;
       float lower = 0;  // of the cell's first corner
-      for (int axis = 0; axis < 3; ++axis) lower += n[axis] * (static_cast<float>(cell[axis]) * size_m - p[axis]);
+      for (int axis = 0; axis < 3; ++axis)
+        lower += n[axis] * (static_cast<float>(cell.coordinate(axis)) * size_m - p[axis]);
       for (int c = 0; c < 8; ++c) {
         const float distance_m = lower + (c & 1 ? dx : 0) + (c & 2 ? dy : 0) + (c & 4 ? dz : 0);
         Sum& sum = sums[static_cast<std::size_t>(rows[c])];
         sum.weight += weight;
         sum.distance_m += weight * std::min(std::max(distance_m, -limit_m), limit_m);
       }
-    });
+    }
   };
 
   // Groups of rays have sums of their own, which are added up in the groups' order.

@@ -538,7 +538,7 @@ class CellBlocks:
         num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
     ) -> numpy.typing.NDArray[numpy.float32]:
         """
-        `values` (C,) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 where there is no cell: (N,).
+        `values` (C, K) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 where there is no cell: (N, K).
         """
     def rows(
         self,

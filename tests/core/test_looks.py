@@ -75,11 +75,31 @@ def test_looks_are_those_of_a_plain_search(kind):
     np.testing.assert_array_equal(looks, expected)
 
 
+def test_a_place_that_one_ray_passes_is_missed_only_where_others_are_near():
+    """Rays of one sensor, counted as in the definition: each cube that a ray is partly in."""
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(4000, 3)) * [1, 1, 0.2]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ranges_m = rng.uniform(5, 30, 4000)
+    rays = tuple(a.astype(np.float32) for a in (directions * ranges_m[:, None], directions, ranges_m))
+    cells, keys = sorted_cells(np.floor(rays[0] / LEAF_M).astype(int))
+    missed = count_looks(keys, LEAF_M, *rays, np.zeros(4000, np.int32)) == 0
+    alone = looks_at(cells, LEAF_M, *rays, np.arange(4000)) > 0
+    assert alone.all()
+    assert not missed.any()  # each has a return
+    half = tuple(a[:2000] for a in rays)
+    looks = count_looks(keys, LEAF_M, *half, np.zeros(2000, np.int32)) > 0
+    alone = looks_at(cells, LEAF_M, *half, np.arange(2000)) > 0
+    assert not (looks & ~alone).any()
+    assert (looks == alone).mean() > 0.97
+
+
 def test_the_number_of_threads_changes_nothing():
     rays, scans = rays_of("any", MANY), scans_of(MANY)
     cells, keys = (a[::8] for a in cells_near(rays[0]))
     keys = np.ascontiguousarray(keys)
     expected = looks_at(cells, LEAF_M, *rays, scans)
+    assert len(np.unique(expected)) > 5
     for num_threads in THREADS:
         np.testing.assert_array_equal(count_looks(keys, LEAF_M, *rays, scans, num_threads), expected)
 
@@ -219,7 +239,7 @@ def test_cells_without_returns_have_no_scans():
         ([0, -1, 1], [0, 0, 1], "cells must lie in"),
         ([0, 3, 1], [0, 0, 1], "cells must lie in"),
         ([0, 1, 1], [0, 2, 1], "scans must be ascending"),
-        ([0, 1], [0, 0, 1], "must have shape"),
+        ([0, 1], [0, 0, 1], "one for each return"),
         ([[0, 1]], [[0, 0]], "must have shape"),
     ],
 )

@@ -267,16 +267,16 @@ TEST_CASE("a linear function of the cells' centres is interpolated exactly") {
   std::vector<float> points = test::normal_numbers<float>(3 * 500, 1, 7);
   for (float& v : points) v = std::clamp(v, -1.8F, 1.8F);
   std::vector<float> found(500);
-  radarsdf::interpolate_cells(blocks, kSize, values.data(), points.data(), 500, found.data(), 2);
+  radarsdf::interpolate_cells(blocks, kSize, values.data(), 1, points.data(), 500, found.data(), 2);
   for (std::size_t i = 0; i < 500; ++i) {
     const double expected = linear(points[3 * i], points[3 * i + 1], points[3 * i + 2]);
     REQUIRE(static_cast<double>(found[i]) == doctest::Approx(expected).epsilon(1e-5));
   }
   const float outside[3] = {10, 0, 0};
-  radarsdf::interpolate_cells(blocks, kSize, values.data(), outside, 1, found.data(), 1);
+  radarsdf::interpolate_cells(blocks, kSize, values.data(), 1, outside, 1, found.data(), 1);
   CHECK(found[0] == 0);
   const float bad[3] = {std::numeric_limits<float>::quiet_NaN(), 0, 0};
-  CHECK_THROWS_AS(radarsdf::interpolate_cells(blocks, kSize, values.data(), bad, 1, found.data(), 1),
+  CHECK_THROWS_AS(radarsdf::interpolate_cells(blocks, kSize, values.data(), 1, bad, 1, found.data(), 1),
                   std::invalid_argument);
 }
 
@@ -314,14 +314,20 @@ TEST_CASE("rays that meet a plane straight average to its distance, cut at the t
 TEST_CASE("a scan looks once at each cube that one of its rays goes through") {
   constexpr std::size_t kRays = 20000;
   constexpr double kSize = 0.25, kCube = 8 * kSize;
-  const auto points = test::normal_numbers<float>(3 * kRays, 4, 9);
-  const auto directions = test::unit_vectors<float>(kRays, 10);
+  auto points = test::normal_numbers<float>(3 * kRays, 4, 9);
+  auto directions = test::unit_vectors<float>(kRays, 10);
   auto ranges = test::normal_numbers<float>(kRays, 4, 11);
   std::vector<std::int32_t> scans;
   for (std::size_t i = 0; i < kRays; ++i) {
     ranges[i] = std::abs(ranges[i]);
-    // Two thirds of the rays are of one scan: more than a thread's share.
-    scans.push_back(static_cast<std::int32_t>(i < kRays / 3 ? i / 50 : 900));
+    // Two thirds of the rays, all alike, are of one scan: more than a thread's share.
+    scans.push_back(static_cast<std::int32_t>(std::min(i, kRays / 3)));
+    if (i <= kRays / 3) continue;
+    ranges[i] = ranges[kRays / 3];
+    for (std::size_t axis = 0; axis < 3; ++axis) {
+      points[3 * i + axis] = points[kRays / 3 * 3 + axis];
+      directions[3 * i + axis] = directions[kRays / 3 * 3 + axis];
+    }
   }
   const Cells cells = cells_of(test::normal_numbers<float>(3 * 300, 4, 12), kSize);
   std::vector<std::uint32_t> expected;

@@ -22,15 +22,15 @@ with whole_import():
 
 def extract_mesh(
     contents: MapContents,
-    voxel_size: float = 0.1,
+    voxel_size: float,
     *,
-    box: ArrayLike | None = None,
-    viewpoint: ArrayLike | None = None,
-    min_confidence: float = 0.0,
-    max_uncertainty: float | None = None,
-    min_detection_rate: float = 0.028,
-    min_component_triangles: int = 30,
-    progress: bool | None = None,
+    box: ArrayLike | None,
+    viewpoint: ArrayLike | None,
+    min_confidence: float,
+    max_uncertainty: float | None,
+    min_detection_rate: float,
+    min_component_triangles: int,
+    progress: bool | None,
 ) -> trimesh.Trimesh:
     """See :meth:`RadarMap.mesh`."""
     if not 0 <= min_confidence <= 1:

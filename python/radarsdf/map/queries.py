@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -86,9 +85,16 @@ class EvidenceAt(NamedTuple):
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
     """The evidence at each point."""
-    found = contents.evidence
-    columns = found.information, found.detections, found.looks
-    return EvidenceAt(*(_interpolated(contents, column.astype(np.float32), points) for column in columns))
+    found, table = contents.evidence, contents.field.cells.table
+    of_cells = np.stack([found.information, found.detections, found.looks], 1, dtype=np.float32)
+    # Points that are too far away for a key are moved to the limit, where there are no cells.
+    limit_m = MAX_CELLS_FROM_ORIGIN * table.leaf_size_m
+    near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
+    # Trilinearly, because a vertex of a mesh may be on the face of two cells.
+    at_points = CellBlocks(table.leaf_keys()).interpolate(
+        table.leaf_size_m, of_cells, near.numpy(), resolve_num_threads(0)
+    )
+    return EvidenceAt(*torch.from_numpy(at_points).unbind(1))
 
 
 def uncertainty(contents: MapContents, evidence: EvidenceAt) -> Tensor:
@@ -183,16 +189,3 @@ def evaluate(
         return torch.cat(
             list(tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress)))
         )
-
-
-def _interpolated(contents: MapContents, of_cells: NDArray[np.float32], points: Tensor) -> Tensor:
-    """(N,) values of leaf cells (C,), interpolated between the centres of the cells. 0 where there are none."""
-    # Trilinearly, because a vertex of a mesh may be on the face of two cells.
-    table = contents.field.cells.table
-    # Points that are too far away for a key are moved to the limit, where there are no cells.
-    limit_m = MAX_CELLS_FROM_ORIGIN * table.leaf_size_m
-    near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
-    cells = CellBlocks(table.leaf_keys())
-    return torch.from_numpy(
-        cells.interpolate(table.leaf_size_m, of_cells, near.numpy(), resolve_num_threads(0))
-    )

@@ -61,7 +61,7 @@ class RadarMap:
 
     @property
     def report(self) -> dict[str, Any]:
-        """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
+        """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method it did not run."""
         return self._contents.report
 
     @property
@@ -186,8 +186,9 @@ class RadarMap:
             a floor that no number of returns makes smaller, added in quadrature; m. The noise σ of a return is
             that along the beam and across it together; see ``report["noise"]``. It grows with the range, so that
             far returns tell less than near ones. The floor is 0.05 leaf cells, and up to 1.1 more where much
-            of the returns lies on no thin surface (:attr:`rough_share`). NaN where nothing was observed. Errors of the poses count if
-            ``returns.pose_sigma_m`` and ``pose_sigma_rad`` in the :class:`FitConfig` state them.
+            of the returns lies on no thin surface (:attr:`rough_share`). NaN where nothing was observed. Errors of
+            the poses count if ``returns.pose_sigma_m`` and ``pose_sigma_rad`` in the :class:`FitConfig` state
+            them.
 
         Raises
         ------
