@@ -64,6 +64,7 @@ REAL = {
     "training.intensity_learning_rate": (TINY, LARGE, 0.0, None),
 }
 TRUTH = [
+    "returns.drop_movers",
     "returns.drop_ghosts",
     "returns.onto_planes",
     "networks.normals",
@@ -359,6 +360,7 @@ PUBLISHED = {
         "min_range_m": 2.5,
         "max_range_m": None,
         "accumulate_scans": 5,
+        "drop_movers": False,
         "drop_ghosts": False,
         "range_noise_m": None,
         "azimuth_noise_rad": None,

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.checking.doppler import folding_interval_mps, sensor_velocity, velocity_of_poses
+from radarsdf.checking.doppler import velocity_of_poses
+from radarsdf.returns.doppler import folding_interval_mps, sensor_velocity
 
 from tests.conftest import recorded_scans
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
-from radarsdf.checking.doppler import folding_interval_mps, sensor_velocity
 from radarsdf.checking.finding import Finding, Severity
 from radarsdf.checking.frames import FULL, Effort
 from radarsdf.checking.recording import FloatArray, Recording
+from radarsdf.returns.doppler import folding_interval_mps, sensor_velocity
 
 _MAX_ROTATION_ERROR = 1e-3  # as of the poses that a fit accepts
 # No radar that gives points sees most of them from farther away, and none has most of them at its own housing.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from radarsdf.cli.saying import say
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
+from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import Rays, prepare
 
 if TYPE_CHECKING:
@@ -40,11 +41,12 @@ def print_intensity_errors(radar_map: RadarMap, test: Scans, train: Scans) -> No
 
 
 def _rays(scans: Scans, config: FitConfig) -> Rays:
-    """The returns whose range the fit accepted."""
+    """The returns that the fit accepts: of a range, and of what does not move."""
+    standing = Standing.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
     return prepare(
-        scans.points,
+        standing.points,
         scans.poses,
-        scans.intensities,
+        standing.intensities,
         min_range_m=config.returns.min_range_m,
         max_range_m=config.returns.max_range_m,
     )

@@ -29,6 +29,7 @@ from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.gaps import bridged
+from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import Workers
 
@@ -38,6 +39,7 @@ def fit(
     poses: ArrayLike | None = None,
     intensities: Sequence[ArrayLike] | None = None,
     *,
+    doppler_mps: Sequence[ArrayLike] | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
@@ -47,12 +49,15 @@ def fit(
     Parameters
     ----------
     points : sequence of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, as they are, their poses
-        and intensities are used where none are given here.
+        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, as they are, their
+        poses, intensities and Doppler are used where none are given here.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
     intensities : sequence of F arrays, optional
         (N_i,) each, sensor units. Without them the map has no intensity network.
+    doppler_mps : sequence of F arrays, optional
+        (N_i,) each: speed of each return along its ray, m/s; NaN where it was not measured. With them, returns that
+        move are left out; see ``config.returns.drop_movers``.
     config : FitConfig, optional
         Settings of the fit. ``FitConfig.paper()`` has the published ones.
     progress : bool, optional
@@ -97,15 +102,9 @@ def fit(
     clock = _Clock()
     radar_map = None
     try:
-        if isinstance(points, Scans):
-            scans, points = points, points.points  # first: it reads all there is, in one pass
-            poses = scans.poses if poses is None else poses
-            intensities = scans.intensities if intensities is None else intensities
-        if poses is None:
-            msg = "poses are missing: T_world_sensor (4, 4) of each scan"
-            raise ValueError(msg)
-        points = list(points)  # which may be a generator
-        rays = prepare(points, poses, intensities, **config.returns.preparation)
+        points, poses, intensities, doppler_mps = _given(points, poses, intensities, doppler_mps)
+        standing = Standing.of(points, intensities, doppler_mps, config.returns)
+        rays = prepare(standing.points, poses, standing.intensities, **config.returns.preparation)
         check_extent(rays, config)
         check_fit(rays, config)
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
@@ -139,6 +138,7 @@ def fit(
                 "returns": sum(len(np.asarray(scan)) for scan in points),
                 "returns_used": len(surface.rays),
                 "ghosts": len(rays) - len(surface.rays),
+                "movers": standing.movers,
                 "noise": dataclasses.asdict(surface.noise),
             }
             radar_map = RadarMap(
@@ -149,7 +149,7 @@ def fit(
                     config=config,
                     evidence=evidence,
                     rough_share=surface.surfels.rough_share(),
-                    report=counts | _report(config, field, training, scale),
+                    report=counts | _report(config, field, training, scale, standing),
                 )
             )
             training.run(progress, saved)
@@ -166,6 +166,24 @@ def fit(
     return radar_map
 
 
+def _given(
+    points: Sequence[ArrayLike] | Scans,
+    poses: ArrayLike | None,
+    intensities: Sequence[ArrayLike] | None,
+    doppler_mps: Sequence[ArrayLike] | None,
+) -> tuple[list[ArrayLike], ArrayLike, Sequence[ArrayLike] | None, Sequence[ArrayLike] | None]:
+    """The same, with what is not given taken from the scans."""
+    if isinstance(points, Scans):
+        scans, points = points, points.points  # first: it reads all there is, in one pass
+        poses = scans.poses if poses is None else poses
+        intensities = scans.intensities if intensities is None else intensities
+        doppler_mps = scans.doppler_mps if doppler_mps is None else doppler_mps
+    if poses is None:
+        msg = "poses are missing: T_world_sensor (4, 4) of each scan"
+        raise ValueError(msg)
+    return list(points), poses, intensities, doppler_mps  # the points may be a generator
+
+
 def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, num_threads: int) -> Field:
     """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
     leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
@@ -173,7 +191,7 @@ def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, nu
 
 
 def _report(
-    config: FitConfig, field: Field, training: Training, scale: IntensityScale | None
+    config: FitConfig, field: Field, training: Training, scale: IntensityScale | None, standing: Standing
 ) -> dict[str, Any]:
     """What the map's report says of cells and training. The training goes on to fill what counts it."""
     return {
@@ -182,13 +200,17 @@ def _report(
         "iterations": training.iterations,
         "iterations_done": training.iterations_done,
         "losses": training.losses,
-        "skipped": _skipped(config, training, scale),
+        "skipped": _skipped(config, training, scale, standing),
     }
 
 
-def _skipped(config: FitConfig, training: Training, scale: IntensityScale | None) -> list[str]:
+def _skipped(
+    config: FitConfig, training: Training, scale: IntensityScale | None, standing: Standing
+) -> list[str]:
     """Parts of the method that this fit did not run, in words."""
     skipped = []
+    if standing.why_none is not None:
+        skipped.append(f"leaving out what moves: {standing.why_none}")
     if scale is None:
         skipped.append("the intensity network: there are no intensities")
     else:

@@ -95,9 +95,10 @@ class Rays:
             yield points.reshape(-1, 3)
 
 
-def _check_scans(
-    points: Sequence[ArrayLike], intensities: Sequence[ArrayLike] | None
+def check_scans(
+    points: Sequence[ArrayLike], intensities: Sequence[ArrayLike] | None = None
 ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None]:
+    """Scans (N_i, 3) and intensities (N_i,) as arrays, if :func:`prepare` takes them; else its ValueError."""
     scans = [real_array(scan, f"scan {i}") for i, scan in enumerate(points)]
     if not scans:
         msg = "points holds no scans"
@@ -185,7 +186,7 @@ def prepare(
         not rigid, all intensities are equal or are too far apart for float32, or no return is within the
         ranges.
     """
-    scans, values = _check_scans(points, intensities)
+    scans, values = check_scans(points, intensities)
     T_world_sensor = check_poses(poses, len(scans))
     positions = T_world_sensor[:, :3, 3]
     local_origin = (

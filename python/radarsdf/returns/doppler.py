@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The velocity of the sensor from the Doppler of a scan, and which returns stand still.
+
+A return that stands still, in direction d of a sensor with velocity v, has the Doppler ``-d·v``: negative if the sensor
+comes nearer. Three returns give v; the v on which most returns agree is refined by least squares. The method is that of
+C. Doer and G. Trommer, "An EKF Based Approach to Radar Inertial Odometry", MFI 2020, written anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+MIN_RETURNS = 10
+"""Fewer returns of a scan tell no velocity."""
+
+_DRAWS = (
+    64  # of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999
+)
+_SIGMA_MPS = 0.15  # a return is off if its Doppler differs by three times the noise, and by at least this
+_ROUNDS = 4
+_MIN_AGREEING = 0.4  # share of the returns that must agree on a velocity
+_MAX_CONDITION = 1e3  # of the normal equations: returns in one direction tell no velocity
+_FOLDS = (-1.0, 0.0, 1.0)  # intervals by which all three returns of a draw may be folded
+
+
+@dataclass(frozen=True)
+class SensorVelocity:
+    """What the Doppler of one scan says."""
+
+    velocity_mps: FloatArray
+    """(3,) velocity of the sensor in its own frame, m/s. NaN if the returns do not agree on one."""
+    covariance: FloatArray
+    """(3, 3) its covariance, m²/s². NaN if there is no velocity."""
+    static: NDArray[np.bool_]
+    """(N,) whether each return agrees with it, so that it stands still. All False if there is no velocity."""
+
+    @property
+    def found(self) -> bool:
+        """Whether the returns agree on a velocity."""
+        return bool(np.isfinite(self.velocity_mps).all())
+
+
+def sensor_velocity(
+    points: NDArray[Any], doppler_mps: NDArray[Any], *, interval_mps: float | None = None
+) -> SensorVelocity:
+    """Finds the velocity of the sensor from one scan. The same scan gives the same bits.
+
+    Parameters
+    ----------
+    points : ndarray
+        (N, 3) returns, sensor frame; their unit does not matter.
+    doppler_mps : ndarray
+        (N,) speed along the ray, m/s, positive away from the sensor.
+    interval_mps : float, optional
+        Width of the interval into which the sensor folds speeds, m/s. None: it folds none.
+
+    Returns
+    -------
+    SensorVelocity
+        Without a velocity if there are fewer than 10 returns, if less than 40 % of them agree, or if they all lie in
+        one direction.
+    """
+    x, speeds = np.asarray(points, np.float64), np.asarray(doppler_mps, np.float64)
+    ranges = np.linalg.norm(x, axis=1)
+    usable = (ranges > 0) & np.isfinite(speeds) & np.isfinite(ranges)
+    unknown = SensorVelocity(np.full(3, np.nan), np.full((3, 3), np.nan), np.zeros(len(x), bool))
+    rows = np.flatnonzero(usable)
+    if len(rows) < MIN_RETURNS:
+        return unknown
+    away = -x[rows] / ranges[rows, None]
+    measured = speeds[rows]
+
+    def residuals(velocities: FloatArray) -> FloatArray:
+        """(K, M) differences of the measured speeds from those of velocities (K, 3)."""
+        off: FloatArray = measured - velocities @ away.T
+        return off if interval_mps is None else off - interval_mps * np.round(off / interval_mps)
+
+    velocity = _most_agreed(away, measured, residuals, interval_mps)
+    if velocity is None:
+        return unknown
+    sigma = _SIGMA_MPS / 3
+    for _ in range(_ROUNDS):
+        off = residuals(velocity[None])[0]
+        agrees = np.abs(off) < max(_SIGMA_MPS, 3 * sigma)
+        if agrees.sum() < max(MIN_RETURNS / 2, _MIN_AGREEING * len(rows)):
+            return unknown
+        normal = away[agrees].T @ away[agrees]
+        if np.linalg.cond(normal) > _MAX_CONDITION:
+            return unknown
+        velocity = velocity + np.linalg.solve(normal, away[agrees].T @ off[agrees])
+        # The median is not drawn by what moves.
+        sigma = min(1.4826 * float(np.median(np.abs(residuals(velocity[None])[0][agrees]))), _SIGMA_MPS)
+    static = np.zeros(len(x), bool)
+    off = residuals(velocity[None])[0]
+    static[rows] = np.abs(off) < max(_SIGMA_MPS, 3 * sigma)
+    spread = float(np.sum(off[agrees] ** 2)) / max(int(agrees.sum()) - 3, 1)
+    return SensorVelocity(velocity, spread * np.linalg.inv(normal), static)
+
+
+def _most_agreed(
+    away: FloatArray,
+    measured: FloatArray,
+    residuals: Callable[[FloatArray], FloatArray],
+    interval_mps: float | None,
+) -> FloatArray | None:
+    """The velocity (3,) of those of random draws of three returns with which most returns agree."""
+    rng = np.random.default_rng(0)
+    drawn = rng.integers(0, len(measured), (_DRAWS, 3))
+    speeds = measured[drawn]
+    if interval_mps is not None:
+        speeds = np.concatenate([speeds + fold * interval_mps for fold in _FOLDS])
+        drawn = np.tile(drawn, (len(_FOLDS), 1))
+    matrices = away[drawn]
+    solvable = np.abs(np.linalg.det(matrices)) > 1e-4
+    if not solvable.any():
+        return None
+    velocities = np.linalg.solve(matrices[solvable], speeds[solvable, :, None])[:, :, 0]
+    counts = (np.abs(residuals(velocities)) < _SIGMA_MPS).sum(axis=1)
+    best: FloatArray = velocities[int(np.argmax(counts))]
+    return best
+
+
+def folding_interval_mps(doppler_mps: Sequence[NDArray[Any]]) -> float | None:
+    """Width of the interval into which the sensor seems to fold speeds, m/s: None if the speeds do not fill one.
+
+    Folded speeds reach both ends of the interval, which lie about as far from 0.
+    """
+    speeds = np.concatenate([np.asarray(values, np.float64) for values in doppler_mps])
+    speeds = speeds[np.isfinite(speeds)]
+    if len(speeds) < 100:
+        return None
+    low, high = float(speeds.min()), float(speeds.max())
+    if not 0 < -low < 1.25 * high or not high < -1.25 * low:
+        return None
+    edge = 0.05 * (high - low)
+    ends = ((speeds < low + edge).mean(), (speeds > high - edge).mean())
+    if min(ends) < 0.002:
+        return None
+    values = np.unique(np.abs(np.diff(np.unique(speeds))))
+    step = float(values[values > 1e-6].min(initial=np.inf))
+    return high - low + (step if step < 0.05 * (high - low) else 0.0)
+
+
+def sensor_velocities(
+    points: Sequence[NDArray[Any]], doppler_mps: Sequence[NDArray[Any]]
+) -> list[SensorVelocity]:
+    """The velocity in each of K scans of one sensor, which may fold speeds into an interval.
+
+    Parameters
+    ----------
+    points, doppler_mps : sequences of K arrays
+        (N_i, 3) and (N_i,) each, as for :func:`sensor_velocity`.
+    """
+    interval = folding_interval_mps(doppler_mps) if points else None
+    choices = [
+        [sensor_velocity(x, v, interval_mps=folded) for x, v in zip(points, doppler_mps, strict=True)]
+        for folded in ((None, interval) if interval else (None,))
+    ]
+    agreeing = [sum(int(velocity.static.sum()) for velocity in found) for found in choices]
+    # Folding lets more returns agree by chance, so that it must explain clearly more.
+    return choices[-1] if agreeing[-1] > 1.2 * agreeing[0] else choices[0]

@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Returns of what moves, by their Doppler. They belong to no surface that stays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf.checks import real_array
+from radarsdf.config import ReturnsConfig
+from radarsdf.returns.doppler import MIN_RETURNS, sensor_velocities
+from radarsdf.returns.rays import check_scans
+
+_MIN_SHARE_WITH_VELOCITY = 0.5  # of the scans that have enough returns
+_MAX_MOVING = 0.4  # share of the returns; if more disagree, it is the Doppler that is not understood
+
+
+@dataclass(frozen=True)
+class Movers:
+    """Which returns of F scans move."""
+
+    masks: list[NDArray[np.bool_]]
+    """F arrays (N_i,). All False where a scan tells no velocity of the sensor, or a return has no Doppler."""
+    why_none: str | None
+    """Why none are named although there is Doppler, in words. None: they were looked for in all scans that tell."""
+
+    @classmethod
+    def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> Movers:
+        """Finds the returns whose Doppler disagrees with a world that stands still.
+
+        Parameters
+        ----------
+        points : sequence of F arrays
+            (N_i, 3) each, sensor frame, m.
+        doppler_mps : sequence of F arrays
+            (N_i,) each, speed along the ray, m/s, of either sign, folded or not. NaN where it was not measured.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `doppler_mps` are not numbers, their shapes do not fit to `points`, or a fit refuses these.
+        """
+        scans, _ = check_scans(points)
+        speeds = _checked(scans, doppler_mps)
+        none = [np.zeros(len(scan), bool) for scan in scans]
+        tried = [i for i, scan in enumerate(scans) if len(scan) >= MIN_RETURNS]
+        found = sensor_velocities([scans[i] for i in tried], [speeds[i] for i in tried])
+        telling = [(i, velocity) for i, velocity in zip(tried, found, strict=True) if velocity.found]
+        if len(telling) < max(1, _MIN_SHARE_WITH_VELOCITY * len(tried)):
+            return cls(none, f"only {len(telling)} of {len(scans)} scans agree on a velocity of the sensor")
+        masks = list(none)
+        for i, velocity in telling:
+            masks[i] = ~velocity.static & np.isfinite(speeds[i]) & scans[i].any(axis=1)
+        share = sum(int(masks[i].sum()) for i, _ in telling) / sum(len(masks[i]) for i, _ in telling)
+        if share > _MAX_MOVING:
+            return cls(none, f"{share:.0%} of the returns disagree with the sensor's own motion")
+        return cls(masks, None)
+
+    @property
+    def count(self) -> int:
+        """Number of returns that move."""
+        return sum(int(mask.sum()) for mask in self.masks)
+
+    def without(self, arrays: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+        """F arrays (N_i, ...) without the rows of what moves."""
+        return [np.asarray(array)[~mask] for array, mask in zip(arrays, self.masks, strict=True)]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The returns of F scans without those that move, as far as Doppler tells them."""
+
+    points: Sequence[ArrayLike]
+    """F arrays (N_i, 3), sensor frame, m."""
+    intensities: Sequence[ArrayLike] | None
+    """F arrays (N_i,), sensor units."""
+    movers: int
+    """Number of returns that were left out."""
+    why_none: str | None
+    """As of :class:`Movers`."""
+
+    @classmethod
+    def of(
+        cls,
+        points: Sequence[ArrayLike],
+        intensities: Sequence[ArrayLike] | None,
+        doppler_mps: Sequence[ArrayLike] | None,
+        config: ReturnsConfig,
+    ) -> Standing:
+        """All returns, if there is no Doppler or ``config.drop_movers`` says so; else see :meth:`Movers.of`."""
+        if doppler_mps is None or not config.drop_movers:
+            return cls(points, intensities, 0, None)
+        if intensities is not None:
+            check_scans(points, intensities)
+        movers = Movers.of(points, doppler_mps)
+        values = None if intensities is None else movers.without(intensities)
+        return cls(movers.without(points), values, movers.count, movers.why_none)
+
+
+def _checked(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+    speeds = [real_array(values, f"doppler_mps of scan {i}") for i, values in enumerate(doppler_mps)]
+    if len(speeds) != len(scans):
+        msg = f"doppler_mps holds {len(speeds)} scans, points {len(scans)}"
+        raise ValueError(msg)
+    for i, (values, scan) in enumerate(zip(speeds, scans, strict=True)):
+        if values.shape != (len(scan),):
+            msg = f"doppler_mps of scan {i} must have shape ({len(scan)},), not {values.shape}"
+            raise ValueError(msg)
+    return speeds

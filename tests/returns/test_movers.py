@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Returns that move are left out of a fit, and only these."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.checking.doppler import velocity_of_poses
+from radarsdf.io.scans import Scans
+from radarsdf.returns.movers import Movers, Standing
+
+from tests.conftest import recorded_scans
+
+QUICK = {"training": {"sdf_iterations": 3, "intensity_iterations": 3}}
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Scans with Doppler, and which of their returns move: a tenth."""
+    scans = radarsdf.simulate.wall(frames=12)
+    velocities = velocity_of_poses(scans.poses, 0.1 * np.arange(12))
+    rng = np.random.default_rng(0)
+    doppler, moves = [], []
+    for points, velocity in zip(scans.points, velocities, strict=True):
+        moving = rng.random(len(points)) < 0.1
+        away = points / np.linalg.norm(points, axis=1, keepdims=True)
+        doppler.append(-away @ velocity + rng.normal(0, 0.04, len(points)) + 3.0 * moving)
+        moves.append(moving)
+    return scans, doppler, moves
+
+
+def test_what_moves_is_found(drive):
+    scans, doppler, moves = drive
+    for sign in (1, -1):  # sensors differ in it
+        found = Movers.of(scans.points, [sign * values for values in doppler])
+        assert found.why_none is None
+        told, true = np.concatenate(found.masks), np.concatenate(moves)
+        assert told[true].mean() > 0.99
+        assert told[~true].mean() < 0.01
+        assert found.count == told.sum()
+
+
+def test_a_fit_leaves_it_out_and_says_how_many(drive):
+    scans, doppler, _ = drive
+    expected = Movers.of(scans.points, doppler).count
+    for given in (
+        {"points": Scans(scans.points, scans.poses, scans.intensities, doppler_mps=doppler)},
+        {
+            "points": scans.points,
+            "poses": scans.poses,
+            "intensities": scans.intensities,
+            "doppler_mps": doppler,
+        },
+    ):
+        report = radarsdf.fit(**given, config=FitConfig(**QUICK), progress=False).report
+        assert report["movers"] == expected
+        assert report["returns"] == sum(map(len, scans.points))
+        kept = report["returns_used"] + report["ghosts"]
+        assert kept == report["returns"] - expected - _too_near(scans, doppler)
+    config = FitConfig(**QUICK, returns={"drop_movers": False})
+    kept_all = radarsdf.fit(scans.points, scans.poses, doppler_mps=doppler, config=config, progress=False)
+    assert kept_all.report["movers"] == 0
+
+
+def _too_near(scans, doppler):
+    left = Movers.of(scans.points, doppler).without(scans.points)
+    return sum(int((np.linalg.norm(points, axis=1) < 2.5).sum()) for points in left)
+
+
+def test_returns_without_doppler_stay(drive):
+    scans, doppler, moves = drive
+    half = [np.where(np.arange(len(v)) % 2, v, np.nan) for v in doppler]
+    found = Movers.of(scans.points, half)
+    assert not any(mask[::2].any() for mask in found.masks)
+    assert sum(int(mask[1::2].sum()) for mask in found.masks) > 0.9 * sum(int(m[1::2].sum()) for m in moves)
+
+
+def test_doppler_that_is_not_understood_leaves_nothing_out(drive):
+    scans, doppler, _ = drive
+    rng = np.random.default_rng(1)
+    noise = [rng.uniform(-20, 20, len(v)) for v in doppler]
+    # In half of the returns, what the sensor measured is lost: they would all seem to move.
+    mostly = [np.where(rng.random(len(v)) < 0.5, v, 37.0 + rng.uniform(-20, 20, len(v))) for v in doppler]
+    for values, why in ((noise, "scans agree on a velocity"), (mostly, "of the returns disagree")):
+        found = Movers.of(scans.points, values)
+        assert found.count == 0
+        assert why in found.why_none
+        report = radarsdf.fit(
+            scans.points, scans.poses, doppler_mps=values, config=FitConfig(**QUICK), progress=False
+        ).report
+        assert any(line.startswith("leaving out what moves: ") for line in report["skipped"])
+
+
+def test_intensities_stay_with_their_returns(drive):
+    scans, doppler, _ = drive
+    standing = Standing.of(scans.points, scans.intensities, doppler, FitConfig().returns)
+    kept = [~mask for mask in Movers.of(scans.points, doppler).masks]
+    for values, all_values, mask in zip(standing.intensities, scans.intensities, kept, strict=True):
+        np.testing.assert_array_equal(values, all_values[mask])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda doppler: doppler[1:], "doppler_mps holds 11 scans, points 12"),
+        (lambda doppler: [doppler[0][1:], *doppler[1:]], "doppler_mps of scan 0 must have shape"),
+    ],
+)
+def test_doppler_that_does_not_fit(drive, change, said):
+    scans, doppler, _ = drive
+    with pytest.raises(ValueError, match=said):
+        radarsdf.fit(scans.points, scans.poses, doppler_mps=change(doppler), progress=False)
+
+
+@pytest.mark.parametrize("name", ["r0009_0024", "r0057_0068", "r0133_0142", "r0144_0167", "r0309_0320"])
+def test_what_moves_in_recorded_drives_is_what_their_flags_say(name):
+    with np.load(recorded_scans(name)) as file:
+        rows = [np.flatnonzero(file["frame"] == i) for i in range(len(file["poses"]))]
+        points, doppler, static = ([file[k][r] for r in rows] for k in ("points", "doppler", "static"))
+    found = Movers.of(points, doppler)
+    wrong = np.concatenate([told == flags for told, flags in zip(found.masks, static, strict=True)])
+    assert found.why_none is None
+    assert wrong.mean() < 0.1
