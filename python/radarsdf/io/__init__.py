@@ -1,11 +1,22 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Reads and writes files of scans, poses, point clouds and meshes. Imports only `checks` and `_core` of this package."""
+"""Reads and writes files of scans, poses, point clouds and meshes. Imports only `checks`, `interrupts` and `_core` of this package."""
 
+from radarsdf.io.cloud_writers import write_cloud
 from radarsdf.io.clouds import read_points
-from radarsdf.io.meshes import write_mesh
+from radarsdf.io.meshes import read_mesh, write_mesh
 from radarsdf.io.read import read
 from radarsdf.io.scans import read_scans, write_scans
 from radarsdf.io.sequence import Scan, Scans
 
-__all__ = ["Scan", "Scans", "read", "read_points", "read_scans", "write_mesh", "write_scans"]
+__all__ = [
+    "Scan",
+    "Scans",
+    "read",
+    "read_mesh",
+    "read_points",
+    "read_scans",
+    "write_cloud",
+    "write_mesh",
+    "write_scans",
+]

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from radarsdf.io.fields import COLUMNS, Fields
 from radarsdf.io.files import check_regular_file
+from radarsdf.io.las import INTENSITY as RADAR_INTENSITY
+from radarsdf.io.origin import origin_of
 from radarsdf.io.pcd import read_pcd
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
@@ -90,7 +92,8 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        (M, 3) float64, frame of the file, m. Points that are not finite are left out.
+        (M, 3) float64, frame of the file, m; the world's, if :func:`radarsdf.io.write_cloud` wrote an origin beside
+        it. Points that are not finite are left out.
 
     Raises
     ------
@@ -107,7 +110,8 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     if len(points) == 0:
         msg = f"{path} holds no points"
         raise ValueError(msg)
-    return points
+    origin = origin_of(path)
+    return points if origin is None else points + origin
 
 
 def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
@@ -241,4 +245,8 @@ def _las(path: Path) -> Columns:
     columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
     if "intensity" in header.point_format.dimension_names:
         columns["intensity"] = np.asarray(cloud.intensity)
+    if "gps_time" in header.point_format.dimension_names:
+        columns["time"] = np.asarray(cloud.gps_time)
+    for name in header.point_format.extra_dimension_names:
+        columns["intensity" if name == RADAR_INTENSITY else str(name)] = np.asarray(cloud[name])
     return columns

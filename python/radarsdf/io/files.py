@@ -8,10 +8,11 @@ import errno
 import os
 import secrets
 import stat
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
+from typing import BinaryIO
 
 _MAX_NAME_BYTES = 255  # of nearly all file systems
 _MAX_PART_OF_NAME = (
@@ -68,24 +69,36 @@ def check_outputs(
 
 
 def write_whole(path: str | PathLike[str], data: bytes) -> None:
-    """Writes a file whole or not at all: an old file at `path` is replaced once the new one is on the disk.
+    """Writes a file whole or not at all; see :func:`whole_file`."""
+    with whole_file(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
+    """A file that is written whole or not at all: an old one at `path` is replaced once the new one is on the disk.
 
     A link is followed, and the old file's permissions stay. A process that is killed while it writes may leave a hidden
     file in the same folder, named `.NAME.` and 16 hexadecimal digits.
+
+    Yields
+    ------
+    file
+        Open for writing, and empty. If the block raises, it is removed, and the old file is as before.
 
     Raises
     ------
     ValueError
         If `path` is a pipe, a socket or a device: it would be replaced by a file.
     OSError
-        If the file cannot be written. The old file is then as before.
+        If the file cannot be written.
     """
     target = Path(os.path.realpath(path))
     mode = _check_target(target, path)
     descriptor, temporary = _open_beside(target)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         if mode is not None:
@@ -94,6 +107,8 @@ def write_whole(path: str | PathLike[str], data: bytes) -> None:
     except OSError as error:
         _remove(temporary)
         if error.errno is None:  # not of the system: its message is all there is
+            raise
+        if error.filename not in (None, str(temporary)):  # of a file that the block reads
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error  # a full disk names no file
     except BaseException:
@@ -124,6 +139,9 @@ def _open_beside(target: Path) -> tuple[int, Path]:
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
         return os.open(temporary, flags, 0o666), temporary
+    except FileNotFoundError as error:
+        why = f"there is no folder {target.parent}"
+        raise FileNotFoundError(error.errno, why, str(target)) from error
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(target)) from error
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,15 +12,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.files import write_whole
+from radarsdf.interrupts import whole_import
+from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.origin import origin_for, origin_of, write_origin
+from radarsdf.io.records import Columns, ply_header, records
 
 if TYPE_CHECKING:
     import trimesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
-_MAX_FLOAT32_M = 1000.0  # further from the origin, float32 resolves less than 0.06 mm
-_PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
+
+
+_FACES = re.compile(rb"element\s+face\s+0*[1-9]")
+_HEADER_BYTES = 1 << 16
+
+
+def holds_mesh(path: str | PathLike[str]) -> bool:
+    """Whether a file is a mesh, by its ending; of PLY, which may be a cloud too, by its header."""
+    file = Path(path)
+    suffix = file.suffix.lower()
+    if suffix != ".ply" or not file.is_file():
+        return suffix in MESH_SUFFIXES and suffix != ".ply" and not file.is_dir()
+    with file.open("rb") as opened:
+        return _FACES.search(opened.read(_HEADER_BYTES).partition(b"end_header")[0]) is not None
 
 
 def check_mesh_path(path: str | PathLike[str]) -> None:
@@ -59,28 +74,60 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.f
     check_mesh_path(path)
     suffix = Path(path).suffix.lower()
     vertices = np.asarray(mesh.vertices, np.float64)
-    origin = None
-    if suffix in _FLOAT32_SUFFIXES and np.abs(vertices).max(initial=0.0) > _MAX_FLOAT32_M:
-        origin = np.round(vertices.mean(axis=0))
+    origin = origin_for(vertices) if suffix in _FLOAT32_SUFFIXES else None
+    if origin is not None:
         mesh = mesh.copy()
         mesh.vertices = vertices - origin
     exported: Any = _ply(mesh) if suffix == ".ply" else mesh.export(file_type=suffix[1:])
     data: bytes = exported.encode() if isinstance(exported, str) else exported
-    if origin is not None:
-        described = {"origin": origin.tolist(), "unit": "m", "frame": "world = local + origin"}
-        write_whole(origin_path(path), json.dumps(described).encode())
+    if suffix in _FLOAT32_SUFFIXES:
+        write_origin(path, origin)
     write_whole(path, data)
     return origin
 
 
-def origin_path(path: str | PathLike[str]) -> Path:
-    """Where :func:`write_mesh` writes the origin of a local frame."""
-    return Path(path).with_name(Path(path).name + ".origin.json")
+def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
+    """Reads a triangle mesh.
+
+    Parameters
+    ----------
+    path : path-like
+        A file of a format that trimesh reads. If :func:`write_mesh` wrote an origin beside it, that is added.
+
+    Returns
+    -------
+    trimesh.Trimesh
+        The mesh with all its vertices: none are merged. A scene of several parts is one mesh.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged, or holds no mesh.
+    OSError
+        If it cannot be opened.
+    """
+    file = Path(path)
+    check_regular_file(file)
+    with whole_import():
+        import trimesh  # noqa: PLC0415 - takes long
+    try:
+        mesh: Any = trimesh.load_mesh(file, process=False)
+    except OSError:
+        raise
+    except Exception as error:  # damaged files raise exceptions of many kinds
+        msg = f"{path} cannot be read as a mesh: {error}"
+        raise ValueError(msg) from error
+    if isinstance(mesh, trimesh.Trimesh) and np.ndim(mesh.faces) == 2:
+        if (origin := origin_of(file)) is not None:
+            mesh.vertices = np.asarray(mesh.vertices, np.float64) + origin
+        return mesh
+    msg = f"{path} is not one mesh"
+    raise ValueError(msg)
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:
     """Binary, little-endian, vertices in double precision."""
-    columns: dict[str, NDArray[Any]] = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True))
+    columns: Columns = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True))
     for name, values in mesh.vertex_attributes.items():
         if np.shape(values) == (len(mesh.vertices),):
             columns[name] = np.asarray(values, np.float32)
@@ -88,21 +135,13 @@ def _ply(mesh: trimesh.Trimesh) -> bytes:
     if visual.kind == "vertex":
         colors = np.asarray(visual.vertex_colors, np.uint8)
         columns |= dict(zip(("red", "green", "blue", "alpha"), colors.T, strict=True))
-    vertices = _records(columns, len(mesh.vertices))
+    vertices = records(columns)
     faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
     faces["count"], faces["rows"] = 3, mesh.faces
-    header = ["ply", "format binary_little_endian 1.0", "comment radarsdf: world frame, m"]
-    header += [f"element vertex {len(vertices)}"]
-    header += [f"property {_PLY_TYPES[array.dtype.str[1:]]} {name}" for name, array in columns.items()]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    return ("\n".join(header) + "\n").encode("ascii") + vertices.tobytes() + faces.tobytes()
-
-
-def _records(columns: dict[str, NDArray[Any]], count: int) -> NDArray[Any]:
-    """One record a vertex."""
-    records = np.zeros(
-        count, np.dtype([(name, array.dtype.newbyteorder("<")) for name, array in columns.items()])
-    )
-    for name, array in columns.items():
-        records[name] = array
-    return records
+    lines = [
+        *ply_header(vertices.dtype, len(vertices)),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii") + vertices.tobytes() + faces.tobytes()

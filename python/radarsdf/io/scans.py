@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -57,12 +58,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     if Path(path).suffix != ".npz":
         msg = f"{path} is not an .npz file: only .npz files of scans can be read"
         raise ValueError(msg)
-    check_regular_file(path)
-    try:
-        arrays = _read_arrays(Path(path))
-    except Exception as error:  # damaged files raise exceptions of many kinds, among them OSError
-        msg = f"{path} is not a whole .npz file: {error}"
-        raise ValueError(msg) from error
+    arrays = arrays_of(path, _ARRAYS)
     if missing := sorted({"points", "frame", "poses"} - set(arrays)):
         msg = f"{path} lacks the arrays {', '.join(missing)}"
         raise ValueError(msg)
@@ -110,10 +106,25 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     )
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """The arrays of an ``.npz`` file that have these names, in this order. Raises as :func:`read_scans`."""
+    check_regular_file(path)
+    try:
+        return _arrays(Path(path), names)
+    except Exception as error:  # damaged files raise exceptions of many kinds, among them OSError
+        msg = f"{path} is not a whole .npz file: {error}"
+        raise ValueError(msg) from error
+
+
+def holds_scans(path: str | PathLike[str]) -> bool:
+    """Whether an ``.npz`` file has poses. Raises as :func:`read_scans`."""
+    return bool(arrays_of(path, ["poses"]))
+
+
+def _arrays(path: Path, wanted: Iterable[str]) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(path) as file:
         names = file.namelist()
-        members = {name: file.getinfo(f"{name}.npy") for name in _ARRAYS if f"{name}.npy" in names}
+        members = {name: file.getinfo(f"{name}.npy") for name in wanted if f"{name}.npy" in names}
         unpacked = sum(member.file_size for member in members.values())
         if unpacked > max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * path.stat().st_size):
             msg = f"its arrays would unpack to {unpacked} bytes: measurements do not compress that much"

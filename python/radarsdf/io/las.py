@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Clouds of radar returns as LAS and LAZ, by laspy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+INTENSITY = "radar_intensity"
+"""The extra dimension of intensities: LAS's own are whole numbers from 0 to 65535."""
+
+_SCALE_M = 1e-4
+_POINT_FORMAT = 6  # the first of LAS 1.4, with a time
+
+
+def las_writer(compressed: bool) -> Callable[[Any, Iterator[NDArray[Any]]], int]:
+    """A function that writes records, an array a scan, to an open file, and gives their number."""
+
+    def write(file: Any, rows: Iterator[NDArray[Any]]) -> int:
+        laspy = _laspy()
+        count, writer = 0, None
+        try:
+            for part in rows:
+                if writer is None:
+                    header = _header(laspy, part)
+                    writer = laspy.open(file, mode="w", header=header, closefd=False, do_compress=compressed)
+                writer.write_points(_points(laspy, part, header))
+                count += len(part)
+        finally:
+            if writer is not None:
+                writer.close()
+        return count
+
+    return write
+
+
+def _laspy() -> Any:
+    try:
+        import laspy  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        msg = 'LAS and LAZ files are written by laspy: pip install "radarsdf[las]"'
+        raise ImportError(msg) from error
+    return laspy
+
+
+def _extra(part: NDArray[Any]) -> dict[str, str]:
+    """Columns that are extra dimensions, by their names in the file."""
+    names = [name for name in part.dtype.names or () if name not in ("x", "y", "z", "time")]
+    return {INTENSITY if name == "intensity" else name: name for name in names}
+
+
+def _header(laspy: Any, first: NDArray[Any]) -> Any:
+    header = laspy.LasHeader(point_format=_POINT_FORMAT, version="1.4")
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams(name, first.dtype[column]) for name, column in _extra(first).items()]
+    )
+    header.offsets = np.round([first[axis].mean() for axis in "xyz"])
+    header.scales = np.full(3, _SCALE_M)
+    return header
+
+
+def _points(laspy: Any, part: NDArray[Any], header: Any) -> Any:
+    points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+    for axis in "xyz":
+        points[axis] = part[axis]
+    for name, column in _extra(part).items():
+        points[name] = part[column]
+    if "time" in (part.dtype.names or ()):
+        points["gps_time"] = part["time"]
+    return points
