@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-from radarsdf.cli.eval import read_mesh, read_points
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.io.folders import read_posed_folder
+from radarsdf.io.ground_truth import read_ground_truth
+from radarsdf.io.meshes import read_mesh
 from radarsdf.io.pcd import read_pcd
 from radarsdf.io.scans import read_scans
 from radarsdf.io.trajectory import read_trajectory
@@ -76,7 +77,7 @@ def _checkpoint(path: Path) -> None:
 
 
 def _points(path: Path) -> None:
-    assert isinstance(read_points(path), np.ndarray)
+    assert isinstance(read_ground_truth(path), np.ndarray)
 
 
 def _mesh(path: Path) -> None:

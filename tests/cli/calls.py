@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import json
+
 from radarsdf.cli import main
 
 FAST = [
@@ -21,6 +23,13 @@ FAST = [
 def call(*words):
     """Exit status of a command. Its words may also be paths or numbers."""
     return main([str(word) for word in words])
+
+
+def values(capsys, *words):
+    """The object that a command prints with --json, and nothing else on standard output."""
+    capsys.readouterr()
+    assert call(*words, "--json") == 0
+    return json.loads(capsys.readouterr().out)
 
 
 def files(folder):

@@ -4,13 +4,17 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 import trimesh
 from radarsdf.evaluation import KNNIntensity
+from radarsdf.io.cloud_writers import write_cloud
+from radarsdf.io.ground_truth import read_ground_truth
 from radarsdf.io.scans import Scans, read_scans, write_scans
 
-from .calls import call, refusal
+from .calls import call, refusal, values
 
 SAMPLES = ["--samples", 20000]
 BOX = ["--box", 9, -4, -1, 18, 4, 1]
@@ -82,7 +86,7 @@ def test_the_baseline_and_its_choice_see_the_training_scans_alone(map_file, scan
 def test_scans_without_lidar_points(map_file, scene, tmp_path, capsys):
     path = tmp_path / "scans.npz"
     write_scans(path, Scans(scene.points, scene.poses, scene.intensities))
-    assert "no lidar_points" in refusal(capsys, tmp_path, "eval", map_file, path)
+    assert "has no lidar points" in refusal(capsys, tmp_path, "eval", map_file, path)
     assert call("eval", map_file, path, "--holdout", 3) == 0
     printed = capsys.readouterr().out
     assert "F-score" not in printed
@@ -94,9 +98,15 @@ def test_points_of_several_formats(mesh_file, tmp_path, capsys):
     np.save(tmp_path / "lidar.npy", points)
     np.savetxt(tmp_path / "lidar.xyz", np.column_stack([points, points]))
     np.savetxt(tmp_path / "lidar.csv", points, delimiter=",")
+    np.savez(tmp_path / "lidar.npz", lidar_points=points)
+    np.savez(tmp_path / "other.npz", points)
+    cloud = Scans([points], np.eye(4)[None])
+    names = ["lidar.pcd", "lidar.las", "lidar.laz"] if find_spec("laspy") else ["lidar.pcd"]
+    for name in names:
+        write_cloud(tmp_path / name, cloud)
     trimesh.PointCloud(points).export(tmp_path / "lidar.ply")
     rows = set()
-    for name in ("lidar.npy", "lidar.xyz", "lidar.csv", "lidar.ply"):
+    for name in ("lidar.npy", "lidar.xyz", "lidar.csv", "lidar.ply", "lidar.npz", "other.npz", *names):
         assert call("eval", mesh_file, tmp_path / name, *SAMPLES) == 0
         rows.add(row(capsys.readouterr().out, "completion"))
     assert len(rows) == 1
@@ -126,10 +136,41 @@ def test_points_are_no_mesh(scans_file, tmp_path, capsys):
     assert "the mesh has no surface" in refusal(capsys, tmp_path, "eval", path, scans_file)
 
 
-def test_a_scene_of_several_parts_is_no_cloud(mesh_file, tmp_path, capsys):
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb", ".off"])
+def test_a_surface_is_ground_truth_everywhere_on_its_triangles(mesh_file, tmp_path, capsys, suffix):
+    plane = trimesh.Trimesh([[9, -4, 0], [18, -4, 0], [18, 4, 0], [9, 4, 0]], [[0, 1, 2], [0, 2, 3]])
+    path = tmp_path / f"plane{suffix}"
+    plane.export(path)
+    printed = values(capsys, "eval", mesh_file, path, *SAMPLES)["surface"]
+    assert printed["num_ground_truth"] == 1_000_000
+    assert printed["completion_ratio"] > 0.9  # of its four vertices, none is near a return
+
+
+def test_a_scene_of_several_parts_is_one_surface(tmp_path):
     path = tmp_path / "scene.glb"
-    trimesh.Scene([trimesh.creation.box(), trimesh.creation.icosphere()]).export(path)
-    assert f"{path} is not one cloud or mesh" in refusal(capsys, tmp_path, "eval", mesh_file, path)
+    parts = [trimesh.creation.box(), trimesh.creation.icosphere().apply_translation([9.0, 0, 0])]
+    trimesh.Scene(parts).export(path)
+    points = read_ground_truth(path)
+    shares = [(points[:, 0] < 5).mean(), (points[:, 0] > 5).mean()]
+    areas = np.array([part.area for part in parts])
+    np.testing.assert_allclose(shares, areas / areas.sum(), atol=0.01)
+    np.testing.assert_array_equal(points, read_ground_truth(path))
+
+
+def test_scans_of_other_kinds(map_file, scans_file, tmp_path, capsys):
+    """A folder with poses and lidar points: the same errors as of the .npz file."""
+    scans = read_scans(scans_file)
+    (tmp_path / "clouds").mkdir()
+    for i, (points, power) in enumerate(zip(scans.points, scans.intensities, strict=True)):
+        np.save(tmp_path / "clouds" / f"{i}.npy", np.column_stack([points, power]))
+    np.save(tmp_path / "poses.npy", scans.poses)
+    trimesh.PointCloud(scans.ground_truth).export(tmp_path / "lidar.ply")
+    errors = [
+        values(capsys, "eval", map_file, *words, *SAMPLES, "--holdout", 3)
+        for words in ([scans_file], [tmp_path], [tmp_path, tmp_path / "poses.npy"])
+    ]
+    assert errors[0]["held_out"] == errors[1]["held_out"] == errors[2]["held_out"]
+    assert errors[0]["surface"]["f_score"] == pytest.approx(errors[1]["surface"]["f_score"])
 
 
 def test_files_that_do_not_exist(mesh_file, scans_file, tmp_path, capsys):

@@ -21,9 +21,11 @@ def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     path = tmp_path / "map.safetensors"
     assert call("fit", scans_file, "-o", path, "--quick", "--geometry-only") == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("fit ")
-    written, noise = printed.splitlines()[-2:]
-    assert written.endswith(f", written to {path}")
+    used, fitted, noise, written, following = printed.splitlines()
+    assert used.startswith("9000 of 9000 returns in 6 scans make the surface")
+    assert fitted.startswith("fit ")
+    assert written == f"written to {path}"
+    assert following == f"next: radarsdf mesh {path} -o {path.with_suffix('.ply')}"
     sigma = radarsdf.load(path).report["noise"]
     assert noise == (
         f"noise {sigma['range_m']:.3f} m, azimuth {sigma['azimuth_rad']:.4f} rad, "

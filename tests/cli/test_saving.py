@@ -92,7 +92,7 @@ def test_the_disk_is_full(scans_file, out, spare, full_disk, capsys):
 def test_the_folder_is_removed_during_the_fit(scans_file, out, spare, monkeypatch, capsys):
     after_the_fit(monkeypatch, lambda _: shutil.rmtree(out.parent))
     said = failure(capsys, "fit", scans_file, "-o", out, *FAST)
-    assert os.strerror(errno.ENOENT) in said
+    assert "there is no folder" in said
     assert kept_in(spare, said).has_intensity
     assert not out.parent.exists()
 
@@ -109,7 +109,7 @@ def test_nothing_can_be_written(scans_file, out, spare, full_disk, monkeypatch, 
     full_disk(spare)
     after_the_fit(monkeypatch, lambda _: shutil.rmtree(out.parent))
     said = failure(capsys, "fit", scans_file, "-o", out, *FAST)
-    assert os.strerror(errno.ENOENT) in said
+    assert "there is no folder" in said
     assert os.strerror(errno.ENOSPC) in said
     assert "the map is lost" in said
     assert files(spare) == []

@@ -57,6 +57,14 @@ def test_a_mounting_moves_the_sensor(folder):
     np.testing.assert_allclose(moved.origin - plain.origin, [0, 0, 2], atol=1e-6)
 
 
+def test_poses_behind_an_option(folder, capsys):
+    out = folder / "map.safetensors"
+    words = [folder / "clouds", "--field", "intensity=echo", folder / "poses.tum", "--dry-run"]
+    assert call("fit", *words) == 0
+    assert capsys.readouterr().out.startswith("9000 returns")
+    assert not out.exists()
+
+
 def test_poses_that_are_missing(folder, capsys):
     (folder / "poses.tum").unlink()  # which would be found beside the folder
     said = refusal(capsys, folder, "fit", folder / "clouds", "-o", folder / "map.safetensors")
@@ -68,7 +76,7 @@ def test_poses_that_are_missing(folder, capsys):
     [
         (["--field", "intensity"], "--field takes ROLE=NAME, not 'intensity'"),
         (["--field", "intensity=nothing"], "nothing"),
-        (["--extrinsic", "poses.tum"], "extrinsic must be T_base_sensor (4, 4), not (6, 8)"),
+        (["--extrinsic", "poses.tum"], "poses.tum is no extrinsic: that is a 4 x 4 matrix"),
     ],
 )
 def test_words_that_are_wrong(folder, capsys, words, said):

@@ -10,6 +10,7 @@ command line, and it imports PyTorch, NumPy and trimesh only in ``run``. So help
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -24,13 +25,24 @@ COMMANDS = {
     "fit": "fit a map to scans",
     "mesh": "extract the surface of a map as a triangle mesh",
     "eval": "print the errors of a mesh or a map",
+    "convert": "write scans as one file or one point cloud, or a mesh in another format",
     "config": "print every setting of a fit with its meaning, as a file for --config",
     "info": "print versions, compiler, instruction set and threads, for bug reports",
+    "completion": "print what bash, zsh or fish need to complete commands and options",
 }
 """Name of each command, which is also the name of its module, and its help in one line."""
 
 _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
 """Errors with a message for the user. Every other error is a bug and keeps its traceback."""
+
+
+_REASONS: dict[type[OSError], str] = {
+    FileNotFoundError: "there is no such file or folder",
+    IsADirectoryError: "it is a folder, not a file",
+    NotADirectoryError: "a part of this path is a file, not a folder",
+    PermissionError: "you may not read or write it",
+}
+"""Errors of the system that most users meet, in words."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,15 +81,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status: int | None = _module(options.command).run(options)
     except _ERRORS as error:
-        return _failed(options.command, str(error) or type(error).__name__, 1)
+        return _failed(options.command, _words_of(error), 1)
     except KeyboardInterrupt as interruption:
         return _interrupted(options.command, interruption)
     return status or 0
 
 
-def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser of all commands. Only the command on the command line has its arguments."""
-    parser = argparse.ArgumentParser(
+class _Parser(argparse.ArgumentParser):
+    """Takes words also behind options, where argparse has done with a word that may be left out, such as POSES."""
+
+    _within = False
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        if self._within or self._subparsers is not None:
+            return super().parse_known_args(args, namespace)
+        self._within = True  # which parse_known_intermixed_args calls again
+        try:
+            return self.parse_known_intermixed_args(args, namespace)
+        finally:
+            self._within = False
+
+
+def whole_parser() -> argparse.ArgumentParser:
+    """The parser with the arguments of all commands."""
+    return _parser((), every=True)
+
+
+def _parser(words: Sequence[str], every: bool = False) -> argparse.ArgumentParser:
+    """The parser of all commands. Only the command on the command line has its arguments, unless `every` one has."""
+    parser = _Parser(
         prog="radarsdf",
         description="From 3D radar scans with known poses to a surface and a reflectance map, on a CPU.",
     )
@@ -85,13 +117,24 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     chosen = next((word for word in words if not word.startswith("-")), None)
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text)
-        if name == chosen:
+        if every or name == chosen:
             _module(name).add_arguments(command)
     return parser
 
 
 def _module(command: str) -> Any:
     return import_module(f"{__name__}.{command}")
+
+
+def _words_of(error: Exception) -> str:
+    """What to say of an error: of those of the system, the file and what is wrong with it."""
+    if isinstance(error, OSError) and error.errno is not None and error.strerror is not None:
+        plain = error.strerror == os.strerror(error.errno)  # not yet said in better words
+        reason = _REASONS.get(type(error), error.strerror) if plain else error.strerror
+        return f"{error.filename}: {reason}" if error.filename is not None else reason
+    if isinstance(error, MemoryError) and not str(error):
+        return "there is not enough memory"
+    return str(error) or type(error).__name__
 
 
 def _interrupted(command: str, interruption: KeyboardInterrupt) -> int:

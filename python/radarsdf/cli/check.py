@@ -8,8 +8,9 @@ import argparse
 import shlex
 from typing import TYPE_CHECKING, Any
 
-from radarsdf.cli.options import add_config_options, config_of
-from radarsdf.cli.saying import complain, say
+from radarsdf.cli.options import add_config_options, add_json, config_of
+from radarsdf.cli.results import Results
+from radarsdf.cli.saying import complain
 from radarsdf.cli.scans_in import add_scans, scans_of, words_of
 
 if TYPE_CHECKING:
@@ -21,14 +22,13 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     add_scans(parser)
-    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     add_config_options(parser)
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the findings, the worst first, and the command to run next. The status is 1 if one is an error."""
     import dataclasses
-    import json
 
     from radarsdf import check
 
@@ -47,12 +47,12 @@ def run(options: argparse.Namespace) -> int:
     target = shlex.quote(str(options.scans.with_suffix(".safetensors")))
     words = words_of(options)
     following = f"radarsdf check {words}" if failed else f"radarsdf fit {words} -o {target}"
-    if options.json:
-        say(json.dumps({"findings": [dataclasses.asdict(f) for f in findings], "next": following}, indent=2))
-    else:
-        for finding in findings:
-            say(str(finding))
-        say(f"next: {'mend the errors, then ' if failed else ''}{following}")
+    results = Results(options)
+    results.add(findings=[dataclasses.asdict(finding) for finding in findings], next=following)
+    for finding in findings:
+        results.add(str(finding))
+    results.add(f"next: {'mend the errors, then ' if failed else ''}{following}")
+    results.end()
     return int(failed)
 
 

@@ -8,8 +8,9 @@ import argparse
 import time
 from pathlib import Path
 
-from radarsdf.cli.options import add_fit_options, config_of, progress_of
-from radarsdf.cli.saying import say
+from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
+from radarsdf.cli.results import Results
+from radarsdf.cli.saying import complain
 
 SCENES = ("hugin", "oculii", "wall", "astyx")
 """The names in `radarsdf.simulate.SCENES`, which is not imported for a help text."""
@@ -23,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("radarsdf_demo"), help="output folder; default: radarsdf_demo"
     )
     add_fit_options(parser)
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -34,7 +36,7 @@ def run(options: argparse.Namespace) -> None:
 
     import radarsdf.map.meshing  # here and not by the first mesh: the printed times are without imports
     from radarsdf import fit
-    from radarsdf.cli.held_out import print_intensity_errors
+    from radarsdf.cli.held_out import add_intensity_errors
     from radarsdf.cli.saving import save_map
     from radarsdf.evaluation import format_metrics, holdout, surface_metrics
     from radarsdf.io.files import check_outputs
@@ -47,7 +49,13 @@ def run(options: argparse.Namespace) -> None:
     simulation = radarsdf.simulate.SCENES[options.scene](frames=options.frames)
     scans = Scans(simulation.points, simulation.poses, simulation.intensities, simulation.ground_truth)
     train, test = holdout(len(scans.points))
-    say(f"simulated {options.scene}: {sum(map(len, scans.points))} returns in {len(scans.points)} scans")
+    results = Results(options)
+    returns = sum(map(len, scans.points))
+    results.add(
+        f"simulated {options.scene}: {returns} returns in {len(scans)} scans",
+        returns=returns,
+        scans=len(scans),
+    )
 
     started_s = time.perf_counter()
     kept = scans.select(train)
@@ -57,11 +65,13 @@ def run(options: argparse.Namespace) -> None:
     started_s = time.perf_counter()
     viewpoint = scans.poses[len(scans.poses) // 2, :3, 3]
     mesh = radar_map.mesh(viewpoint=viewpoint, progress=progress_of(options))
-    say(f"fit {fit_s:.1f} s, mesh {time.perf_counter() - started_s:.1f} s: {radar_map}")
+    mesh_s = time.perf_counter() - started_s
+    results.add(f"fit {fit_s:.1f} s, mesh {mesh_s:.1f} s: {radar_map}", fit_s=fit_s, mesh_s=mesh_s)
 
     if scans.ground_truth is not None:
-        say(format_metrics(surface_metrics(mesh, scans.ground_truth, samples=1_000_000)))
-    print_intensity_errors(radar_map, scans.select(test), kept)
+        metrics = surface_metrics(mesh, scans.ground_truth, samples=1_000_000)
+        results.add(format_metrics(metrics), surface=metrics)
+    add_intensity_errors(results, radar_map, scans.select(test), kept)
 
     write_scans(options.out / "scans.npz", scans)
     write_mesh(options.out / "mesh.ply", mesh)
@@ -70,5 +80,9 @@ def run(options: argparse.Namespace) -> None:
         save_picture(options.out / "picture.png", mesh, scalar=mesh.vertex_attributes["intensity"])
         files.append("picture.png")
     except ImportError as error:  # Matplotlib is optional
-        say(f"no picture: {error}")
-    say("wrote " + ", ".join(str(options.out / name) for name in files))
+        complain(f"no picture: {error}")
+    results.add(
+        "wrote " + ", ".join(str(options.out / name) for name in files),
+        files=[options.out / n for n in files],
+    )
+    results.end()

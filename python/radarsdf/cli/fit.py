@@ -5,12 +5,19 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import shlex
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from radarsdf.cli.options import add_fit_options, config_of, progress_of
-from radarsdf.cli.saying import say
-from radarsdf.cli.scans_in import add_scans, scans_of
+from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
+from radarsdf.cli.results import Results
+from radarsdf.cli.saying import complain
+from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
+
+if TYPE_CHECKING:
+    from radarsdf import RadarMap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "it is removed when the map is written",
     )
     add_fit_options(parser)
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -48,8 +56,8 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.cli.saving import save_map
     from radarsdf.io.files import check_outputs
 
-    inputs = [path for path in (options.scans, options.poses, options.extrinsic) if path is not None]
-    check_outputs([options.out, options.checkpoint], inputs)
+    check_outputs([options.out, options.checkpoint], inputs_of(options))
+    results = Results(options)
     scans = scans_of(options)
     if options.holdout is not None:
         from radarsdf.evaluation import holdout
@@ -57,7 +65,9 @@ def run(options: argparse.Namespace) -> None:
         scans = scans.select(holdout(len(scans.points), options.holdout)[0])
     intensities = None if options.geometry_only else scans.intensities
     if options.dry_run:
-        say(str(estimate(scans.points, scans.poses, intensities, config=config)))
+        expected = estimate(scans.points, scans.poses, intensities, config=config)
+        results.add(str(expected), **dataclasses.asdict(expected))
+        results.end()
         return
     if not options.no_check:
         warn_or_refuse(scans, intensities)
@@ -67,6 +77,7 @@ def run(options: argparse.Namespace) -> None:
             scans.points,
             scans.poses,
             intensities,
+            doppler_mps=scans.doppler_mps,
             config=config,
             progress=progress_of(options),
             checkpoint=options.checkpoint,
@@ -82,9 +93,35 @@ def run(options: argparse.Namespace) -> None:
     save_map(radar_map, options.out)
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
-    say(f"fit {time.perf_counter() - started_s:.1f} s: {radar_map}, written to {options.out}")
-    say(
-        "noise {range_m:.3f} m, azimuth {azimuth_rad:.4f} rad, elevation {elevation_rad:.4f} rad".format(
-            **radar_map.report["noise"]
-        )
+    _say(results, radar_map, len(scans), time.perf_counter() - started_s, options.out)
+    results.end()
+
+
+def _say(results: Results, radar_map: RadarMap, scans: int, seconds: float, out: Path) -> None:
+    """Say what the fit used, what it left out, what it found, and what to do next."""
+    report = radar_map.report
+    returns, used, movers, ghosts = (report[name] for name in ("returns", "returns_used", "movers", "ghosts"))
+    left_out = {"move by their Doppler": movers, "are ghosts": ghosts}
+    left_out["are out of range"] = returns - used - movers - ghosts
+    parts = [f"{count} {why}" for why, count in left_out.items() if count]
+    results.add(
+        f"{used} of {returns} returns in {scans} scans make the surface"
+        + "".join(f", {part}" for part in parts),
+        scans=scans,
+        **{name: report[name] for name in ("returns", "returns_used", "movers", "ghosts")},
     )
+    for line in report["skipped"]:
+        if "moves" in line:
+            complain(f"radarsdf fit: warning: no returns were left out that move: {line.partition(': ')[2]}")
+    noise, losses = report["noise"], report["losses"]
+    loss = "".join(f", {stage} loss {value:.3g}" for stage, value in losses.items())
+    results.add(f"fit {seconds:.1f} s: {radar_map}{loss}", seconds=seconds, losses=losses)
+    results.add(
+        "noise {range_m:.3f} m, azimuth {azimuth_rad:.4f} rad, elevation {elevation_rad:.4f} rad".format(
+            **noise
+        ),
+        noise=noise,
+    )
+    results.add(f"written to {out}", out=out, leaf_cells=report["leaf_cells"], map_bytes=radar_map.nbytes)
+    following = f"radarsdf mesh {shlex.quote(str(out))} -o {shlex.quote(str(out.with_suffix('.ply')))}"
+    results.add(f"next: {following}", next=following)

@@ -6,21 +6,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from radarsdf.cli.saying import say
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import Rays, prepare
 
 if TYPE_CHECKING:
     from radarsdf import FitConfig, RadarMap
+    from radarsdf.cli.results import Results
     from radarsdf.io.scans import Scans
 
 
-def print_intensity_errors(radar_map: RadarMap, test: Scans, train: Scans) -> None:
-    """Print the errors of a map, and of a kNN baseline that is as good as these scans allow; nothing if map or scans have no intensities.
+def add_intensity_errors(results: Results, radar_map: RadarMap, test: Scans, train: Scans) -> None:
+    """Add the errors of a map, and of a kNN baseline that is as good as these scans allow; nothing if map or scans have no intensities.
 
     Parameters
     ----------
+    results
+        Where they go.
     radar_map
         The map.
     test
@@ -34,10 +36,14 @@ def print_intensity_errors(radar_map: RadarMap, test: Scans, train: Scans) -> No
     (x, sensors), measured = tested.in_world(), tested.intensities
     assert measured is not None
     assert known.intensities is not None
-    say("held-out " + format_metrics(intensity_metrics(radar_map.intensity(x, sensors), measured)))
+    errors = intensity_metrics(radar_map.intensity(x, sensors), measured)
+    results.add("held-out " + format_metrics(errors), held_out=errors)
     knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
     metrics = intensity_metrics(knn.predict(x, sensors), measured)
-    say(f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours")
+    results.add(
+        f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours",
+        knn=metrics | {"neighbours": knn.k, "candidates": knn.candidates},
+    )
 
 
 def _rays(scans: Scans, config: FitConfig) -> Rays:

@@ -7,14 +7,16 @@ from __future__ import annotations
 import argparse
 import platform
 
-from radarsdf.cli.saying import say
+from radarsdf.cli.options import add_json
+from radarsdf.cli.results import Results
 
 
-def add_arguments(_: argparse.ArgumentParser) -> None:
-    """The command has no arguments."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add_json(parser)
 
 
-def run(_: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> None:
     """Print one line for each part."""
     import torch
 
@@ -30,5 +32,7 @@ def run(_: argparse.Namespace) -> None:
         "openmp": f"{openmp}, {_core.num_threads()} threads" if openmp else "none: the core is serial",
         "instruction set": f"{_core.instruction_set()} of {', '.join(_core.available_instruction_sets())}",
     }
+    results = Results(options)
     for name, value in rows.items():
-        say(f"{name:<16}{value}")
+        results.add(f"{name:<16}{value}", **{name.replace(" ", "_"): value})
+    results.end()

@@ -6,9 +6,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from radarsdf.cli.options import add_box, add_quiet, box_of, progress_of
-from radarsdf.cli.saying import say
+from radarsdf.cli.options import add_box, add_json, add_quiet, box_of, progress_of
+from radarsdf.cli.results import Results
+
+if TYPE_CHECKING:
+    import numpy as np
+    import trimesh
+    from numpy.typing import NDArray
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,13 +63,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the mesh as a picture")
     add_quiet(parser)
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Extract the mesh, write it, draw it."""
     import radarsdf
     from radarsdf.io.files import check_outputs
-    from radarsdf.io.meshes import check_mesh_path, origin_path, write_mesh
+    from radarsdf.io.meshes import check_mesh_path, write_mesh
     from radarsdf.render.picture import save_picture
 
     check_mesh_path(options.out)
@@ -83,9 +90,25 @@ def run(options: argparse.Namespace) -> None:
         msg = f"{options.map} has no surface here: nothing written"
         raise ValueError(msg)
     origin = write_mesh(options.out, mesh)
-    say(f"{len(mesh.vertices)} vertices and {len(mesh.faces)} triangles written to {options.out}")
-    if origin is not None:
-        say(f"in a local frame, whose origin is in {origin_path(options.out)}")
+    results = Results(options)
+    say_mesh(results, mesh, options.out, origin)
     if options.picture:
         save_picture(options.picture, mesh, scalar=mesh.vertex_attributes.get("intensity"))
-        say(f"picture written to {options.picture}")
+        results.add(f"picture written to {options.picture}", picture=options.picture)
+    results.end()
+
+
+def say_mesh(results: Results, mesh: trimesh.Trimesh, path: Path, origin: NDArray[np.float64] | None) -> None:
+    """Say what was written, and where its origin is, if it has one of its own."""
+    from radarsdf.io.origin import origin_path
+
+    vertices, triangles = len(mesh.vertices), len(mesh.faces)
+    results.add(
+        f"{vertices} vertices and {triangles} triangles written to {path}",
+        vertices=vertices,
+        triangles=triangles,
+        out=path,
+        origin=origin,
+    )
+    if origin is not None:
+        results.add(f"in a local frame, whose origin is in {origin_path(path)}")

@@ -71,7 +71,7 @@ def _setting(text: str) -> dict[str, Any]:
     try:
         read = ast.literal_eval(value)
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
-        read = value
+        read = {"true": True, "false": False}.get(value, value)  # as in TOML
     return {group: {name: read}} if dot else {path: read}
 
 
@@ -83,6 +83,15 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
 def progress_of(options: argparse.Namespace) -> bool | None:
     """The argument ``progress`` of a fit or a mesh. None: a bar if standard error is a terminal."""
     return False if options.quiet else None
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add the option that :class:`radarsdf.cli.results.Results` reads."""
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print the results as one JSON object, lengths in m; progress and warnings go to standard error",
+    )
 
 
 def add_box(parser: argparse.ArgumentParser) -> None:

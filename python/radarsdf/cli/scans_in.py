@@ -13,13 +13,17 @@ if TYPE_CHECKING:
     from radarsdf.io.sequence import Scans
 
 
-def add_scans(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that :func:`scans_of` reads."""
-    parser.add_argument(
-        "scans",
-        type=Path,
-        help="the scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set",
-    )
+SCANS = ".npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"
+
+
+def add_scans(parser: argparse.ArgumentParser, *, also: str = "") -> None:
+    """Add the arguments that :func:`scans_of` reads; `also` says what else the command takes for scans."""
+    parser.add_argument("scans", type=Path, help=f"the scans: {SCANS}{also}")
+    add_poses(parser)
+
+
+def add_poses(parser: argparse.ArgumentParser) -> None:
+    """Add all of them but the scans themselves."""
     parser.add_argument(
         "poses",
         type=Path,
@@ -43,18 +47,22 @@ def add_scans(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def inputs_of(options: argparse.Namespace) -> list[Path]:
+    """The files and folders that :func:`scans_of` reads."""
+    return [path for path in (options.scans, options.poses, options.extrinsic) if path is not None]
+
+
 def scans_of(options: argparse.Namespace) -> Scans:
     """The scans of the command. What was assumed or left out is said on standard error."""
-    import numpy as np
-
     from radarsdf.io.read import read
+    from radarsdf.io.trajectory import read_table
 
     extrinsic = None
     if options.extrinsic is not None:
         try:
-            extrinsic = np.loadtxt(options.extrinsic)
+            extrinsic = read_table(options.extrinsic, 4)
         except ValueError as error:
-            msg = f"{options.extrinsic} is not a 4 x 4 matrix: {error}"
+            msg = f"{options.extrinsic} is no extrinsic: that is a 4 x 4 matrix T_base_sensor, four lines of four numbers"
             raise ValueError(msg) from error
     return read(
         options.scans,

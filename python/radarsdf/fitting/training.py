@@ -331,6 +331,7 @@ class Training:
             for name in stage.counts:
                 before = stage.iterations_before if name == stage.name else 0
                 self.iterations_done[name] = min(before + i + 1, self.iterations[name])
+            pauses.bar.set_postfix_str(f"{stage.name} loss {loss:.3g}", refresh=False)
             pauses.bar.update()
             if look:
                 # A sum is finite only if all numbers are. A sum that overflows is no better.
