@@ -74,3 +74,18 @@ def test_files_that_are_no_scans(garbage, tmp_path, capsys, suffix):
 def test_a_folder_that_does_not_exist(scans_file, tmp_path, capsys):
     out = tmp_path / "absent" / "map.safetensors"
     assert "absent" in refusal(capsys, tmp_path, "fit", scans_file, "-o", out, *FAST)
+
+
+def test_a_map_is_known_by_its_ending(scans_file, tmp_path, capsys):
+    for name in ("map", "map.npz"):
+        said = refusal(capsys, tmp_path, "fit", scans_file, "-o", tmp_path / name, *FAST)
+        assert "a map is written as .safetensors" in said
+
+
+def test_choices_without_an_effect_are_refused(scans_file, tmp_path, capsys):
+    out = tmp_path / "map.safetensors"
+    for words, said in (
+        (["--topic", "/radar"], "is no bag: topic is of bags alone"),
+        (["--field", "intensity=Power"], "fields and columns are not used for .npz files"),
+    ):
+        assert said in refusal(capsys, tmp_path, "fit", scans_file, "-o", out, *words)

@@ -8,7 +8,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from radarsdf.cli.options import add_box, add_json, box_of
+from radarsdf.cli.options import MAP_SUFFIX, add_box, add_json, box_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.scans_in import SCANS, add_poses, scans_of
 
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.meshes import read_mesh
 
     check_regular_file(options.what)
-    radar_map = radarsdf.load(options.what) if options.what.suffix == ".safetensors" else None
+    radar_map = radarsdf.load(options.what) if options.what.suffix == MAP_SUFFIX else None
     scans = _scans(options)
     if options.holdout is not None and (radar_map is None or scans is None):
         msg = "--holdout needs a map and scans"

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
+from radarsdf.cli.options import MAP_SUFFIX, add_fit_options, add_json, config_of, progress_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
@@ -57,6 +57,9 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.files import check_outputs
 
     check_outputs([options.out, options.checkpoint], inputs_of(options))
+    if options.out is not None and options.out.suffix != MAP_SUFFIX:
+        msg = f"{options.out}: a map is written as {MAP_SUFFIX}, by which the other commands know it"
+        raise ValueError(msg)
     results = Results(options)
     scans = scans_of(options)
     if options.holdout is not None:

@@ -140,7 +140,9 @@ def _open_beside(target: Path) -> tuple[int, Path]:
     try:
         return os.open(temporary, flags, 0o666), temporary
     except FileNotFoundError as error:
-        why = f"there is no folder {target.parent}"
+        why = (
+            "nothing can be written here" if target.parent.is_dir() else f"there is no folder {target.parent}"
+        )
         raise FileNotFoundError(error.errno, why, str(target)) from error
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(target)) from error

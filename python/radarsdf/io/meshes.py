@@ -92,7 +92,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     Parameters
     ----------
     path : path-like
-        A file of a format that trimesh reads. If :func:`write_mesh` wrote an origin beside it, that is added.
+        One of `MESH_SUFFIXES`. If :func:`write_mesh` wrote an origin beside it, that is added.
 
     Returns
     -------
@@ -108,6 +108,9 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     """
     file = Path(path)
     check_regular_file(file)
+    if file.suffix.lower() not in MESH_SUFFIXES:
+        msg = f"{path} is no mesh that can be read: those end in {', '.join(MESH_SUFFIXES)}"
+        raise ValueError(msg)
     with whole_import():
         import trimesh  # noqa: PLC0415 - takes long
     try:

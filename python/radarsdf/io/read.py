@@ -160,14 +160,25 @@ def _folder(folder: Path, request: Request, truth: Callable[[], NDArray[np.float
     return _files(files, folder, request, truth or (lambda: lidar_map(folder)))
 
 
+def _refuse_choices_of_bags(path: Path, request: Request) -> None:
+    """Raises where a choice would have no effect."""
+    for name in ("topic", "pose_topic", "world_frame", "stamps"):
+        if getattr(request, name) is not None:
+            msg = f"{path} is no bag: {name} is of bags alone"
+            raise ValueError(msg)
+
+
 def _files(
     files: list[Path], folder: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None]
 ) -> Scans:
     """Scans of files with poses."""
+    _refuse_choices_of_bags(files[0], request)
     places = dict.fromkeys((folder, files[0].parent, files[0].parent.parent))
     poses = request.poses
     if poses is None:
         poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
+        if poses is not None and poses.parent != folder:  # which is easily overlooked
+            request.notes.add(f"poses: of {poses}")
         if poses is None:
             what = files[0] if len(files) == 1 else folder
             msg = f"{what} has no poses: give them by poses, as a file (TUM, KITTI, 4 x 4) or an array (F, 4, 4)"
@@ -191,6 +202,10 @@ def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] |
     if request.poses is not None or request.extrinsic is not None:
         msg = f"{path} has its own poses T_world_sensor: poses and extrinsic are not used for .npz files"
         raise ValueError(msg)
+    if request.fields is not None or request.columns is not None:
+        msg = f"{path} has arrays of known names: fields and columns are not used for .npz files"
+        raise ValueError(msg)
+    _refuse_choices_of_bags(path, request)
     scans = read_scans(path)
 
     def source() -> Iterator[Scan]:

@@ -111,6 +111,9 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
     check_regular_file(path)
     try:
         return _arrays(Path(path), names)
+    except zipfile.BadZipFile as error:
+        msg = f"{path} is not a whole .npz file: it is cut off, damaged, or of another kind"
+        raise ValueError(msg) from error
     except Exception as error:  # damaged files raise exceptions of many kinds, among them OSError
         msg = f"{path} is not a whole .npz file: {error}"
         raise ValueError(msg) from error

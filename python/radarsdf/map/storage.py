@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 from torch import Tensor
@@ -107,6 +107,9 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
         return _build(tensors, json.loads(metadata["description"]))
     except (OSError, _OtherFileError):
         raise
+    except SafetensorError as error:
+        msg = f"{path} is not a whole radarsdf map: it is cut off, damaged, or of another kind; radarsdf fit writes maps"
+        raise ValueError(msg) from error
     except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} is not a whole radarsdf map: {error}"
         raise ValueError(msg) from error
