@@ -27,6 +27,7 @@ ROOMS = (
     ("map",),
     ("fitting",),
     ("render",),
+    ("view",),
     ("evaluation", "simulate"),
     ("cli",),
 )

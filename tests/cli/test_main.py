@@ -73,6 +73,8 @@ def test_help_of_a_command_imports_this_one_only(command):
         (["fit", "scans", "-o", "map", "--quick", "--paper"], "not allowed with"),
         (["mesh", "map", "-o", "mesh", "--box", "1"], "--box: expected 6 arguments"),
         (["mesh", "map", "-o", "mesh", "--voxel", "x"], "invalid float value: 'x'"),
+        (["view"], "arguments are required: map"),
+        (["view", "map", "--port", "x"], "invalid int value: 'x'"),
         (["eval", "mesh"], "arguments are required: truth"),
         (["demo", "--scene", "moon"], "invalid choice: 'moon'"),
         (["info", "more"], "unrecognized arguments: more"),

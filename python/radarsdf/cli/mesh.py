@@ -8,7 +8,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from radarsdf.cli.options import add_box, add_json, add_quiet, box_of, progress_of
+from radarsdf.cli.options import add_box, add_json, add_quiet, add_voxel, box_of, progress_of
 from radarsdf.cli.results import Results
 
 if TYPE_CHECKING:
@@ -23,9 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--out", type=Path, required=True, help="the mesh to write: .ply, .obj, .stl, .glb"
     )
-    parser.add_argument(
-        "--voxel", type=float, default=0.1, metavar="M", help="edge length of a voxel, m; default: 0.1"
-    )
+    add_voxel(parser)
     add_box(parser)
     parser.add_argument(
         "--viewpoint",

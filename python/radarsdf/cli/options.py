@@ -98,6 +98,13 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_voxel(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--voxel``."""
+    parser.add_argument(
+        "--voxel", type=float, default=0.1, metavar="M", help="edge length of a voxel, m; default: 0.1"
+    )
+
+
 def add_box(parser: argparse.ArgumentParser) -> None:
     """Add the option that :func:`box_of` reads."""
     parser.add_argument(

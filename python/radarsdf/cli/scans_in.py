@@ -16,9 +16,14 @@ if TYPE_CHECKING:
 SCANS = ".npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"
 
 
-def add_scans(parser: argparse.ArgumentParser, *, also: str = "") -> None:
-    """Add the arguments that :func:`scans_of` reads; `also` says what else the command takes for scans."""
-    parser.add_argument("scans", type=Path, help=f"the scans: {SCANS}{also}")
+def add_scans(parser: argparse.ArgumentParser, *, also: str = "", required: bool = True) -> None:
+    """Add the arguments that :func:`scans_of` reads; `also` says what else the command takes for scans.
+
+    If they are not `required`, ``options.scans`` may be None.
+    """
+    parser.add_argument(
+        "scans", type=Path, nargs=None if required else "?", help=f"the scans: {SCANS}{also}"
+    )
     add_poses(parser)
 
 

@@ -1,0 +1,184 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A client of the viewer without a browser: it answers, drags the sensor and keeps what it receives."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
+import numpy as np
+import viser
+import zstandard
+from numpy.typing import NDArray
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+STEP_S = 0.05
+"""The page sends so often where the sensor is."""
+
+
+@dataclass(frozen=True)
+class Received:
+    """One message of the server, as it arrived."""
+
+    at_s: float
+    """When, s, of `time.perf_counter`."""
+    frame_bytes: int
+    """Size of the frame that it came in, with what came along."""
+    message: dict[str, Any]
+    """Its fields. Arrays are given as their dtype and place in the frame."""
+
+    @property
+    def kind(self) -> str:
+        """Its type."""
+        return str(self.message["type"])
+
+    @property
+    def name(self) -> str:
+        """The node of the scene that it is about."""
+        return str(self.message.get("name", ""))
+
+    def changes(self, name: str, what: str) -> bool:
+        """Whether it changes a property of a node."""
+        return self.name == name and what in self.message.get("updates", {})
+
+
+class PlainClient:
+    """Connects to a viewer as its page does. A thread of it receives."""
+
+    def __init__(self, host: str, port: int) -> None:
+        protocol = Subprotocol(f"viser-v{viser.__version__}")
+        # Whole meshes come in one frame; its answers to pings must not wait for them.
+        self._socket = connect(
+            f"ws://{host}:{port}", subprotocols=[protocol], max_size=None, ping_interval=None
+        )
+        self._received: list[Received] = []
+        self._news = threading.Condition()
+        self._thread = threading.Thread(target=self._receive, daemon=True)
+        self._thread.start()
+        self.send(  # which tells the server that a page is there
+            "ViewerCameraMessage",
+            wxyz=(1.0, 0.0, 0.0, 0.0),
+            position=(0.0, 0.0, 0.0),
+            fov=1.0,
+            near=0.1,
+            far=1000.0,
+            image_height=700,
+            image_width=1000,
+            look_at=(0.0, 0.0, 1.0),
+            up_direction=(0.0, 0.0, 1.0),
+        )
+
+    def __enter__(self) -> Self:
+        """The client, which the end of the block closes."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self._socket.close()
+        self._thread.join()
+
+    def received(self, since: int = 0) -> list[Received]:
+        """All messages, without the first ones."""
+        with self._news:
+            return self._received[since:]
+
+    def wait_for(self, wanted: Any, since: int = 0, timeout_s: float = 30.0) -> Received:
+        """The first message after the first ones of which the function `wanted` is true."""
+
+        def found() -> Received | None:
+            return next((message for message in self._received[since:] if wanted(message)), None)
+
+        with self._news:
+            message = self._news.wait_for(found, timeout_s)
+        if message is None:
+            msg = f"the server sent no such message in {timeout_s} s"
+            raise TimeoutError(msg)
+        return message
+
+    def send(self, kind: str, **fields: Any) -> None:
+        """Send a message."""
+        self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def move_sensor(self, position: tuple[float, float, float]) -> None:
+        """A step of a drag, to a position in the frame of the page, m."""
+        self.send(
+            "TransformControlsUpdateMessage",
+            name="/sensor",
+            wxyz=(1.0, 0.0, 0.0, 0.0),
+            position=position,
+            owner="",
+        )
+
+    def drag(self, seconds: float) -> tuple[float, float]:
+        """Drag the sensor to and fro along x. Returns when it began and ended, s, of `time.perf_counter`."""
+        began_s = time.perf_counter()
+        self.send("TransformControlsDragStartMessage", name="/sensor", owner="")
+        steps = round(seconds / STEP_S)
+        for step in range(steps):
+            self.move_sensor((0.1 * (step + 1), 0.0, 1.0))
+            time.sleep(max(0.0, began_s + (step + 1) * STEP_S - time.perf_counter()))
+        ended_s = time.perf_counter()
+        self.send("TransformControlsDragEndMessage", name="/sensor", owner="")
+        return began_s, ended_s
+
+    def _receive(self) -> None:
+        try:
+            for frame in self._socket:
+                assert isinstance(frame, bytes)
+                at_s = time.perf_counter()
+                size, packed = (int.from_bytes(frame[i : i + 8], "little") for i in (0, 8))
+                inner = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + packed], max_output_size=size)
+                messages = msgspec.msgpack.decode(inner)["messages"]
+                with self._news:
+                    self._received += [Received(at_s, len(frame), message) for message in messages]
+                    self._news.notify_all()
+                for message in messages:
+                    if message["type"] == "LocalStorageGetItemRequestMessage":
+                        asked = message["request_uuid"]
+                        self.send(
+                            "LocalStorageGetItemResponseMessage", value=None, error=None, request_uuid=asked
+                        )
+        except ConnectionClosed:
+            pass
+
+
+class Glb(NamedTuple):
+    """What a GLB file of one mesh holds."""
+
+    vertices: NDArray[np.float32]
+    """(V, 3)."""
+    faces: NDArray[np.uint32]
+    """(F, 3)."""
+    colors: NDArray[np.uint8]
+    """(V, 3) linear in light, as glTF has them."""
+
+    @classmethod
+    def of(cls, data: bytes) -> Glb:
+        """Read it. trimesh would drop the colours of a mesh that has a material too."""
+        described = int.from_bytes(data[12:16], "little")
+        tree = json.loads(data[20 : 20 + described])
+        binary = data[28 + described :]
+
+        def array(accessor: int, dtype: str, width: int) -> NDArray[Any]:
+            found = tree["accessors"][accessor]
+            start = tree["bufferViews"][found["bufferView"]]["byteOffset"] + found.get("byteOffset", 0)
+            count = found["count"] * (width if found["type"] != "SCALAR" else 1)
+            return np.frombuffer(binary, dtype, count, start).reshape(-1, width)
+
+        (primitive,) = tree["meshes"][0]["primitives"]
+        attributes = primitive["attributes"]
+        return cls(
+            array(attributes["POSITION"], "<f4", 3),
+            array(primitive["indices"], "<u4", 3),
+            array(attributes["COLOR_0"], "u1", 4)[:, :3],
+        )

@@ -1,0 +1,157 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The viewer in a real browser without a screen: drags, clicks, and every frame that it draws."""
+
+from __future__ import annotations
+
+import base64
+import io
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+# Without a graphics card the browser draws in software.
+_FLAGS = [
+    "--no-sandbox",
+    "--ignore-gpu-blocklist",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+
+
+def why_no_browser() -> str | None:
+    """Why no browser can be driven here. None: one can."""
+    try:
+        import playwright.sync_api  # noqa: F401, PLC0415 - may be missing
+    except ImportError:
+        return "playwright is not installed"
+    if not any(map(shutil.which, BROWSERS)):
+        return f"none of {', '.join(BROWSERS)} is installed"
+    return None
+
+
+@contextmanager
+def open_page(url: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
+    """The page in a browser, when it has drawn the scene."""
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=next(filter(None, map(shutil.which, BROWSERS))), args=_FLAGS
+        )
+        try:
+            tab = browser.new_page(viewport={"width": width, "height": height})
+            tab.goto(url)
+            yield Page(tab)
+        finally:
+            browser.close()
+
+
+class Page:
+    """A tab with the viewer."""
+
+    def __init__(self, tab: Any) -> None:
+        self.tab = tab
+        self._frames: list[tuple[float, str]] = []
+        self._session: Any = None
+
+    def screenshot(self) -> NDArray[np.uint8]:
+        """(H, W, 3) what is seen now."""
+        return _pixels(self.tab.screenshot())
+
+    def start_recording(self) -> None:
+        """Keep each frame that the browser draws."""
+        self._session = self.tab.context.new_cdp_session(self.tab)
+
+        def on_frame(event: Any) -> None:
+            self._frames.append((time.perf_counter(), event["data"]))
+            self._session.send("Page.screencastFrameAck", {"sessionId": event["sessionId"]})
+
+        self._session.on("Page.screencastFrame", on_frame)
+        self._session.send("Page.startScreencast", {"format": "png", "everyNthFrame": 1})
+
+    def stop_recording(self) -> list[tuple[float, NDArray[np.uint8]]]:
+        """The frames since the start, (H, W, 3), and when they arrived, s, of `time.perf_counter`."""
+        self._session.send("Page.stopScreencast")
+        frames, self._frames = self._frames, []
+        return [(at_s, _pixels(base64.b64decode(data))) for at_s, data in frames]
+
+    def pause(self, seconds: float) -> None:
+        """Let the browser go on."""
+        self.tab.wait_for_timeout(1000 * seconds)
+
+    def wait_until(self, done: Callable[[], bool], timeout_s: float = 60.0) -> None:
+        """Let the browser go on until a function is true."""
+        until_s = time.monotonic() + timeout_s
+        while not done():
+            if time.monotonic() > until_s:
+                msg = f"it did not come in {timeout_s} s"
+                raise TimeoutError(msg)
+            self.pause(0.1)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int, step_s: float) -> None:
+        """Press the mouse at a pixel, move it to another and let go."""
+        mouse = self.tab.mouse
+        mouse.move(*start)
+        self.pause(step_s)
+        mouse.down()
+        for i in range(1, steps + 1):
+            mouse.move(*(a + (b - a) * i / steps for a, b in zip(start, end, strict=True)))
+            self.pause(step_s)
+        mouse.up()
+
+    def click(self, at: tuple[float, float]) -> None:
+        """Click on a pixel."""
+        self.tab.mouse.click(*at)
+
+    def text(self) -> str:
+        """All words on the page."""
+        return str(self.tab.inner_text("body"))
+
+
+def camera_of(server: Any, timeout_s: float = 30.0) -> Any:
+    """The camera of the first page, as it told the viser server."""
+    until_s = time.monotonic() + timeout_s
+    while time.monotonic() < until_s:
+        for client in server.get_clients().values():
+            return client.camera
+        time.sleep(0.05)
+    msg = f"no page connected in {timeout_s} s"
+    raise TimeoutError(msg)
+
+
+def pixel_of(camera: Any, point: NDArray[np.float64]) -> tuple[float, float]:
+    """The pixel in which the page draws a point (3,), frame of the page, m."""
+    w, x, y, z = camera.wxyz
+    R_page_camera = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    right, down, forward = R_page_camera.T @ (point - camera.position)
+    focal = camera.image_height / 2 / np.tan(camera.fov / 2)
+    return (
+        float(camera.image_width / 2 + focal * right / forward),
+        float(camera.image_height / 2 + focal * down / forward),
+    )
+
+
+def drawn(frame: NDArray[np.uint8]) -> int:
+    """Pixels of a frame (H, W, 3) that are not of the background, which is white; of the left part, without the panel."""
+    scene = frame[:, : frame.shape[1] * 2 // 3]
+    return int((scene.min(axis=2) < 235).sum())
+
+
+def _pixels(png: bytes) -> NDArray[np.uint8]:
+    from PIL import Image  # noqa: PLC0415 - comes with viser
+
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))

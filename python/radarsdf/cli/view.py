@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``radarsdf view``: a map in the browser."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from radarsdf.cli.options import add_box, add_quiet, add_voxel, box_of, progress_of
+from radarsdf.cli.saying import say
+from radarsdf.cli.scans_in import add_scans, scans_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument("map", type=Path, help="the map that radarsdf fit wrote, .safetensors")
+    add_scans(parser, required=False)
+    add_voxel(parser)
+    add_box(parser)
+    parser.add_argument(
+        "--max-vertices",
+        type=int,
+        default=500_000,
+        metavar="N",
+        help="take larger voxels if the mesh would have more than N vertices; default: 500000",
+    )
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to listen on; default: 127.0.0.1, which only this machine reaches",
+    )
+    parser.add_argument(
+        "--port", type=int, metavar="N", help="port to listen on; default: 8080, or the next that is free"
+    )
+    parser.add_argument(
+        "--open",
+        action=argparse.BooleanOptionalAction,
+        help="open the page in a browser here; default: if there is a screen",
+    )
+    add_quiet(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Serve the page until Ctrl-C."""
+    from radarsdf.view.serving import free_port, has_display, require_viser, ssh_line, url_of
+
+    # First: what would be said only after the map was read and meshed.
+    require_viser()
+    free_port(options.host, options.port or 0, exactly=True)
+
+    import radarsdf
+    from radarsdf.view.viewer import Viewer
+
+    radar_map = radarsdf.load(options.map)
+    scans = None if options.scans is None else scans_of(options)
+    with Viewer(
+        radar_map,
+        scans,
+        voxel_size=options.voxel,
+        box=box_of(options),
+        max_vertices=options.max_vertices,
+        host=options.host,
+        port=options.port,
+        progress=progress_of(options),
+    ) as viewer:
+        url = url_of(viewer.host, viewer.port)
+        for note in viewer.notes:
+            say(note)
+        say(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it")
+        say(f"from elsewhere: {ssh_line(viewer.host, viewer.port)}, then {url_of('localhost', viewer.port)}")
+        if has_display() if options.open is None else options.open:
+            import webbrowser
+
+            webbrowser.open(url)
+        try:
+            viewer.wait()
+        except KeyboardInterrupt:  # the way to end it, and no failure
+            say("stopped")

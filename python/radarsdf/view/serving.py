@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The server of the page: where it listens, and when a page has drawn what was sent. The one module that imports viser."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from radarsdf.checks import whole_number
+
+_PORTS_TRIED = 100
+_TITLE = "radarsdf"
+_WINDOW_S = 0.05  # viser collects messages for a sixtieth of a second
+_ROUND_TRIPS = 3
+_PATIENCE_S = 20.0
+
+
+def require_viser() -> None:
+    """Raise an ImportError that says what to install, if viser is missing."""
+    try:
+        import viser  # noqa: F401, PLC0415 - an extra
+    except ImportError as error:
+        msg = 'the viewer needs viser: pip install "radarsdf[view]"'
+        raise ImportError(msg) from error
+
+
+def free_port(host: str, port: int, *, exactly: bool) -> int:
+    """The port to listen on: `port`, or unless it must be `exactly` that one, the next that is free.
+
+    Raises
+    ------
+    ValueError
+        If `port` is no port.
+    OSError
+        If there is none, or the host is not an address of this machine.
+    """
+    whole_number(port, "--port", 0, 65535)
+    # Before viser tries: of an address that it cannot listen on it would wait for ever.
+    for candidate in [port] if exactly else range(port, min(port + _PORTS_TRIED, 65536)):
+        try:
+            with socket.create_server((host, candidate), family=_family(host)) as listening:
+                found: int = listening.getsockname()[1]
+                return found
+        except OSError as error:  # also of a name that is none
+            reason = (error.strerror or str(error)).partition(" (while")[0]
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                msg = f"cannot listen on {host}, port {candidate}: {reason}; --host takes an address of this machine"
+                raise OSError(msg) from error
+    msg = f"cannot listen on {host}, port {port}: {reason}; --port takes another"
+    raise OSError(msg)
+
+
+def _family(host: str) -> socket.AddressFamily:
+    """IPv4 or IPv6."""
+    return socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
+
+
+def start_server(host: str, port: int) -> Any:
+    """A `viser.ViserServer` that listens on host and port, without the button that would make the page public.
+
+    Raises
+    ------
+    ImportError
+        If viser is missing.
+    OSError
+        If the port was taken meanwhile.
+    """
+    require_viser()
+    import viser  # noqa: PLC0415
+
+    with _silence():
+        server: Any = viser.ViserServer(host, port, _TITLE, verbose=False)
+    # A page asks for it by a message, which others can send too: a tunnel through a third party.
+    server.request_share_url = lambda *_, **__: None
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    if server.get_port() != port:
+        stop_server(server)
+        msg = f"port {port} of {host} was taken meanwhile"
+        raise OSError(msg)
+    return server
+
+
+def stop_server(server: Any) -> None:
+    """Close all connections and end the threads of a server."""
+    with _silence():
+        server.stop()
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep what viser prints from standard output, where each command prints its own lines."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+def wait_until_drawn(server: Any, superseded: Callable[[], bool]) -> None:
+    """Wait until each page has drawn what was sent so far, or something newer is to be drawn.
+
+    viser does not tell. A question to the page is answered after what came before it: the first answer says that the
+    messages before were received and the last ones are on their way, the second that these were received, the third
+    that the page has been through another frame.
+    """
+    time.sleep(_WINDOW_S)
+    for client in server.get_clients().values():
+        until_s = time.monotonic() + _PATIENCE_S
+        answers = 0
+        while answers < _ROUND_TRIPS and time.monotonic() < until_s and not superseded():
+            try:
+                client.local_storage.get_item("drawn", timeout=0.5)
+            except TimeoutError:
+                continue
+            except RuntimeError as error:  # the page has no storage, which is an answer too, or is gone
+                if "disconnected" in str(error):
+                    break
+            answers += 1
+
+
+def has_display() -> bool:
+    """Whether a browser that is started here would be seen by who sits here."""
+    if "SSH_CONNECTION" in os.environ:
+        return False
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def url_of(host: str, port: int) -> str:
+    """Where a browser on this machine finds the page."""
+    return f"http://{_reached(host)}:{port}"
+
+
+def ssh_line(host: str, port: int) -> str:
+    """The command that brings the page of this machine to another one."""
+    return f"ssh -L {port}:{_reached(host)}:{port} {socket.gethostname()}"
+
+
+def _reached(host: str) -> str:
+    """The name under which this machine reaches a server that listens on the address `host`."""
+    if host in ("127.0.0.1", "::1", "0.0.0.0", "::"):
+        return "localhost"
+    return f"[{host}]" if ":" in host else host

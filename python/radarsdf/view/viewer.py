@@ -1,0 +1,228 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The page: a server with the surface, the sensor, the scans and the controls."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf.io.sequence import Scans
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.view.canvas import DRAG_POINTS, Colors, SurfaceCanvas
+from radarsdf.view.controls import Controls
+from radarsdf.view.painter import HELD_S, SLID_S, Painter, Wish
+from radarsdf.view.picking import first_hit
+from radarsdf.view.serving import free_port, require_viser, start_server, stop_server
+from radarsdf.view.surface import Surface
+from radarsdf.view.walk import Walk
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_SCALE_PERCENTILES = (2.0, 98.0)
+_TO_CAMERA = np.array([-0.33, -0.57, 0.5])  # of the first view, in diagonals of what is to be seen
+_BESIDE_PANEL = np.array([0.1, -0.06, 0.0])  # what is looked at is not behind the panel on the right
+_GIZMO_SHARE = 0.06  # size of the handles of the sensor in diagonals of the surface
+_CLICKED = "/clicked"
+
+
+class Viewer:
+    """Serves a map in the browser until it is stopped.
+
+    While the sensor is dragged, at most 40,000 vertices are recoloured, spread evenly over the surface: intensities of
+    all take too long for ten updates a second on two cores. All are recoloured when the drag ends. The scale of the
+    colours does not change: it is the range from the 2nd to the 98th percentile of what is predicted for the first
+    position. The page shows the map's local frame, so that float32 is fine enough for any coordinates; numbers are
+    world coordinates.
+
+    Parameters
+    ----------
+    radar_map : RadarMap
+        The map.
+    scans : Scans, optional
+        Scans with poses, to walk through. Their returns are kept in memory.
+    voxel_size : float
+        Edge of the voxels of the mesh, m.
+    box : (2, 3) array_like, optional
+        Lower and upper corner of the part to be shown, world, m.
+    max_vertices : int
+        A mesh of more vertices is made with larger voxels.
+    host : str
+        Address to listen on. Others than those of this machine alone let everyone in who can reach it.
+    port : int, optional
+        Port to listen on. None: 8080, or the next that is free.
+    progress : bool, optional
+        Whether to show a progress bar. By default only on a terminal.
+
+    Raises
+    ------
+    ImportError
+        If viser is missing.
+    OSError
+        If host and port cannot be listened on.
+    ValueError
+        If the map has no surface, or for wrong arguments.
+    """
+
+    def __init__(
+        self,
+        radar_map: RadarMap,
+        scans: Scans | None = None,
+        *,
+        voxel_size: float = 0.1,
+        box: ArrayLike | None = None,
+        max_vertices: int = 500_000,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        progress: bool | None = None,
+    ) -> None:
+        require_viser()
+        self.host = host
+        self.port = free_port(host, 8080 if port is None else port, exactly=port is not None)
+        self._map = radar_map
+        self.surface = Surface.of(
+            radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress
+        )
+        """What is shown."""
+        self._server: Any = start_server(host, self.port)
+        try:
+            self._fill(scans)
+        except BaseException:
+            stop_server(self._server)
+            raise
+        self.notes = self._notes(voxel_size)
+        """Sentences on what is shown coarser or thinner than it is."""
+
+    def wait(self) -> None:
+        """Wait until the viewer is stopped, from another thread or by Ctrl-C. An error in its thread is raised here."""
+        self._painter.wait()
+
+    def stop(self) -> None:
+        """Close the page and end all threads."""
+        self._painter.stop()
+        stop_server(self._server)
+
+    def __enter__(self) -> Self:
+        """The viewer, which the end of the block stops."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Stop."""
+        self.stop()
+
+    def _fill(self, scans: Scans | None) -> None:
+        origin, vertices = self._map.origin, self.surface.vertices
+        path = np.zeros((1, 3)) if scans is None else scans.poses[:, :3, 3] - origin
+        low, high = np.percentile(vertices - origin, [1, 99], axis=0)
+        low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
+        size_m = float(np.linalg.norm(high - low))
+        server = self._server
+        look_at = (low + high) / 2 + size_m * _BESIDE_PANEL
+        server.initial_camera.look_at = tuple(look_at)
+        server.initial_camera.position = tuple(look_at + size_m * _TO_CAMERA)
+        start = origin if scans is None else scans.poses[0, :3, 3]
+        first = (float(start[0]), float(start[1]), float(start[2]))
+        colors = None
+        if self._map.has_intensity:
+            step = max(1, len(vertices) // DRAG_POINTS)
+            predicted = self._map.intensity(vertices[::step], np.array(first))
+            colors = Colors(*(float(limit) for limit in np.percentile(predicted, _SCALE_PERCENTILES)))
+        self._walk = None
+        measured = None if scans is None or scans.intensities is None else colors
+        count = 0 if scans is None else len(scans)
+        self.colors = colors
+        """The scale of the colours. None: the map has no intensities."""
+        self._controls = controls = Controls(
+            server, self.surface, colors, count, predicts=measured is not None
+        )
+        if scans is not None:
+            self._walk = Walk(server, self._map, scans, measured, controls.say_of_scan)
+        self._clicked: NDArray[np.float64] | None = None
+        self._canvas = SurfaceCanvas(server, self._map, self.surface, colors, self._walk, self._describe)
+        wish = Wish(
+            first,
+            max_uncertainty_m=controls.max_uncertainty_m,
+            min_confidence=controls.min_confidence,
+            scan=None if self._walk is None else 0,
+        )
+        self._gizmo: Any = None
+        if colors is not None:
+            self._add_sensor(np.array(first) - origin, size_m)
+        self._painter = Painter(self._canvas, wish)
+        controls.connect(self._painter, self._canvas, self._walk, self._go_to_scan)
+        server.scene.on_click()(self._on_click)
+
+    def _add_sensor(self, position: NDArray[np.float64], size_m: float) -> None:
+        scale = _GIZMO_SHARE * size_m
+        far = 1e6
+        self._gizmo = self._server.scene.add_transform_controls(
+            "/sensor",
+            scale,
+            disable_rotations=True,
+            depth_test=False,
+            translation_limits=((-far, far),) * 3,
+            position=tuple(position),
+        )
+        self._server.scene.add_icosphere("/sensor/ball", scale / 8, (20, 20, 24))
+
+        # A coroutine, because viser would run functions in several threads, in any order.
+        async def on_update(event: Any) -> None:
+            sensor = self._map.origin + np.asarray(event.target.position, np.float64)
+            ended = event.phase == "end"
+            self._painter.wish(
+                sensor=tuple(sensor.tolist()), coarse=not ended, settle_s=0.0 if ended else HELD_S
+            )
+
+        self._gizmo.on_update(on_update)
+
+    def _go_to_scan(self, index: int) -> None:
+        """Show a scan, and move the sensor to where it was measured."""
+        assert self._walk is not None
+        sensor = self._walk.sensor(index)
+        if self._gizmo is not None:
+            self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
+        self._painter.wish(scan=index, sensor=sensor, coarse=True, settle_s=SLID_S)
+
+    def _on_click(self, event: Any) -> None:
+        vertices = self.surface.vertices - self._map.origin
+        point = first_hit(vertices, self._canvas.faces, event.ray_origin, event.ray_direction)
+        if point is None:
+            return
+        self._clicked = point + self._map.origin
+        self._server.scene.add_icosphere(
+            _CLICKED, 0.5 * self.surface.voxel_size_m, (214, 39, 40), position=tuple(point)
+        )
+        self._describe(self._painter.newest)
+
+    def _describe(self, wish: Wish) -> None:
+        """Say what the map knows of the point that was clicked last, for the sensor of a wish."""
+        if self._clicked is None:
+            return
+        x = self._clicked[None]
+        rows = {
+            "position": "{:.3f}, {:.3f}, {:.3f} m".format(*self._clicked),
+            "signed distance": f"{self._map.sdf(x)[0]:+.3f} m",
+            "uncertainty": f"{self._map.uncertainty(x)[0]:.3f} m",
+            "confidence": f"{self._map.confidence(x)[0]:.2f}",
+        }
+        if self._map.has_intensity:
+            range_m = float(np.linalg.norm(self._clicked - np.array(wish.sensor)))
+            rows["intensity"] = f"{self._map.intensity(x, np.array(wish.sensor))[0]:.1f} from {range_m:.1f} m"
+        self._controls.say_of_click(rows)
+
+    def _notes(self, voxel_size: float) -> list[str]:
+        notes = []
+        if self.surface.voxel_size_m > voxel_size:
+            notes.append(
+                f"the mesh has voxels of {self.surface.voxel_size_m:.2g} m, not {voxel_size:g} m, and so "
+                f"{len(self.surface.vertices)} vertices: --max-vertices allows more"
+            )
+        if self._walk is not None and self._walk.every > 1:
+            notes.append(f"of all returns together, one in {self._walk.every} is shown")
+        return notes

@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The scans on the page: the path of the sensor, and the returns of one scan, measured beside predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.io.sequence import Scans
+from radarsdf.map.colors import NEUTRAL
+from radarsdf.map.radar_map import RadarMap
+
+ALL_RETURNS = 200_000
+"""Returns of all scans that are shown together at most."""
+_POINT_M = 0.2
+_PATH_COLOR = (40, 44, 52)
+
+
+class Walk:
+    """Shows the returns of one scan after another.
+
+    Parameters
+    ----------
+    server
+        The viser server.
+    radar_map
+        The map that predicts.
+    scans
+        The scans. All returns are kept in memory.
+    colors
+        (N, 3) sRGB of intensities (N,). None: scans or map have none, and returns are grey.
+    say
+        Called with a sentence about the scan that is shown.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        radar_map: RadarMap,
+        scans: Scans,
+        colors: Callable[[NDArray[Any]], NDArray[np.uint8]] | None,
+        say: Callable[[str], None],
+    ) -> None:
+        self._server, self._map, self._say = server, radar_map, say
+        self._points, self._poses = scans.points, scans.poses
+        self._intensities = None if colors is None else scans.intensities
+        self._colors = colors
+        self._shown: int | None = None
+        self._clouds: dict[str, Any] = {}
+        self._visible = {"measured": True, "predicted": True, "all": False}
+        path = (self._poses[:, :3, 3] - radar_map.origin).astype(np.float32)
+        self.path: Any = server.scene.add_line_segments(
+            "/scans/path",
+            np.stack([path[:-1], path[1:]], axis=1),
+            _PATH_COLOR,
+            thickness=3.0,
+            thickness_units="screen",
+        )
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self._points)
+
+    def sensor(self, index: int) -> tuple[float, float, float]:
+        """Position of the sensor in a scan, world, m."""
+        x, y, z = self._poses[index, :3, 3].tolist()
+        return x, y, z
+
+    def show(self, index: int) -> None:
+        """Show the returns of a scan, unless they are shown."""
+        if index == self._shown:
+            return
+        self._shown = index
+        world = self._in_world(index)
+        sensor = self._poses[index, :3, 3]
+        if self._intensities is None or self._colors is None:
+            self._draw("measured", world, np.full((len(world), 3), NEUTRAL, np.uint8))
+            self._say(f"scan {index}: {len(world)} returns")
+            return
+        measured = np.asarray(self._intensities[index], np.float64)
+        predicted = self._map.intensity(world, sensor)
+        # To the right of each measured return, seen from the sensor, and so beside it.
+        right = np.cross(world - sensor, [0.0, 0.0, 1.0])
+        right *= _POINT_M / np.maximum(np.linalg.norm(right, axis=1), 1e-9)[:, None]
+        with self._server.atomic():
+            self._draw("measured", world, self._colors(measured))
+            self._draw("predicted", world + right, self._colors(predicted))
+        errors = np.abs(predicted - measured)
+        errors = errors[np.isfinite(errors)]
+        error = f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
+        self._say(f"scan {index}: {len(world)} returns{error}")
+
+    def set_visible(self, what: str, visible: bool) -> None:
+        """Show or hide the clouds "measured" and "predicted" of the scan, or the cloud of "all" returns."""
+        self._visible[what] = visible
+        if what == "all" and visible and "all" not in self._clouds:
+            self._draw_all()
+        if what in self._clouds:
+            self._clouds[what].visible = visible
+
+    @property
+    def every(self) -> int:
+        """Of how many returns one is shown among all."""
+        return max(1, -(-sum(map(len, self._points)) // ALL_RETURNS))
+
+    def _draw_all(self) -> None:
+        step = self.every
+        world = np.concatenate([self._in_world(i) for i in range(len(self))])[::step]
+        if self._intensities is None or self._colors is None:
+            colors = np.full((len(world), 3), NEUTRAL, np.uint8)
+        else:
+            colors = self._colors(np.concatenate(self._intensities)[::step])
+        self._draw("all", world, colors)
+
+    def _in_world(self, index: int) -> NDArray[np.float64]:
+        """(N, 3) returns, world, m."""
+        T_world_sensor = self._poses[index]
+        world: NDArray[np.float64] = (
+            np.asarray(self._points[index], np.float64) @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
+        )
+        return world
+
+    def _draw(self, what: str, world: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
+        local = (world - self._map.origin).astype(np.float32)
+        if what in self._clouds:
+            cloud = self._clouds[what]
+            cloud.points, cloud.colors = local, colors
+            return
+        self._clouds[what] = self._server.scene.add_point_cloud(
+            f"/scans/{what}",
+            local,
+            colors,
+            point_size=_POINT_M,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+            visible=self._visible[what],
+        )

@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What is shown of a surface, and where a ray meets it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from radarsdf.view.glb import glb
+from radarsdf.view.picking import first_hit
+from radarsdf.view.surface import Surface, spread_evenly
+from scipy.spatial import cKDTree
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
+TWO = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+
+
+def test_a_surface_has_no_more_vertices_than_allowed(sharp_map):
+    full = Surface.of(sharp_map, 0.1, max_vertices=10**9, progress=False)
+    assert full.voxel_size_m == 0.1
+    most = len(full.vertices) // 3
+    thin = Surface.of(sharp_map, 0.1, max_vertices=most, progress=False)
+    assert most / 2 < len(thin.vertices) <= most
+    assert thin.voxel_size_m > 0.1
+    np.testing.assert_allclose(np.ptp(thin.vertices, axis=0), np.ptp(full.vertices, axis=0), atol=0.5)
+
+
+def test_a_map_without_a_surface_here(sharp_map):
+    with pytest.raises(ValueError, match="no surface here"):
+        Surface.of(sharp_map, 0.2, max_vertices=1000, box=[[90, 90, 90], [91, 91, 91]], progress=False)
+
+
+def test_limits_leave_out_vertices_and_their_triangles():
+    surface = Surface(
+        SQUARE, TWO, np.array([0.1, 0.1, 0.1, 0.4], np.float32), np.array([0.5, 1, 1, 1], np.float32),
+        np.ones(4, np.float32), 1.0,
+    )  # fmt: skip
+
+    def part(*limits):
+        rows, faces = surface.part(surface.kept(*limits))
+        return rows.tolist(), rows[faces].tolist()
+
+    assert part(1.0, 0.0) == ([0, 1, 2, 3], [[0, 1, 2], [1, 3, 2]])
+    assert part(0.2, 0.0) == ([0, 1, 2], [[0, 1, 2]])
+    assert part(1.0, 0.7) == ([1, 2, 3], [[1, 3, 2]])
+    assert part(0.2, 0.7) == ([], [])
+
+
+def test_points_are_spread_evenly():
+    rng = np.random.default_rng(1)
+    points = np.zeros((20_000, 3))
+    points[:, :2] = rng.uniform(0, 10, (20_000, 2))
+    points[:15_000, :2] *= 0.1  # most of them in a corner
+    rows, edge_m = spread_evenly(points, 1000, 0.05)
+    assert 500 < len(rows) <= 1000
+    assert len(set(rows)) == len(rows)
+    gaps = cKDTree(points[rows]).query(points)[0]
+    assert gaps.max() < 1.8 * edge_m  # within the diagonal of a cube: no place is left out
+    everything, edge_m = spread_evenly(points, len(points), 0.05)
+    assert (everything == np.arange(len(points))).all()
+    assert edge_m == 0.05
+
+
+def test_a_glb_has_the_colors_that_were_given():
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    from bench.viewing.client import Glb  # noqa: PLC0415 - which needs it
+
+    colors = np.array([[0, 0, 0], [43, 20, 133], [249, 237, 82], [255, 255, 255]], np.uint8)
+    mesh = Glb.of(glb(SQUARE, TWO, colors))
+    np.testing.assert_array_equal(mesh.faces, TWO)
+    np.testing.assert_array_equal(mesh.vertices, SQUARE)
+    linear = mesh.colors / 255  # glTF is linear in light
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(255 * shown, colors, atol=7)
+
+
+def test_a_ray_meets_the_nearest_triangle():
+    vertices = np.concatenate([SQUARE, SQUARE - [0, 0, 1]])
+    faces = np.concatenate([TWO + 4, TWO])
+    assert first_hit(vertices, faces, [0.25, 0.25, 2], [0, 0, -5]) == pytest.approx([0.25, 0.25, 0])
+    assert first_hit(vertices, faces, [0.75, 0.8, -3], [0, 0, 1]) == pytest.approx([0.75, 0.8, -1])
+    assert first_hit(vertices, faces, [0.25, 0.25, -0.5], [0, 0, -1]) == pytest.approx([0.25, 0.25, -1])
+    for origin, direction in [([0, 0, 2], [0, 0, 1]), ([1.1, 0.5, 2], [0, 0, -1]), ([-1, 0.5, 0], [1, 0, 0])]:
+        assert first_hit(vertices, faces, origin, direction) is None
+    assert first_hit(vertices, faces[:0], [0, 0, 2], [0, 0, -1]) is None
+
+
+def test_rays_meet_a_mesh_where_others_say():
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=2.0)
+    rng = np.random.default_rng(2)
+    for target in rng.normal(scale=1.0, size=(50, 3)):
+        direction = target - [9, 1, 2]
+        hit = first_hit(mesh.vertices, mesh.faces, [9, 1, 2], direction)
+        along = direction / np.linalg.norm(direction)
+        closest = np.array([9, 1, 2]) - along * (along @ [9, 1, 2])
+        if np.linalg.norm(closest) < 1.95:
+            expected = closest - along * np.sqrt(4 - closest @ closest)
+            assert hit == pytest.approx(expected, abs=0.1)
+        elif np.linalg.norm(closest) > 2:
+            assert hit is None

@@ -1,0 +1,184 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The viewer, as a client sees it that counts what it receives, and its handlers."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf.io import Scans
+from radarsdf.view.viewer import Viewer
+
+from ..conftest import ground_and_wall
+
+pytest.importorskip("viser", reason="the extra view is not installed")
+
+from bench.viewing.client import Glb, PlainClient
+
+CLOUD = "/surface/cloud"
+
+
+@pytest.fixture(scope="module")
+def scans(scene):
+    return Scans(scene.points, scene.poses, scene.intensities)
+
+
+@pytest.fixture(scope="module")
+def viewer(sharp_map, scans):
+    with Viewer(sharp_map, scans, voxel_size=0.2, port=0, progress=False) as viewer:
+        yield viewer
+
+
+@pytest.fixture
+def client(viewer):
+    with PlainClient(viewer.host, viewer.port) as client:
+        client.wait_for(lambda message: message.kind == "ReplayDoneMessage")
+        client.wait_for(lambda message: message.kind == "GlbMessage")
+        yield client
+
+
+def mesh_of(message):
+    return Glb.of(message.message["props"]["glb_data"])
+
+
+def is_mesh(message):
+    return message.kind == "GlbMessage"
+
+
+def slide(client, label, value):
+    """Move a slider, or set a check box, as the page does."""
+    found = client.wait_for(
+        lambda m: m.kind.startswith("Gui") and m.message.get("props", {}).get("label") == label
+    )
+    client.send("GuiUpdateMessage", uuid=found.message["uuid"], updates={"value": value})
+
+
+def test_a_new_client_gets_the_scene(client, viewer):
+    nodes = {message.name for message in client.received()}
+    assert {CLOUD, "/sensor", "/scans/path", "/scans/measured", "/scans/predicted"} <= nodes
+    mesh = mesh_of(client.wait_for(is_mesh))
+    assert len(mesh.faces) == len(viewer.surface.faces)
+
+
+def test_a_drag_recolours_few_points_and_then_the_mesh(client, viewer, sharp_map):
+    before = len(client.received())
+    _, ended_s = client.drag(1.0)
+    new_mesh = client.wait_for(is_mesh, before)
+    assert new_mesh.at_s > ended_s
+    updates = [m for m in client.received(before) if m.changes(CLOUD, "colors") and m.at_s < ended_s]
+    assert len(updates) >= 5  # of at most 20; twice as many on an idle machine
+    moving = [m for m in client.received(before) if m.at_s < ended_s]
+    assert {m.kind for m in moving} <= {"SceneNodeUpdateMessage", "SetSceneNodeVisibilityMessage"}
+    assert not any(m.changes(CLOUD, "points") for m in moving)  # only what changed is sent
+    points = len(viewer.surface.vertices)
+    assert min(m.frame_bytes for m in updates) < 3 * points + 1000
+
+    # The mesh is coloured for the last position of the drag, in the frame of the page.
+    def difference(position):
+        sensor = sharp_map.origin + position
+        colors = viewer.colors(sharp_map.intensity(viewer.surface.vertices, sensor)).astype(float)
+        shaded = colors * viewer.surface.brightness[:, None]
+        return np.abs(shaded - _srgb(mesh_of(new_mesh).colors)).mean()
+
+    assert difference([2.0, 0.0, 1.0]) < 2
+    assert difference([1.0, 0.0, 1.0]) > 4
+
+
+def _srgb(linear):
+    """Colours as a screen shows them."""
+    linear = linear / 255
+    return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def test_limits_hide_triangles(client, viewer):
+    surface = viewer.surface
+    limit = float(np.median(surface.uncertainty_m))
+    before = len(client.received())
+    slide(client, "uncertainty ≤ m", limit)
+    mesh = mesh_of(client.wait_for(is_mesh, before))
+    assert 0 < len(mesh.faces) < len(surface.faces)
+    assert len(mesh.faces) == len(surface.part(surface.kept(limit, 0.0))[1])
+    before = len(client.received())
+    slide(client, "uncertainty ≤ m", 0.0)
+    client.wait_for(lambda m: m.kind == "RemoveSceneNodeMessage", before)  # nothing is left
+    slide(client, "uncertainty ≤ m", 9.0)
+    mesh = mesh_of(client.wait_for(is_mesh, before))
+    assert len(mesh.faces) == len(surface.faces)
+
+
+def test_the_walk_shows_a_scan_and_moves_the_sensor(client, scans, sharp_map):
+    before = len(client.received())
+    slide(client, "scan", 4)
+    client.wait_for(lambda m: m.changes("/scans/measured", "colors"), before)
+    client.wait_for(lambda m: m.changes("/scans/predicted", "colors"), before)
+    moved = client.wait_for(lambda m: m.kind == "SetPositionMessage" and m.name == "/sensor", before)
+    np.testing.assert_allclose(moved.message["position"], scans.poses[4, :3, 3] - sharp_map.origin, atol=1e-6)
+    client.wait_for(is_mesh, before)  # coloured for that position
+    said = client.wait_for(lambda m: "scan 4: " in str(m.message.get("updates", {}).get("_markdown")), before)
+    assert f"{len(scans.points[4])} returns; median error" in str(said.message)
+    assert not any(m.name == "/scans/all" for m in client.received())
+    slide(client, "all scans", value=True)
+    client.wait_for(lambda m: m.name == "/scans/all" and m.kind == "PointCloudMessage", before)
+
+
+def test_a_click_tells_what_the_map_knows(client, viewer, sharp_map):
+    before = len(client.received())
+    eye = np.array([3.0, 0.5, 2.0])
+    target = np.array([12.0, 1.0, 0.0]) - sharp_map.origin  # on the plane
+    viewer._on_click(SimpleNamespace(ray_origin=eye, ray_direction=target - eye))
+    said = client.wait_for(
+        lambda m: "signed distance" in str(m.message.get("updates", {}).get("_markdown")), before
+    )
+    rows = dict(row.strip("| ").split(" | ") for row in said.message["updates"]["_markdown"].splitlines()[2:])
+    position = np.array([float(number) for number in rows["position"].removesuffix(" m").split(",")])
+    assert position == pytest.approx([12, 1, 0], abs=0.3)
+    assert float(rows["signed distance"].removesuffix(" m")) == pytest.approx(
+        sharp_map.sdf(position[None])[0], abs=0.02
+    )
+    assert float(rows["uncertainty"].removesuffix(" m")) == pytest.approx(
+        sharp_map.uncertainty(position[None])[0], abs=0.01
+    )
+    sensor = np.array(viewer._painter.newest.sensor)
+    assert float(rows["intensity"].split()[0]) == pytest.approx(
+        sharp_map.intensity(position[None], sensor)[0], abs=0.5
+    )
+    # A click into the sky says nothing, and leaves what was said.
+    before = len(client.received())
+    viewer._on_click(SimpleNamespace(ray_origin=eye, ray_direction=[0.0, 0.0, 1.0]))
+    assert not any("_markdown" in m.message.get("updates", {}) for m in client.received(before))
+
+
+def test_the_page_cannot_be_made_public(viewer):
+    assert viewer._server.request_share_url() is None
+
+
+def test_a_map_far_away_without_intensities():
+    scene = ground_and_wall(offset=(500_000.0, 5_400_000.0, 300.0))
+    radar_map = radarsdf.fit(scene.points, scene.poses, config=radarsdf.FitConfig.quick(), progress=False)
+    scans = Scans(scene.points, scene.poses, scene.intensities)
+    threads = set(threading.enumerate())
+    with (
+        Viewer(radar_map, scans, voxel_size=0.2, port=0, progress=False) as viewer,
+        PlainClient(viewer.host, viewer.port) as client,
+    ):
+        mesh = mesh_of(client.wait_for(is_mesh))
+        assert np.abs(mesh.vertices).max() < 50  # of the local frame, which float32 can hold
+        assert not any(message.name in (CLOUD, "/sensor") for message in client.received())
+        viewer._on_click(SimpleNamespace(ray_origin=[0.0, 0.0, 2.0], ray_direction=[8.0, 0.0, -3.0]))
+        said = client.wait_for(lambda m: "signed distance" in str(m.message))
+        assert "position | 5000" in str(said.message)
+        assert "intensity" not in str(said.message)
+    left = [thread for thread in set(threading.enumerate()) - threads if thread.name == "radarsdf view"]
+    assert left == []
+    with Viewer(radar_map, voxel_size=0.3, port=viewer.port, progress=False):  # the port is free again
+        pass
+
+
+def test_a_port_that_is_taken_is_said_before_the_work(viewer, sharp_map, monkeypatch):
+    monkeypatch.setattr("radarsdf.view.surface.Surface.of", lambda *_, **__: pytest.fail("work was done"))
+    with pytest.raises(OSError, match="in use"):
+        Viewer(sharp_map, port=viewer.port)
