@@ -96,6 +96,14 @@ class Page:
                 raise TimeoutError(msg)
             self.pause(0.1)
 
+    def settle(self, pause_s: float = 0.5) -> NDArray[np.uint8]:
+        """Wait until the page does not change, and return what is seen then."""
+        last, seen = None, self.screenshot()
+        while last is None or not np.array_equal(last, seen):
+            self.pause(pause_s)
+            last, seen = seen, self.screenshot()
+        return seen
+
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int, step_s: float) -> None:
         """Press the mouse at a pixel, move it to another and let go."""
         mouse = self.tab.mouse

@@ -24,7 +24,7 @@ def test_a_drag_and_a_click(sharp_map, scene):
     ):
         page.wait_until(lambda: drawn(page.screenshot()) > 8_000)
         camera = camera_of(viewer._server)
-        before = page.screenshot()
+        before = page.settle()
 
         # A click on the plane.
         target = np.array([13.0, 0.0, 0.0])
@@ -39,7 +39,7 @@ def test_a_drag_and_a_click(sharp_map, scene):
         page.start_recording()
         page.drag(pixel_of(camera, arrow), pixel_of(camera, arrow + [4, 0, 0]), steps=10, step_s=0.06)
         page.wait_until(lambda: viewer._canvas.sent > meshes and not viewer._canvas.coarse)
-        page.pause(0.5)
+        after = page.settle()
         frames = page.stop_recording()
         moved = np.array(viewer._gizmo.position) - start
         assert moved == pytest.approx([4, 0, 0], abs=1)
@@ -49,7 +49,6 @@ def test_a_drag_and_a_click(sharp_map, scene):
         assert least > 0.8 * drawn(before)
 
         # The surface has other colours now.
-        after = page.screenshot()
         both = (before.min(axis=2) < 235) & (after.min(axis=2) < 235)
         both[:, 470:] = False  # the panel
         change = np.abs(after.astype(int) - before)[both].mean()

@@ -21,9 +21,7 @@ def add_scans(parser: argparse.ArgumentParser, *, also: str = "", required: bool
 
     If they are not `required`, ``options.scans`` may be None.
     """
-    parser.add_argument(
-        "scans", type=Path, nargs=None if required else "?", help=f"the scans: {SCANS}{also}"
-    )
+    parser.add_argument("scans", type=Path, nargs=None if required else "?", help=f"the scans: {SCANS}{also}")
     add_poses(parser)
 
 

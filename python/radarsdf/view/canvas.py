@@ -23,8 +23,8 @@ from radarsdf.view.serving import wait_until_drawn
 from radarsdf.view.surface import Surface, spread_evenly
 from radarsdf.view.walk import Walk
 
-DRAG_POINTS = 40_000
-"""Vertices that are recoloured while the sensor moves: on two cores intensities of 40,000 points take about 0.03 s, of
+DRAG_POINTS = 30_000
+"""Vertices that are recoloured while the sensor moves: on two cores intensities of 30,000 points take about 0.025 s, of
 400,000 about 0.4 s."""
 _POINT_EDGES = 1.4  # size of a point in distances of neighbours, so that there are no holes between them
 

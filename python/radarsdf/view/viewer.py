@@ -33,7 +33,7 @@ _CLICKED = "/clicked"
 class Viewer:
     """Serves a map in the browser until it is stopped.
 
-    While the sensor is dragged, at most 40,000 vertices are recoloured, spread evenly over the surface: intensities of
+    While the sensor is dragged, at most 30,000 vertices are recoloured, spread evenly over the surface: intensities of
     all take too long for ten updates a second on two cores. All are recoloured when the drag ends. The scale of the
     colours does not change: it is the range from the 2nd to the 98th percentile of what is predicted for the first
     position. The page shows the map's local frame, so that float32 is fine enough for any coordinates; numbers are
@@ -196,7 +196,7 @@ class Viewer:
             return
         self._clicked = point + self._map.origin
         self._server.scene.add_icosphere(
-            _CLICKED, 0.5 * self.surface.voxel_size_m, (214, 39, 40), position=tuple(point)
+            _CLICKED, 1.5 * self.surface.voxel_size_m, (214, 39, 40), position=tuple(point)
         )
         self._describe(self._painter.newest)
 
