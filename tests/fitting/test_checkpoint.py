@@ -64,6 +64,10 @@ def assert_same_bits(one, other):
         assert torch.equal(value, other.field.state_dict()[name]), name
     assert one.report["losses"] == other.report["losses"]
     assert one.report["iterations_done"] == other.report["iterations_done"]
+    histories = (
+        [(h["iterations"], h["losses"]) for h in m.report["loss_history"].values()] for m in (one, other)
+    )
+    assert next(histories) == next(histories)
 
 
 @pytest.mark.parametrize(

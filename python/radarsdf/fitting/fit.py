@@ -20,6 +20,7 @@ from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.skipped import Skipped, skipped_parts
 from radarsdf.fitting.start import STARTS
 from radarsdf.fitting.stopping import Diverged, Interrupted
 from radarsdf.fitting.surface import SurfaceReturns
@@ -149,7 +150,7 @@ def fit(
                     config=config,
                     evidence=evidence,
                     rough_share=surface.surfels.rough_share(),
-                    report=counts | _report(config, field, training, scale, standing),
+                    report=counts | _report(config, field, training, counts, standing, workers.num_threads),
                 )
             )
             training.run(progress, saved)
@@ -161,7 +162,7 @@ def fit(
     finally:
         if radar_map is not None:
             clock.lap("training_s")
-            radar_map.report.update(clock.laps)
+            radar_map.report.update(clock.laps, loss_history=training.history.to_report())
             radar_map.field.requires_grad_(False)
     return radar_map
 
@@ -191,42 +192,34 @@ def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, nu
 
 
 def _report(
-    config: FitConfig, field: Field, training: Training, scale: IntensityScale | None, standing: Standing
+    config: FitConfig,
+    field: Field,
+    training: Training,
+    counts: dict[str, Any],
+    standing: Standing,
+    threads: int,
 ) -> dict[str, Any]:
     """What the map's report says of cells and training. The training goes on to fill what counts it."""
+    skipped = skipped_parts(
+        config,
+        training.schedule,
+        returns=counts["returns_used"] + counts["ghosts"],
+        cells=len(field.cells.table.leaf_keys()),
+        rows=field.cells.table.num_rows,
+        with_intensity=field.intensity_network is not None,
+        threads=threads,
+    )
+    if standing.why_none is not None:
+        skipped.insert(0, Skipped(f"leaving out what moves: {standing.why_none}", None))
     return {
         "leaf_cells": len(field.cells.table.leaf_keys()),
         "vertices": field.cells.table.num_rows,
         "iterations": training.iterations,
         "iterations_done": training.iterations_done,
         "losses": training.losses,
-        "skipped": _skipped(config, training, scale, standing),
+        "skipped": [part.words for part in skipped],
+        "skipped_s": [part.seconds for part in skipped],
     }
-
-
-def _skipped(
-    config: FitConfig, training: Training, scale: IntensityScale | None, standing: Standing
-) -> list[str]:
-    """Parts of the method that this fit did not run, in words."""
-    skipped = []
-    if standing.why_none is not None:
-        skipped.append(f"leaving out what moves: {standing.why_none}")
-    if scale is None:
-        skipped.append("the intensity network: there are no intensities")
-    else:
-        unused = [
-            ("normals", config.networks.normals),
-            ("geometry feature", config.networks.geometry_feature_dim > 0),
-        ]
-        skipped += [
-            f"the {name}, which the intensity network does not use" for name, used in unused if not used
-        ]
-    if training.passes < 1 and config.training.sdf_iterations is None:
-        why = "the others were enough" if config.effort >= 1 else f"effort is {config.effort:g}"
-        skipped.append(f"{1 - training.passes:.0%} of the samples: {why}")
-    if training.moves_rows and training.iterations["sdf"] > 0:
-        skipped.append("in each iteration, updates of features that its samples did not use")
-    return skipped
 
 
 class _Clock:

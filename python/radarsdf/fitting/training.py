@@ -23,6 +23,7 @@ from radarsdf.fitting.autograd_gradients import AutogradGradients
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.core_gradients import CoreGradients
 from radarsdf.fitting.gradients import GradientBackend, Gradients, Share
+from radarsdf.fitting.history import LossHistory
 from radarsdf.fitting.optimiser import Adam, RowAdam
 from radarsdf.fitting.sampling import RaySampler, Samples
 from radarsdf.fitting.stopping import Diverged
@@ -149,8 +150,8 @@ class Training:
             vertices=field.cells.table.num_rows,
             with_intensity=scale is not None,
         )
+        self.schedule = schedule
         self.iterations = schedule.iterations
-        self.passes = schedule.passes
         parts = min(workers.num_threads, schedule.batch_size, config.training.intensity_batch_size)
         self._draws: _Draws | None = None  # not made without iterations, because it sorts the returns
         self._backends: list[GradientBackend] = []
@@ -159,6 +160,7 @@ class Training:
             self._backends = _backends(field, config, schedule, parts)
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
+        self.history = LossHistory(self.iterations)
         sdf_parameters = list(field.sdf_network.parameters())
         self._rows = None
         if config.moves_rows(scale is not None):
@@ -171,11 +173,6 @@ class Training:
                 field.intensity_network.parameters(), config.training.intensity_learning_rate
             )
 
-    @property
-    def moves_rows(self) -> bool:
-        """Whether an iteration changes only the features that its samples touch."""
-        return self._rows is not None
-
     def state(self) -> dict[str, Tensor]:
         """All that the rest of the training depends on, between two iterations. Tensors are not copied."""
         losses = [self.losses.get(name, 0.0) for name in self.iterations_done]
@@ -183,6 +180,7 @@ class Training:
             "done": torch.tensor(list(self.iterations_done.values()), dtype=torch.int64, device="cpu"),
             "losses": torch.tensor(losses, dtype=torch.float64, device="cpu"),
         }
+        state |= {f"history.{name}": spans for name, spans in self.history.state().items()}
         state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
         for name, adam in self._adams.items():
             state |= {f"adam.{name}.{k}": v for k, v in adam.state().items()}
@@ -203,6 +201,7 @@ class Training:
         self.iterations_done.update(done)
         losses = zip(done, state["losses"].tolist(), strict=True)
         self.losses.update({name: loss for name, loss in losses if done[name]})
+        self.history.restore(_part(state, "history"))
         for name, parameter in self._field.named_parameters():
             parameter.data.copy_(state[f"field.{name}"])
         for name, adam in self._adams.items():
@@ -227,6 +226,7 @@ class Training:
         """
         field = self._field
         stages = self._stages()
+        self.history.start()
         with (
             tqdm(
                 total=sum(stage.iterations for stage in stages),
@@ -326,11 +326,12 @@ class Training:
                     self._workers,
                     meanwhile=rest,
                 )
-            del found, rest  # gradients of all features are as large as these: not two for each thread
             self.losses[stage.name] = loss
             for name in stage.counts:
                 before = stage.iterations_before if name == stage.name else 0
                 self.iterations_done[name] = min(before + i + 1, self.iterations[name])
+            self.history.add(found, self.iterations_done)
+            del found, rest  # gradients of all features are as large as these: not two for each thread
             pauses.bar.set_postfix_str(f"{stage.name} loss {loss:.3g}", refresh=False)
             pauses.bar.update()
             if look:
