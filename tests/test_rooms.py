@@ -16,7 +16,7 @@ import radarsdf
 ROOT = Path(radarsdf.__file__).parent
 # From the lowest to the highest. A room may import itself and those below it.
 ROOMS = (
-    ("_core", "checks", "interrupts", "progress", "settings", "threads"),
+    ("_core", "checks", "interrupts", "progress", "settings", "threads", "versions"),
     ("config",),
     ("config_toml",),
     ("io",),
@@ -29,6 +29,7 @@ ROOMS = (
     ("render",),
     ("view",),
     ("evaluation", "simulate"),
+    ("report",),
     ("cli",),
 )
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

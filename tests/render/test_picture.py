@@ -180,7 +180,7 @@ def test_without_matplotlib_the_message_says_what_to_install(tmp_path, monkeypat
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(ImportError, match=r'pip install "radarsdf\[demo\]"'):
+    with pytest.raises(ImportError, match=r'pip install "radarsdf\[plot\]"'):
         save_picture(tmp_path / "map.png", square((0.0, 0.0, 0.0)))
 
 

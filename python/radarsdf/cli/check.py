@@ -16,6 +16,7 @@ from radarsdf.cli.scans_in import add_scans, scans_of, words_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from radarsdf import Finding, FitConfig
     from radarsdf.io.sequence import Scans
 
 
@@ -30,19 +31,8 @@ def run(options: argparse.Namespace) -> int:
     """Print the findings, the worst first, and the command to run next. The status is 1 if one is an error."""
     import dataclasses
 
-    from radarsdf import check
-
     config = config_of(options)
-    scans = scans_of(options)
-    points = scans.points  # first: it reads all there is, in one pass
-    findings = check(
-        points,
-        scans.poses,
-        scans.intensities,
-        doppler_mps=scans.doppler_mps,
-        times_s=scans.times_s,
-        config=config,
-    )
+    findings = findings_of(scans_of(options), config)
     failed = any(finding.severity == "error" for finding in findings)
     target = shlex.quote(str(options.scans.with_suffix(".safetensors")))
     words = words_of(options)
@@ -54,6 +44,21 @@ def run(options: argparse.Namespace) -> int:
     results.add(f"next: {'mend the errors, then ' if failed else ''}{following}")
     results.end()
     return int(failed)
+
+
+def findings_of(scans: Scans, config: FitConfig) -> list[Finding]:
+    """All findings about scans, the worst first."""
+    from radarsdf import check
+
+    points = scans.points  # first: it reads all there is, in one pass
+    return check(
+        points,
+        scans.poses,
+        scans.intensities,
+        doppler_mps=scans.doppler_mps,
+        times_s=scans.times_s,
+        config=config,
+    )
 
 
 def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None:

@@ -43,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="save the state of the fit in this file from time to time; if the file exists, continue from it; "
         "it is removed when the map is written",
     )
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="HTML",
+        help="also write a page about the map: pictures, errors, plots, settings",
+    )
     add_fit_options(parser)
     add_json(parser)
 
@@ -50,22 +56,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Fit a map, or estimate what the fit takes."""
     config = config_of(options)
+    _check_report(options)
 
     from radarsdf import Interrupted, estimate, fit
     from radarsdf.cli.check import warn_or_refuse
     from radarsdf.cli.saving import save_map
     from radarsdf.io.files import check_outputs
 
-    check_outputs([options.out, options.checkpoint], inputs_of(options))
+    check_outputs([options.out, options.checkpoint, options.report], inputs_of(options))
     if options.out is not None and options.out.suffix != MAP_SUFFIX:
         msg = f"{options.out}: a map is written as {MAP_SUFFIX}, by which the other commands know it"
         raise ValueError(msg)
     results = Results(options)
-    scans = scans_of(options)
+    every_scan = scans = scans_of(options)
+    held_out = None
     if options.holdout is not None:
         from radarsdf.evaluation import holdout
 
-        scans = scans.select(holdout(len(scans.points), options.holdout)[0])
+        train, test = holdout(len(scans.points), options.holdout)
+        scans, held_out = scans.select(train), scans.select(test)
     intensities = None if options.geometry_only else scans.intensities
     if options.dry_run:
         expected = estimate(scans.points, scans.poses, intensities, config=config)
@@ -97,7 +106,33 @@ def run(options: argparse.Namespace) -> None:
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
     _say(results, radar_map, len(scans), time.perf_counter() - started_s, options.out)
+    if options.report is not None:
+        from radarsdf.cli.check import findings_of
+        from radarsdf.cli.report import add_report
+        from radarsdf.report.subject import Subject
+
+        subject = Subject(
+            radar_map,
+            options.out.name,
+            scans,
+            held_out,
+            findings_of(every_scan, config),
+            progress=progress_of(options),
+        )
+        add_report(results, options.report, subject)
     results.end()
+
+
+def _check_report(options: argparse.Namespace) -> None:
+    """Refuse a report that could not be made, before the work."""
+    if options.report is None:
+        return
+    from radarsdf.report.extras import require_extras
+
+    require_extras()
+    if options.dry_run:
+        msg = "--dry-run makes no map that --report could be about: leave out one of them"
+        raise ValueError(msg)
 
 
 def _say(results: Results, radar_map: RadarMap, scans: int, seconds: float, out: Path) -> None:

@@ -7,11 +7,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
-from radarsdf.returns.movers import Standing
-from radarsdf.returns.rays import Rays, prepare
+from radarsdf.returns.movers import rays_as_measured
 
 if TYPE_CHECKING:
-    from radarsdf import FitConfig, RadarMap
+    from radarsdf import RadarMap
     from radarsdf.cli.results import Results
     from radarsdf.io.scans import Scans
 
@@ -32,7 +31,7 @@ def add_intensity_errors(results: Results, radar_map: RadarMap, test: Scans, tra
     """
     if not radar_map.has_intensity or test.intensities is None:
         return
-    tested, known = (_rays(scans, radar_map.config) for scans in (test, train))
+    tested, known = (rays_as_measured(scans, radar_map.config) for scans in (test, train))
     (x, sensors), measured = tested.in_world(), tested.intensities
     assert measured is not None
     assert known.intensities is not None
@@ -43,16 +42,4 @@ def add_intensity_errors(results: Results, radar_map: RadarMap, test: Scans, tra
     results.add(
         f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours",
         knn=metrics | {"neighbours": knn.k, "candidates": knn.candidates},
-    )
-
-
-def _rays(scans: Scans, config: FitConfig) -> Rays:
-    """The returns that the fit accepts: of a range, and of what does not move."""
-    standing = Standing.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
-    return prepare(
-        standing.points,
-        scans.poses,
-        standing.intensities,
-        min_range_m=config.returns.min_range_m,
-        max_range_m=config.returns.max_range_m,
     )

@@ -129,7 +129,7 @@ def save_picture(
     Raises
     ------
     ImportError
-        If matplotlib is not installed. It comes with the extra `demo`.
+        If matplotlib is not installed. It comes with the extra `plot`.
     ValueError
         As `render` and `intensity_colors`, or if `scalar` has a wrong shape.
     OSError
@@ -141,7 +141,7 @@ def save_picture(
         from matplotlib.colors import ListedColormap, Normalize  # noqa: PLC0415
         from matplotlib.figure import Figure  # noqa: PLC0415
     except ImportError as error:
-        msg = 'pictures need matplotlib: pip install "radarsdf[demo]"'
+        msg = 'pictures need matplotlib: pip install "radarsdf[plot]"'
         raise ImportError(msg) from error
     dpi = 100
     figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
@@ -174,18 +174,33 @@ def save_picture(
     write_whole(path, file.getvalue())
 
 
+def eye_around(points: _Floats, turn_deg: float = 25.0, rise_deg: float = 36.0) -> _Floats:
+    """Position (3,) from which points (N, 3), m, with z up, are seen as a whole.
+
+    It stands before the southern one of their two longer sides, then goes round them by `turn_deg`, anticlockwise as
+    seen from above, and is `rise_deg` above the horizon.
+    """
+    center, radius = middle_of(points)
+    spread = points[:, :2] - points[:, :2].mean(axis=0)
+    along = np.linalg.eigh(spread.T @ spread)[1][:, 1]
+    across = np.array([along[1], -along[0]])
+    across *= -1.0 if across[1] > 0 else 1.0  # of the two sides, the southern one
+    turn, rise = np.deg2rad([turn_deg, rise_deg])
+    flat = np.cos(turn) * across + np.sin(turn) * np.array([-across[1], across[0]])
+    return np.asarray(center + 2.6 * radius * np.array([*(np.cos(rise) * flat), np.sin(rise)]))
+
+
+def middle_of(points: _Floats) -> tuple[_Floats, float]:
+    """Centre (3,) of the box round points (N, 3), and half its diagonal. A few stray points do not decide."""
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    return 0.5 * (low + high), max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
 def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tuple[_Floats, _Floats]:
     """Position (3,) of the eye relative to `origin`, and the unit vectors right, up and forward, (3, 3)."""
-    low, high = np.percentile(points, [0.5, 99.5], axis=0)  # a few stray triangles must not decide
-    center, radius = 0.5 * (low + high), max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    center, radius = middle_of(points)
     if viewpoint is None:
-        spread = points[:, :2] - points[:, :2].mean(axis=0)
-        along = np.linalg.eigh(spread.T @ spread)[1][:, 1]
-        across = np.array([along[1], -along[0]])
-        across *= -1.0 if across[1] > 0 else 1.0  # of the two sides, the southern one
-        turn, rise = np.deg2rad(25.0), np.deg2rad(36.0)
-        flat = np.cos(turn) * across + np.sin(turn) * np.array([-across[1], across[0]])
-        eye = center + 2.6 * radius * np.array([*(np.cos(rise) * flat), np.sin(rise)])
+        eye = eye_around(points)
     else:
         eye = real_array(viewpoint, "viewpoint")
         if eye.shape != (3,) or not np.isfinite(eye).all():

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import real_array
-from radarsdf.config import ReturnsConfig
+from radarsdf.config import FitConfig, ReturnsConfig
+from radarsdf.io.sequence import Scans
 from radarsdf.returns.doppler import MIN_RETURNS, sensor_velocities
-from radarsdf.returns.rays import check_scans
+from radarsdf.returns.rays import Rays, check_scans, prepare
 
 _MIN_SHARE_WITH_VELOCITY = 0.5  # of the scans that have enough returns
 _MAX_MOVING = 0.4  # share of the returns; if more disagree, it is the Doppler that is not understood
@@ -112,3 +113,15 @@ def _checked(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> lis
             msg = f"doppler_mps of scan {i} must have shape ({len(scan)},), not {values.shape}"
             raise ValueError(msg)
     return speeds
+
+
+def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
+    """The returns that a fit with this configuration accepts, of a range and of what does not move, each seen from where its scan was taken."""
+    standing = Standing.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
+    return prepare(
+        standing.points,
+        scans.poses,
+        standing.intensities,
+        min_range_m=config.returns.min_range_m,
+        max_range_m=config.returns.max_range_m,
+    )

@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Plots as PNG files. They are drawn without a display, and no setting of matplotlib is changed."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Floats = NDArray[np.float64]
+
+FIRST, SECOND = "#0072b2", "#d55e00"
+"""Two colours that also colour-blind people tell apart."""
+_SIZE_INCHES, _DPI = (4.4, 3.3), 180  # so that letters are legible when a phone shrinks the plot to its width
+
+
+def _axes(rows: int = 1) -> tuple[Any, Any]:
+    """A figure, and its axes one above the other: an array of `rows`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - an extra
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    width, height = _SIZE_INCHES
+    figure = Figure((width, height * (1 + 0.35 * (rows - 1))), _DPI, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    shares = [2, 1][:rows]
+    return figure, figure.subplots(rows, 1, sharex=True, squeeze=False, height_ratios=shares)[:, 0]
+
+
+def _png(figure: Any) -> bytes:
+    for ax in figure.axes:
+        if ax.get_label() != "<colorbar>":
+            ax.grid(alpha=0.3)
+            ax.spines[["top", "right"]].set_visible(False)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", metadata={"Software": None})
+    return file.getvalue()
+
+
+def losses(history: Mapping[str, Mapping[str, Sequence[float]]]) -> bytes:
+    """Each loss over the seconds of the training. `history` is that of the fit's report."""
+    figure, axes = _axes()
+    (ax,) = axes
+    for (name, spans), color in zip(history.items(), (FIRST, SECOND), strict=False):
+        ax.plot(spans["seconds"], spans["losses"], color=color, linewidth=1.5, label=name)
+    ax.set(xlabel="time of training, s", ylabel="loss", yscale="log")
+    ax.set_xlim(left=0)
+    ax.legend(frameon=False)
+    return _png(figure)
+
+
+def histogram(values: _Floats, *, label: str, most: float) -> bytes:
+    """Shares of values (N,) of the surface from 0 to `most`, in percent; the last bin has all that are larger."""
+    figure, (ax,) = _axes()
+    weights = np.full(len(values), 100 / len(values))
+    ax.hist(np.minimum(values, most), np.linspace(0, most, 41), weights=weights, color=FIRST)
+    ax.set(xlabel=label, ylabel="share of the surface, %", xlim=(0, most))
+    ax.locator_params(axis="x", nbins=6)
+    return _png(figure)
+
+
+def cumulative(series: Mapping[str, _Floats], *, label: str, most: float, mark: float) -> bytes:
+    """Share of the values below each number from 0 to `most`, with a line at `mark`."""
+    figure, (ax,) = _axes()
+    x = np.linspace(0, most, 201)
+    for (name, values), color in zip(series.items(), (FIRST, SECOND), strict=False):
+        ax.plot(x, 100 * np.searchsorted(np.sort(values), x) / len(values), color=color, label=name)
+    ax.axvline(mark, color="gray", linestyle="--", linewidth=1)
+    ax.set(xlabel=label, ylabel="share below, %", xlim=(0, most), ylim=(0, 100))
+    ax.legend(frameon=False, loc="lower right")
+    return _png(figure)
+
+
+def reliability(predicted: Sequence[float], measured: Sequence[float]) -> bytes:
+    """Errors over the uncertainties that were predicted for them, in bins, m."""
+    figure, (ax,) = _axes()
+    most = 1.1 * max(*predicted, *measured)
+    ax.plot([0, most], [0, most], color="gray", linestyle="--", linewidth=1, label="perfect")
+    ax.plot(predicted, measured, "o-", color=FIRST, markersize=4, label="this map")
+    ax.set(xlabel="uncertainty, m", ylabel="error, root mean square, m", xlim=(0, most), ylim=(0, most))
+    ax.legend(frameon=False, loc="upper left")
+    return _png(figure)
+
+
+def measured_predicted(measured: _Floats, predicted: _Floats, unit: str) -> bytes:
+    """Density of predicted over measured values, both (N,), with the diagonal."""
+    from matplotlib.colors import LogNorm  # noqa: PLC0415 - an extra
+
+    figure, (ax,) = _axes()
+    low, high = np.percentile(np.concatenate([measured, predicted]), [0.2, 99.8])
+    high = max(high, low + 1e-6)
+    *_, drawn = ax.hist2d(
+        measured, predicted, bins=60, range=[[low, high]] * 2, cmap="viridis", norm=LogNorm(), cmin=1
+    )
+    ax.plot([low, high], [low, high], color=SECOND, linewidth=1.5, label="equal")
+    ax.set(xlabel=f"measured, {unit}", ylabel=f"predicted, {unit}", xlim=(low, high), ylim=(low, high))
+    ax.legend(frameon=False, loc="upper left")
+    figure.colorbar(drawn, label="returns", pad=0.02)
+    return _png(figure)
+
+
+def by_bins(
+    edges: _Floats, values: _Floats, measured: _Floats, predicted: _Floats, *, label: str, unit: str
+) -> bytes:
+    """Medians of measured and predicted values (N,) in bins of other `values` (N,), and the mean error below.
+
+    The band holds the middle two thirds of the measured values. Bins of fewer than 20 are left out.
+    """
+    figure, (above, below) = _axes(2)
+    rows = []
+    for low, high in itertools.pairwise(edges):
+        own = (values >= low) & (values < high)
+        if own.sum() >= 20:
+            m, p = measured[own], predicted[own]
+            quartiles = np.percentile(m, [17, 50, 83])
+            rows.append([(low + high) / 2, *quartiles, np.median(p), np.abs(p - m).mean(), high - low])
+    if rows:
+        x, bottom, middle, top, median, error, width = np.array(rows).T
+        above.fill_between(x, bottom, top, color=FIRST, alpha=0.2, linewidth=0)
+        above.plot(x, middle, "o-", color=FIRST, markersize=3, label="measured")
+        above.plot(x, median, "s--", color=SECOND, markersize=3, label="predicted")
+        above.legend(frameon=False)
+        below.bar(x, error, 0.9 * width, color="gray")
+    above.set(ylabel=f"median, {unit}")
+    below.set(xlabel=label, ylabel="mean error", xlim=(edges[0], edges[-1]))
+    return _png(figure)

@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The section of the surface: to be turned round, and from three sides."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.map.colors import NEUTRAL, intensity_colors
+from radarsdf.render.picture import eye_around, middle_of, render
+from radarsdf.report.page import Section, color_bar, frame, grid, image, note, paragraph
+from radarsdf.report.scene import scene_page
+from radarsdf.report.subject import Subject
+
+_WIDTH, _HEIGHT = 1040, 650  # pixels
+_JPEG_QUALITY = 82
+_SIDES = {
+    "One long side": (25.0, 36.0),
+    "The other long side": (205.0, 36.0),
+    "Steeply from above": (0.0, 70.0),  # not straight: walls would be lines
+}
+"""Names of the sides, and turn and rise of each, degrees."""
+
+
+def surface_section(subject: Subject) -> Section:
+    """The surface that is shown, coloured by intensity if the map has any."""
+    mesh, voxel_size_m = subject.shown
+    anchor, title = "surface", "Surface"
+    if len(mesh.faces) == 0:
+        return Section(anchor, title, [paragraph("The map has no surface here.")])
+    values = mesh.vertex_attributes.get("intensity")
+    colors, legend = colored(values, "intensity, sensor units")
+    where = "(" + ", ".join(f"{x:.1f}" for x in subject.viewpoint) + ") m"
+    painted = (
+        f"coloured by the intensity predicted for a sensor at {where}" if values is not None else "in grey"
+    )
+    body = [
+        frame(_scene(subject, colors), "The surface in three dimensions"),
+        legend,
+        note(
+            "Drag to turn it, scroll or pinch to come nearer, drag with the right button or two fingers to move it. "
+            + ("Blue points are positions of the sensor." if subject.scans is not None else "")
+        ),
+        grid(
+            *(
+                image(
+                    picture(mesh, colors, name),
+                    f"The surface, {painted}. View: {name.lower()}.",
+                    f"{name}.",
+                )
+                for name in _SIDES
+            )
+        ),
+        paragraph(f"The surface is {painted}. Frame: world, with z up."),
+    ]
+    if voxel_size_m != subject.voxel_size_m:
+        body.append(
+            note(
+                f"Shown are {len(mesh.faces):,} triangles, made with voxels of {voxel_size_m:.3g} m. With the voxels of "
+                f"{subject.voxel_size_m:g} m that all numbers of this page are of, there are "
+                f"{len(subject.mesh.faces):,}: too many for a page that opens fast."
+            )
+        )
+    return Section(anchor, title, body)
+
+
+def colored(
+    values: NDArray[Any] | None, label: str, limits: tuple[float, float] | None = None
+) -> tuple[NDArray[np.uint8], str]:
+    """Colours (V, 3) of values (V,) of vertices, and a legend in HTML. NaN is grey.
+
+    `limits` None: the 2nd and the 98th percentile. `values` None: all are grey, and there is no legend.
+    """
+    if values is None or not np.isfinite(values).any():
+        return np.full((0 if values is None else len(values), 3), NEUTRAL, np.uint8), ""
+    low, high = np.nanpercentile(values, [2, 98]) if limits is None else limits
+    steps = intensity_colors(np.linspace(0, 1, 9), 0, 1)[:, :3]
+    bar = color_bar([(int(r), int(g), int(b)) for r, g, b in steps], f"{low:.3g}", f"{high:.3g}", label)
+    return intensity_colors(values, float(low), float(high))[:, :3], bar
+
+
+def picture(mesh: Any, colors: NDArray[np.uint8], side: str = "One long side") -> bytes:
+    """A picture of a mesh as a JPEG file. Colours (V, 3) of its vertices; none, (0, 3): grey."""
+    from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
+
+    vertices = np.asarray(mesh.vertices, np.float64)
+    pixels = render(
+        mesh,
+        colors if len(colors) else None,
+        width=_WIDTH,
+        height=_HEIGHT,
+        viewpoint=eye_around(vertices, *_SIDES[side]),
+    )
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="jpeg", quality=_JPEG_QUALITY, optimize=True)
+    return file.getvalue()
+
+
+def _scene(subject: Subject, colors: NDArray[np.uint8]) -> str:
+    mesh, _ = subject.shown
+    origin = subject.radar_map.origin
+    vertices = np.asarray(mesh.vertices, np.float64) - origin
+    center, _ = middle_of(vertices)
+    eye = eye_around(vertices, *_SIDES["One long side"])
+    return scene_page(
+        vertices,
+        np.asarray(mesh.faces, np.int32),
+        colors if len(colors) else np.full((len(vertices), 3), NEUTRAL, np.uint8),
+        None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin,
+        0.38 * eye + 0.62 * center,  # nearer: what is to be turned may reach beyond the frame
+        center,
+    )

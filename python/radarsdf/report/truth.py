@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The sections of errors against ground truth, and of the uncertainty that the map states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from radarsdf.evaluation import surface_metrics, uncertainty_metrics
+from radarsdf.report import plots
+from radarsdf.report.page import Section, grid, image, note, paragraph, table
+from radarsdf.report.subject import Subject
+from radarsdf.report.surface import colored, picture
+from radarsdf.threads import resolve_num_threads
+
+_SAMPLES = 1_000_000
+_TRUE_M = (
+    0.4  # a vertex nearer to the truth than this is a surface with an error; a farther one is no surface
+)
+_LEAST_POINTS = 100
+
+_Floats = NDArray[np.float64]
+
+
+def truth_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]:
+    """Errors of the surface, and the most important one for the top of the page."""
+    anchor, title = "errors", "Errors against ground truth"
+    truth, mesh = subject.ground_truth, subject.mesh
+    if truth is None or len(mesh.faces) == 0:
+        why = "The scans have no lidar points." if truth is None else "There is no surface."
+        if subject.scans is None:
+            why = "This report was made without scans, which may have lidar points."
+        return Section(anchor, title, [paragraph(f"Not measured. {why}")]), []
+    m = surface_metrics(mesh, truth, box=subject.box, samples=_SAMPLES)
+    accuracy = (
+        "–" if m["accuracy_error_m"] is None else f"{100 * m['accuracy_error_m']:.1f}\N{NO-BREAK SPACE}cm"
+    )
+    rows = [
+        (
+            "F-score, nothing discarded",
+            _percent(m["f_score_all"]),
+            "harmonic mean of precision and completion",
+        ),
+        ("Precision", _percent(m["precision"]), f"surface within {m['threshold_m']:g} m of a lidar point"),
+        (
+            "Completion",
+            _percent(m["completion_ratio"]),
+            f"lidar points within {m['threshold_m']:g} m of the surface",
+        ),
+        (
+            "Outliers",
+            _percent(m["outlier_ratio"]),
+            f"surface farther than {m['outlier_m']:g} m from any lidar point",
+        ),
+        ("Mean error of the surface", accuracy, "without outliers"),
+        (
+            "Mean error of completion",
+            f"{100 * m['completion_error_m']:.1f}\N{NO-BREAK SPACE}cm",
+            f"distances count as at most {m['truncation_m']:g} m",
+        ),
+    ]
+    distance_m = _distances(truth, np.asarray(mesh.vertices))
+    shown, _ = subject.shown
+    colors, legend = colored(
+        _distances(truth, np.asarray(shown.vertices)), "distance to the truth, m", (0.0, _TRUE_M)
+    )
+    body = [
+        table("", ("", "value", "meaning"), rows),
+        grid(
+            image(
+                picture(shown, colors),
+                "The surface coloured by the distance to the nearest lidar point.",
+                "Dark is right; yellow is far from every lidar point.",
+                legend,
+            ),
+            image(
+                plots.cumulative(
+                    {
+                        "surface to lidar": distance_m,
+                        "lidar to surface": _distances(np.asarray(mesh.vertices), truth),
+                    },
+                    label="distance, m",
+                    most=1.0,
+                    mark=m["threshold_m"],
+                ),
+                "Shares of surface and of lidar points whose distance to the other is below a number of metres.",
+                f"Distances from vertex to point and back. The dashed line is at {m['threshold_m']:g} m.",
+            ),
+        ),
+        note(
+            f"{m['protocol']}: {m['num_mesh_samples']:,} samples of the surface, {m['num_ground_truth']:,} lidar points. "
+            + (
+                ""
+                if subject.box is not None
+                else "Everything counts, also where only radar or only lidar could see. "
+            )
+            + "radarsdf eval measures with other samples or in a box."
+        ),
+    ]
+    return Section(anchor, title, body), [("F-score, all", _percent(m["f_score_all"]))]
+
+
+def uncertainty_section(subject: Subject) -> Section:
+    """The uncertainty of the surface, and whether it is right where there is ground truth."""
+    anchor, title = "uncertainty", "Uncertainty"
+    mesh = subject.mesh
+    if len(mesh.faces) == 0:
+        return Section(anchor, title, [paragraph("There is no surface.")])
+    sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
+    confidence = np.asarray(mesh.vertex_attributes["confidence"], np.float64)
+    shown, _ = subject.shown
+    low, high = np.nanpercentile(sigma_m, [2, 98])
+    colors, legend = colored(
+        shown.vertex_attributes["uncertainty_m"], "standard error, m", (float(low), float(high))
+    )
+    figures = [
+        image(
+            picture(shown, colors),
+            "The surface coloured by its uncertainty.",
+            "Dark is certain, yellow uncertain.",
+            legend,
+        ),
+        image(
+            plots.histogram(sigma_m, label="uncertainty, m", most=float(np.nanpercentile(sigma_m, 99.5))),
+            "Histogram of the uncertainty of the surface.",
+            "Shares of the surface by uncertainty.",
+        ),
+    ]
+    ranks = (10, 50, 90)
+    rows = [
+        ("Uncertainty,\N{NO-BREAK SPACE}m", *(f"{x:.3f}" for x in np.nanpercentile(sigma_m, ranks))),
+        ("Confidence", *(f"{x:.2f}" for x in np.nanpercentile(confidence, ranks))),
+    ]
+    body = [
+        paragraph(
+            "The standard error of the surface's position, which follows from the noise of the returns. The confidence is "
+            "the probability that there is a surface."
+        ),
+        table("", ("", *(f"{rank} % are below" for rank in ranks)), rows),
+    ]
+    if (truth := subject.ground_truth) is not None:
+        figure, words = _reliability(mesh, truth, sigma_m)
+        figures += figure
+        body.append(note(words))
+    body.insert(2, grid(*figures))
+    return Section(anchor, title, body)
+
+
+def _reliability(mesh: Any, truth: _Floats, sigma_m: _Floats) -> tuple[list[str], str]:
+    """A plot of the errors over the uncertainties, and what else they say."""
+    vertices = np.asarray(mesh.vertices, np.float64)
+    distance_m, nearest = _tree(truth).query(vertices, workers=resolve_num_threads(0))
+    error_m = ((truth[nearest] - vertices) * np.asarray(mesh.vertex_normals)).sum(axis=1)
+    error_m[distance_m > _TRUE_M] = np.nan
+    if np.count_nonzero(np.isfinite(error_m) & np.isfinite(sigma_m)) < _LEAST_POINTS:
+        return [], "Too little of the surface is near a lidar point to compare the uncertainty with errors."
+    m = uncertainty_metrics(error_m, sigma_m)
+    figure = image(
+        plots.reliability(m["decile_predicted_m"], m["decile_rmse_m"]),
+        "Errors of the surface over the uncertainties predicted for them, in ten bins.",
+        "Each point is a tenth of the surface. On the dashed line the map knows its errors.",
+    )
+    return [figure], (
+        f"Errors are distances to the nearest lidar point along the normal, of the {_percent(m['num_points'] / len(vertices))} "
+        f"of the surface that is within {_TRUE_M:g} m of one. {_percent(m['coverage_68'])} of them are within one standard "
+        f"error (68 % would be right), {_percent(m['coverage_95'])} within the interval for 95 %. The lidar's own noise and "
+        "the gaps between its points count as errors here."
+    )
+
+
+def _distances(points: _Floats, queries: _Floats) -> _Floats:
+    """(N,) distance of each query (N, 3) to the nearest point, m."""
+    distance_m: _Floats = _tree(points).query(queries, workers=resolve_num_threads(0))[0]
+    return distance_m
+
+
+def _tree(points: _Floats) -> Any:
+    return cKDTree(points)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}\N{NO-BREAK SPACE}%"
