@@ -26,7 +26,7 @@ def test_every_command_that_prints_results_has_it_with_one_meaning():
         for name, command in commands.items()
     }
     assert set(helps) == set(COMMANDS)
-    assert {name for name, text in helps.items() if text is None} == {"config", "completion"}
+    assert {name for name, text in helps.items() if text is None} == {"config", "completion", "view"}
     assert len({text for text in helps.values() if text}) == 1
 
 
