@@ -23,6 +23,7 @@ __all__: list[str] = [
     "RAY_INTENSITY",
     "RAY_POINT",
     "RAY_RANGE",
+    "SurfaceTracer",
     "SurfelMap",
     "TaskQueue",
     "VertexTable",
@@ -586,6 +587,35 @@ class SurfelMap:
         """
         For each ray the first surfel that it crosses from the front and ends behind of by more than `margin_m` and `sigmas` standard deviations, -1 where there is none: (N,) int32.
         """
+
+class SurfaceTracer:
+    """
+    Finds where rays first meet a triangle mesh.
+    """
+    def __init__(
+        self,
+        vertices: numpy.typing.NDArray[numpy.float64],
+        faces: numpy.typing.NDArray[numpy.int32],
+        cell_size_m: typing.SupportsFloat | typing.SupportsIndex,
+    ) -> None:
+        """
+        `vertices` (V, 3) float64, local frame, m; `faces` (F, 3) int32; `cell_size_m`: edge of the cells in which triangles are listed, best one or two edges of a triangle.
+        """
+    def first_hits(
+        self,
+        origin: typing.Annotated[
+            collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+        ],
+        directions: numpy.typing.NDArray[numpy.float32],
+        max_range_m: typing.SupportsFloat | typing.SupportsIndex,
+        front_only: bool = False,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> tuple[numpy.typing.NDArray[numpy.float32], numpy.typing.NDArray[numpy.int32]]:
+        """
+        Distance to the first triangle along each ray (N,) float32, m, infinite without one, and its row in `faces` (N,) int32, -1 without one. `origin` (3,), local frame, m; `directions` (N, 3) float32 unit vectors. `front_only`: rays pass through triangles from behind.
+        """
+    @property
+    def nbytes(self) -> int: ...
 
 def available_instruction_sets() -> list[str]:
     """

@@ -25,6 +25,7 @@ COMMANDS = {
     "fit": "fit a map to scans",
     "mesh": "extract the surface of a map as a triangle mesh",
     "view": "show a map in the browser, with a sensor that can be dragged",
+    "render": "predict the scan that the radar would get from other poses",
     "report": "write a page about a map: pictures, errors, plots, settings",
     "eval": "print the errors of a mesh or a map",
     "convert": "write scans as one file or one point cloud, or a mesh in another format",

@@ -32,6 +32,7 @@ from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import Rays, prepare
+from radarsdf.returns.sensor import Sensor
 from radarsdf.threads import Workers
 
 
@@ -150,6 +151,13 @@ def fit(
                     config=config,
                     evidence=evidence,
                     rough_share=surface.surfels.rough_share(),
+                    sensor=Sensor.of(
+                        standing.points,
+                        standing.intensities,
+                        noise=surface.noise,
+                        min_range_m=config.returns.min_range_m,
+                        max_range_m=config.returns.max_range_m,
+                    ),
                     report=counts | _report(config, field, training, counts, standing, workers.num_threads),
                 )
             )
@@ -182,7 +190,8 @@ def _given(
     if poses is None:
         msg = "poses are missing: T_world_sensor (4, 4) of each scan"
         raise ValueError(msg)
-    return list(points), poses, intensities, doppler_mps  # the points may be a generator
+    # Points and intensities may be generators.
+    return list(points), poses, None if intensities is None else list(intensities), doppler_mps
 
 
 def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, num_threads: int) -> Field:

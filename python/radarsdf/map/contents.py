@@ -14,6 +14,7 @@ from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.sensor import Sensor
 
 
 @dataclass(frozen=True)
@@ -32,5 +33,7 @@ class MapContents:
     """What the returns tell of each leaf cell."""
     rough_share: float
     """Share of the returns that lie on no thin surface, in [0, 1]."""
+    sensor: Sensor
+    """The radar, as the scans of the fit show it."""
     report: dict[str, Any]
     """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""

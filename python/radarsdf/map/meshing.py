@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +20,71 @@ from radarsdf.map.voxels import sample_lattice
 
 with whole_import():
     import trimesh
+
+
+@dataclass(frozen=True)
+class Surface:
+    """All triangles where the field crosses zero, and what the returns tell of their vertices."""
+
+    vertices: NDArray[np.float64]
+    """(V, 3) local frame, m."""
+    faces: NDArray[np.int32]
+    """(F, 3) rows of the vertices, counter-clockwise seen from free space."""
+    evidence: queries.EvidenceAt
+    """Of each vertex."""
+    confidence: NDArray[np.float32]
+    """(V,) see :meth:`RadarMap.confidence`."""
+    uncertainty_m: NDArray[np.float32]
+    """(V,) see :meth:`RadarMap.uncertainty`."""
+    cells_searched: int
+    """Number of leaf cells in which the surface can be."""
+
+    @classmethod
+    def of(
+        cls,
+        contents: MapContents,
+        voxel_size: float,
+        box: NDArray[np.float64] | None = None,
+        progress: bool | None = False,
+    ) -> Surface:
+        """The surface in voxels of this edge, m, in the whole map or in a `box` (2, 3), local frame, m."""
+        lattice = sample_lattice(contents, voxel_size, box, progress)
+        vertices, faces = extract_cells(
+            lattice.corners,
+            lattice.distances_m,
+            lattice.voxel_corners,
+            spacing=[voxel_size] * 3,
+            num_threads=torch.get_num_threads(),
+        )
+        # By way of the world's coordinates, as those who query the mesh's own vertices do.
+        evidence = queries.evidence(contents, _local(contents, vertices + contents.origin))
+        return cls(
+            vertices,
+            faces,
+            evidence,
+            queries.confidence(contents, evidence).numpy(),
+            queries.uncertainty(contents, evidence).numpy(),
+            lattice.cells_searched,
+        )
+
+    def kept(
+        self,
+        min_confidence: float,
+        max_uncertainty: float,
+        min_detection_rate: float,
+        min_component_triangles: int,
+    ) -> NDArray[np.bool_]:
+        """Which of the faces a mesh keeps, (F,). The arguments are those of :meth:`RadarMap.mesh`."""
+        good = (self.confidence >= min_confidence) & queries.answers(
+            self.evidence, min_detection_rate
+        ).numpy()
+        good &= np.nan_to_num(self.uncertainty_m, nan=np.inf) <= max_uncertainty
+        kept: NDArray[np.bool_] = good[self.faces].all(axis=1)
+        rows = np.flatnonzero(kept)
+        if len(rows):
+            labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
+            kept[rows] = sizes[labels] >= min_component_triangles
+        return kept
 
 
 def extract_mesh(
@@ -50,29 +117,18 @@ def extract_mesh(
         raise ValueError(msg)
     sensor_position = None if viewpoint is None else _check_viewpoint(contents, viewpoint)
     local_box = None if box is None else _check_box(box) - contents.origin
-    lattice = sample_lattice(contents, voxel_size, local_box, progress)
-    vertices, faces = extract_cells(
-        lattice.corners,
-        lattice.distances_m,
-        lattice.voxel_corners,
-        spacing=[voxel_size] * 3,
-        num_threads=torch.get_num_threads(),
-    )
-    points = _local(contents, vertices + contents.origin)
-    evidence = queries.evidence(contents, points)
-    confidence = queries.confidence(contents, evidence).numpy()
-    uncertainty_m = queries.uncertainty(contents, evidence).numpy()
-    kept = (confidence >= min_confidence) & queries.answers(evidence, min_detection_rate).numpy()
-    kept &= np.nan_to_num(uncertainty_m, nan=np.inf) <= max_uncertainty
-    faces = faces[kept[faces].all(axis=1)]
-    kept, faces = _without_small_components(len(vertices), faces, min_component_triangles)
-    mesh = trimesh.Trimesh(vertices[kept] + contents.origin, faces, process=False)
+    surface = Surface.of(contents, voxel_size, local_box, progress)
+    faces = surface.faces[
+        surface.kept(min_confidence, max_uncertainty, min_detection_rate, min_component_triangles)
+    ]
+    kept, faces = _renumbered(len(surface.vertices), faces)
+    mesh = trimesh.Trimesh(surface.vertices[kept] + contents.origin, faces, process=False)
     mesh.metadata |= {
         "leaf_cells": len(contents.evidence.looks),
-        "leaf_cells_searched": lattice.cells_searched,
+        "leaf_cells_searched": surface.cells_searched,
     }
-    mesh.vertex_attributes["confidence"] = confidence[kept]
-    mesh.vertex_attributes["uncertainty_m"] = uncertainty_m[kept]
+    mesh.vertex_attributes["confidence"] = surface.confidence[kept]
+    mesh.vertex_attributes["uncertainty_m"] = surface.uncertainty_m[kept]
     if sensor_position is not None:
         _add_intensity(mesh, contents, sensor_position)
     return mesh
@@ -118,15 +174,8 @@ def _check_box(box: ArrayLike) -> NDArray[np.float64]:
     return corners
 
 
-def _without_small_components(
-    num_vertices: int, faces: NDArray[np.int32], min_triangles: int
-) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
-    """Drops components of fewer triangles than `min_triangles`.
-
-    Returns which vertices are kept, (V,) bool, and the faces (F, 3) as rows of the kept vertices.
-    """
-    labels, sizes = mesh_components(faces, num_vertices)
-    faces = faces[sizes[labels] >= min_triangles] if len(faces) else faces
+def _renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+    """Which vertices faces use, (V,) bool, and the faces (F, 3) as rows of these."""
     used = np.zeros(num_vertices, bool)
     used[faces] = True
     renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)

@@ -38,6 +38,10 @@ _MIN_ROUGH_SHARE = 0.01
 # A place counts as answering too rarely if its detections are so many standard deviations of a chance count (Poisson)
 # below what is expected: ten scans cannot tell as much as a thousand.
 _RATE_DEVIATIONS = 0.5
+# Defaults of a mesh.
+VOXEL_M = 0.1
+MIN_DETECTION_RATE = 0.028
+MIN_COMPONENT_TRIANGLES = 30
 _CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
 _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
 
@@ -111,9 +115,14 @@ def max_uncertainty_m(contents: MapContents) -> float:
     return math.hypot(error_cells * contents.config.leaf_size_m, _floor_m(contents))
 
 
+def roughness(contents: MapContents) -> float:
+    """From 0, where all returns lie on thin surfaces, to 1, of a scene as rough as real drives."""
+    share: float = contents.rough_share / _ROUGH_SHARE
+    return min(share, 1.0)
+
+
 def _floor_m(contents: MapContents) -> float:
-    roughness: float = min(contents.rough_share / _ROUGH_SHARE, 1.0) ** 1.5
-    return (_FLOOR_CELLS + _ROUGH_FLOOR_CELLS * roughness) * contents.config.leaf_size_m
+    return (_FLOOR_CELLS + _ROUGH_FLOOR_CELLS * roughness(contents) ** 1.5) * contents.config.leaf_size_m
 
 
 def confidence(contents: MapContents, evidence: EvidenceAt) -> Tensor:

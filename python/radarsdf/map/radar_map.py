@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, overload
 
@@ -20,9 +21,13 @@ from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.sensor import Sensor
 
 if TYPE_CHECKING:
     import trimesh
+
+    from radarsdf.map.traced_surface import TracedSurface
+    from radarsdf.map.views import View
 
 
 class RadarMap:
@@ -73,6 +78,11 @@ class RadarMap:
     def rough_share(self) -> float:
         """Share of the returns that lie on no thin surface, in [0, 1]: clutter, vegetation, rough ground."""
         return self._contents.rough_share
+
+    @property
+    def sensor(self) -> Sensor:
+        """The radar, as the scans of the fit show it."""
+        return self._contents.sensor
 
     @property
     def has_intensity(self) -> bool:
@@ -231,14 +241,14 @@ class RadarMap:
 
     def mesh(
         self,
-        voxel_size: float = 0.1,
+        voxel_size: float = queries.VOXEL_M,
         *,
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
         min_confidence: float = 0.0,
         max_uncertainty: float | None = None,
-        min_detection_rate: float = 0.028,
-        min_component_triangles: int = 30,
+        min_detection_rate: float = queries.MIN_DETECTION_RATE,
+        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
         """Extracts the surface as triangles, by marching cubes in the leaf cells of the map.
@@ -297,6 +307,58 @@ class RadarMap:
             min_component_triangles=min_component_triangles,
             progress=progress,
         )
+
+    def render(
+        self,
+        T_world_sensor: ArrayLike,
+        sensor: Sensor | None = None,
+        *,
+        returns: float | None = None,
+        noise: bool = False,
+        seed: int | np.random.Generator = 0,
+    ) -> View:
+        """The returns that a radar would get from a pose, and what each of its beams first meets.
+
+        Beams are traced to the surface that :meth:`mesh` keeps by default. Returns come from patches of the field's
+        surface, most from those that answered often to the scans that looked there, and few from those that are
+        hidden. They are the likeliest scan, not a random one: spread evenly, and on the surface.
+
+        Parameters
+        ----------
+        T_world_sensor : (4, 4) array_like
+            Pose of the sensor, m. Its frame: x forward, y left, z up.
+        sensor : Sensor, optional
+            The radar. Default: that of the scans of the fit, :attr:`sensor`.
+        returns : float, optional
+            Number of returns before those below the sensor's threshold are left out. Default: what the sensor gives. More
+            returns show more of what it can see.
+        noise : bool
+            Whether the returns have the sensor's noise in range, azimuth and elevation.
+        seed : int or numpy.random.Generator
+            Of the noise. No global generator is touched.
+
+        Returns
+        -------
+        View
+            The first call for a map prepares its surface, which takes about a second for each million leaf cells.
+
+        Raises
+        ------
+        ValueError
+            If the pose is not a rigid transform, or a number is out of range.
+        """
+        from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
+
+        return view_from(
+            self._contents, self._traced, T_world_sensor, sensor, returns=returns, noise=noise, seed=seed
+        )
+
+    @cached_property
+    def _traced(self) -> TracedSurface:
+        """The surface as rays meet it."""
+        from radarsdf.map.traced_surface import TracedSurface  # noqa: PLC0415 - as above
+
+        return TracedSurface.of(self._contents)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes the map to a safetensors file. After :func:`radarsdf.load`, all results have the same bits.

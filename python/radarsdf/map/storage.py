@@ -22,9 +22,10 @@ from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.map.contents import MapContents
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.sensor import Sensor
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
@@ -81,6 +82,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
         "rough_share": contents.rough_share,
+        "sensor": contents.sensor.to_dict(),
         "report": contents.report,
     }
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
@@ -180,4 +182,5 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         report=dict(description["report"]),
         evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
         rough_share=rough_share,
+        sensor=Sensor.from_dict(description["sensor"]),
     )

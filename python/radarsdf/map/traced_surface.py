@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The surface of a map as rays meet it: where the mesh stops them, and how often each patch of the field answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from radarsdf._core import SurfaceTracer
+from radarsdf.map import queries
+from radarsdf.map.contents import MapContents
+from radarsdf.map.meshing import Surface
+from radarsdf.threads import resolve_num_threads
+
+# Scans that looked at a place where none had a return count for so many: with few looks, a rate is uncertain.
+_LOOKS_BEFORE = 2.0
+_DETECTIONS_BEFORE = 0.5
+
+
+class Hits(NamedTuple):
+    """Where N rays first meet the mesh."""
+
+    ranges_m: NDArray[np.float32]
+    """(N,) infinite where a ray meets nothing."""
+    faces: NDArray[np.int32]
+    """(N,) row of the triangle, -1 where a ray meets nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class TracedSurface:
+    """What views of a map are made of. It is made once for a map."""
+
+    tracer: SurfaceTracer
+    """Of the triangles that the mesh keeps by default, local frame."""
+    centres: NDArray[np.float64]
+    """(P, 3) patches: middles of all triangles where the field crosses zero, local frame, m."""
+    normals: NDArray[np.float64]
+    """(P, 3) unit vectors towards free space."""
+    areas_m2: NDArray[np.float64]
+    """(P,) of the patches."""
+    rates: NDArray[np.float64]
+    """(P,) share of the scans that looked at a patch and have a return there."""
+
+    @classmethod
+    def of(cls, contents: MapContents) -> TracedSurface:
+        """The surface in voxels of a leaf cell's size, which is finer than the noise of a radar."""
+        voxel_m = contents.config.leaf_size_m
+        surface = Surface.of(contents, voxel_m)
+        corners = surface.vertices[surface.faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        twice_m2 = np.sqrt(np.einsum("ni,ni->n", across, across))
+        centres = corners.mean(axis=1)
+        evidence = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
+        rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
+        # A component is as large as one that a mesh of the default's finer voxels keeps.
+        components = round(queries.MIN_COMPONENT_TRIANGLES * min(1.0, (queries.VOXEL_M / voxel_m) ** 2))
+        kept = surface.kept(0.0, queries.max_uncertainty_m(contents), queries.MIN_DETECTION_RATE, components)
+        faces = np.ascontiguousarray(surface.faces[kept])
+        return cls(
+            SurfaceTracer(surface.vertices, faces, voxel_m),
+            centres,
+            across / np.maximum(twice_m2, 1e-12)[:, None],
+            twice_m2 / 2,
+            rates.astype(np.float64),
+        )
+
+    def first_hits(
+        self, origin: NDArray[np.float64], directions: NDArray[np.float64], max_range_m: float
+    ) -> Hits:
+        """Where rays from `origin` (3,) in unit `directions` (N, 3), local frame, first meet what the mesh keeps."""
+        rows = np.ascontiguousarray(directions, np.float32)
+        return Hits(
+            *self.tracer.first_hits(origin.tolist(), rows, max_range_m, False, resolve_num_threads(0))
+        )

@@ -1,0 +1,227 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The returns that a radar would get from a pose never driven."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf._core import cell_keys
+from radarsdf.checks import check_poses, number, real_array
+from radarsdf.io.sequence import Scans
+from radarsdf.map import queries
+from radarsdf.map.contents import MapContents
+from radarsdf.map.traced_surface import TracedSurface
+from radarsdf.returns.sensor import Sensor
+
+_Floats = NDArray[np.float64]
+
+# The density of returns on the surface is rate^a · cosine^b / range^c, times d where the patch is hidden: (a, b, c, d) in
+# smooth scenes and in rough ones. Beams are spread by angle, so in smooth scenes a patch gets as many as it is wide. A
+# real radar sees much behind surfaces, and answers come from few places. Chosen with `python -m bench.paper novel-views`.
+_SMOOTH = np.array([1.0, 1.0, 2.0, 0.01])
+_ROUGH = np.array([2.2, 0.3, 1.0, 0.65])
+_HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden
+_MIN_COSINE = 0.05
+_MIN_BEAM_RAD = 2e-3
+_MAX_BEAMS = 1_000_000
+_ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a radar would get from one pose: N returns, and what each of its E · A beams first meets."""
+
+    T_world_sensor: _Floats
+    """(4, 4) m."""
+    sensor: Sensor
+    """The radar."""
+    points: NDArray[np.float32]
+    """(N, 3) returns, sensor frame, m."""
+    intensities: NDArray[np.float32] | None
+    """(N,) sensor units. None if the map has no intensities."""
+    azimuth_rad: _Floats
+    """(A,) azimuths of the beams, ascending, rad."""
+    elevation_rad: _Floats
+    """(E,) elevations of the beams, ascending, rad."""
+    beam_ranges_m: NDArray[np.float32]
+    """(E, A) distance to the first surface along each beam, m. NaN where there is none."""
+    beam_intensities: NDArray[np.float32] | None
+    """(E, A) intensity of a return from there, sensor units. NaN where there is none."""
+
+    def __len__(self) -> int:
+        """Number of returns."""
+        return len(self.points)
+
+    @property
+    def ranges_m(self) -> _Floats:
+        """(N,) distances of the returns from the sensor, m."""
+        lengths: _Floats = np.linalg.norm(self.points.astype(np.float64), axis=1)
+        return lengths
+
+    @property
+    def world_points(self) -> _Floats:
+        """(N, 3) returns, world, m."""
+        points: _Floats = (
+            self.points.astype(np.float64) @ self.T_world_sensor[:3, :3].T + self.T_world_sensor[:3, 3]
+        )
+        return points
+
+    @property
+    def scans(self) -> Scans:
+        """The returns as scans of one scan, which the writers of :mod:`radarsdf.io` take."""
+        return scans_of([self])
+
+
+def scans_of(views: list[View]) -> Scans:
+    """The returns of views, one scan each."""
+    values = [view.intensities for view in views if view.intensities is not None]
+    return Scans(
+        [view.points for view in views],
+        np.stack([view.T_world_sensor for view in views]),
+        values if len(values) == len(views) else None,
+    )
+
+
+def view_from(
+    contents: MapContents,
+    surface: TracedSurface,
+    T_world_sensor: ArrayLike,
+    sensor: Sensor | None = None,
+    *,
+    returns: float | None = None,
+    noise: bool = False,
+    seed: Any = 0,
+) -> View:
+    """See :meth:`RadarMap.render`."""
+    pose = real_array(T_world_sensor, "T_world_sensor")
+    if pose.shape != (4, 4):
+        msg = f"T_world_sensor must have shape (4, 4), not {pose.shape}"
+        raise ValueError(msg)
+    pose = check_poses(pose[None], 1)[0]
+    sensor = contents.sensor if sensor is None else sensor
+    wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
+    if not 0 <= wanted <= 1e8:
+        msg = f"returns must be in [0, 10^8], not {returns}"
+        raise ValueError(msg)
+    position = pose[:3, 3] - contents.origin
+    chosen = _answers(surface, pose[:3, :3], position, sensor, round(wanted), queries.roughness(contents))
+    points = (surface.centres[chosen] - position) @ pose[:3, :3]
+    intensities = _intensities(contents, surface.centres[chosen], position)
+    if intensities is not None:
+        detected = intensities >= sensor.threshold(np.linalg.norm(points, axis=1))
+        points, intensities = points[detected], intensities[detected]
+    if noise:
+        points = _with_noise(points, sensor, np.random.default_rng(seed))
+    azimuth, elevation = _beams(sensor)
+    ranges_m, beam_intensities = _first_surface(
+        contents, surface, pose[:3, :3], position, sensor, azimuth, elevation
+    )
+    return View(
+        pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, ranges_m, beam_intensities
+    )
+
+
+def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
+    """Ranges, azimuths and elevations (N,) of points (N, 3), sensor frame, m."""
+    x, y, z = points.T
+    ranges_m = np.sqrt(x * x + y * y + z * z)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return ranges_m, np.arctan2(y, x), np.arcsin(z / ranges_m)
+
+
+def _answers(
+    surface: TracedSurface, R: _Floats, position: _Floats, sensor: Sensor, count: int, roughness: float
+) -> NDArray[np.int64]:
+    """The patches that answer: `count` rows, spread evenly as the returns that are expected of each."""
+    offsets = (surface.centres - position) @ R
+    ranges_m, azimuth, elevation = _polar(offsets)
+    seen = np.ones(len(offsets), bool)
+    for values, (low, high) in (
+        (ranges_m, sensor.range_m),
+        (azimuth, sensor.azimuth_rad),
+        (elevation, sensor.elevation_rad),
+    ):
+        seen &= (values >= low) & (values <= high)
+    rows = np.flatnonzero(seen)
+    if len(rows) == 0 or count == 0:
+        return rows[:0]
+    order = cell_keys(surface.centres[rows].astype(np.float32), _ORDER_M, 1)
+    rows = rows[np.argsort(order, kind="stable")]
+    to_patch = (surface.centres[rows] - position) / ranges_m[rows, None]
+    first = surface.first_hits(position, to_patch, float(sensor.range_m[1]))
+    cosine = np.abs(np.einsum("ni,ni->n", surface.normals[rows], to_patch))
+    rate_power, cosine_power, range_power, hidden = _SMOOTH + roughness * (_ROUGH - _SMOOTH)
+    expected = surface.areas_m2[rows] * surface.rates[rows] ** rate_power
+    expected *= np.maximum(cosine, _MIN_COSINE) ** cosine_power / ranges_m[rows] ** range_power
+    expected *= np.where(ranges_m[rows] > first.ranges_m + _HIDDEN_M, hidden, 1.0)
+    sums = np.cumsum(expected)
+    if not sums[-1] > 0:
+        return rows[:0]
+    places = np.searchsorted(sums, (np.arange(count) + 0.5) * (sums[-1] / count))
+    chosen: NDArray[np.int64] = rows[np.unique(np.minimum(places, len(rows) - 1))]
+    return chosen
+
+
+def _intensities(contents: MapContents, points: _Floats, position: _Floats) -> NDArray[np.float32] | None:
+    """(N,) intensities of returns from points (N, 3) to `position` (3,), local frame, m."""
+    if contents.intensity_scale is None:
+        return None
+    x = torch.from_numpy(points.astype(np.float32))
+    sensors = torch.from_numpy(position.astype(np.float32)).expand(len(x), 3)
+    values: NDArray[np.float32] = queries.intensity(contents, x, sensors).numpy()
+    return values
+
+
+def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _Floats:
+    ranges_m, azimuth, elevation = _polar(points)
+    errors = rng.standard_normal((3, len(points)))
+    directions = sensor.directions(
+        azimuth + sensor.noise.azimuth_rad * errors[1], elevation + sensor.noise.elevation_rad * errors[2]
+    )
+    noisy: _Floats = directions * np.maximum(ranges_m + sensor.noise.range_m * errors[0], 0.0)[:, None]
+    return noisy
+
+
+def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
+    """Azimuths (A,) and elevations (E,) of beams that overlap by half."""
+    steps = [max(width / 2, _MIN_BEAM_RAD) for width in sensor.beam_rad]
+    limits = (sensor.azimuth_rad, sensor.elevation_rad)
+    counts = [int((high - low) / step) + 1 for (low, high), step in zip(limits, steps, strict=True)]
+    while counts[0] * counts[1] > _MAX_BEAMS:
+        counts = [max(1, count // 2) for count in counts]
+    azimuth, elevation = (
+        np.asarray(low + (np.arange(count) + 0.5) * ((high - low) / count), np.float64)
+        for (low, high), count in zip(limits, counts, strict=True)
+    )
+    return azimuth, elevation
+
+
+def _first_surface(
+    contents: MapContents,
+    surface: TracedSurface,
+    R: _Floats,
+    position: _Floats,
+    sensor: Sensor,
+    azimuth: _Floats,
+    elevation: _Floats,
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Range and intensity (E, A) of what each beam first meets, NaN where that is nothing."""
+    shape = (len(elevation), len(azimuth))
+    grid = np.meshgrid(elevation, azimuth, indexing="ij")
+    directions = sensor.directions(grid[1].ravel(), grid[0].ravel()) @ R.T
+    hits = surface.first_hits(position, directions, float(sensor.range_m[1]))
+    met = np.isfinite(hits.ranges_m) & (hits.ranges_m >= sensor.range_m[0])
+    ranges_m = np.where(met, hits.ranges_m, np.float32(np.nan))
+    places = position + directions[met] * hits.ranges_m[met, None]
+    of_hits = _intensities(contents, places, position)
+    if of_hits is None:
+        return ranges_m.reshape(shape), None
+    intensities = np.full(len(ranges_m), np.nan, np.float32)
+    intensities[met] = of_hits
+    return ranges_m.reshape(shape), intensities.reshape(shape)

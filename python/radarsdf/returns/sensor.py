@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a radar can see: field of view, resolution, detection threshold and noise, as its own scans tell."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf.checks import number, real_array
+from radarsdf.io.sequence import Scans
+from radarsdf.returns.noise import SensorNoise
+
+# Of the returns: what lies beyond in azimuth, in elevation or in range is taken for a stray one.
+_STRAY = 0.002
+_MAX_RETURNS = 50_000  # more do not make the quantiles better
+_RANGE_BINS = 8
+_WEAKEST = 0.01  # share of the returns in a bin of ranges that is below the threshold there
+_FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))  # of a normal distribution, standard deviations
+_MAX_RANGE_M = 1e6
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A radar, as its scans show it. Sensor frame: x forward, y left, z up.
+
+    Azimuth is the angle from x towards y, elevation that above the xy plane. A sensor is made of scans by :meth:`of`, or of
+    numbers; ``dataclasses.replace`` changes one.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range, or limits are not ascending.
+    """
+
+    azimuth_rad: tuple[float, float]
+    """Field of view in azimuth: from, to, within [-π, π], rad."""
+    elevation_rad: tuple[float, float]
+    """Field of view in elevation: from, to, within [-π/2, π/2], rad."""
+    range_m: tuple[float, float]
+    """Nearest and farthest return, m."""
+    returns_per_scan: float
+    """Number of returns in a scan, the median."""
+    noise: SensorNoise
+    """Standard deviations of the position of a return."""
+    thresholds: tuple[tuple[float, float], ...] = ()
+    """Range, m, ascending, and the weakest intensity that is detected there, sensor units. Between them it is
+    interpolated. Empty: the sensor measures no intensities."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("azimuth_rad", -math.pi, math.pi),
+            ("elevation_rad", -math.pi / 2, math.pi / 2),
+            ("range_m", 0.0, _MAX_RANGE_M),
+        ):
+            first, last = (number(value, name) for value in _pair(getattr(self, name), name))
+            if not low <= first < last <= high:
+                msg = f"{name} must be two ascending numbers in [{low:.4g}, {high:.4g}], not {first:.6g} and {last:.6g}"
+                raise ValueError(msg)
+            object.__setattr__(self, name, (first, last))
+        if not 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7:
+            msg = f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}"
+            raise ValueError(msg)
+        if any(not 0 <= number(value, "noise") < math.inf for value in dataclasses.astuple(self.noise)):
+            msg = f"noise must be finite and at least 0, not {self.noise}"
+            raise ValueError(msg)
+        steps = tuple(
+            (number(a, "thresholds"), number(b, "thresholds"))
+            for a, b in (_pair(step, "thresholds") for step in self.thresholds)
+        )
+        if any(a >= b for (a, _), (b, _) in itertools.pairwise(steps)):
+            msg = "thresholds must have ascending ranges"
+            raise ValueError(msg)
+        object.__setattr__(self, "thresholds", steps)
+
+    @property
+    def beam_rad(self) -> tuple[float, float]:
+        """Width of a beam in azimuth and elevation, rad: the full width at half maximum of the noise."""
+        return _FWHM * self.noise.azimuth_rad, _FWHM * self.noise.elevation_rad
+
+    @property
+    def resolution_m(self) -> float:
+        """Full width at half maximum of the noise along the beam, m."""
+        return _FWHM * self.noise.range_m
+
+    def threshold(self, ranges_m: NDArray[Any]) -> NDArray[np.float64]:
+        """(N,) the weakest intensity that is detected at ranges (N,), m, sensor units. -inf without `thresholds`."""
+        if not self.thresholds:
+            return np.full(len(ranges_m), -np.inf)
+        at_m, weakest = np.transpose(self.thresholds)
+        interpolated: NDArray[np.float64] = np.interp(ranges_m, at_m, weakest)
+        return interpolated
+
+    def directions(self, azimuth_rad: NDArray[Any], elevation_rad: NDArray[Any]) -> NDArray[np.float64]:
+        """Unit vectors (N, 3), sensor frame, of azimuths and elevations (N,)."""
+        cosine = np.cos(elevation_rad)
+        return np.stack(
+            [cosine * np.cos(azimuth_rad), cosine * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=1
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """What JSON can store. :meth:`from_dict` makes an equal sensor of it."""
+        described = dataclasses.asdict(self)
+        return described | {"thresholds": [list(step) for step in self.thresholds]}
+
+    @classmethod
+    def from_dict(cls, described: dict[str, Any]) -> Sensor:
+        """The inverse of :meth:`to_dict`."""
+        return cls(**described | {"noise": SensorNoise(**described["noise"])})
+
+    @classmethod
+    def of(
+        cls,
+        points: Sequence[ArrayLike] | Scans,
+        intensities: Sequence[ArrayLike] | None = None,
+        *,
+        noise: SensorNoise | None = None,
+        min_range_m: float = 0.0,
+        max_range_m: float | None = None,
+    ) -> Sensor:
+        """The sensor that took scans.
+
+        Parameters
+        ----------
+        points : sequence of F arrays, or Scans
+            (N_i, 3) each: the returns of one scan, sensor frame, m. `Scans` bring their intensities.
+        intensities : sequence of F arrays, optional
+            (N_i,) each, sensor units.
+        noise : SensorNoise, optional
+            See :func:`radarsdf.returns.noise.sensor_noise`. Default: none.
+        min_range_m, max_range_m : float
+            Returns outside these ranges do not count, m. `max_range_m` None: no limit.
+
+        Raises
+        ------
+        ValueError
+            If there is no return within the ranges, or returns are all in one direction.
+        """
+        if isinstance(points, Scans):
+            intensities = points.intensities if intensities is None else intensities
+            points = points.points
+        scans = [real_array(scan, "points") for scan in points]
+        counts = np.array([len(scan) for scan in scans])
+        returns = np.concatenate(scans) if scans else np.zeros((0, 3))
+        ranges_m = np.sqrt(np.einsum("ni,ni->n", returns, returns))
+        used = (ranges_m > 0) & (ranges_m >= min_range_m)
+        used &= ranges_m <= (np.inf if max_range_m is None else max_range_m)
+        if not used.any():
+            msg = "no return lies within the ranges: a sensor cannot be told from its scans"
+            raise ValueError(msg)
+        per_scan = np.bincount(np.repeat(np.arange(len(scans)), counts)[used], minlength=len(scans))
+        rows = np.flatnonzero(used)
+        rows = rows[:: -(-len(rows) // _MAX_RETURNS)]
+        x, y, z = returns[rows].T
+        range_m = ranges_m[rows]
+        thresholds: tuple[tuple[float, float], ...] = ()
+        if intensities is not None:
+            values = np.concatenate([real_array(v, "intensities") for v in intensities])[rows]
+            thresholds = _thresholds(range_m, values)
+        return cls(
+            azimuth_rad=_limits(np.arctan2(y, x)),
+            elevation_rad=_limits(np.arcsin(np.clip(z / range_m, -1, 1))),
+            range_m=_limits(range_m),
+            returns_per_scan=float(np.median(per_scan[per_scan > 0])),
+            noise=SensorNoise(0.0, 0.0, 0.0) if noise is None else noise,
+            thresholds=thresholds,
+        )
+
+
+def _pair(values: Any, name: str) -> tuple[Any, Any]:
+    if not isinstance(values, (tuple, list)) or len(values) != 2:
+        msg = f"{name} must be two numbers, not {values!r:.50}"
+        raise ValueError(msg)
+    return values[0], values[1]
+
+
+def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Lower and upper end of most values."""
+    low, high = np.quantile(values, [_STRAY, 1 - _STRAY])
+    if low == high:  # of very few returns
+        low -= 1e-3 * max(abs(low), 1e-3)
+    return float(low), float(high)
+
+
+def _thresholds(
+    ranges_m: NDArray[np.float64], intensities: NDArray[np.float64]
+) -> tuple[tuple[float, float], ...]:
+    """Middle of each bin of ranges with as many returns, and the weakest intensity there, apart from stray ones."""
+    order = np.argsort(ranges_m)
+    bins = [part for part in np.array_split(order, _RANGE_BINS) if len(part)]
+    found = {
+        float(np.median(ranges_m[part])): float(np.quantile(intensities[part], _WEAKEST)) for part in bins
+    }
+    return tuple(sorted(found.items()))

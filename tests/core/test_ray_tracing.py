@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Rays meet the first triangle, as a loop over all triangles finds it, and exact spheres and planes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from radarsdf._core import SurfaceTracer
+
+
+def unit_vectors(count, seed=0):
+    vectors = np.random.default_rng(seed).standard_normal((count, 3))
+    return (vectors / np.linalg.norm(vectors, axis=1)[:, None]).astype(np.float32)
+
+
+def reference(vertices, faces, origin, directions, max_range_m=np.inf, *, front_only=False):
+    """Distance to the nearest triangle of all, in float64."""
+    first = np.full(len(directions), np.inf)
+    for a, b, c in vertices[faces]:
+        columns = np.stack(
+            [np.broadcast_to(b - a, directions.shape), np.broadcast_to(c - a, directions.shape), -directions],
+            2,
+        )
+        facing = np.einsum("ni,i->n", directions, np.cross(b - a, c - a)) < 0
+        with np.errstate(all="ignore"):
+            det = np.linalg.det(columns)
+            ok = np.abs(det) > 1e-12
+            columns[~ok] = np.eye(3)
+            u, v, t = np.linalg.solve(columns, np.broadcast_to(origin - a, directions.shape)[..., None])[
+                ..., 0
+            ].T
+        hit = ok & (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= max_range_m)
+        if front_only:
+            hit &= facing
+        first[hit] = np.minimum(first[hit], t[hit])
+    return first
+
+
+def soup(count=60, extent=4.0, size=1.0, seed=1):
+    """Triangles that lie anywhere, and face anywhere."""
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-extent, extent, (count, 1, 3)) + rng.uniform(-size, size, (count, 3, 3))
+    return corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+
+
+def agree(found, expected):
+    """Rays that graze an edge may differ."""
+    same = np.isclose(found, expected, rtol=1e-5, atol=1e-4) | (np.isinf(found) & np.isinf(expected))
+    return same.mean()
+
+
+@pytest.mark.parametrize("cell_size_m", [0.05, 0.3, 2.0, 100.0])
+@pytest.mark.parametrize("front_only", [False, True])
+@pytest.mark.parametrize("origin", [[0.0, 0.0, 0.0], [-9.0, 3.0, 1.0]])
+def test_the_first_triangle_of_many(cell_size_m, front_only, origin):
+    vertices, faces = soup()
+    # From outside, towards the triangles.
+    directions = unit_vectors(600) + np.float32(0.3) * -np.array(origin, np.float32)
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    found, rows = SurfaceTracer(vertices, faces, cell_size_m).first_hits(
+        origin, directions, 50.0, front_only=front_only
+    )
+    expected = reference(
+        vertices, faces, np.array(origin), directions.astype(np.float64), front_only=front_only
+    )
+    assert 0.03 < np.isfinite(expected).mean() < 0.99
+    assert agree(found, expected) >= 0.998
+    assert ((rows >= 0) == np.isfinite(found)).all()
+    hit = rows >= 0
+    places = np.array(origin) + directions[hit] * found[hit, None]
+    a, b, c = np.moveaxis(vertices[faces[rows[hit]]], 1, 0)
+    normals = np.cross(b - a, c - a)
+    off_plane = np.abs(np.einsum("ni,ni->n", places - a, normals)) / np.linalg.norm(normals, axis=1)
+    assert off_plane.max() < 1e-4
+
+
+def test_no_ray_leaves_a_closed_mesh():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=5.0)
+    tracer = SurfaceTracer(np.array(ball.vertices), np.array(ball.faces, np.int32), 0.2)
+    # Some rays go through vertices and along the axes, where all cells meet.
+    directions = np.concatenate([unit_vectors(200_000), ball.vertices / 5.0, np.eye(3), -np.eye(3)]).astype(
+        np.float32
+    )
+    found, _ = tracer.first_hits([0.0, 0.0, 0.0], directions, 10.0)
+    assert np.abs(found - 5.0).max() < 0.01
+    found, _ = tracer.first_hits([0.0, 0.0, 0.0], directions, 10.0, front_only=True)
+    assert np.isinf(found).all()
+
+
+def test_a_plane_at_a_grazing_angle():
+    x, y = np.meshgrid(np.arange(0, 60.5, 0.5), np.arange(-20, 20.5, 0.5), indexing="ij")
+    vertices = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
+    columns = x.shape[1]
+    corner = (np.arange(x.shape[0] - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
+    lower = np.stack([corner, corner + columns, corner + 1], 1)
+    upper = np.stack([corner + 1, corner + columns, corner + columns + 1], 1)
+    tracer = SurfaceTracer(vertices, np.concatenate([lower, upper]).astype(np.int32), 0.5)
+    depression = np.linspace(0.03, 1.2, 5000)
+    directions = np.stack([np.cos(depression), np.zeros(5000), -np.sin(depression)], 1).astype(np.float32)
+    found, _ = tracer.first_hits([0.0, 0.3, 1.5], directions, 100.0)
+    np.testing.assert_allclose(found, 1.5 / np.sin(depression), rtol=1e-4)
+
+
+def test_ranges_end_at_the_limit():
+    vertices = np.array([[5.0, -1, -1], [5, 1, -1], [5, 0, 1]])
+    tracer = SurfaceTracer(vertices, np.array([[0, 1, 2]], np.int32), 0.2)
+    ahead = np.array([[1, 0, 0]], np.float32)
+    for limit, found in ((4.99, np.inf), (5.01, 5.0), (np.inf, 5.0), (0.0, np.inf)):
+        assert tracer.first_hits([0, 0, 0], ahead, limit)[0][0] == pytest.approx(found)
+    assert tracer.first_hits([0, 0, 0], -ahead, 100.0)[0][0] == np.inf
+
+
+def test_the_same_bits_with_any_number_of_threads():
+    vertices, faces = soup(400, 8.0)
+    tracer = SurfaceTracer(vertices, faces, 0.2)
+    directions = unit_vectors(30_000)
+    alone = tracer.first_hits([0, 0, 0], directions, 50.0, num_threads=1)
+    for threads in (2, 5):
+        for ours, theirs in zip(
+            tracer.first_hits([0, 0, 0], directions, 50.0, num_threads=threads), alone, strict=True
+        ):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_far_apart_triangles_need_little_memory():
+    near, faces = soup(20)
+    vertices = np.concatenate([near, near + [1e6, 1e6, 1e3]])
+    tracer = SurfaceTracer(vertices, np.concatenate([faces, faces + len(near)]).astype(np.int32), 0.1)
+    assert tracer.nbytes < 200e6
+    directions = unit_vectors(500)
+    found, _ = tracer.first_hits([0, 0, 0], directions, 50.0)
+    assert agree(found, reference(near, faces, np.zeros(3), directions.astype(np.float64))) >= 0.99
+
+
+def test_nothing_to_meet():
+    tracer = SurfaceTracer(np.zeros((0, 3)), np.zeros((0, 3), np.int32), 0.1)
+    found, rows = tracer.first_hits([0, 0, 0], unit_vectors(10), 50.0)
+    assert np.isinf(found).all()
+    assert (rows == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "cell", "said"),
+    [
+        (np.zeros((3, 3)), np.array([[0, 1, 3]], np.int32), 0.1, "does not exist"),
+        (np.zeros((3, 3)), np.array([[0, 1, -1]], np.int32), 0.1, "does not exist"),
+        (np.full((3, 3), np.nan), np.array([[0, 1, 2]], np.int32), 0.1, "finite"),
+        (np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32), 0.0, "cell_size_m"),
+        (np.zeros((3, 2)), np.array([[0, 1, 2]], np.int32), 0.1, "shape"),
+    ],
+)
+def test_wrong_meshes(vertices, faces, cell, said):
+    with pytest.raises(ValueError, match=said):
+        SurfaceTracer(vertices, faces, cell)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "limit"),
+    [([np.nan, 0, 0], 1.0, 5.0), ([0, 0, 0], np.inf, 5.0), ([0, 0, 0], 1.0, -1.0)],
+)
+def test_wrong_rays(origin, direction, limit):
+    vertices, faces = soup(3)
+    with pytest.raises(ValueError, match="must be finite"):
+        SurfaceTracer(vertices, faces, 0.1).first_hits(origin, np.full((1, 3), direction, np.float32), limit)

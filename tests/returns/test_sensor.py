@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A sensor is what its scans show."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from radarsdf.io import Scans
+from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.sensor import Sensor
+
+NOISE = SensorNoise(0.1, 0.01, 0.02)
+
+
+def scans(counts=(300, 500, 700), seed=0):
+    """Returns within 60° to both sides, 10° down and 20° up, 3 to 40 m away; intensities above 50 - range / 2."""
+    rng = np.random.default_rng(seed)
+    points, intensities = [], []
+    for count in counts:
+        azimuth, elevation = np.deg2rad(rng.uniform(-60, 60, count)), np.deg2rad(rng.uniform(-10, 20, count))
+        ranges_m = rng.uniform(3, 40, count)
+        directions = np.stack(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1
+        )
+        points.append(directions * ranges_m[:, None])
+        intensities.append(50 - ranges_m / 2 + rng.uniform(0, 30, count))
+    return points, intensities
+
+
+def test_limits_counts_and_thresholds():
+    points, intensities = scans()
+    sensor = Sensor.of(points, intensities, noise=NOISE)
+    np.testing.assert_allclose(np.rad2deg(sensor.azimuth_rad), [-60, 60], atol=1)
+    np.testing.assert_allclose(np.rad2deg(sensor.elevation_rad), [-10, 20], atol=1)
+    np.testing.assert_allclose(sensor.range_m, [3, 40], atol=0.5)
+    assert sensor.returns_per_scan == 500
+    at_m = np.array([8.0, 20.0, 35.0])
+    np.testing.assert_allclose(sensor.threshold(at_m), 50 - at_m / 2, atol=2.5)
+    assert sensor.beam_rad == pytest.approx((0.02355, 0.0471), rel=1e-3)
+
+
+def test_ranges_limit_what_counts():
+    points, _ = scans()
+    sensor = Sensor.of(points, min_range_m=10.0, max_range_m=30.0)
+    np.testing.assert_allclose(sensor.range_m, [10, 30], atol=0.5)
+    assert sensor.returns_per_scan == pytest.approx(270, abs=30)
+    assert (sensor.threshold(np.array([1.0])) == -np.inf).all()
+
+
+def test_scans_bring_their_intensities():
+    points, intensities = scans()
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    assert Sensor.of(Scans(points, poses, intensities)) == Sensor.of(points, intensities)
+
+
+def test_json_keeps_a_sensor():
+    sensor = Sensor.of(*scans(), noise=NOISE)
+    assert Sensor.from_dict(json.loads(json.dumps(sensor.to_dict()))) == sensor
+
+
+def test_one_return_is_enough():
+    sensor = Sensor.of([[[5.0, 0.0, 0.0]]], [[60.0]])
+    assert sensor.azimuth_rad[0] < sensor.azimuth_rad[1] <= 1e-3
+    assert sensor.threshold(np.array([5.0]))[0] == 60
+
+
+def test_no_return():
+    with pytest.raises(ValueError, match="no return"):
+        Sensor.of(scans()[0], min_range_m=100.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"azimuth_rad": (0.5, 0.5)}, "azimuth_rad"),
+        ({"azimuth_rad": (-4.0, 0.5)}, "azimuth_rad"),
+        ({"elevation_rad": 0.5}, "two numbers"),
+        ({"range_m": (-1.0, 5.0)}, "range_m"),
+        ({"range_m": (1.0, np.nan)}, "range_m"),
+        ({"returns_per_scan": 0}, "returns_per_scan"),
+        ({"noise": SensorNoise(-1.0, 0.0, 0.0)}, "noise"),
+        ({"thresholds": ((5.0, 1.0), (5.0, 2.0))}, "ascending"),
+    ],
+)
+def test_wrong_numbers(change, said):
+    sensor = Sensor.of(*scans())
+    with pytest.raises(ValueError, match=said):
+        dataclasses.replace(sensor, **change)
