@@ -16,7 +16,19 @@ from tqdm import tqdm
 from bench.peers.interface import PEERS
 from bench.settings import Changes, parsed
 
-from . import ablation, angles, calibration, curve, intensity, map_size, ranges, sparse, surface, views
+from . import (
+    ablation,
+    angles,
+    calibration,
+    curve,
+    intensity,
+    map_size,
+    novel_views,
+    ranges,
+    sparse,
+    surface,
+    views,
+)
 from .experiment import Experiment, Options, Row
 from .report import provenance, write_json
 from .scenes import load_scene
@@ -29,6 +41,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "map-size": map_size.EXPERIMENT,
     "angles": angles.EXPERIMENT,
     "views": views.EXPERIMENT,
+    "novel-views": novel_views.EXPERIMENT,
     "curve": curve.EXPERIMENT,
     "calibration": calibration.EXPERIMENT,
     "ranges": ranges.EXPERIMENT,

@@ -1,0 +1,48 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Rays a second through the surface of a map, from a sensor's pose, on one thread and on two.
+
+The extra information has the rays a second. Each case checks that most rays end near a return's range or nowhere, so
+that a wrong result cannot be fast.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
+from radarsdf.map.traced_surface import TracedSurface
+
+RAYS = (600, 2000)  # elevations, azimuths
+
+
+@pytest.fixture(scope="module")
+def scene():
+    scans = radarsdf.simulate.hugin(frames=60)
+    radar_map = radarsdf.fit(scans.points, scans.poses, config=FitConfig.quick(), progress=False)
+    return radar_map, scans.poses[30]
+
+
+@pytest.mark.parametrize("order", ["in order", "shuffled"])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_first_hits(benchmark, scene, threads, order):
+    benchmark.group = f"{RAYS[0] * RAYS[1]:,} rays through a map, {order}"
+    radar_map, pose = scene
+    surface = TracedSurface.of(radar_map._contents)
+    low, high = np.transpose([radar_map.sensor.elevation_rad, radar_map.sensor.azimuth_rad])
+    axes = [np.linspace(*limits) for limits in zip(low, high, RAYS, strict=True)]
+    elevation, azimuth = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
+    directions = (radar_map.sensor.directions(azimuth, elevation) @ pose[:3, :3].T).astype(np.float32)
+    if order == "shuffled":
+        directions = np.random.default_rng(0).permutation(directions)
+    origin = (pose[:3, 3] - radar_map.origin).tolist()
+    ranges_m, _ = benchmark(surface.tracer.first_hits, origin, directions, 60.0, num_threads=threads)
+    benchmark.extra_info["million_rays_per_s"] = (
+        len(directions) / benchmark.stats["median"] / 1e6 if benchmark.stats else 0
+    )
+    met = np.isfinite(ranges_m)
+    assert 0.3 < met.mean() < 0.95
+    places = torch.from_numpy(np.array(origin) + directions[met][::997] * ranges_m[met][::997, None])
+    assert np.median(np.abs(radar_map.sdf(places + torch.from_numpy(radar_map.origin)).numpy())) < 0.05
