@@ -52,8 +52,8 @@ def run(options: argparse.Namespace) -> None:
     import numpy as np
 
     import radarsdf
-    from radarsdf.io.files import check_outputs
     from radarsdf.io.cloud_writers import write_cloud
+    from radarsdf.io.files import check_outputs
     from radarsdf.io.scans import write_scans
     from radarsdf.map.views import scans_of
     from radarsdf.render.view_picture import save_view_picture
