@@ -122,7 +122,8 @@ def roughness(contents: MapContents) -> float:
 
 
 def _floor_m(contents: MapContents) -> float:
-    return (_FLOOR_CELLS + _ROUGH_FLOOR_CELLS * roughness(contents) ** 1.5) * contents.config.leaf_size_m
+    cells: float = _FLOOR_CELLS + _ROUGH_FLOOR_CELLS * roughness(contents) ** 1.5
+    return cells * contents.config.leaf_size_m
 
 
 def confidence(contents: MapContents, evidence: EvidenceAt) -> Tensor:
