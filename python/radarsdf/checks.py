@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,37 @@ def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
     return points
 
 
+def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
+    """Raises a ValueError unless there are scans, each an array (N, 3)."""
+    if not scans:
+        msg = "points holds no scans"
+        raise ValueError(msg)
+    for i, scan in enumerate(scans):
+        if scan.ndim != 2 or scan.shape[1] != 3:
+            msg = f"scan {i} must have shape (N, 3), not {scan.shape}"
+            raise ValueError(msg)
+
+
+def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
+    """Raises a ValueError unless the values are arrays (N,) for scans (N, 3)."""
+    if len(values) != len(scans):
+        msg = f"{name} holds {len(values)} scans, points {len(scans)}"
+        raise ValueError(msg)
+    for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
+        if value.shape != (len(scan),):
+            msg = f"{name} of scan {i} must have shape ({len(scan)},), not {value.shape}"
+            raise ValueError(msg)
+
+
+def pose_matrices(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
+    """`poses` as (F, 4, 4) float64, of any numbers. Raises a ValueError if the shape is wrong."""
+    T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")
+    if T_world_sensor.shape != (num_scans, 4, 4):
+        msg = f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
+        raise ValueError(msg)
+    return T_world_sensor
+
+
 def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
     """`poses` as (F, 4, 4) float64 T_world_sensor, m.
 
@@ -72,10 +104,7 @@ def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
     ValueError
         If the shape is wrong, or a pose is not a rigid transform. The error names the first such pose.
     """
-    T_world_sensor = real_array(poses, "poses")
-    if T_world_sensor.shape != (num_scans, 4, 4):
-        msg = f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
-        raise ValueError(msg)
+    T_world_sensor = pose_matrices(poses, num_scans)
     rotation = T_world_sensor[:, :3, :3]
     with np.errstate(all="ignore"):  # poses that are not finite are refused below
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))

@@ -103,9 +103,8 @@ def _are_speeds(recording: Recording, values: list[NDArray[Any]]) -> bool:
 
 def _beside_poses(recording: Recording, velocities: Velocities) -> list[Finding]:
     """Compares velocities by Doppler with those by poses: sign, yaw, and with times the clock."""
-    times = recording.times_s
-    timed = times is not None and bool((np.diff(times) > 0).all())
-    knots = times if timed and times is not None else np.arange(len(recording), dtype=np.float64)
+    times = recording.ascending_times_s
+    knots = np.arange(len(recording), dtype=np.float64) if times is None else times
     inner = (velocities.scans > 0) & (velocities.scans < len(recording) - 1)
     found: list[Finding] = []
     if inner.sum() < _MIN_SCANS:
@@ -145,7 +144,7 @@ def _beside_poses(recording: Recording, velocities: Velocities) -> list[Finding]
                 "Multiply the poses by the calibration of the sensor, or turn the points by this yaw.",
             ),
         ]
-    return found + (_clock(recording.poses, knots, scans, by_doppler) if timed else [])
+    return found + ([] if times is None else _clock(recording.poses, times, scans, by_doppler))
 
 
 def _clock(

@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import real_array, refuse_masked
+from radarsdf.checks import (
+    check_scan_shapes,
+    check_values_of_scans,
+    pose_matrices,
+    real_array,
+    refuse_masked,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -44,17 +50,8 @@ class Recording:
     ) -> Recording:
         """The arrays, if their shapes fit together. Else a TypeError or a ValueError that names the argument."""
         scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(points)]
-        if not scans:
-            msg = "points holds no scans"
-            raise ValueError(msg)
-        for i, scan in enumerate(scans):
-            if scan.ndim != 2 or scan.shape[1] != 3:
-                msg = f"scan {i} must have shape (N, 3), not {scan.shape}"
-                raise ValueError(msg)
-        T_world_sensor = real_array(poses, "poses")
-        if T_world_sensor.shape != (len(scans), 4, 4):
-            msg = f"poses must have shape ({len(scans)}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
-            raise ValueError(msg)
+        check_scan_shapes(scans)
+        T_world_sensor = pose_matrices(poses, len(scans))
         times = None if times_s is None else real_array(times_s, "times_s")
         if times is not None and times.shape != (len(scans),):
             msg = f"times_s must have shape ({len(scans)},), not {times.shape}"
@@ -67,6 +64,12 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def ascending_times_s(self) -> FloatArray | None:
+        """`times_s`, if each is later than the one before; else None."""
+        times = self.times_s
+        return times if times is not None and (np.diff(times) > 0).all() else None
 
     def select(self, scans: NDArray[np.int64]) -> Recording:
         """The scans with these numbers (K,), in this order."""
@@ -97,11 +100,5 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
 
 def _values_of(given: Sequence[ArrayLike], scans: list[NDArray[Any]], name: str) -> list[NDArray[Any]]:
     values = [_numbers(value, f"{name} of scan {i}") for i, value in enumerate(given)]
-    if len(values) != len(scans):
-        msg = f"{name} holds {len(values)} scans, points {len(scans)}"
-        raise ValueError(msg)
-    for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
-        if value.shape != (len(scan),):
-            msg = f"{name} of scan {i} must have shape ({len(scan)},), not {value.shape}"
-            raise ValueError(msg)
+    check_values_of_scans(values, scans, name)
     return values

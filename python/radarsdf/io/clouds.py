@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.fields import COLUMNS, Fields
-from radarsdf.io.files import check_regular_file
+from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.las import INTENSITY as RADAR_INTENSITY
 from radarsdf.io.origin import origin_of
 from radarsdf.io.pcd import read_pcd
@@ -168,7 +168,7 @@ def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
         return {name: np.zeros(0) for name in names_of(3, None)}
     separator = next(s for s in _SEPARATORS if s is None or s in first)
     words = [word.strip().strip('"') for word in first.split(separator)]
-    header = not all(_is_number(word) for word in words)
+    header = not are_numbers(words)
     table = np.loadtxt(path, delimiter=separator, skiprows=skipped + header, ndmin=2, comments=("#", "//"))
     if header:
         words = [word.lstrip("/#").strip() for word in words]
@@ -186,14 +186,6 @@ def _is_comment(line: str) -> bool:
     if not line.startswith(("#", "//")):
         return False
     return not {"x", "y", "z"} <= set(re.split(r"[\s,;]+", line.lstrip("/#").strip().lower()))
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _ply(path: Path) -> Columns:

@@ -21,7 +21,7 @@ from radarsdf.checks import check_poses
 from radarsdf.io.bag_files import bags_in
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import read_columns
-from radarsdf.io.folders import SnailRadar, is_snail_radar
+from radarsdf.io.folders import SnailRadar, base_T_radar, is_snail_radar
 from radarsdf.io.poses import ScanPoses, poses_of, read_calibration, trajectory_of
 from radarsdf.io.sequence import Scans
 from radarsdf.io.sources import RawScan, Request, files_source, natural, posed, scan_poses
@@ -232,12 +232,7 @@ class VikingHill:
     def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
         if request.extrinsic is None:
-            matrix = read_table(folder / "base_T_radar.txt", 4)
-            try:
-                request = dataclasses.replace(request, extrinsic=check_poses(matrix[None], 1)[0])
-            except ValueError as error:
-                msg = f"{folder / 'base_T_radar.txt'} does not hold a rigid transform: {error}"
-                raise ValueError(msg) from error
+            request = dataclasses.replace(request, extrinsic=base_T_radar(folder))
         return read_bags(bags_in(folder), request, truth)
 
 

@@ -39,6 +39,15 @@ def check_regular_file(path: str | PathLike[str]) -> None:
         pass
 
 
+def are_numbers(words: list[str]) -> bool:
+    """Whether words of a text file are numbers, and so no header."""
+    try:
+        [float(word) for word in words]
+    except ValueError:
+        return False
+    return True
+
+
 def check_outputs(
     outputs: Iterable[str | PathLike[str] | None], inputs: Iterable[str | PathLike[str] | None] = ()
 ) -> None:

@@ -22,10 +22,7 @@ from radarsdf._core import cell_keys
 from radarsdf.checks import check_poses
 from radarsdf.io.pcd import read_pcd
 from radarsdf.io.sequence import Scans
-from radarsdf.io.trajectory import Trajectory, read_table, read_trajectory
-
-MAX_GAP_S = 0.5
-"""Longest time between two poses over which poses are interpolated."""
+from radarsdf.io.trajectory import MAX_GAP_S, Trajectory, read_table, read_trajectory
 
 INTENSITY_FIELDS = ("power", "Power", "intensity", "rcs")
 """Names of the intensity in PCD files, of which the first that is present counts. Hugin: power; Oculii: Power."""

@@ -15,12 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check_poses, real_array
-from radarsdf.io.files import check_regular_file
+from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.sequence import Notes
 from radarsdf.io.trajectory import Trajectory, trajectory_of_table
-
-MAX_GAP_S = 0.5
-"""Longest time between two poses over which poses are interpolated, by default."""
 
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 """Names of files of poses that are found beside scans."""
@@ -243,7 +240,7 @@ def _table(path: Path) -> NDArray[np.float64]:
     try:
         lines = [line.partition("#")[0].replace(",", " ") for line in path.read_text("utf-8").splitlines()]
         rows = [line.split() for line in lines if line.strip()]
-        if rows and not _numbers(rows[0]):
+        if rows and not are_numbers(rows[0]):
             rows = rows[1:]  # a header
         table = np.array(rows, np.float64)
     except ValueError as error:
@@ -253,14 +250,6 @@ def _table(path: Path) -> NDArray[np.float64]:
         msg = f"{path} is not a table of poses, of finite numbers in rows of one length"
         raise ValueError(msg)
     return table
-
-
-def _numbers(words: list[str]) -> bool:
-    try:
-        [float(word) for word in words]
-    except ValueError:
-        return False
-    return True
 
 
 def _npy(path: Path) -> NDArray[Any]:

@@ -17,10 +17,11 @@ from radarsdf.checks import positions, positive
 from radarsdf.io import bags, datasets
 from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
 from radarsdf.io.folders import base_T_radar, lidar_map
-from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, extrinsic_of, poses_of
+from radarsdf.io.poses import POSE_FILES, extrinsic_of, poses_of
 from radarsdf.io.scans import read_scans
 from radarsdf.io.sequence import Notes, Scan, Scans
-from radarsdf.io.sources import Request, cloud_files, files_source, posed, scan_poses, times_of
+from radarsdf.io.sources import NOT_FINITE, Request, cloud_files, files_source, posed, scan_poses, times_of
+from radarsdf.io.trajectory import MAX_GAP_S
 
 _STAMPS = (None, "header", "record")
 _CALIBRATIONS = ("calib.txt", "calibration.txt")
@@ -213,9 +214,7 @@ def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] |
             finite = np.isfinite(scan.points).all(axis=1)
             if scan.intensities is not None:
                 finite &= np.isfinite(scan.intensities)
-            request.notes.count(
-                "returns left out: a coordinate or the intensity is not a finite number", int((~finite).sum())
-            )
+            request.notes.count(NOT_FINITE, int((~finite).sum()))
             if finite.all():
                 yield scan
             elif finite.any():

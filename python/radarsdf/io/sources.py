@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_columns
 from radarsdf.io.fields import Fields
-from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, ScanPoses, StampedPoses
+from radarsdf.io.poses import POSE_FILES, ScanPoses, StampedPoses
 from radarsdf.io.sequence import Notes, Scan
-from radarsdf.io.trajectory import Trajectory
+from radarsdf.io.trajectory import MAX_GAP_S, Trajectory
 
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
 """Names of files with a time, s, for each scan, one a line."""
@@ -25,6 +25,10 @@ TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
 SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
 """Names of folders of scans that are found within the folder that is read."""
 
+NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
+"""What a note says of such returns, after their number."""
+
+_NO_RETURNS = "scans left out: they hold no returns"
 _NOT_SCANS = {
     *POSE_FILES,
     *TIME_FILES,
@@ -87,18 +91,16 @@ def posed(
             taken += 1
             columns = raw.read()
             if not columns or len(next(iter(columns.values()))) == 0:
-                notes.count("scans left out: they hold no returns", 1)
+                notes.count(_NO_RETURNS, 1)
                 continue
             if fields is None:
                 fields = Fields.of(list(columns), request.fields, raw.name)
                 if fields.dialect is not None and fields.dialect.note:
                     notes.add(fields.dialect.note)
             cloud = fields.read(columns, raw.name)
-            notes.count(
-                "returns left out: a coordinate or the intensity is not a finite number", cloud.dropped
-            )
+            notes.count(NOT_FINITE, cloud.dropped)
             if len(cloud.points) == 0:
-                notes.count("scans left out: they hold no returns", 1)
+                notes.count(_NO_RETURNS, 1)
                 continue
             yield Scan(
                 cloud.points, T_world_sensor, cloud.intensities, cloud.doppler_mps, raw.time_s, cloud.sigma

@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import MAX_POSITION_M, check_poses, number, real_array, whole_number
+from radarsdf.checks import (
+    MAX_POSITION_M,
+    check_poses,
+    check_scan_shapes,
+    check_values_of_scans,
+    number,
+    real_array,
+    whole_number,
+)
 from radarsdf.checks import positions as check_positions
 
 _MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
@@ -100,26 +108,15 @@ def check_scans(
 ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None]:
     """Scans (N_i, 3) and intensities (N_i,) as arrays, if :func:`prepare` takes them; else its ValueError."""
     scans = [real_array(scan, f"scan {i}") for i, scan in enumerate(points)]
-    if not scans:
-        msg = "points holds no scans"
-        raise ValueError(msg)
+    check_scan_shapes(scans)
     for i, scan in enumerate(scans):
-        if scan.ndim != 2 or scan.shape[1] != 3:
-            msg = f"scan {i} must have shape (N, 3), not {scan.shape}"
-            raise ValueError(msg)
         if len(scan) == 0:
             msg = f"scan {i} is empty: leave out the scan and its pose"
             raise ValueError(msg)
     values = None
     if intensities is not None:
         values = [real_array(v, f"intensities of scan {i}", np.float32) for i, v in enumerate(intensities)]
-        if len(values) != len(scans):
-            msg = f"intensities holds {len(values)} scans, points {len(scans)}"
-            raise ValueError(msg)
-        for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
-            if value.shape != (len(scan),):
-                msg = f"intensities of scan {i} must have shape ({len(scan)},), not {value.shape}"
-                raise ValueError(msg)
+        check_values_of_scans(values, scans, "intensities")
     if not all((np.abs(scan) <= MAX_POSITION_M).all() for scan in scans) or not all(
         np.isfinite(value).all() for value in values or ()
     ):
