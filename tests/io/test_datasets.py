@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.datasets import DATASETS, find
+from radarsdf.io.snail_radar import read_snail_radar
 from scipy.spatial.transform import Rotation
 
 from ..conftest import pose
@@ -219,8 +220,6 @@ def test_viking_hill(tmp_path, kind):
 
 
 def test_snail_radar(snail):  # noqa: F811 - the fixture
-    from radarsdf.io.folders import read_snail_radar  # noqa: PLC0415
-
     assert name_of(snail) == "SNAIL-Radar"
     expected, scans = read_snail_radar(snail), read(snail)
     assert_allclose(scans.poses, expected.poses, atol=1e-6)
@@ -229,6 +228,74 @@ def test_snail_radar(snail):  # noqa: F811 - the fixture
         assert_array_equal(scan.intensities, values)
     write_pcd(snail / "xt32" / "1706001766.000000000.pcd", radar_cloud([[0, -3, 1]]))
     assert_allclose(read(snail).ground_truth, read_snail_radar(snail).ground_truth)
+
+
+# The mounting of the ARS548 in the frame of the lidar on the morning of 2023-11-05, as python/view_radar_lidar.py of
+# github.com/snail-radar/dataset_tools has it.
+T_XT32_ARS548 = np.array(
+    [
+        [-0.0148246945939438, 0.999869704931098, -0.00638767491813221, 0],
+        [-0.967459492843472, -0.0127297492912655, 0.252705525895304, 0],
+        [0.252591285490489, 0.00992609917652017, 0.967522151941183, 0.07],
+        [0, 0, 0, 1],
+    ]
+)
+
+
+@pytest.fixture
+def ars548(tmp_path):
+    """A sequence whose ARS548 is in the folder and the format of bag_to_folder.py of the data set."""
+    folder = tmp_path / "20231105" / "data4"
+    for i, time_s in enumerate(TIMES_S):
+        table = returns(i, 4)
+        std = {f"{name}_std": np.full(i + 2, 0.1) for name in ("range", "azimuth", "elevation", "doppler")}
+        columns = radar_cloud(table[:, :3], doppler=np.full(i + 2, -1.5), intensity=table[:, 3], **std)
+        write_pcd(folder / "ars548" / "points" / f"{time_s:.9f}.pcd", columns)
+    (folder / "ars548" / "points" / "times.txt").write_text("".join(f"{t:.9f}\n" for t in TIMES_S))
+    (folder / "utm50r_T_xt32.txt").write_text(tum_rows())
+    return folder
+
+
+def test_the_ars548_of_snail_radar(ars548):
+    assert name_of(ars548) == "SNAIL-Radar"
+    scans = read(ars548)
+    check(scans, POSES @ T_XT32_ARS548)
+    assert scans.notes == ["the intensities of ARS548 clouds with these fields are RCS + 128"]
+    assert_allclose(next(iter(scans)).sigma, 0.1, rtol=1e-6)
+    check(read(ars548, extrinsic=MOUNTING), POSES @ MOUNTING)
+    afternoon = ars548.parent.with_name("20231105_aft")
+    ars548.parent.rename(afternoon)
+    corrected = read(afternoon / "data4").poses
+    turned = Rotation.from_matrix((corrected @ np.linalg.inv(POSES @ T_XT32_ARS548))[0, :3, :3])
+    assert 14 < np.rad2deg(turned.magnitude()) < 16  # its pitch was corrected that noon
+    (afternoon / "data4" / "body_T_ars548.txt").write_text("1 0 0 1\n0 1 0 2\n0 0 1 3\n0 0 0 1\n")
+    # The body looks forward, along -y of the lidar, which looks left, back and up.
+    check(read(afternoon / "data4"), POSES @ pose([2, -1, 3], -np.pi / 2))
+
+
+def test_radars_of_snail_radar_are_chosen_by_their_folders(ars548):
+    write_pcd(ars548 / "eagleg7" / "enhanced" / f"{TIMES_S[1]:.9f}.pcd", radar_cloud([[9, 0, 0]], Power=[1]))
+    scans = read(ars548)
+    assert [scan.points.tolist() for scan in scans] == [[[9, 0, 0]]]
+    assert scans.notes == ["eagleg7/enhanced is read; ars548/points are read as folders of their own"]
+    for inner in ("ars548", "ars548/points"):
+        scans = read(ars548 / inner)
+        check(scans, POSES @ T_XT32_ARS548)
+        assert len(scans.notes) == 1
+
+
+def test_a_day_without_a_calibration_of_the_ars548(ars548):
+    for name in ("20231101", "recordings"):
+        folder = ars548.parent.with_name(name)
+        ars548.parent.rename(folder)
+        with pytest.raises(ValueError, match=f"depends on the day.* but that is {name}: give extrinsic"):
+            read(folder / "data4")
+        check(read(folder / "data4", extrinsic=np.eye(4)), POSES)
+        folder.rename(ars548.parent)
+    (ars548 / "utm50r_T_xt32.txt").unlink()
+    with pytest.raises(ValueError, match="full_trajs"):
+        read(ars548)
+    check(read(ars548, POSES), POSES @ T_XT32_ARS548)
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ __all__ = ["bags_in", "is_bag", "read_bags"]
 KNOWN_TOPICS = {
     "/hugin_raf_1/radar_data": "/icp_odom",  # Viking Hill
     "/radar_enhanced_pcl": None,  # NTU4DRadLM and others with an Oculii Eagle
+    "/radar_enhanced_pcl2": None,  # SNAIL-Radar
     "/ti_mmwave/radar_scan_pcl": None,
 }
 """Topics of radars in data sets, and of the poses there. They are preferred to others."""

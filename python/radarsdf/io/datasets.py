@@ -21,9 +21,10 @@ from radarsdf.checks import check_poses
 from radarsdf.io.bag_files import bags_in
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import read_columns
-from radarsdf.io.folders import SnailRadar, base_T_radar, is_snail_radar
+from radarsdf.io.folders import base_T_radar
 from radarsdf.io.poses import ScanPoses, poses_of, read_calibration, trajectory_of
 from radarsdf.io.sequence import Scans
+from radarsdf.io.snail_radar import SnailRadar, is_snail_radar
 from radarsdf.io.sources import RawScan, Request, files_source, natural, posed, scan_poses
 from radarsdf.io.trajectory import read_table
 
@@ -237,7 +238,10 @@ class VikingHill:
 
 
 class Snail:
-    """A sequence of SNAIL-Radar; see :class:`radarsdf.io.folders.SnailRadar`."""
+    """A sequence of SNAIL-Radar, or one radar of it; see :func:`radarsdf.io.snail_radar.read_snail_radar`.
+
+    ``data3`` means its Oculii Eagle, ``data3/ars548/points`` its Continental ARS548.
+    """
 
     name = "SNAIL-Radar"
 
@@ -248,6 +252,9 @@ class Snail:
     def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
         snail = SnailRadar.of(folder)
+        if snail.others() and folder.resolve() == snail.folder:
+            others = " and ".join(snail.others())
+            request.notes.add(f"{snail.radar} is read; {others} are read as folders of their own")
         files = snail.files()
         poses = snail.trajectory if request.poses is None else request.poses
         extrinsic = snail.T_base_radar if request.extrinsic is None else request.extrinsic
