@@ -118,6 +118,7 @@ READERS = {
     "read: text": Reader(readers.read_one, "scan.csv", readers.text),
     "read: PLY": Reader(readers.read_one, "scan.ply", readers.plys),
     "read: LAS": Reader(readers.read_one, "scan.las", readers.las("las")),
+    "read: LAZ": Reader(readers.read_one, "scan.laz", readers.las("laz")),
     "read: ROS 1": Reader(readers.read_bag, "drive.bag", readers.bags("ros1")),
     "read: sqlite3": Reader(readers.read_bag, "drive.db3", readers.bags("sqlite3")),
     "read: mcap": Reader(readers.read_bag, "drive.mcap", readers.bags("mcap")),

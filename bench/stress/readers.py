@@ -96,11 +96,14 @@ def las(suffix: str) -> Callable[[], list[bytes]]:
     def files() -> list[bytes]:
         import laspy  # noqa: PLC0415 - an extra
 
-        header = laspy.LasHeader(point_format=0, version="1.2")
-        header.scales = np.full(3, 1e-4)
-        cloud = laspy.LasData(header)
-        cloud.x, cloud.y, cloud.z = _TABLE[:, :3].T.astype(np.float64)
-        return [_written(cloud.write, f"a.{suffix}")]
+        written = []
+        for point_format, version in ((0, "1.2"), (6, "1.4")):  # LAZ compresses the latter in layers
+            header = laspy.LasHeader(point_format=point_format, version=version)
+            header.scales = np.full(3, 1e-4)
+            cloud = laspy.LasData(header)
+            cloud.x, cloud.y, cloud.z = _TABLE[:, :3].T.astype(np.float64)
+            written.append(_written(cloud.write, f"a.{suffix}"))
+        return written
 
     return files
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from radarsdf.io.fields import COLUMNS, Fields
 from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.las import INTENSITY as RADAR_INTENSITY
+from radarsdf.io.laz import check_las_points, check_las_records
 from radarsdf.io.origin import origin_of
 from radarsdf.io.pcd import read_pcd
 
@@ -24,13 +25,7 @@ CLOUD_SUFFIXES = (".pcd", ".ply", ".bin", ".npy", *TEXT_SUFFIXES, ".las", ".laz"
 """What :func:`read_columns` reads."""
 
 _KITTI_COLUMNS = 4
-_MAX_LAZ_COMPRESSION = 200  # LAZ packs lidar points to a tenth; more is an attack
 _PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
-_LAS_HEADER, _VLR, _EVLR = (
-    375,
-    54,
-    60,
-)  # bytes, of a header and of the least record before or behind the points
 _SEPARATORS = (",", ";", "\t", None)  # None: any white space
 
 Columns = dict[str, NDArray[Any]]
@@ -70,9 +65,13 @@ def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Colu
             return _npy(path, columns)
         if suffix in TEXT_SUFFIXES:
             return _text(path, columns)
-    except (OSError, ImportError, MemoryError):
+    except (ImportError, MemoryError):
         raise
-    except BaseException as error:  # libraries raise exceptions of many kinds for damaged files
+    except (
+        BaseException
+    ) as error:  # libraries raise exceptions of many kinds for damaged files, OSError among them
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
         if not isinstance(error, Exception) and type(error).__name__ != _PANIC:
             raise
         msg = f"{path} is not a whole {suffix} file of points: {error}"
@@ -206,33 +205,18 @@ def _ply(path: Path) -> Columns:
     return columns
 
 
-def _check_las_header(path: Path) -> None:
-    """Raises unless the file can hold as many records before and behind its points as its header says: laspy would
-    count to four billion."""
-    with path.open("rb") as file:
-        header = file.read(_LAS_HEADER)
-    counts = [(100, _VLR)] + [(243, _EVLR)] * (len(header) == _LAS_HEADER and header[24:26] == b"\x01\x04")
-    for offset, least in counts:
-        count = int.from_bytes(header[offset : offset + 4], "little")
-        if count * least > path.stat().st_size:
-            msg = f"its header says {count} records, for which the file is too small"
-            raise ValueError(msg)
-
-
 def _las(path: Path) -> Columns:
     try:
         import laspy  # noqa: PLC0415 - an extra
     except ImportError as error:
         msg = f'{path}: LAS and LAZ files are read by laspy: pip install "radarsdf[las]"'
         raise ImportError(msg) from error
-    _check_las_header(path)
-    with laspy.open(path) as file:
+    check_las_records(path)
+    # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
         header = file.header
-        unpacked = header.point_count * header.point_format.size
-        if unpacked > path.stat().st_size * (_MAX_LAZ_COMPRESSION if header.are_points_compressed else 1):
-            msg = f"its header says {header.point_count} points, for which the file is too small"
-            raise ValueError(msg)
-        cloud = file.read()
+        check_las_points(path, header)
+        cloud = file.read_points(header.point_count)
     # Scaled and shifted, in double precision: the integers in the file are no metres.
     columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
     if "intensity" in header.point_format.dimension_names:
