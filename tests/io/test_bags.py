@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import bz2
 import contextlib
 import tracemalloc
 
@@ -11,10 +12,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
+from radarsdf.io.unpacking import unpack
 
 from ..conftest import pose
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
+
+import lz4.frame  # of rosbags
+from rosbags.rosbag2 import Reader
 
 from bench.reading.bag_writing import KINDS, BagWriter
 
@@ -372,6 +377,50 @@ def test_a_message_that_claims_more_than_it_holds(tmp_path):
             bag.write("/radar", message, START_S)
         with pytest.raises(ValueError, match=r"is not a whole sensor_msgs/msg/PointCloud2: .*do not fit"):
             list(read(path))
+
+
+PACKED = [("ros1", "bz2"), ("ros1", "lz4"), ("mcap", "storage"), ("mcap", "message"), ("sqlite3", "message"), ("sqlite3", "file")]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "packed"), PACKED)
+def test_bags_are_unpacked_with_a_bound(tmp_path, monkeypatch, kind, packed):
+    path = name(tmp_path, kind)
+    with BagWriter(path, kind, packed) as bag:
+        odometry(bag)
+        for i, time_s in enumerate(TIMES_S):
+            bag.write("/radar", bag.cloud2(time_s, columns(i)), time_s + 0.02)
+    check(read(path))
+    zeros = dict.fromkeys("xyz", np.zeros(700_000, np.float32))  # 8 MB
+    bomb = name(tmp_path, kind, "bomb")
+    with BagWriter(bomb, kind, packed) as bag:
+        odometry(bag)
+        bag.write("/radar", bag.cloud2(START_S, zeros), START_S)
+    assert len(next(iter(read(bomb)))) == 700_000  # 8 MB are no attack
+    monkeypatch.setattr("radarsdf.io.unpacking._ALWAYS_UNPACKED", 1 << 20)
+    with pytest.raises(ValueError, match=r"is not a whole bag: .* would unpack to .* bytes or more"):
+        list(read(bomb))
+    check(read(path))
+
+
+def test_rosbags_itself_is_left_as_it_is(tmp_path, monkeypatch):
+    with BagWriter(tmp_path / "a", "mcap", "storage") as bag:
+        odometry(bag)
+        bag.write("/radar", bag.cloud2(START_S, dict.fromkeys("xyz", np.zeros(700_000, np.float32))), START_S)
+    monkeypatch.setattr("radarsdf.io.unpacking._ALWAYS_UNPACKED", 1 << 20)
+    with pytest.raises(ValueError, match="would unpack"):
+        list(read(tmp_path / "a"))
+    with Reader(tmp_path / "a") as reader:
+        assert len([raw for _, _, raw in reader.messages()]) == 14
+
+
+@pytest.mark.parametrize("decompressor", [bz2.BZ2Decompressor, lz4.frame.LZ4FrameDecompressor])
+def test_unpacking(decompressor):
+    pack = bz2.compress if decompressor is bz2.BZ2Decompressor else lz4.frame.compress
+    noise = np.random.default_rng(0).bytes(100_000)
+    assert unpack(pack(noise), decompressor, "it") == noise
+    assert unpack(pack(noise) + pack(b"more"), decompressor, "it") == noise + b"more"
+    with pytest.raises(ValueError, match="it is cut off"):
+        unpack(pack(noise)[:50_000], decompressor, "it")
 
 
 def test_memory_is_that_of_a_message(tmp_path):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from radarsdf.io.files import check_regular_file
+from radarsdf.io.unpacking import bound_ros1, bounded, check_zstd_files, unpack_zstd
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _ROS1_SUFFIX = ".bag"
@@ -92,10 +93,11 @@ def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
         connections = [c for c in reader.connections if c.topic in names]
         if not connections:  # of none, rosbags would give all messages
             return
-        messages = reader.messages(connections=connections)
+        messages = _messages(reader, connections)
         while True:
             try:
-                connection, recorded_ns, raw = next(messages)
+                with bounded():
+                    connection, recorded_ns, raw = next(messages)
             except StopIteration:
                 return
             except Exception as error:  # damaged bags raise exceptions of many kinds
@@ -104,6 +106,17 @@ def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
             if not (isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))):
                 raise _damaged(path, ValueError("a message has no time or no bytes"))
             yield Message(connection.topic, connection.msgtype, 1e-9 * recorded_ns, raw, cdr, path)
+
+
+def _messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, Any, Any]]:
+    """Of rosbags, but messages that are packed one by one are unpacked with a bound."""
+    storage = getattr(reader, "storage", None)
+    if storage is None or storage.metadata.compression_mode != "message":
+        yield from reader.messages(connections=connections)
+        return
+    storage.metadata = storage.metadata._replace(compression_mode=None)
+    for connection, recorded_ns, packed in reader.messages(connections=connections):
+        yield connection, recorded_ns, unpack_zstd(packed)
 
 
 @contextmanager
@@ -118,7 +131,12 @@ def _opened(path: Path) -> Iterator[Any]:
     ros1 = path.suffix.lower() == _ROS1_SUFFIX
     try:
         reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
-        reader.open()
+        if path.is_dir():
+            check_zstd_files(path)
+        with bounded():
+            reader.open()
+        if ros1:
+            bound_ros1(reader)
     except PermissionError:
         raise
     except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them

@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.unpacking import check_unpacked
 
 __all__ = ["Scan", "Scans", "read_scans", "write_scans"]
 
 _ARRAYS = ("points", "frame", "poses", "intensity", "static", "lidar_points", "doppler", "times", "sigma")
-# A few megabytes of zeros can unpack to gigabytes. Measurements are mostly noise and compress by a factor of 2 to 5.
-_MAX_COMPRESSION = 100
-_ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are unpacked at any compression
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:
@@ -129,9 +127,7 @@ def _arrays(path: Path, wanted: Iterable[str]) -> dict[str, NDArray[Any]]:
         names = file.namelist()
         members = {name: file.getinfo(f"{name}.npy") for name in wanted if f"{name}.npy" in names}
         unpacked = sum(member.file_size for member in members.values())
-        if unpacked > max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * path.stat().st_size):
-            msg = f"its arrays would unpack to {unpacked} bytes: measurements do not compress that much"
-            raise ValueError(msg)
+        check_unpacked(unpacked, path.stat().st_size, "its arrays")
         arrays = {}
         for name, member in members.items():
             with file.open(member) as stream:
