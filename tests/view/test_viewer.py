@@ -110,7 +110,7 @@ def test_limits_hide_triangles(client, viewer):
     assert len(mesh.faces) == len(surface.faces)
 
 
-def test_the_walk_shows_a_scan_and_moves_the_sensor(client, scans, sharp_map):
+def test_the_walk_shows_a_scan_and_moves_the_sensor(client, viewer, scans, sharp_map):
     before = len(client.received())
     slide(client, "scan", 4)
     client.wait_for(lambda m: m.changes("/scans/measured", "colors"), before)
@@ -119,7 +119,13 @@ def test_the_walk_shows_a_scan_and_moves_the_sensor(client, scans, sharp_map):
     np.testing.assert_allclose(moved.message["position"], scans.poses[4, :3, 3] - sharp_map.origin, atol=1e-6)
     client.wait_for(is_mesh, before)  # coloured for that position
     said = client.wait_for(lambda m: "scan 4: " in str(m.message.get("updates", {}).get("_markdown")), before)
-    assert f"{len(scans.points[4])} returns; median error" in str(said.message)
+    view = sharp_map.render(scans.poses[4])
+    assert len(view) > 20
+    assert f"{len(scans.points[4])} returns measured, {len(view)} predicted; median error" in str(
+        said.message
+    )
+    shown = viewer._walk._clouds["predicted"].points
+    np.testing.assert_allclose(shown, view.world_points - sharp_map.origin, atol=1e-4)
     assert not any(m.name == "/scans/all" for m in client.received())
     slide(client, "all scans", value=True)
     client.wait_for(lambda m: m.name == "/scans/all" and m.kind == "PointCloudMessage", before)
@@ -172,6 +178,8 @@ def test_a_map_far_away_without_intensities():
         said = client.wait_for(lambda m: "signed distance" in str(m.message))
         assert "position | 5000" in str(said.message)
         assert "intensity" not in str(said.message)
+        nodes = {message.name for message in client.received()}
+        assert {"/scans/measured", "/scans/predicted"} <= nodes
     left = [thread for thread in set(threading.enumerate()) - threads if thread.name == "radarsdf view"]
     assert left == []
     with Viewer(radar_map, voxel_size=0.3, port=viewer.port, progress=False):  # the port is free again

@@ -8,7 +8,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from radarsdf.cli.saying import say
+from radarsdf.cli.options import add_json
+from radarsdf.cli.results import Results
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--noise", action="store_true", help="add the noise of the sensor")
     parser.add_argument("--seed", type=int, default=0, help="seed of the noise; default: 0")
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -85,7 +87,16 @@ def run(options: argparse.Namespace) -> None:
     else:
         save_view_picture(options.out, views)
     empty = f", {len(views) - len(seen)} poses see nothing" if len(seen) < len(views) else ""
-    say(f"{sum(map(len, seen))} returns of {len(views)} scans written to {options.out}{empty}")
+    results = Results(options)
+    count = sum(map(len, seen))
+    results.add(
+        f"{count} returns of {len(views)} scans written to {options.out}{empty}",
+        returns=count,
+        scans=len(views),
+        scans_without_returns=len(views) - len(seen),
+        out=options.out,
+    )
+    results.end()
 
 
 def _poses(words: list[str]) -> NDArray[np.float64]:

@@ -35,13 +35,9 @@ class Controls:
         The scale of the intensities, if there are any.
     scans
         The number of scans to walk through.
-    predicts
-        Whether returns of the scans are shown as predicted too.
     """
 
-    def __init__(
-        self, server: Any, surface: Surface, colors: Colors | None, scans: int = 0, *, predicts: bool = False
-    ) -> None:
+    def __init__(self, server: Any, surface: Surface, colors: Colors | None, scans: int = 0) -> None:
         gui = server.gui
         if colors is not None:
             gui.add_html(_legend(colors))
@@ -62,9 +58,10 @@ class Controls:
         with gui.add_folder("scans"):
             self._scan = gui.add_slider("scan", 0, max(scans - 1, 1), 1, 0, disabled=scans == 1)
             self._scan_text = gui.add_markdown("")
-            self._layers["measured"] = gui.add_checkbox("measured", True)
-            if predicts:
-                self._layers["predicted"] = gui.add_checkbox("predicted", True, hint="to the right of each")
+            self._layers["measured"] = gui.add_checkbox("measured", True, hint="round points")
+            self._layers["predicted"] = gui.add_checkbox(
+                "predicted", True, hint="diamonds: what the map expects the sensor to get from there"
+            )
             self._layers["all"] = gui.add_checkbox("all scans", False)
             self._path = gui.add_checkbox("trajectory", True)
 

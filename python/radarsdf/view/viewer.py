@@ -134,15 +134,12 @@ class Viewer:
             predicted = self._map.intensity(vertices[::step], np.array(first))
             colors = Colors(*(float(limit) for limit in np.percentile(predicted, _SCALE_PERCENTILES)))
         self._walk = None
-        measured = None if scans is None or scans.intensities is None else colors
         count = 0 if scans is None else len(scans)
         self.colors = colors
         """The scale of the colours. None: the map has no intensities."""
-        self._controls = controls = Controls(
-            server, self.surface, colors, count, predicts=measured is not None
-        )
+        self._controls = controls = Controls(server, self.surface, colors, count)
         if scans is not None:
-            self._walk = Walk(server, self._map, scans, measured, controls.say_of_scan)
+            self._walk = Walk(server, self._map, scans, colors, controls.say_of_scan)
         self._clicked: NDArray[np.float64] | None = None
         self._canvas = SurfaceCanvas(server, self._map, self.surface, colors, self._walk, self._describe)
         wish = Wish(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The scans on the page: the path of the sensor, and the returns of one scan, measured beside predicted."""
+"""The scans on the page: the path of the sensor, and the returns of one scan, measured and predicted."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ ALL_RETURNS = 200_000
 """Returns of all scans that are shown together at most."""
 _POINT_M = 0.2
 _PATH_COLOR = (40, 44, 52)
+_PREDICTED_COLOR = (31, 119, 180)  # without intensities
+_SHAPES = {"measured": "circle", "predicted": "diamond", "all": "circle"}
 
 
 class Walk:
@@ -32,7 +34,7 @@ class Walk:
     scans
         The scans. All returns are kept in memory.
     colors
-        (N, 3) sRGB of intensities (N,). None: scans or map have none, and returns are grey.
+        (N, 3) sRGB of intensities (N,). None: the map has none.
     say
         Called with a sentence about the scan that is shown.
     """
@@ -47,7 +49,7 @@ class Walk:
     ) -> None:
         self._server, self._map, self._say = server, radar_map, say
         self._points, self._poses = scans.points, scans.poses
-        self._intensities = None if colors is None else scans.intensities
+        self._intensities = scans.intensities
         self._colors = colors
         self._shown: int | None = None
         self._clouds: dict[str, Any] = {}
@@ -76,23 +78,20 @@ class Walk:
             return
         self._shown = index
         world = self._in_world(index)
-        sensor = self._poses[index, :3, 3]
-        if self._intensities is None or self._colors is None:
-            self._draw("measured", world, np.full((len(world), 3), NEUTRAL, np.uint8))
-            self._say(f"scan {index}: {len(world)} returns")
-            return
-        measured = np.asarray(self._intensities[index], np.float64)
-        predicted = self._map.intensity(world, sensor)
-        # To the right of each measured return, seen from the sensor, and so beside it.
-        right = np.cross(world - sensor, [0.0, 0.0, 1.0])
-        right *= _POINT_M / np.maximum(np.linalg.norm(right, axis=1), 1e-9)[:, None]
+        view = self._map.render(self._poses[index])
+        measured = None if self._intensities is None else self._intensities[index]
         with self._server.atomic():
-            self._draw("measured", world, self._colors(measured))
-            self._draw("predicted", world + right, self._colors(predicted))
-        errors = np.abs(predicted - measured)
-        errors = errors[np.isfinite(errors)]
-        error = f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
-        self._say(f"scan {index}: {len(world)} returns{error}")
+            self._draw("measured", world, self._colors_of(measured, len(world), NEUTRAL))
+            predicted = self._colors_of(view.intensities, len(view), _PREDICTED_COLOR)
+            self._draw("predicted", view.world_points, predicted)
+        error = ""
+        if measured is not None and self._map.has_intensity:
+            errors = np.abs(
+                self._map.intensity(world, self._poses[index, :3, 3]) - np.asarray(measured, np.float64)
+            )
+            errors = errors[np.isfinite(errors)]
+            error = f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
+        self._say(f"scan {index}: {len(world)} returns measured, {len(view)} predicted{error}")
 
     def set_visible(self, what: str, visible: bool) -> None:
         """Show or hide the clouds "measured" and "predicted" of the scan, or the cloud of "all" returns."""
@@ -110,11 +109,16 @@ class Walk:
     def _draw_all(self) -> None:
         step = self.every
         world = np.concatenate([self._in_world(i) for i in range(len(self))])[::step]
-        if self._intensities is None or self._colors is None:
-            colors = np.full((len(world), 3), NEUTRAL, np.uint8)
-        else:
-            colors = self._colors(np.concatenate(self._intensities)[::step])
-        self._draw("all", world, colors)
+        measured = None if self._intensities is None else np.concatenate(self._intensities)[::step]
+        self._draw("all", world, self._colors_of(measured, len(world), NEUTRAL))
+
+    def _colors_of(
+        self, intensities: NDArray[Any] | None, count: int, without: tuple[int, int, int]
+    ) -> NDArray[np.uint8]:
+        """(N, 3) sRGB of `count` returns; `without`: the colour of all where there are no intensities."""
+        if intensities is None or self._colors is None:
+            return np.full((count, 3), without, np.uint8)
+        return self._colors(np.asarray(intensities, np.float64))
 
     def _in_world(self, index: int) -> NDArray[np.float64]:
         """(N, 3) returns, world, m."""
@@ -135,7 +139,7 @@ class Walk:
             local,
             colors,
             point_size=_POINT_M,
-            point_shape="circle",
+            point_shape=_SHAPES[what],
             point_shading="flat",
             precision="float32",
             visible=self._visible[what],
