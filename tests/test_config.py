@@ -80,6 +80,7 @@ WORDS = {
     "encoding.kind": ["tri-quadtree", "octree"],
     "training.start": ["noise"],  # an average needs more: see below
     "training.gradients": ["core", "autograd"],
+    "networks.reflectance": ["network", "closed-form"],
 }
 WIDTHS = ["networks.sdf_hidden", "networks.intensity_hidden"]
 NONE = [
@@ -380,6 +381,7 @@ PUBLISHED = {
         "sdf_hidden": (32, 32),
         "intensity_hidden": (64, 64),
         "geometry_feature_dim": 15,
+        "reflectance": "network",
         "normals": True,
         "sdf_input": True,
         "view_direction": True,
@@ -430,6 +432,8 @@ def test_quick_averages_and_trains_no_surface():
         "octree",
     )
     assert (quick.near_band_m, quick.truncation_m, quick.seed) == (0.4, 0.6, 4)
+    assert not quick.trains_intensity
+    assert FitConfig().trains_intensity
 
 
 def test_what_is_told_to_prepare():

@@ -22,6 +22,7 @@ void bind_encodings(pybind11::module_& m);
 void bind_mlp(pybind11::module_& m);
 void bind_field_loss(pybind11::module_& m);
 void bind_surfaces(pybind11::module_& m);
+void bind_cell_means(pybind11::module_& m);
 void bind_cell_sums(pybind11::module_& m);
 void bind_looks(pybind11::module_& m);
 void bind_surface_crossings(pybind11::module_& m);

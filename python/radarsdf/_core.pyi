@@ -11,6 +11,7 @@ import typing
 
 __all__: list[str] = [
     "CellBlocks",
+    "CellMeans",
     "CellSet",
     "Encoding",
     "FEATURE_DIM",
@@ -29,9 +30,11 @@ __all__: list[str] = [
     "VertexTable",
     "available_instruction_sets",
     "cell_keys",
+    "cell_rows",
     "compiler",
     "count_looks",
     "count_scans",
+    "fit_cell_means",
     "fourier",
     "instruction_set",
     "marching_cubes_dense",
@@ -522,6 +525,31 @@ class FieldLoss:
         By weights and biases of each layer of the SDF network in turn, as the last call that trained it wrote them.
         """
 
+class CellMeans:
+    """
+    Answers from means in cells.
+    """
+    def __init__(
+        self,
+        kinds: numpy.typing.NDArray[numpy.float64],
+        num_tilings: typing.SupportsInt | typing.SupportsIndex,
+        keys: numpy.typing.NDArray[numpy.uint64],
+        means: numpy.typing.NDArray[numpy.float32],
+    ) -> None:
+        """
+        Keys and means as `fit_cell_means` gives them for the same `kinds` and `num_tilings`.
+        """
+    def sums(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        directions: numpy.typing.NDArray[numpy.float32],
+        incidence_rad: numpy.typing.NDArray[numpy.float32],
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.float32]:
+        """
+        Means of the cells of each view, added over the kinds, averaged over the tilings: (N,) float32.
+        """
+
 class CellBlocks:
     """
     From the keys of cells to their rows, and sums over the cells round a key.
@@ -642,6 +670,16 @@ def cell_keys(
     Morton key (N,) uint64 of the leaf cell of each point (N, 3), local frame, m.
     """
 
+def cell_rows(
+    kind: numpy.typing.NDArray[numpy.float64],
+    points: numpy.typing.NDArray[numpy.float32],
+    directions: numpy.typing.NDArray[numpy.float32],
+    incidence_rad: numpy.typing.NDArray[numpy.float32],
+) -> tuple[numpy.typing.NDArray[numpy.int32], int]:
+    """
+    The cell of each view, (N,) int32, numbered as they first occur, and how many there are. `kind` (1, 3).
+    """
+
 def compiler() -> str:
     """
     Compiler that built the core.
@@ -668,6 +706,26 @@ def count_scans(
 ) -> numpy.typing.NDArray[numpy.uint32]:
     """
     Number of different scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each return's cell; `scans` (N,) int32, ascending.
+    """
+
+def fit_cell_means(
+    kinds: numpy.typing.NDArray[numpy.float64],
+    num_tilings: typing.SupportsInt | typing.SupportsIndex,
+    points: numpy.typing.NDArray[numpy.float32],
+    directions: numpy.typing.NDArray[numpy.float32],
+    incidence_rad: numpy.typing.NDArray[numpy.float32],
+    values: numpy.typing.NDArray[numpy.float32],
+    weights: numpy.typing.NDArray[numpy.float32],
+    shrinkage: typing.SupportsFloat | typing.SupportsIndex,
+    rounds: typing.SupportsInt | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> tuple[
+    numpy.typing.NDArray[numpy.uint64],
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+]:
+    """
+    Splits `values` (N,) into means in cells of several `kinds` (K, 3): edge in m, step of the direction's components, step of the incidence in rad; a step of 0: not by it. `points`, `directions` (N, 3) float32, `incidence_rad` (N,), NaN: not known. Gives keys (M,) uint64 and means (M,) float32 of the cells, and what they explain of each value (N,).
     """
 
 @typing.overload

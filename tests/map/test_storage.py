@@ -107,7 +107,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "6"
+    assert metadata["format_version"] == "7"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -350,3 +350,43 @@ def test_saving_overwrites_and_takes_strings(saved, tmp_path):
         saved[0].save(path)
     assert os.listdir(tmp_path) == ["map.safetensors"]  # noqa: PTH208 - a string is the point
     assert repr(radarsdf.load(path)) == repr(saved[0])
+
+
+@pytest.fixture(scope="module")
+def saved_closed_form(scene, tmp_path_factory):
+    """A quick map with intensities, its file, and the file's parts."""
+    config = FitConfig.quick()
+    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+    path = tmp_path_factory.mktemp("map") / "quick.safetensors"
+    radar_map.save(path)
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        metadata = file.metadata()
+    return radar_map, path, tensors, metadata
+
+
+def test_intensities_in_closed_form_are_kept(scene, saved_closed_form):
+    radar_map, path, _, _ = saved_closed_form
+    points = scene.points[0] + scene.poses[0, :3, 3]
+    expected = radar_map.intensity(points, SENSOR)
+    assert expected.std() > 0
+    for other in (radarsdf.load(path), pickle.loads(pickle.dumps(radar_map))):
+        np.testing.assert_array_equal(other.intensity(points, SENSOR), expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        ("reflectance.means", lambda t: t * math.nan),
+        ("reflectance.means", lambda t: t[1:]),
+        ("reflectance.coefficients", lambda t: t[1:]),
+        ("reflectance.normals", lambda t: t.double()),
+        ("reflectance.plane_keys", lambda t: t.flip(0)),
+        ("reflectance.mean_keys", lambda t: t * 0),
+    ],
+)
+def test_damaged_intensities_in_closed_form_are_refused(saved_closed_form, tmp_path, name, spoil):
+    _, _, tensors, metadata = saved_closed_form
+    spoilt = write(tmp_path / "map.safetensors", tensors | {name: spoil(tensors[name])}, metadata)
+    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+        radarsdf.load(spoilt)

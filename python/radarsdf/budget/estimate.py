@@ -28,6 +28,7 @@ _ALWAYS = 35e6  # code that the fit loads, stacks and arenas of the threads
 _PER_RETURN = 30.0
 _PER_INTENSITY = 20.0
 _PER_RETURN_AGAIN = 110.0  # if the intensity stage uses other returns than the sdf stage
+_PER_RETURN_OF_CLOSED_FORM = 150.0  # cells of intensities in closed form
 _PER_RETURN_CHECKED = 200.0  # scans in float64, freed before the training
 _PER_CELL = 215.0
 _PER_OCTREE_ROW = 30.0  # freed when the rows are numbered
@@ -113,7 +114,12 @@ def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
     cells, rows = _count_cells(rays, config)
     schedule = _schedule(rays, rows, config)
     work = work_of(
-        config, schedule, returns=count, cells=cells, rows=rows, with_intensity=rays.intensities is not None
+        config,
+        schedule,
+        returns=count,
+        cells=cells,
+        rows=rows,
+        with_intensity=_trains_intensity(rays, config),
     )
     return Estimate(
         peak_memory_bytes=_fit_bytes(rays, cells, rows, config),
@@ -126,14 +132,18 @@ def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
 
 
 def _schedule(rays: Rays, rows: int, config: FitConfig) -> Schedule:
-    count, with_intensity = len(rays), rays.intensities is not None
+    count, with_intensity = len(rays), _trains_intensity(rays, config)
     return Schedule.of(
         config, surface_returns=count, returns=count, vertices=rows, with_intensity=with_intensity
     )
 
 
+def _trains_intensity(rays: Rays, config: FitConfig) -> bool:
+    return rays.intensities is not None and config.trains_intensity
+
+
 def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
-    count, with_intensity = len(rays), rays.intensities is not None
+    count, with_intensity = len(rays), _trains_intensity(rays, config)
     schedule, moves_rows = _schedule(rays, rows, config), config.moves_rows(with_intensity)
     memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL
     memory += 4 * rows * FEATURE_DIM * _copies(config, schedule, with_intensity=with_intensity)
@@ -150,6 +160,8 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
     memory += samples * _sample_bytes(config)
     if with_intensity:
         memory += count * (_PER_INTENSITY + config.returns.drop_ghosts * _PER_RETURN_AGAIN)
+    elif rays.intensities is not None:
+        memory += count * _PER_RETURN_OF_CLOSED_FORM
     passing = count * _PER_RETURN_CHECKED
     if config.encoding.kind == "octree":
         passing = max(passing, _ALWAYS + cells * _PER_CELL + rows * _PER_OCTREE_ROW)

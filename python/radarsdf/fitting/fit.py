@@ -32,6 +32,7 @@ from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import Rays, prepare
+from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 from radarsdf.threads import Workers
 
@@ -131,7 +132,9 @@ def fit(
             )
             clock.lap("start_s")
             scale = IntensityScale.of(rays.intensities)
-            training = Training(field, surface.rays, rays, scale, config, workers)
+            training = Training(
+                field, surface.rays, rays, scale if config.trains_intensity else None, config, workers
+            )
             if saved is not None:
                 saved.resume(training)
             # The map is made before the training, which changes its field: Interrupted and Diverged can hand
@@ -148,6 +151,7 @@ def fit(
                     field=field,
                     origin=rays.origin,
                     intensity_scale=scale,
+                    reflectance=_closed_form(rays, scale, surface, config, workers.num_threads),
                     config=config,
                     evidence=evidence,
                     rough_share=surface.surfels.rough_share(),
@@ -197,7 +201,19 @@ def _given(
 def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, num_threads: int) -> Field:
     """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
     leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
-    return Field(leaf_keys, config, with_intensity=rays.intensities is not None, num_threads=num_threads)
+    with_intensity = rays.intensities is not None and config.trains_intensity
+    return Field(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
+
+
+def _closed_form(
+    rays: Rays, scale: IntensityScale | None, surface: SurfaceReturns, config: FitConfig, num_threads: int
+) -> Reflectance | None:
+    """The intensities in closed form, if they are wanted."""
+    if scale is None or rays.intensities is None or config.trains_intensity:
+        return None
+    return Reflectance.of(
+        rays, scale.to_unit(rays.intensities), surface.surfels, config.leaf_size_m, num_threads
+    )
 
 
 def _report(
@@ -217,6 +233,7 @@ def _report(
         rows=field.cells.table.num_rows,
         with_intensity=field.intensity_network is not None,
         threads=threads,
+        closed_form=standing.intensities is not None and not config.trains_intensity,
     )
     if standing.why_none is not None:
         skipped.insert(0, Skipped(f"leaving out what moves: {standing.why_none}", None))

@@ -31,8 +31,12 @@ def skipped_parts(
     rows: int,
     with_intensity: bool,
     threads: int,
+    closed_form: bool = False,
 ) -> list[Skipped]:
-    """All of them, for a fit of so many `returns`, leaf `cells` and `rows` of features."""
+    """All of them, for a fit of so many `returns`, leaf `cells` and `rows` of features.
+
+    `closed_form`: there are intensities, but no network.
+    """
 
     def seconds(config: FitConfig, schedule: Schedule, with_intensity: bool) -> float:
         work = work_of(
@@ -48,7 +52,8 @@ def skipped_parts(
     ours_s = seconds(config, schedule, with_intensity)
     skipped = []
     if not with_intensity:
-        words = "the intensity network: there are no intensities"
+        why = "intensities are in closed form" if closed_form else "there are no intensities"
+        words = f"the intensity network: {why}"
         skipped.append(Skipped(words, seconds(config, scheduled(config, True), True) - ours_s))
     else:
         published = FitConfig.paper().networks

@@ -14,6 +14,7 @@ from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 
 
@@ -27,6 +28,8 @@ class MapContents:
     """(3,) origin of the local frame in world coordinates, m."""
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
+    reflectance: Reflectance | None
+    """Intensities in closed form. None: the intensity network answers, or there are no intensities."""
     config: FitConfig
     """Settings of the fit."""
     evidence: Evidence

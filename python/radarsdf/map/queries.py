@@ -168,6 +168,9 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
         positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
         ranges_m = rays.norm(dim=1)
         directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
+        if contents.reflectance is not None:
+            unit = contents.reflectance.at(positions.numpy(), directions.numpy(), ranges_m.numpy(), 1)
+            return scale.to_sensor(torch.from_numpy(unit))
         return scale.to_sensor(field.intensity(field.geometry(positions), directions, ranges_m))
 
     return evaluate(of_chunk, torch.cat([points, sensors], 1))

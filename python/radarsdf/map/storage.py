@@ -22,13 +22,22 @@ from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.map.contents import MapContents
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
+# Types and numbers of dimensions of the arrays of `Reflectance`. Keys have at most 63 bits, as those of leaf cells.
+_REFLECTANCE = {
+    "coefficients": (torch.float64, 1),
+    "plane_keys": (torch.int64, 1),
+    "normals": (torch.float32, 2),
+    "mean_keys": (torch.int64, 1),
+    "means": (torch.float32, 1),
+}
 
 
 def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
@@ -77,6 +86,8 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     # Morton keys have 63 bits, so they fit into int64, which all readers of safetensors have.
     tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
+    if contents.reflectance is not None:
+        tensors |= _tensors_of(contents.reflectance)
     scale = contents.intensity_scale
     description = {
         "config": contents.config.to_dict(),
@@ -86,6 +97,29 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "report": contents.report,
     }
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
+
+
+def _tensors_of(reflectance: Reflectance) -> dict[str, Tensor]:
+    arrays = {name: getattr(reflectance, name) for name in _REFLECTANCE}
+    return {
+        f"reflectance.{name}": torch.from_numpy(a.view(np.int64) if a.dtype == np.uint64 else a)
+        for name, a in arrays.items()
+    }
+
+
+def _reflectance_of(tensors: dict[str, Tensor], config: FitConfig) -> Reflectance:
+    """Takes its part of the tensors."""
+    arrays: dict[str, Any] = {}
+    for name, (dtype, dimensions) in _REFLECTANCE.items():
+        tensor = tensors.pop(f"reflectance.{name}")
+        if tensor.dtype != dtype or tensor.ndim != dimensions or not tensor.isfinite().all():
+            msg = f"{name} of the reflectance is not {dimensions}-dimensional, finite and {dtype}"
+            raise ValueError(msg)
+        array = tensor.numpy()
+        arrays[name] = array.view(np.uint64) if dtype == torch.int64 else array
+    reflectance = Reflectance(config.leaf_size_m, **arrays)
+    reflectance.check()
+    return reflectance
 
 
 @torch.inference_mode(mode=False)  # or the map could not give gradients
@@ -160,13 +194,19 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     if not 0 <= rough_share <= 1:
         msg = f"rough_share must be in [0, 1], not {rough_share}"
         raise ValueError(msg)
+    in_closed_form = scale is not None and not config.trains_intensity
+    reflectance = _reflectance_of(tensors, config) if in_closed_form else None
     # A damaged description could ask for networks of any size. So the number of layers is limited, and the
     # field is made without memory: it only serves to check the shapes of the tensors.
     if len(config.networks.sdf_hidden + config.networks.intensity_hidden) > len(tensors):
         msg = "there are fewer tensors than layers"
         raise ValueError(msg)
     with torch.device("meta"):
-        field = Field(leaf_keys.numpy().astype(np.uint64), config, with_intensity=scale is not None)
+        field = Field(
+            leaf_keys.numpy().astype(np.uint64),
+            config,
+            with_intensity=scale is not None and not in_closed_form,
+        )
     state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
     for name, tensor in state.items():
         if tensor.dtype != torch.float32 or not tensor.isfinite().all():
@@ -178,6 +218,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         field=field,
         origin=origin.numpy(),
         intensity_scale=scale,
+        reflectance=reflectance,
         config=config,
         report=dict(description["report"]),
         evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),

@@ -1,0 +1,123 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include <cmath>
+#include <memory>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
+#include "returns/cell_means.hpp"
+
+namespace radarsdf {
+namespace {
+
+std::vector<CellKind> kinds_of(const Array<double>& kinds) {
+  const py::ssize_t count = kinds.ndim() == 2 ? kinds.shape(0) : 0;
+  check_shape(kinds, count, 3, "kinds");
+  std::vector<CellKind> found;
+  for (py::ssize_t i = 0; i < count; ++i) {
+    const double* row = kinds.data(i, 0);
+    if (!(std::isfinite(row[0]) && row[0] > 0 && row[1] >= 0 && row[2] >= 0)) {
+      throw std::invalid_argument("kinds must have edges above 0 and steps of at least 0");
+    }
+    found.push_back({row[0], row[1], row[2]});
+  }
+  return found;
+}
+
+int check_tilings(int num_tilings) {
+  if (num_tilings < 1) throw std::invalid_argument("num_tilings must be at least 1");
+  return num_tilings;
+}
+
+Views views_of(const Array<float>& points, const Array<float>& directions, const Array<float>& incidence_rad) {
+  const std::int64_t count = check_column(incidence_rad, "incidence_rad");
+  check_shape(points, count, 3, "points");
+  check_shape(directions, count, 3, "directions");
+  return {points.data(), directions.data(), incidence_rad.data(), count};
+}
+
+}  // namespace
+
+void bind_cell_means(py::module_& m) {
+  using namespace py::literals;
+  m.def(
+      "cell_rows",
+      [](const Array<double>& kind, const Array<float>& points, const Array<float>& directions,
+         const Array<float>& incidence_rad) {
+        const std::vector<CellKind> kinds = kinds_of(kind);
+        if (kinds.size() != 1) throw std::invalid_argument("kind must be one");
+        const Views views = views_of(points, directions, incidence_rad);
+        py::array_t<std::int32_t> rows(static_cast<py::ssize_t>(views.count));
+        std::int32_t* result = rows.mutable_data();
+        std::int64_t count = 0;
+        {
+          const py::gil_scoped_release release;
+          count = cell_rows(kinds[0], views, result);
+        }
+        return std::make_pair(rows, count);
+      },
+      "kind"_a.noconvert(), "points"_a.noconvert(), "directions"_a.noconvert(), "incidence_rad"_a.noconvert(),
+      "The cell of each view, (N,) int32, numbered as they first occur, and how many there are. `kind` (1, 3).");
+  m.def(
+      "fit_cell_means",
+      [](const Array<double>& kinds, int num_tilings, const Array<float>& points, const Array<float>& directions,
+         const Array<float>& incidence_rad, const Array<float>& values, const Array<float>& weights, double shrinkage,
+         int rounds, int num_threads) {
+        const std::vector<CellKind> k = kinds_of(kinds);
+        const int tilings = check_tilings(num_tilings);
+        const Views views = views_of(points, directions, incidence_rad);
+        if (check_column(values, "values") != views.count || check_column(weights, "weights") != views.count) {
+          throw std::invalid_argument("values and weights must have shape (N,)");
+        }
+        if (!(shrinkage > 0)) throw std::invalid_argument("shrinkage must be above 0");
+        const float *v = values.data(), *w = weights.data();
+        CellMeans found;
+        {
+          const py::gil_scoped_release release;
+          found = fit_cell_means(k, tilings, views, v, w, shrinkage, rounds, num_threads);
+        }
+        return std::make_tuple(to_array(std::move(found.keys)), to_array(std::move(found.means)),
+                               to_array(std::move(found.explained)));
+      },
+      "kinds"_a.noconvert(), "num_tilings"_a, "points"_a.noconvert(), "directions"_a.noconvert(),
+      "incidence_rad"_a.noconvert(), "values"_a.noconvert(), "weights"_a.noconvert(), "shrinkage"_a, "rounds"_a,
+      "num_threads"_a = 0,
+      "Splits `values` (N,) into means in cells of several `kinds` (K, 3): edge in m, step of the direction's "
+      "components, step of the incidence in rad; a step of 0: not by it. `points`, `directions` (N, 3) float32, "
+      "`incidence_rad` (N,), NaN: not known. Gives keys (M,) uint64 and means (M,) float32 of the cells, and "
+      "what they explain of each value (N,).");
+  py::class_<CellMeansAt>(m, "CellMeans", "Answers from means in cells.")
+      .def(py::init([](const Array<double>& kinds, int num_tilings, const Array<std::uint64_t>& keys,
+                       const Array<float>& means) {
+             std::vector<CellKind> k = kinds_of(kinds);
+             const int tilings = check_tilings(num_tilings);
+             const std::int64_t count = check_column(keys, "keys");
+             if (check_column(means, "means") != count) throw std::invalid_argument("means must have shape (M,)");
+             const std::uint64_t* key = keys.data();
+             const float* mean = means.data();
+             const py::gil_scoped_release release;
+             return std::make_unique<CellMeansAt>(std::move(k), tilings, key, mean, count);
+           }),
+           "kinds"_a.noconvert(), "num_tilings"_a, "keys"_a.noconvert(), "means"_a.noconvert(),
+           "Keys and means as `fit_cell_means` gives them for the same `kinds` and `num_tilings`.")
+      .def(
+          "sums",
+          [](const CellMeansAt& cells, const Array<float>& points, const Array<float>& directions,
+             const Array<float>& incidence_rad, int num_threads) {
+            const Views views = views_of(points, directions, incidence_rad);
+            py::array_t<float> sums(static_cast<py::ssize_t>(views.count));
+            float* result = sums.mutable_data();
+            {
+              const py::gil_scoped_release release;
+              cells.sums(views, result, num_threads);
+            }
+            return sums;
+          },
+          "points"_a.noconvert(), "directions"_a.noconvert(), "incidence_rad"_a.noconvert(), "num_threads"_a = 0,
+          "Means of the cells of each view, added over the kinds, averaged over the tilings: (N,) float32.");
+}
+
+}  // namespace radarsdf

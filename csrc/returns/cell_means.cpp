@@ -1,0 +1,209 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "returns/cell_means.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <utility>
+
+#include "util/parallel.hpp"
+
+namespace radarsdf {
+namespace {
+
+constexpr double kDirectionOffset = 0.37;  // or axes of the world would be edges of bins
+constexpr double kFarthestCell = 1e15;     // where all lies that is farther, or no number
+constexpr int kViewsPerCell = 8;           // about; where they are fewer, the table grows
+constexpr double kCauchyMedians = 2.0;     // where a value has weight 1/sqrt(2), in median absolute values
+
+// Of the 64 bits, 63 are used: no key is kEmptyKey. Two of a million cells share one with a probability of 1e-7.
+std::uint64_t mixed(std::uint64_t hash, std::uint64_t number) {
+  hash = (hash ^ number) * 0x9e3779b97f4a7c15;
+  return hash ^ hash >> 32;
+}
+
+std::uint64_t cell_of(double place) {
+  if (!(std::abs(place) < kFarthestCell)) place = kFarthestCell;
+  auto cell = static_cast<std::int64_t>(place);
+  cell -= static_cast<double>(cell) > place;  // std::floor is a call where the baseline has no instruction for it
+  return static_cast<std::uint64_t>(cell);
+}
+
+// One number of three: different for cells that are less than 2^20 from the origin.
+std::uint64_t cell_of(const float* vector, double per_unit, double offset) {
+  const std::uint64_t x = cell_of(vector[0] * per_unit + offset);
+  const std::uint64_t y = cell_of(vector[1] * per_unit + offset);
+  const std::uint64_t z = cell_of(vector[2] * per_unit + offset);
+  return x + (y << 21) + (z << 42);
+}
+
+// From views to keys of the cells of a kind in a tiling.
+class Tiles {
+ public:
+  Tiles(const CellKind& kind, int number, double offset)
+      : seed_(hash_key(static_cast<std::uint64_t>(number) + 1)),
+        offset_(offset),
+        per_m_(1 / kind.edge_m),
+        per_direction_(kind.direction_step > 0 ? 1 / kind.direction_step : 0),
+        per_rad_(kind.incidence_step_rad > 0 ? 1 / kind.incidence_step_rad : 0) {}
+
+  std::uint64_t key(const Views& views, std::int64_t i) const {
+    std::uint64_t hash = mixed(seed_, cell_of(views.points + 3 * i, per_m_, offset_));
+    if (per_direction_ > 0) {
+      hash = mixed(hash, cell_of(views.directions + 3 * i, per_direction_, offset_ + kDirectionOffset));
+    }
+    if (per_rad_ > 0) {
+      const double angle = views.incidence_rad[i];
+      hash = mixed(hash, cell_of(std::isnan(angle) ? -2.0 : angle * per_rad_ + offset_));  // no angle has bin -2
+    }
+    return hash >> 1;
+  }
+
+ private:
+  std::uint64_t seed_;
+  double offset_, per_m_, per_direction_, per_rad_;
+};
+
+Tiles tiles_of(const CellKind& kind, std::size_t kind_number, std::size_t num_kinds, int tiling, int num_tilings) {
+  const int number = tiling * static_cast<int>(num_kinds) + static_cast<int>(kind_number);
+  return {kind, number, static_cast<double>(tiling) / num_tilings};
+}
+
+// Numbers the cells of the views as they first occur, from 0, and appends their keys.
+std::int64_t number_cells(const Tiles& tiles, const Views& views, std::int32_t* rows,
+                          std::vector<std::uint64_t>* keys) {
+  FlatMap numbers(static_cast<std::size_t>(views.count / kViewsPerCell));
+  std::int32_t next = 0;
+  for (std::int64_t i = 0; i < views.count; ++i) {
+    const std::uint64_t key = tiles.key(views, i);
+    if (numbers.insert(key, next)) {
+      rows[i] = next++;
+      if (keys != nullptr) keys->push_back(key);
+    } else {
+      rows[i] = numbers.find(key);
+    }
+  }
+  return next;
+}
+
+double median_absolute(const std::vector<double>& values) {
+  std::vector<double> sizes(values.size());
+  std::transform(values.begin(), values.end(), sizes.begin(), [](double v) { return std::abs(v); });
+  const auto middle = sizes.begin() + static_cast<std::ptrdiff_t>(sizes.size() / 2);
+  std::nth_element(sizes.begin(), middle, sizes.end());
+  return *middle;
+}
+
+CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_tilings, const Views& views,
+                     const float* values, const float* weights, double shrinkage, int rounds, float* explained) {
+  const auto count = static_cast<std::size_t>(views.count);
+  CellMeans result;
+  std::vector<std::int32_t> rows(kinds.size() * count);
+  std::vector<std::size_t> firsts;  // of each kind's cells, and the end
+  for (std::size_t k = 0; k < kinds.size(); ++k) {
+    check_interrupt();
+    firsts.push_back(result.keys.size());
+    number_cells(tiles_of(kinds[k], k, kinds.size(), tiling, num_tilings), views, &rows[k * count], &result.keys);
+  }
+  firsts.push_back(result.keys.size());
+
+  std::vector<double> left(values, values + count), means(result.keys.size(), 0.0);
+  std::vector<double> weight(weights, weights + count), sums, masses;
+  for (int round = 0; round < rounds; ++round) {
+    for (std::size_t k = 0; k < kinds.size(); ++k) {
+      check_interrupt();
+      const std::int32_t* row = &rows[k * count];
+      double* mean = &means[firsts[k]];
+      const std::size_t size = firsts[k + 1] - firsts[k];
+      sums.assign(size, 0.0);
+      masses.assign(size, 0.0);
+      for (std::size_t i = 0; i < count; ++i) {
+        const auto r = static_cast<std::size_t>(row[i]);
+        sums[r] += weight[i] * (left[i] + mean[r]);
+        masses[r] += weight[i];
+      }
+      for (std::size_t r = 0; r < size; ++r) {
+        sums[r] /= masses[r] + shrinkage;  // the new mean
+        std::swap(sums[r], mean[r]);
+        sums[r] -= mean[r];  // what it takes less than the old one
+      }
+      for (std::size_t i = 0; i < count; ++i) left[i] += sums[static_cast<std::size_t>(row[i])];
+    }
+    if (round == 0 && rounds > 1) {
+      const double scale = kCauchyMedians * median_absolute(left);
+      for (std::size_t i = 0; scale > 0 && i < count; ++i) {
+        const double relative = left[i] / scale;
+        weight[i] = weights[i] / std::sqrt(1 + relative * relative);
+      }
+    }
+  }
+  for (std::size_t i = 0; i < count; ++i) explained[i] = static_cast<float>(values[i] - left[i]);
+  result.means.assign(means.begin(), means.end());
+  return result;
+}
+
+}  // namespace
+
+std::int64_t cell_rows(const CellKind& kind, const Views& views, std::int32_t* rows) {
+  return number_cells(tiles_of(kind, 0, 1, 0, 1), views, rows, nullptr);
+}
+
+CellMeans fit_cell_means(const std::vector<CellKind>& kinds, int num_tilings, const Views& views, const float* values,
+                         const float* weights, double shrinkage, int rounds, int num_threads) {
+  CellMeans all;
+  if (views.count == 0 || kinds.empty()) return all;
+  std::vector<CellMeans> parts(static_cast<std::size_t>(num_tilings));
+  std::vector<std::vector<float>> explained(static_cast<std::size_t>(num_tilings));
+  parallel_tasks(num_tilings, num_threads, [&](std::int64_t t) {
+    const auto i = static_cast<std::size_t>(t);
+    explained[i].resize(static_cast<std::size_t>(views.count));
+    parts[i] = fit_tiling(kinds, static_cast<int>(t), num_tilings, views, values, weights, shrinkage, rounds,
+                          explained[i].data());
+  });
+  for (std::int64_t i = 0; i < views.count; ++i) {
+    double sum = 0;
+    for (const std::vector<float>& own : explained) sum += own[static_cast<std::size_t>(i)];
+    all.explained.push_back(static_cast<float>(sum / num_tilings));
+  }
+  for (const CellMeans& part : parts) {
+    all.keys.insert(all.keys.end(), part.keys.begin(), part.keys.end());
+    all.means.insert(all.means.end(), part.means.begin(), part.means.end());
+  }
+  return all;
+}
+
+CellMeansAt::CellMeansAt(std::vector<CellKind> kinds, int num_tilings, const std::uint64_t* keys, const float* means,
+                         std::int64_t count)
+    : kinds_(std::move(kinds)),
+      num_tilings_(num_tilings),
+      means_(means, means + count),
+      rows_(static_cast<std::size_t>(count)) {
+  for (std::int64_t i = 0; i < count; ++i) {
+    if (keys[i] == kEmptyKey || !rows_.insert(keys[i], static_cast<std::int32_t>(i))) {
+      throw std::invalid_argument("keys must be different keys of cells");
+    }
+  }
+}
+
+void CellMeansAt::sums(const Views& views, float* sums, int num_threads) const {
+  constexpr std::int64_t kMinBlock = 1 << 10;
+  std::vector<Tiles> tiles;
+  for (int t = 0; t < num_tilings_; ++t) {
+    for (std::size_t k = 0; k < kinds_.size(); ++k) {
+      tiles.push_back(tiles_of(kinds_[k], k, kinds_.size(), t, num_tilings_));
+    }
+  }
+  parallel_blocks(views.count, kMinBlock, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      double sum = 0;
+      for (const Tiles& tile : tiles) {
+        const std::int32_t row = rows_.find(tile.key(views, i));
+        if (row >= 0) sum += means_[static_cast<std::size_t>(row)];
+      }
+      sums[i] = static_cast<float>(sum / num_tilings_);
+    }
+  });
+}
+
+}  // namespace radarsdf
