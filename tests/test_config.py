@@ -80,7 +80,7 @@ WORDS = {
     "encoding.kind": ["tri-quadtree", "octree"],
     "training.start": ["noise"],  # an average needs more: see below
     "training.gradients": ["core", "autograd"],
-    "networks.reflectance": ["network", "closed-form"],
+    "networks.reflectance": ["network", "closed-form", "both"],
 }
 WIDTHS = ["networks.sdf_hidden", "networks.intensity_hidden"]
 NONE = [

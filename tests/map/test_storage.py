@@ -374,6 +374,21 @@ def test_intensities_in_closed_form_are_kept(scene, saved_closed_form):
         np.testing.assert_array_equal(other.intensity(points, SENSOR), expected)
 
 
+def test_what_the_network_leaves_is_added_and_kept(scene, tmp_path):
+    alone, both = (fitted(scene, reflectance=answers) for answers in ("network", "both"))
+    world = [
+        scan @ pose[:3, :3].T + pose[:3, 3] for scan, pose in zip(scene.points, scene.poses, strict=True)
+    ]
+    sensors = [np.broadcast_to(pose[:3, 3], x.shape) for x, pose in zip(world, scene.poses, strict=True)]
+    asked = np.concatenate(world), np.concatenate(sensors)
+    measured = np.concatenate(scene.intensities)
+    errors = [np.abs(radar_map.intensity(*asked) - measured).mean() for radar_map in (alone, both)]
+    assert errors[1] < 0.9 * errors[0]
+    both.save(tmp_path / "map.safetensors")
+    again = radarsdf.load(tmp_path / "map.safetensors")
+    np.testing.assert_array_equal(again.intensity(*asked), both.intensity(*asked))
+
+
 @pytest.mark.parametrize(
     ("name", "spoil"),
     [

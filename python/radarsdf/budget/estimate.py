@@ -160,7 +160,7 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
     memory += samples * _sample_bytes(config)
     if with_intensity:
         memory += count * (_PER_INTENSITY + config.returns.drop_ghosts * _PER_RETURN_AGAIN)
-    elif rays.intensities is not None:
+    if rays.intensities is not None and config.closes_intensity:
         memory += count * _PER_RETURN_OF_CLOSED_FORM
     passing = count * _PER_RETURN_CHECKED
     if config.encoding.kind == "octree":

@@ -29,7 +29,8 @@ class MapContents:
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
     reflectance: Reflectance | None
-    """Intensities in closed form. None: the intensity network answers, or there are no intensities."""
+    """Intensities in closed form, or what the network leaves of them. None: the network alone answers, or there are
+    no intensities."""
     config: FitConfig
     """Settings of the fit."""
     evidence: Evidence

@@ -168,10 +168,15 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
         positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
         ranges_m = rays.norm(dim=1)
         directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
-        if contents.reflectance is not None:
-            unit = contents.reflectance.at(positions.numpy(), directions.numpy(), ranges_m.numpy(), 1)
-            return scale.to_sensor(torch.from_numpy(unit))
-        return scale.to_sensor(field.intensity(field.geometry(positions), directions, ranges_m))
+        closed, share = contents.reflectance, 1.0
+        unit = torch.zeros_like(ranges_m)
+        if closed is not None:
+            unit += torch.from_numpy(closed.at(positions.numpy(), directions.numpy(), ranges_m.numpy(), 1))
+            share = closed.network_share
+        if share > 0:
+            unit += share * field.intensity(field.geometry(positions), directions, ranges_m)
+        # The closed form knows no limits, and what is beyond those of the training was never measured.
+        return scale.to_sensor(unit if closed is None else unit.clamp(0, 1))
 
     return evaluate(of_chunk, torch.cat([points, sensors], 1))
 

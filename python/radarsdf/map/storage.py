@@ -92,6 +92,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     description = {
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
+        "network_share": None if contents.reflectance is None else contents.reflectance.network_share,
         "rough_share": contents.rough_share,
         "sensor": contents.sensor.to_dict(),
         "report": contents.report,
@@ -107,8 +108,11 @@ def _tensors_of(reflectance: Reflectance) -> dict[str, Tensor]:
     }
 
 
-def _reflectance_of(tensors: dict[str, Tensor], config: FitConfig) -> Reflectance:
+def _reflectance_of(tensors: dict[str, Tensor], leaf_size_m: float, network_share: float) -> Reflectance:
     """Takes its part of the tensors."""
+    if not 0 <= network_share <= 1:
+        msg = f"network_share must be in [0, 1], not {network_share}"
+        raise ValueError(msg)
     arrays: dict[str, Any] = {}
     for name, (dtype, dimensions) in _REFLECTANCE.items():
         tensor = tensors.pop(f"reflectance.{name}")
@@ -117,7 +121,7 @@ def _reflectance_of(tensors: dict[str, Tensor], config: FitConfig) -> Reflectanc
             raise ValueError(msg)
         array = tensor.numpy()
         arrays[name] = array.view(np.uint64) if dtype == torch.int64 else array
-    reflectance = Reflectance(config.leaf_size_m, **arrays)
+    reflectance = Reflectance(leaf_size_m, **arrays, network_share=network_share)
     reflectance.check()
     return reflectance
 
@@ -194,8 +198,13 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     if not 0 <= rough_share <= 1:
         msg = f"rough_share must be in [0, 1], not {rough_share}"
         raise ValueError(msg)
-    in_closed_form = scale is not None and not config.trains_intensity
-    reflectance = _reflectance_of(tensors, config) if in_closed_form else None
+    share = description["network_share"]
+    reflectance = None if share is None else _reflectance_of(tensors, config.leaf_size_m, float(share))
+    # One of the two must answer for intensities, and without them neither can.
+    trained = scale is not None and config.trains_intensity
+    if (trained or reflectance is not None) != (scale is not None):
+        msg = "what answers for intensities is missing, or there are none"
+        raise ValueError(msg)
     # A damaged description could ask for networks of any size. So the number of layers is limited, and the
     # field is made without memory: it only serves to check the shapes of the tensors.
     if len(config.networks.sdf_hidden + config.networks.intensity_hidden) > len(tensors):
@@ -205,7 +214,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         field = Field(
             leaf_keys.numpy().astype(np.uint64),
             config,
-            with_intensity=scale is not None and not in_closed_form,
+            with_intensity=trained,
         )
     state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
     for name, tensor in state.items():

@@ -46,7 +46,10 @@ NUM_COEFFICIENTS = _BASE + 4 + len(_LOBES_RAD)
 
 @dataclass(frozen=True)
 class Reflectance:
-    """Intensities in [0, 1] of the returns of a fit, as a function of place, direction, range and incidence."""
+    """A quantity of the returns of a fit, as a function of place, direction, range and incidence.
+
+    It is their intensity in [0, 1], or what a network leaves of it.
+    """
 
     leaf_size_m: float
     """Edge of a leaf cell, m."""
@@ -60,6 +63,8 @@ class Reflectance:
     """(M,) keys of the cells with means."""
     means: Float32
     """(M,) means in them of what the regression leaves."""
+    network_share: float = 0.0
+    """The answer of the intensity network counts so many times; the quantity is what that leaves."""
 
     @cached_property
     def _planes(self) -> CellBlocks:
@@ -79,7 +84,13 @@ class Reflectance:
 
     @classmethod
     def of(
-        cls, rays: Rays, unit: Float32, surfels: Surfels, leaf_size_m: float, num_threads: int = 0
+        cls,
+        rays: Rays,
+        unit: Float32,
+        surfels: Surfels,
+        leaf_size_m: float,
+        num_threads: int = 0,
+        network_share: float = 0.0,
     ) -> Reflectance:
         """The reflectance of `rays`.
 
@@ -88,7 +99,7 @@ class Reflectance:
         rays : Rays
             All returns, with ghosts: a sensor sees these again.
         unit : (N,) float32
-            Their intensities, scaled to [0, 1].
+            Their intensities, scaled to [0, 1]; less `network_share` times what the network answers.
         surfels : Surfels
             Surfels of the same returns.
         leaf_size_m : float
@@ -114,10 +125,10 @@ class Reflectance:
         # The cells have means, and the error that counts is the absolute one, whose centre is the median.
         coefficients[0] += np.median(left[some] - explained[rows[some]])
         plane_keys = surfels.cells.keys[surfels.cell_of_plane[flat]]
-        return cls(leaf_size_m, coefficients, plane_keys, normals, keys, means)
+        return cls(leaf_size_m, coefficients, plane_keys, normals, keys, means, network_share)
 
     def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
-        """Intensities (N,) in [0, 1] at points (N, 3), local frame, m, seen along directions (N, 3), unit vectors."""
+        """The quantity (N,) at points (N, 3), local frame, m, seen along directions (N, 3), unit vectors."""
         size_m = LEAVES_PER_SURFEL * self.leaf_size_m
         limit_m = MAX_CELLS_FROM_ORIGIN * self.leaf_size_m  # farther points have no key, and no cell
         near = np.ascontiguousarray(np.clip(np.nan_to_num(points), -limit_m, limit_m))
@@ -126,7 +137,6 @@ class Reflectance:
         incidence = _incidence(self.normals, rows, directions)
         response = _response(self.coefficients, directions, ranges_m, incidence)
         response += self._cells.sums(near, directions, incidence, num_threads)
-        np.clip(response, 0, 1, out=response)
         return response
 
 
