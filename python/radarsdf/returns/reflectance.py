@@ -20,7 +20,7 @@ Float32 = NDArray[np.float32]
 
 # Kinds of cells: edge in leaf cells, step of the direction's components, step of the incidence in rad. Materials differ
 # in how the echo falls with the incidence, so cells by incidence are what helps most on simulated scenes, cells by
-# direction on real drives. Chosen on `hugin`, `oculii` and `wall` of seeds 1 and 2 and on two drives.
+# direction on real drives. Chosen on `hugin`, `oculii` and `wall` of seeds 1 and 2 and on three drives.
 _KINDS = np.array([
     [40, 0, 0], [10, 0, 0], [2, 0, 0],
     [40, 0, 0.07], [16, 0, 0.1], [6, 0, 0.1],
