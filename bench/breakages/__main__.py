@@ -25,6 +25,7 @@ SCENES = (
     ("astyx", 8),
 )
 _STEP_S = 0.1
+_NAMED, _UNTRIED = "named", "–"
 _GOOD_SEEDS = range(1, 4)
 
 
@@ -68,22 +69,23 @@ def main() -> None:
     scenes = {f"{name} {frames}": simulated(name, frames) for name, frames in chosen}
     scenes |= {path.stem: recorded(path) for path in options.files}
     columns = list(scenes)
-    print("| breakage | " + " | ".join(columns) + " |")
-    print("|---" * (len(columns) + 1) + "|")
+    print("| breakage | finding | named | " + " | ".join(columns) + " |")
+    print("|---" * (len(columns) + 3) + "|")
     named = tried = 0
     for words, (finding, broken) in WAYS.items():
-        cells = []
+        cells: list[str] = []
         for data in scenes.values():
             if finding in NEED_DOPPLER and (data.doppler_mps is None or options.cheap):
-                cells.append("–")
+                cells.append(_UNTRIED)
                 continue
             findings = found_in(broken(data), options.cheap)
             worse = [name for name, severity in findings if severity != "note"]
             hit = finding in [name for name, _ in findings]
             tried += 1
             named += hit
-            cells.append("named" if hit else ", ".join(worse) or "no")
-        print(f"| {words} | " + " | ".join(cells) + " |", flush=True)
+            cells.append(_NAMED if hit else ", ".join(worse) or "no")
+        share = f"{cells.count(_NAMED)} of {len(cells) - cells.count(_UNTRIED)}"
+        print(f"| {words} | `{finding}` | {share} | " + " | ".join(cells) + " |", flush=True)
     print(f"\n{named} of {tried} breakages are named: {named / tried:.1%}")
     good = dict(scenes)
     if not options.quick:

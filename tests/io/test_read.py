@@ -210,7 +210,7 @@ def test_ground_truth(tmp_path):
 
 def test_sentences(tmp_path):
     clouds(tmp_path / "scans", 3)
-    with pytest.raises(ValueError, match=r"has no poses: give them by poses"):
+    with pytest.raises(ValueError, match=r"has no poses: give a file of poses"):
         read(tmp_path)
     with pytest.raises(ValueError, match=r"3 scans but 2 poses: give as many poses as scans"):
         read(tmp_path, POSES[:2])

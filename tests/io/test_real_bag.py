@@ -42,7 +42,7 @@ def test_it_becomes_the_scans_that_it_holds():
 def test_its_way_out_without_poses():
     bag, poses = bag_and_poses()
     with pytest.raises(
-        ValueError, match=r"has no poses \(Odometry, PoseStamped, Path or TF\): give them by poses"
+        ValueError, match=r"has no poses \(Odometry, PoseStamped, Path or TF\): give a file of poses"
     ):
         read(bag)
     with pytest.raises(ValueError, match="are both of one clock"):

@@ -75,7 +75,7 @@ def check_frames(recording: Recording, effort: Effort = FULL) -> list[Finding]:
         Finding(
             guess.finding,
             "error",
-            f"{guess.what[0].upper()}{guess.what[1:]}: then returns of different scans are {np.exp(gain):.2f} times "
+            f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times "
             f"closer to each other ({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
             guess.mend,
         )

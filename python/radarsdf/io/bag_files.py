@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import heapq
+import re
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from radarsdf.io.unpacking import bound_ros1, bounded, check_zstd_files, unpack_
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _ROS1_SUFFIX = ".bag"
 _METADATA = "metadata.yaml"
+_QUOTED = re.compile(r"\('(.*?)',\)")  # how rosbags prints the words of another error
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,11 @@ def _damaged(path: Path, error: Exception) -> ValueError:
     why = str(error) or type(error).__name__
     if isinstance(error, MemoryError):  # rosbags reads as many bytes as a damaged size says
         why = "a size in it is larger than the memory"
+    why = _QUOTED.sub(r"\1", why)
     way_out = ""
     if path.suffix.lower() == _ROS1_SUFFIX and "index" in why.lower():
         way_out = f"; if its recording was cut off, rosbag reindex {path.name} may mend it"
+    elif "end magic" in why:
+        files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        way_out = f"; if its recording was cut off, mcap recover {files[0].name} may mend it" if files else ""
     return ValueError(f"{path} is not a whole bag: {why}{way_out}")

@@ -147,9 +147,7 @@ def _pose_topic(
         msg = f"{path} has several topics with poses: say by pose_topic which one counts, of {', '.join(sorted(fitting))}"
         raise ValueError(msg)
     if not transforms:
-        msg = (
-            f"{path} has no poses (Odometry, PoseStamped, Path or TF): give them by poses, such as a TUM file"
-        )
+        msg = f"{path} has no poses (Odometry, PoseStamped, Path or TF): give a file of poses, such as TUM"
         raise ValueError(msg)
     return None
 

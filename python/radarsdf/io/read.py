@@ -182,7 +182,7 @@ def _files(
             request.notes.add(f"poses: of {poses}")
         if poses is None:
             what = files[0] if len(files) == 1 else folder
-            msg = f"{what} has no poses: give them by poses, as a file (TUM, KITTI, 4 x 4) or an array (F, 4, 4)"
+            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4)"
             raise ValueError(msg)
     if isinstance(poses, (str, PathLike)):
         places = dict.fromkeys((Path(poses).parent, *places))
