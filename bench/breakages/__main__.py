@@ -13,7 +13,7 @@ import radarsdf
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checking.doppler import velocity_of_poses
 
-from bench.breakages.ways import NEED_DOPPLER, WAYS, Data
+from bench.breakages.ways import NEED_DOPPLER, WAYS, Data, with_other_sign
 
 SCENES = (
     ("hugin", 120),
@@ -43,7 +43,7 @@ def simulated(name: str, frames: int, seed: int = 0) -> Data:
 
 
 def recorded(path: Path) -> Data:
-    """A file of scans; with the arrays doppler and times if it has them."""
+    """A file of scans; with the arrays doppler, negative for what comes nearer, and times if it has them."""
     with np.load(path) as file:
         frame, count = file["frame"], len(file["poses"])
 
@@ -53,7 +53,10 @@ def recorded(path: Path) -> Data:
 
         doppler = split("doppler") if "doppler" in file else None
         times_s = file.get("times")
-        return Data(split("points"), file["poses"].astype(np.float64), split("intensity"), doppler, times_s)
+        data = Data(split("points"), file["poses"].astype(np.float64), split("intensity"), doppler, times_s)
+    # Some sensors measure speeds with the other sign. Turned, it is a breakage for all.
+    turned = "doppler_sign" in [name for name, _ in found_in(data, cheap=False)]
+    return with_other_sign(data) if turned else data
 
 
 def main() -> None:

@@ -153,7 +153,7 @@ def _doppler_as_intensity(data: Data) -> Data:
     return data if data.doppler_mps is None else dataclasses.replace(data, intensities=data.doppler_mps)
 
 
-def _sign(data: Data) -> Data:
+def with_other_sign(data: Data) -> Data:
     return (
         data
         if data.doppler_mps is None
@@ -203,7 +203,7 @@ WAYS: dict[str, tuple[str, Way]] = {
     "intensity clipped": ("intensity_clipped", _clipped),
     "intensity is RCS + 128": ("intensity_offset", _intensities(lambda v: np.round(v - np.median(v)) + 128)),
     "Doppler as intensity": ("intensity_is_doppler", _doppler_as_intensity),
-    "Doppler with the other sign": ("doppler_sign", _sign),
+    "Doppler with the other sign": ("doppler_sign", with_other_sign),
     "sensor turned by 8 degrees": ("sensor_turned", _sensor_turned),
     "reflections below the ground": ("below_ground", _below_ground),
 }

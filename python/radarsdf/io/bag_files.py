@@ -153,7 +153,7 @@ def _damaged(path: Path, error: Exception) -> ValueError:
     why = str(error) or type(error).__name__
     if isinstance(error, MemoryError):  # rosbags reads as many bytes as a damaged size says
         why = "a size in it is larger than the memory"
-    why = _QUOTED.sub(r"\1", why)
+    why = _QUOTED.sub(r"\1", why).rstrip(".")
     way_out = ""
     if path.suffix.lower() == _ROS1_SUFFIX and "index" in why.lower():
         way_out = f"; if its recording was cut off, rosbag reindex {path.name} may mend it"
