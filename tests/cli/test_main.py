@@ -107,6 +107,7 @@ def test_success_is_status_0(monkeypatch, capsys):
         (FloatingPointError("the loss is nan"), 1, "the loss is nan"),
         (MemoryError("needs 80 GB"), 1, "needs 80 GB"),
         (MemoryError(), 1, "there is not enough memory"),
+        (MemoryError("Unable to allocate 4.04 MiB for an array"), 1, "there is not enough memory"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (radarsdf.Interrupted(), 130, "interrupted before the training"),
         (radarsdf.Diverged("the loss is inf"), 1, "the loss is inf"),

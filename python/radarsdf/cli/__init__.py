@@ -135,7 +135,8 @@ def _words_of(error: Exception) -> str:
         plain = error.strerror == os.strerror(error.errno)  # not yet said in better words
         reason = _REASONS.get(type(error), error.strerror) if plain else error.strerror
         return f"{error.filename}: {reason}" if error.filename is not None else reason
-    if isinstance(error, MemoryError) and not str(error):
+    # NumPy says which array it could not have; our own words are kept.
+    if isinstance(error, MemoryError) and (not str(error) or str(error).startswith("Unable to allocate")):
         return "there is not enough memory"
     return str(error) or type(error).__name__
 

@@ -121,6 +121,9 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
         msg = f"{path} cannot be read as a mesh: {error}"
         raise ValueError(msg) from error
     if isinstance(mesh, trimesh.Trimesh) and np.ndim(mesh.faces) == 2:
+        if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+            msg = f"{path} is damaged: a triangle has a corner that is none of its {len(mesh.vertices)} vertices"
+            raise ValueError(msg)
         if (origin := origin_of(file)) is not None:
             mesh.vertices = np.asarray(mesh.vertices, np.float64) + origin
         return mesh
