@@ -67,7 +67,7 @@ def test_eval_refuses_a_file_of_other_types(kind, tmp_path, capsys):
     trimesh.creation.box().export(tmp_path / "mesh.ply")
     np.save(tmp_path / "truth.npy", np.tile(WRONG[kind], (3, 1)))
     assert main(["eval", str(tmp_path / "mesh.ply"), str(tmp_path / "truth.npy")]) == 1
-    assert "must be real numbers" in capsys.readouterr().err
+    assert "not one row of numbers a point" in capsys.readouterr().err
 
 
 def test_a_picture_takes_real_viewpoints():

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.interrupts import whole_import
 from radarsdf.io.fields import COLUMNS, Fields
 from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.las import INTENSITY as RADAR_INTENSITY
@@ -188,7 +189,8 @@ def _is_comment(line: str) -> bool:
 
 
 def _ply(path: Path) -> Columns:
-    import trimesh  # noqa: PLC0415 - takes long, and few files need it
+    with whole_import():
+        import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
     with path.open("rb") as file:
         # Of an open file, and without materials: a PLY file may name an image, which is then not looked for.

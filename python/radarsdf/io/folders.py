@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from radarsdf.checks import check_poses
+from radarsdf.interrupts import whole_import
 from radarsdf.io.pcd import read_pcd
 from radarsdf.io.sequence import Scans
 from radarsdf.io.trajectory import MAX_GAP_S, Trajectory, read_table, read_trajectory
@@ -156,6 +156,9 @@ def lidar_map(folder: Path) -> NDArray[np.float64] | None:
 
 
 def _read_ply(path: Path) -> NDArray[np.float64]:
+    with whole_import():
+        import trimesh  # noqa: PLC0415 - takes long
+
     try:
         vertices = getattr(trimesh.load(path, process=False), "vertices", np.zeros((0, 3)))
         return np.asarray(vertices, np.float64)
