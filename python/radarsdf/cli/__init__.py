@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             say(end="")  # what help printed may still be on its way
         except OSError as error:
-            return _failed("", str(error), 1)
+            return _failed("", _words_of(error), 1)
         raise
     try:
         status: int | None = _module(options.command).run(options)
