@@ -124,7 +124,8 @@ class NetworksConfig:
     reflectance: Literal["network", "closed-form", "both"] = "network"
     """What answers for intensities: the intensity network, or a regression on range and incidence and means in
     cells of what that leaves, in closed form. Measured: the closed form has 3 to 12 % more error on simulated
-    scenes and 2 % less to 0.3 % more on real drives, in 0.03 to 0.1 s instead of seconds. "both":
+    scenes and 2 % less to 0.3 % more on real drives, in 0.03 to 0.1 s instead of seconds; but where scans are few
+    and far apart up to 40 % more. "both":
     the network, and in closed form what it leaves of the training returns. Measured: 0.3 % more to 2 % less error
     than the network on simulated scenes and 2 to 3 % less on real drives; the file is 1.4 to 2.5 times as
     large."""
@@ -341,14 +342,13 @@ class FitConfig:
     def quick(cls, **changes: Any) -> FitConfig:
         """Settings for a surface that is averaged over the rays instead of trained.
 
-        The fit takes a fraction of the time; the surface is rougher and the map larger. Intensities are in
-        closed form instead of trained. Mesh it with voxels
-        of the size of its leaf cells, since smaller ones show no more detail. `changes`: as for
-        :meth:`override`.
+        The fit takes a fraction of the time; the surface is rougher and the map larger. Mesh it with voxels of the
+        size of its leaf cells, since smaller ones show no more detail. Intensities still train a network, for
+        seconds, unless ``networks={"reflectance": "closed-form"}``. `changes`: as for :meth:`override`.
         """
         return cls(
             encoding=EncodingConfig(kind="octree", num_levels=1, fourier_count=0, bridge_cells=0),
-            networks=NetworksConfig(sdf_hidden=(2,), reflectance="closed-form"),
+            networks=NetworksConfig(sdf_hidden=(2,)),
             sampling=SamplingConfig(near_band_cells=2.0),
             training=TrainingConfig(start="average", sdf_iterations=0, joint=False),
         ).override(**changes)

@@ -355,7 +355,7 @@ def test_saving_overwrites_and_takes_strings(saved, tmp_path):
 @pytest.fixture(scope="module")
 def saved_closed_form(scene, tmp_path_factory):
     """A quick map with intensities, its file, and the file's parts."""
-    config = FitConfig.quick()
+    config = FitConfig.quick(networks={"reflectance": "closed-form"})
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
     path = tmp_path_factory.mktemp("map") / "quick.safetensors"
     radar_map.save(path)

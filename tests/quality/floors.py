@@ -140,7 +140,7 @@ MEASURED: dict[tuple[str, str], tuple[Quality, ...]] = {
 # - jitter: errors of the sensor's positions along each axis
 # - ghosts: no return is dropped as a ghost, and no piece of surface for its size or want of evidence
 # - untrained: 5 iterations of the surface, after which there is no mesh, and 1 of the intensities; the quick fit
-#   has no training: its line is of a network that was trained alone, before it had intensities in closed form
+#   trains its intensities alone
 #
 #                        limits               jitter 10 cm   jitter 30 cm   ghosts         untrained
 #                        F      out.   MAE    F      out.    F      out.    F      out.    F       out.    MAE
@@ -242,7 +242,7 @@ def with_ghosts(kind: str, scene: Scene) -> Quality:
 
 
 def untrained(kind: str, scene: Scene) -> Quality:
-    """With a training that ends almost at once. The quick fit has none."""
+    """With a training that ends almost at once. The quick fit trains its intensities alone."""
     config = config_of(kind, scene).override(
         training={"intensity_iterations": 1} | ({} if kind == "quick" else {"sdf_iterations": 5})
     )

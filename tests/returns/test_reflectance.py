@@ -104,7 +104,7 @@ def test_answers_are_numbers_everywhere(rays):
 
 def test_few_returns_have_no_planes_and_still_answer():
     points = [np.array([[5.0, 0, 0], [6.0, 1, 0]]), np.array([[7.0, 2, 0]])]
-    config = FitConfig.quick()
+    config = FitConfig.quick(networks={"reflectance": "closed-form"})
     radar_map = radarsdf.fit(
         points, np.stack([np.eye(4)] * 2), [[1.0, 2.0], [3.0]], config=config, progress=False
     )
