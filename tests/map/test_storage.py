@@ -34,8 +34,12 @@ def fitted(scene, *, with_intensity=True, **changes):
 @pytest.fixture(scope="module")
 def saved(scene, tmp_path_factory):
     """A map, its file, and the file's parts."""
-    radar_map = fitted(scene)
-    path = tmp_path_factory.mktemp("map") / "map.safetensors"
+    return saved_parts(fitted(scene), tmp_path_factory.mktemp("map"))
+
+
+def saved_parts(radar_map, folder):
+    """A map, its file in this folder, and the file's parts."""
+    path = folder / "map.safetensors"
     radar_map.save(path)
     with safe_open(path, framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
@@ -357,12 +361,7 @@ def saved_closed_form(scene, tmp_path_factory):
     """A quick map with intensities, its file, and the file's parts."""
     config = FitConfig.quick(networks={"reflectance": "closed-form"})
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
-    path = tmp_path_factory.mktemp("map") / "quick.safetensors"
-    radar_map.save(path)
-    with safe_open(path, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        metadata = file.metadata()
-    return radar_map, path, tensors, metadata
+    return saved_parts(radar_map, tmp_path_factory.mktemp("map"))
 
 
 def test_intensities_in_closed_form_are_kept(scene, saved_closed_form):

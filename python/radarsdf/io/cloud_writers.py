@@ -117,10 +117,7 @@ def _in_float32(rows: Rows, origin: NDArray[np.float64]) -> Rows:
 
 
 def _columns(scan: Scan, number: int) -> dict[str, NDArray[Any]]:
-    R, t = scan.T_world_sensor[:3, :3], scan.T_world_sensor[:3, 3]
-    columns: dict[str, NDArray[Any]] = dict(
-        zip("xyz", (scan.points.astype(np.float64) @ R.T + t).T, strict=True)
-    )
+    columns: dict[str, NDArray[Any]] = dict(zip("xyz", scan.world_points.T, strict=True))
     if scan.intensities is not None:
         columns["intensity"] = scan.intensities.astype(np.float32)
     if scan.doppler_mps is not None:

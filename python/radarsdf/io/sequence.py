@@ -37,6 +37,13 @@ class Scan:
         """Number of returns."""
         return len(self.points)
 
+    @property
+    def world_points(self) -> NDArray[np.float64]:
+        """(N, 3) float64, world frame, m."""
+        R, t = self.T_world_sensor[:3, :3], self.T_world_sensor[:3, 3]
+        world: NDArray[np.float64] = np.asarray(self.points, np.float64) @ R.T + t
+        return world
+
 
 class Notes:
     """Sentences on what was assumed or left out. Each is logged once, as a warning of the logger ``radarsdf.io``.

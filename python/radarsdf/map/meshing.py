@@ -121,7 +121,7 @@ def extract_mesh(
     faces = surface.faces[
         surface.kept(min_confidence, max_uncertainty, min_detection_rate, min_component_triangles)
     ]
-    kept, faces = _renumbered(len(surface.vertices), faces)
+    kept, faces = renumbered(len(surface.vertices), faces)
     mesh = trimesh.Trimesh(surface.vertices[kept] + contents.origin, faces, process=False)
     mesh.metadata |= {
         "leaf_cells": len(contents.evidence.looks),
@@ -174,7 +174,7 @@ def _check_box(box: ArrayLike) -> NDArray[np.float64]:
     return corners
 
 
-def _renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
     """Which vertices faces use, (V,) bool, and the faces (F, 3) as rows of these."""
     used = np.zeros(num_vertices, bool)
     used[faces] = True

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import cell_keys
 from radarsdf.checks import check_poses, number, real_array
-from radarsdf.io.sequence import Scans
+from radarsdf.io.sequence import Scan, Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.traced_surface import TracedSurface
@@ -67,10 +67,7 @@ class View:
     @property
     def world_points(self) -> _Floats:
         """(N, 3) returns, world, m."""
-        points: _Floats = (
-            self.points.astype(np.float64) @ self.T_world_sensor[:3, :3].T + self.T_world_sensor[:3, 3]
-        )
-        return points
+        return Scan(self.points, self.T_world_sensor).world_points
 
     @property
     def scans(self) -> Scans:

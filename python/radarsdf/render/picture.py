@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import io
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import real_array
 from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
+from radarsdf.render.figures import new_figure, png_of
 from radarsdf.render.raster import PIXELS_AT_ONCE, barycentric, contours, corner_normals, project, rasterise
 
 if TYPE_CHECKING:
@@ -135,20 +135,14 @@ def save_picture(
     OSError
         If the file cannot be written.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
-        from matplotlib.cm import ScalarMappable  # noqa: PLC0415
-        from matplotlib.colors import ListedColormap, Normalize  # noqa: PLC0415
-        from matplotlib.figure import Figure  # noqa: PLC0415
-    except ImportError as error:
-        msg = 'pictures need matplotlib: pip install "radarsdf[plot]"'
-        raise ImportError(msg) from error
     dpi = 100
-    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
     if scalar is None:
         image = render(mesh, width=width, height=height, viewpoint=viewpoint)
     else:
+        from matplotlib.cm import ScalarMappable  # noqa: PLC0415
+        from matplotlib.colors import ListedColormap, Normalize  # noqa: PLC0415
+
         values = real_array(scalar, "scalar")
         if values.shape != (len(mesh.vertices),):
             msg = f"scalar must be ({len(mesh.vertices)},), one value per vertex, not {values.shape}"
@@ -169,9 +163,7 @@ def save_picture(
         bar.ax.tick_params(labelsize=12)
         bar.outline.set_visible(False)
     figure.figimage(image, 0, 0)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=dpi)
-    write_whole(path, file.getvalue())
+    write_whole(path, png_of(figure, dpi=dpi))
 
 
 def eye_around(points: _Floats, turn_deg: float = 25.0, rise_deg: float = 36.0) -> _Floats:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from os import PathLike
 from typing import Any
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from radarsdf.io.files import write_whole
 from radarsdf.map.views import View
+from radarsdf.render.figures import new_figure, png_of
 
 _DPI = 100
 _ROW_INCHES, _COLUMN_INCHES = 3.6, 4.6
@@ -39,22 +39,15 @@ def save_view_picture(
     Raises
     ------
     ImportError
-        If matplotlib is not installed. It comes with the extra `demo`.
+        If matplotlib is not installed. It comes with the extra `plot`.
     OSError
         If the file cannot be written.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
-        from matplotlib.figure import Figure  # noqa: PLC0415
-    except ImportError as error:
-        msg = 'pictures need matplotlib: pip install "radarsdf[demo]"'
-        raise ImportError(msg) from error
     scans = list(measured) or [None] * len(views)
     columns = 3 if any(scan is not None for scan in scans) else 2
-    figure = Figure(
+    figure = new_figure(
         figsize=(_COLUMN_INCHES * columns, _ROW_INCHES * len(views)), dpi=_DPI, layout="constrained"
     )
-    FigureCanvasAgg(figure)
     rows = figure.subplots(len(views), columns, squeeze=False)
     for axes, view, scan in zip(rows, views, scans, strict=True):
         values = None if view.intensities is None else view.intensities
@@ -73,9 +66,7 @@ def save_view_picture(
         axes[-1].set(title="first surface", xlabel="azimuth, °", ylabel="elevation, °")
         axes[-1].invert_xaxis()  # as seen from the sensor: left is left
         figure.colorbar(image, ax=axes[-1], label="range, m")
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=_DPI)
-    write_whole(path, file.getvalue())
+    write_whole(path, png_of(figure, dpi=_DPI))
 
 
 def _scatter(

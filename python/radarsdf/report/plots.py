@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from radarsdf.render.figures import new_figure, png_of
 
 _Floats = NDArray[np.float64]
 
@@ -21,12 +22,9 @@ _SIZE_INCHES, _DPI = (4.4, 3.3), 180  # so that letters are legible when a phone
 
 def _axes(rows: int = 1) -> tuple[Any, Any]:
     """A figure, and its axes one above the other: an array of `rows`."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - an extra
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     width, height = _SIZE_INCHES
-    figure = Figure((width, height * (1 + 0.35 * (rows - 1))), _DPI, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    size = width, height * (1 + 0.35 * (rows - 1))
+    figure = new_figure(figsize=size, dpi=_DPI, layout="constrained", facecolor="white")
     shares = [2, 1][:rows]
     return figure, figure.subplots(rows, 1, sharex=True, squeeze=False, height_ratios=shares)[:, 0]
 
@@ -36,9 +34,7 @@ def _png(figure: Any) -> bytes:
         if ax.get_label() != "<colorbar>":
             ax.grid(alpha=0.3)
             ax.spines[["top", "right"]].set_visible(False)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": None})
-    return file.getvalue()
+    return png_of(figure, metadata={"Software": None})
 
 
 def losses(history: Mapping[str, Mapping[str, Sequence[float]]]) -> bytes:

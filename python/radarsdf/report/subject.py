@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from radarsdf.checking.finding import Finding
 from radarsdf.io.sequence import Scans
@@ -79,3 +80,8 @@ class Subject:
             low, high = np.asarray(self.box, np.float64)
             truth = truth[((truth >= low) & (truth <= high)).all(axis=1)]
         return truth if len(truth) else None
+
+    @cached_property
+    def truth_tree(self) -> Any:
+        """The lidar points, to be asked for the nearest. Only where there are some."""
+        return cKDTree(self.ground_truth)

@@ -63,11 +63,10 @@ def truth_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]:
             f"distances count as at most {m['truncation_m']:g} m",
         ),
     ]
-    distance_m = _distances(truth, np.asarray(mesh.vertices))
+    distance_m = _distances(subject.truth_tree, mesh.vertices)
     shown, _ = subject.shown
-    colors, legend = colored(
-        _distances(truth, np.asarray(shown.vertices)), "distance to the truth, m", (0.0, _TRUE_M)
-    )
+    shown_m = distance_m if shown is mesh else _distances(subject.truth_tree, shown.vertices)
+    colors, legend = colored(shown_m, "distance to the truth, m", (0.0, _TRUE_M))
     body = [
         table("", ("", "value", "meaning"), rows),
         grid(
@@ -81,7 +80,7 @@ def truth_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]:
                 plots.cumulative(
                     {
                         "surface to lidar": distance_m,
-                        "lidar to surface": _distances(np.asarray(mesh.vertices), truth),
+                        "lidar to surface": _distances(cKDTree(mesh.vertices), truth),
                     },
                     label="distance, m",
                     most=1.0,
@@ -143,17 +142,17 @@ def uncertainty_section(subject: Subject) -> Section:
         table("", ("", *(f"{rank} % are below" for rank in ranks)), rows),
     ]
     if (truth := subject.ground_truth) is not None:
-        figure, words = _reliability(mesh, truth, sigma_m)
+        figure, words = _reliability(mesh, truth, subject.truth_tree, sigma_m)
         figures += figure
         body.append(note(words))
     body.insert(2, grid(*figures))
     return Section(anchor, title, body)
 
 
-def _reliability(mesh: Any, truth: _Floats, sigma_m: _Floats) -> tuple[list[str], str]:
+def _reliability(mesh: Any, truth: _Floats, tree: Any, sigma_m: _Floats) -> tuple[list[str], str]:
     """A plot of the errors over the uncertainties, and what else they say."""
     vertices = np.asarray(mesh.vertices, np.float64)
-    distance_m, nearest = _tree(truth).query(vertices, workers=resolve_num_threads(0))
+    distance_m, nearest = tree.query(vertices, workers=resolve_num_threads(0))
     error_m = ((truth[nearest] - vertices) * np.asarray(mesh.vertex_normals)).sum(axis=1)
     error_m[distance_m > _TRUE_M] = np.nan
     if np.count_nonzero(np.isfinite(error_m) & np.isfinite(sigma_m)) < _LEAST_POINTS:
@@ -172,14 +171,10 @@ def _reliability(mesh: Any, truth: _Floats, sigma_m: _Floats) -> tuple[list[str]
     )
 
 
-def _distances(points: _Floats, queries: _Floats) -> _Floats:
-    """(N,) distance of each query (N, 3) to the nearest point, m."""
-    distance_m: _Floats = _tree(points).query(queries, workers=resolve_num_threads(0))[0]
+def _distances(tree: Any, queries: _Floats) -> _Floats:
+    """(N,) distance of each query (N, 3) to the nearest point of a tree, m."""
+    distance_m: _Floats = tree.query(queries, workers=resolve_num_threads(0))[0]
     return distance_m
-
-
-def _tree(points: _Floats) -> Any:
-    return cKDTree(points)
 
 
 def _percent(share: float) -> str:

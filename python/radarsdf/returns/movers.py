@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import real_array
+from radarsdf.checks import check_values_of_scans, real_array
 from radarsdf.config import FitConfig, ReturnsConfig
 from radarsdf.io.sequence import Scans
 from radarsdf.returns.doppler import MIN_RETURNS, sensor_velocities
@@ -105,13 +105,7 @@ class Standing:
 
 def _checked(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
     speeds = [real_array(values, f"doppler_mps of scan {i}") for i, values in enumerate(doppler_mps)]
-    if len(speeds) != len(scans):
-        msg = f"doppler_mps holds {len(speeds)} scans, points {len(scans)}"
-        raise ValueError(msg)
-    for i, (values, scan) in enumerate(zip(speeds, scans, strict=True)):
-        if values.shape != (len(scan),):
-            msg = f"doppler_mps of scan {i} must have shape ({len(scan)},), not {values.shape}"
-            raise ValueError(msg)
+    check_values_of_scans(speeds, scans, "doppler_mps")
     return speeds
 
 

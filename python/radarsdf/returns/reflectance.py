@@ -108,12 +108,10 @@ class Reflectance:
             0: as many as OpenMP uses. The result has the same bits with any number.
         """
         flat = np.flatnonzero(surfels.is_flat())
-        normals = surfels.normals[flat].astype(np.float32)
-        plane = np.full(len(surfels.cells.keys), -1, np.int32)
-        plane[surfels.cell_of_plane[flat]] = np.arange(len(flat), dtype=np.int32)
+        plane = surfels.flat_plane_of(surfels.cells.cell_of_ray)
         points = np.ascontiguousarray(rays.points)
         directions = np.ascontiguousarray(rays.directions)
-        incidence = _incidence(normals, plane[surfels.cells.cell_of_ray], directions)
+        incidence = _incidence(surfels.normals.astype(np.float32), plane, directions)
 
         some = slice(None, None, -(-len(rays) // _MOST_REGRESSED))
         design = _design(directions[some], rays.ranges_m[some], incidence[some])
@@ -125,7 +123,15 @@ class Reflectance:
         # The cells have means, and the error that counts is the absolute one, whose centre is the median.
         coefficients[0] += np.median(left[some] - explained[rows[some]])
         plane_keys = surfels.cells.keys[surfels.cell_of_plane[flat]]
-        return cls(leaf_size_m, coefficients, plane_keys, normals, keys, means, network_share)
+        return cls(
+            leaf_size_m,
+            coefficients,
+            plane_keys,
+            surfels.normals[flat].astype(np.float32),
+            keys,
+            means,
+            network_share,
+        )
 
     def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
         """The quantity (N,) at points (N, 3), local frame, m, seen along directions (N, 3), unit vectors."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import whole_number
+from radarsdf.map.meshing import renumbered
 
 if TYPE_CHECKING:
     from radarsdf.map.radar_map import RadarMap
@@ -85,11 +86,8 @@ class Surface:
 
     def part(self, kept: NDArray[np.bool_]) -> tuple[_Rows, NDArray[np.int32]]:
         """The triangles of which all vertices are kept: rows of their vertices (N,), and faces (M, 3) as rows of those."""
-        faces = self.faces[kept[self.faces].all(axis=1)]
-        used = np.zeros(len(kept), bool)
-        used[faces] = True
-        renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        return np.flatnonzero(used), renumbered[faces]
+        used, faces = renumbered(len(kept), self.faces[kept[self.faces].all(axis=1)])
+        return np.flatnonzero(used), faces
 
 
 def _brightness(normals: _Floats) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.sequence import Scans
+from radarsdf.io.sequence import Scan, Scans
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.radar_map import RadarMap
 
@@ -122,11 +122,7 @@ class Walk:
 
     def _in_world(self, index: int) -> NDArray[np.float64]:
         """(N, 3) returns, world, m."""
-        T_world_sensor = self._poses[index]
-        world: NDArray[np.float64] = (
-            np.asarray(self._points[index], np.float64) @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
-        )
-        return world
+        return Scan(self._points[index], self._poses[index]).world_points
 
     def _draw(self, what: str, world: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
         local = (world - self._map.origin).astype(np.float32)
