@@ -10,7 +10,9 @@ the walls.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,22 +48,28 @@ def street(count: int, size_m: float | None = None) -> Street:
 
     It is `size_m` long. The default is 200 m + 1 m for every 5,000 returns, which keeps their density almost constant.
     """
+    poses, points, intensities, truths = [], [], [], []
+    for pose, scan, intensity, *truth in street_scans(count, size_m):
+        poses.append(pose)
+        points.append(scan)
+        intensities.append(intensity)
+        truths.append(truth)
+    some = slice(-(-_NUM_HITS // len(poses)))
+    truths = [[part[some] for part in truth] for truth in truths]
+    hits, hit_intensities, hit_sensors = (np.concatenate(parts) for parts in zip(*truths, strict=True))
+    return Street(points, np.stack(poses), intensities, hits, hit_intensities, hit_sensors)
+
+
+def street_scans(count: int, size_m: float | None = None) -> Iterator[tuple[NDArray[Any], ...]]:
+    """The scans of :func:`street` one after another: pose, points, intensities, and the truth about the true returns."""
     size_m = 200 + count / 5000 if size_m is None else size_m
     rng = np.random.default_rng(0)
     frames = max(-(-count // _MAX_SCAN), round(size_m / _MAX_STEP_M), 2)
-    poses = np.tile(np.eye(4), (frames, 1, 1))
-    poses[:, 0, 3] = (np.arange(frames) + 0.5) / frames * size_m
-    poses[:, 2, 3] = _HEIGHT_M
-    points, intensities, truths = [], [], []
-    for frame, pose in enumerate(poses):
+    for frame in range(frames):
+        pose = np.eye(4)
+        pose[0, 3], pose[2, 3] = (frame + 0.5) / frames * size_m, _HEIGHT_M
         own = count * (frame + 1) // frames - count * frame // frames
-        scan, intensity, *truth = _scan(own, pose[:3, 3].astype(np.float32), np.float32(size_m), rng)
-        points.append(scan)
-        intensities.append(intensity)
-        some = slice(-(-_NUM_HITS // frames))
-        truths.append([part[some] for part in truth])
-    hits, hit_intensities, hit_sensors = (np.concatenate(parts) for parts in zip(*truths, strict=True))
-    return Street(points, poses, intensities, hits, hit_intensities, hit_sensors)
+        yield pose, *_scan(own, pose[:3, 3].astype(np.float32), np.float32(size_m), rng)
 
 
 def _scan(

@@ -65,18 +65,19 @@ def maps() -> list[bytes]:
 @functools.cache
 def training() -> Training:
     """The training of :func:`fit_of_checkpoints`, to which the files of :func:`checkpoints` belong."""
-    rays, config = fit_of_checkpoints()
+    rays, scale, config = fit_of_checkpoints()
     keys = near_leaf_keys(rays, config, 1)
     field = Field(keys, config, with_intensity=True, num_threads=1)
     field.initialise(torch.Generator().manual_seed(0))
-    return Training(field, rays, rays, IntensityScale.of(rays.intensities), config, Workers(1))
+    return Training(field, rays, rays, scale, config, Workers(1))
 
 
 @functools.cache
-def fit_of_checkpoints() -> tuple[Rays, FitConfig]:
-    """Rays and configuration of a small fit."""
+def fit_of_checkpoints() -> tuple[Rays, IntensityScale | None, FitConfig]:
+    """Rays, their intensities' scale and configuration of a small fit."""
     scans = _small_scans(True)
-    return prepare(scans.points, scans.poses, scans.intensities, **_CONFIG.returns.preparation), _CONFIG
+    rays = prepare(scans.points, scans.poses, scans.intensities, **_CONFIG.preparation)
+    return rays, IntensityScale.of(rays.intensities), _CONFIG
 
 
 @functools.cache

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-import radarsdf
+from radarsdf.map.radar_map import load
 
 from bench.paper.report import markdown
 
@@ -78,7 +78,7 @@ def kill_savers(folder: Path, kills: int) -> tuple[list[int], int]:
 
 def _content(path: Path) -> bytes:
     """All numbers of a map. The bytes of its file are not compared: safetensors writes metadata in random order."""
-    field = radarsdf.load(path).field
+    field = load(path).field
     numbers = [field.cells.table.leaf_keys(), *(tensor.numpy() for tensor in field.state_dict().values())]
     return b"".join(array.tobytes() for array in numbers)
 
@@ -100,7 +100,7 @@ def fill_disk(folder: Path) -> list[int]:
     """
     old, new = samples.maps()
     (folder / "new").write_bytes(new)
-    radar_map = radarsdf.load(folder / "new")
+    radar_map = load(folder / "new")
     disk, refused = folder / "disk", []
     disk.mkdir()
     target, page = disk / "map.safetensors", os.sysconf("SC_PAGESIZE")

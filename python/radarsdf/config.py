@@ -26,6 +26,7 @@ MAX_SAMPLES = 2**24  # samples in a batch, and samples for a return
 MAX_ITERATIONS = 2**31 - 1  # the core counts iterations in 32 bits
 _MAX_BRIDGE_CELLS = 8  # the time grows with the square, and longer bridges join separate surfaces
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
+BLOCK_CELLS = 32  # edge of a block, leaf cells: a multiple of that of the cubes in which looks are counted
 _MAX_WIDTH = 4096  # units of a layer: far more than a map of a scene can use
 
 _MAX_NOISE_M, _MAX_NOISE_RAD = 100, 1
@@ -77,12 +78,6 @@ class ReturnsConfig:
     """Whether each return is moved towards the surfel of its cell, a plane through the returns there, if there
     is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones;
     up to 1 % more error of intensities."""
-
-    @property
-    def preparation(self) -> dict[str, Any]:
-        """Keyword arguments of :func:`radarsdf.returns.rays.prepare`."""
-        names = ("min_range_m", "max_range_m", "accumulate_scans")
-        return {name: getattr(self, name) for name in names}
 
     def __post_init__(self) -> None:
         if self.max_range_m is not None and self.max_range_m <= self.min_range_m:
@@ -317,6 +312,17 @@ class FitConfig:
     def fourier_half_width_m(self) -> float:
         """`encoding.fourier_half_width_cells`, m."""
         return self._metres(self.encoding.fourier_half_width_cells)
+
+    @property
+    def block_m(self) -> float:
+        """Edge of a block, m: fits whose origins are multiples of it share all cells, from leaf cells to the coarsest."""
+        return self._metres(max(BLOCK_CELLS, 2 ** (self.encoding.num_levels - 1)))
+
+    @property
+    def preparation(self) -> dict[str, Any]:
+        """Keyword arguments of :func:`radarsdf.returns.rays.prepare`."""
+        names = ("min_range_m", "max_range_m", "accumulate_scans")
+        return {name: getattr(self.returns, name) for name in names} | {"block_m": self.block_m}
 
     @property
     def trains_intensity(self) -> bool:

@@ -62,7 +62,7 @@ def test_a_sample_tells_about_as_much(monkeypatch):
 
 def test_a_fit_beyond_the_budget_is_refused_before_anything_is_allocated(scene, monkeypatch):
     config = QUICK.override(max_memory_bytes=40_000_000)
-    monkeypatch.setattr("radarsdf.fitting.fit.SurfaceReturns.of", lambda *_: pytest.fail("began"))
+    monkeypatch.setattr("radarsdf.fitting.steps.SurfaceReturns.of", lambda *_: pytest.fail("began"))
     with pytest.raises(
         MemoryError, match=r"about 0\.\d\d GB for \d+ leaf cells and 9000 returns, of 0\.04: use larger"
     ):

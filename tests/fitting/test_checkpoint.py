@@ -243,7 +243,7 @@ class TestOtherFiles:
 
 
 def test_a_folder_that_does_not_exist_is_said_before_any_work(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("radarsdf.fitting.fit.SurfaceReturns.of", lambda *_: pytest.fail("began"))
+    monkeypatch.setattr("radarsdf.fitting.steps.SurfaceReturns.of", lambda *_: pytest.fail("began"))
     with pytest.raises(FileNotFoundError, match="no folder"):
         fitted(scene, tmp_path / "nowhere" / "state")
 

@@ -121,7 +121,9 @@ def test_the_mesh_from_vertices_is_that_of_the_field(hidden):
     )
     everywhere = [[-100.0] * 3, [100.0] * 3]  # a box: vertices are looked up one by one
     one, other = radar_map.mesh(0.2), radar_map.mesh(0.2, box=everywhere)
-    assert len(one.faces) == len(other.faces) > 1000
+    # A distance of nearly zero may have another sign there: a triangle more or less.
+    assert len(one.faces) == pytest.approx(len(other.faces), rel=1e-3)
+    assert len(one.faces) > 1000
     for a, b in ((one, other), (other, one)):
         off_m = cKDTree(a.vertices).query(b.vertices)[0]
         assert np.median(off_m) < 1e-4

@@ -103,7 +103,7 @@ def estimate(
     True
     """
     config = FitConfig() if config is None else config
-    rays = prepare(points, poses, intensities, **config.returns.preparation)
+    rays = prepare(points, poses, intensities, **config.preparation)
     check_extent(rays, config)
     return estimate_rays(rays, config)
 

@@ -57,7 +57,7 @@ def check_ground(recording: Recording) -> list[Finding]:
 def check_fit(recording: Recording, config: FitConfig) -> list[Finding]:
     """Tells the noise of the sensor, and what a fit will cost, or why it would refuse."""
     try:
-        rays = prepare(recording.points, recording.poses, recording.intensities, **config.returns.preparation)
+        rays = prepare(recording.points, recording.poses, recording.intensities, **config.preparation)
         check_extent(rays, config)
     except ValueError as error:
         return [

@@ -4,11 +4,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
+
+from radarsdf.checks import number
 
 
 @dataclass(frozen=True)
@@ -25,9 +28,20 @@ class IntensityScale:
         """The range of `intensities` (N,), sensor units. None if there are none."""
         return None if intensities is None else cls(float(intensities.min()), float(intensities.max()))
 
+    @classmethod
+    def between(cls, low: float, high: float) -> IntensityScale:
+        """A range that is given. Raises a ValueError unless it is finite and ascending."""
+        low, high = number(low, "intensity_range"), number(high, "intensity_range")
+        if not -math.inf < low < high < math.inf:
+            msg = f"the range of intensities must be finite and ascending, not {low} to {high}"
+            raise ValueError(msg)
+        return cls(low, high)
+
     def to_unit(self, intensities: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Intensities (N,) from sensor units to [0, 1]."""
-        return ((intensities - np.float32(self.low)) / np.float32(self.high - self.low)).astype(np.float32)
+        """Intensities (N,) from sensor units to [0, 1]. Those beyond the range are moved to its ends."""
+        unit = (intensities - np.float32(self.low)) / np.float32(self.high - self.low)
+        clipped: NDArray[np.float32] = np.clip(unit, 0, 1).astype(np.float32)
+        return clipped
 
     def to_sensor(self, unit: Tensor) -> Tensor:
         """Intensities (N,) from [0, 1] to sensor units."""

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.config import FitConfig
+from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.returns.rays import Rays
 
@@ -40,7 +41,9 @@ class Checkpoint:
         An existing file must be a checkpoint of the same fit. It is replaced only once the new one is
         complete.
     rays : Rays
-        All returns of the fit. The file holds a digest of them.
+        All returns of the fit. The file holds a digest of them, and of the `scale`.
+    scale : IntensityScale or None
+        Of their intensities.
     config : FitConfig
         Settings of the fit. The file holds a copy.
 
@@ -52,11 +55,13 @@ class Checkpoint:
         If the file cannot be read, or its folder does not exist.
     """
 
-    def __init__(self, path: str | PathLike[str], rays: Rays, config: FitConfig) -> None:
+    def __init__(
+        self, path: str | PathLike[str], rays: Rays, scale: IntensityScale | None, config: FitConfig
+    ) -> None:
         self._path = Path(path)
         settings = {k: v for k, v in config.to_dict().items() if k not in _SETTINGS_NOT_COMPARED}
         self._identity: dict[str, Any] = json.loads(
-            json.dumps({"version": _core.__version__, "scans": _digest(rays), "config": settings})
+            json.dumps({"version": _core.__version__, "scans": _digest(rays, scale), "config": settings})
         )
         self._next_s = time.monotonic() + _EVERY_S
         if self._path.exists():
@@ -161,9 +166,9 @@ def _flat(settings: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _digest(rays: Rays) -> str:
+def _digest(rays: Rays, scale: IntensityScale | None) -> str:
     """Digest of all arrays of the scans that the training uses."""
-    digest = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(repr(scale).encode(), digest_size=16)
     for array in (rays.origin, rays.points, rays.directions, rays.ranges_m, rays.intensities):
         digest.update(b"-" if array is None else array.data if array.flags.c_contiguous else array.tobytes())
     return digest.hexdigest()

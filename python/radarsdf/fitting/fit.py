@@ -1,45 +1,25 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From scans with poses to a map: the steps of a fit, in order."""
+"""From scans with poses to a map: what is given to a fit, checked and made into rays."""
 
 from __future__ import annotations
 
-import dataclasses
-import time
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from radarsdf.budget.estimate import check_fit
-from radarsdf.budget.extent import check_extent
 from radarsdf.config import FitConfig
-from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
-from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.skipped import Skipped, skipped_parts
-from radarsdf.fitting.start import STARTS
-from radarsdf.fitting.stopping import Diverged, Interrupted
-from radarsdf.fitting.surface import SurfaceReturns
-from radarsdf.fitting.training import Training
+from radarsdf.fitting.steps import Clock, FitInput, fit_rays
+from radarsdf.fitting.stopping import Interrupted
 from radarsdf.io.sequence import Scans
-from radarsdf.map import queries
-from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.gaps import bridged
 from radarsdf.returns.movers import Standing
-from radarsdf.returns.rays import Rays, prepare
-from radarsdf.returns.reflectance import Reflectance
+from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import Sensor
-from radarsdf.threads import Workers
-
-# Of rough scenes the network knows less than of smooth ones: its answer counts so much less there, and the closed form
-# the more. Measured on five real drives, which are rough, and on simulated scenes, which are not.
-_LESS_IN_ROUGH_SCENES = 0.5
 
 
 def fit(
@@ -51,6 +31,8 @@ def fit(
     config: FitConfig | None = None,
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
+    origin: ArrayLike | None = None,
+    intensity_range: tuple[float, float] | None = None,
 ) -> RadarMap:
     """Fits a signed distance field, and with intensities a reflectance map, to radar returns.
 
@@ -75,6 +57,12 @@ def fit(
         interrupted or done. If it exists, a fit of the same scans with the same configuration and number of
         threads goes on from it, and ends with the same bits as one without a stop. It is not removed when the
         fit is done.
+    origin : (3,) array_like, optional
+        Origin of the map's local frame, world, m. By default the sensors' mean position, moved to the next multiple of
+        ``config.block_m``: fits whose origins are such multiples share their cells.
+    intensity_range : (low, high), optional
+        Intensities that become 0 and 1 for the network, sensor units; those beyond are moved to its ends. By default the
+        lowest and the highest.
 
     Returns
     -------
@@ -87,7 +75,7 @@ def fit(
     ------
     ValueError
         If scans or poses are invalid (see :func:`radarsdf.returns.rays.prepare`), a return is too far away,
-        or the `checkpoint` is damaged or from another fit.
+        the range of intensities is not ascending, or the `checkpoint` is damaged or from another fit.
     MemoryError
         If the memory by :func:`radarsdf.estimate` exceeds ``config.max_memory_bytes``, or what the system has
         left.
@@ -107,84 +95,35 @@ def fit(
     True
     """
     config = FitConfig() if config is None else config
-    clock = _Clock()
-    radar_map = None
+    clock = Clock()
     try:
         points, poses, intensities, doppler_mps = _given(points, poses, intensities, doppler_mps)
         standing = Standing.of(points, intensities, doppler_mps, config.returns)
-        rays = prepare(standing.points, poses, standing.intensities, **config.returns.preparation)
-        check_extent(rays, config)
-        check_fit(rays, config)
-        saved = None if checkpoint is None else Checkpoint(checkpoint, rays, config)
-        clock.lap("prepare_s")
-        # A map that is made in inference mode could not give gradients later.
-        with torch.inference_mode(mode=False), Workers(config.num_threads) as workers:
-            surface = SurfaceReturns.of(rays, config, workers.num_threads)
-            clock.lap("ghosts_s")
-            start = STARTS[config.training.start](surface, config, workers.num_threads)
-            field = _open_cells(start.leaf_keys(), surface.rays, config, workers.num_threads)
-            clock.lap("occupied_cells_s")
-            start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
-            if not all(parameter.isfinite().all() for parameter in field.parameters()):
-                msg = "what the training starts from is not finite: training.sigma_cells may be too small"
-                raise Diverged(msg)
-            evidence = Evidence.of(
-                start.returns_of_cells(),
-                rays,
-                field.cells.table.leaf_keys(),
-                config.leaf_size_m,
-                workers.num_threads,
-            )
-            clock.lap("start_s")
-            scale = IntensityScale.of(rays.intensities)
-            training = Training(
-                field, surface.rays, rays, scale if config.trains_intensity else None, config, workers
-            )
-            if saved is not None:
-                saved.resume(training)
-            # The map is made before the training, which changes its field: Interrupted and Diverged can hand
-            # it over.
-            counts = {
-                "returns": sum(len(np.asarray(scan)) for scan in points),
-                "returns_used": len(surface.rays),
-                "ghosts": len(rays) - len(surface.rays),
-                "movers": standing.movers,
-                "noise": dataclasses.asdict(surface.noise),
-            }
-            contents = MapContents(
-                field=field,
-                origin=rays.origin,
-                intensity_scale=scale,
-                reflectance=None,
-                config=config,
-                evidence=evidence,
-                rough_share=surface.surfels.rough_share(),
-                sensor=Sensor.of(
-                    standing.points,
-                    standing.intensities,
-                    noise=surface.noise,
-                    min_range_m=config.returns.min_range_m,
-                    max_range_m=config.returns.max_range_m,
-                ),
-                report=counts | _report(config, field, training, counts, standing, workers.num_threads),
-            )
-            if not config.trains_intensity:
-                contents = _with_closed_form(contents, rays, surface, workers.num_threads)
-            radar_map = RadarMap(contents)
-            training.run(progress, saved)
-            if config.trains_intensity:
-                radar_map = RadarMap(_with_closed_form(contents, rays, surface, workers.num_threads))
+        rays = prepare(standing.points, poses, standing.intensities, origin=origin, **config.preparation)
+        scale = IntensityScale.of(rays.intensities)
+        if intensity_range is not None and scale is not None:
+            scale = IntensityScale.between(*intensity_range)
     except KeyboardInterrupt as interruption:
-        raise Interrupted(radar_map) from interruption
-    except Diverged as error:
-        error.radar_map = radar_map
-        raise
-    finally:
-        if radar_map is not None:
-            clock.lap("training_s")
-            radar_map.report.update(clock.laps, loss_history=training.history.to_report())
-            radar_map.field.requires_grad_(False)
-    return radar_map
+        raise Interrupted(None) from interruption
+
+    def sensor_of(noise: SensorNoise) -> Sensor:
+        return Sensor.of(
+            standing.points,
+            standing.intensities,
+            noise=noise,
+            min_range_m=config.returns.min_range_m,
+            max_range_m=config.returns.max_range_m,
+        )
+
+    given = FitInput(
+        rays=rays,
+        scale=scale,
+        sensor_of=sensor_of,
+        returns=sum(len(np.asarray(scan)) for scan in points),
+        movers=standing.movers,
+        why_no_movers=standing.why_none,
+    )
+    return fit_rays(given, config, progress=progress, checkpoint=checkpoint, clock=clock)
 
 
 def _given(
@@ -204,72 +143,3 @@ def _given(
         raise ValueError(msg)
     # Points and intensities may be generators.
     return list(points), poses, None if intensities is None else list(intensities), doppler_mps
-
-
-def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, num_threads: int) -> Field:
-    """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
-    leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
-    with_intensity = rays.intensities is not None and config.trains_intensity
-    return Field(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
-
-
-def _with_closed_form(
-    contents: MapContents, rays: Rays, surface: SurfaceReturns, num_threads: int
-) -> MapContents:
-    """The map with intensities, or with what its network leaves of them, in closed form, if they are wanted."""
-    scale, config = contents.intensity_scale, contents.config
-    if scale is None or rays.intensities is None or not config.closes_intensity:
-        return contents
-    share, unit = 0.0, scale.to_unit(rays.intensities)
-    if config.trains_intensity:
-        share = 1 - _LESS_IN_ROUGH_SCENES * queries.roughness(contents)
-        sensors = torch.from_numpy(rays.points - rays.directions * rays.ranges_m[:, None])
-        answers = queries.intensity(contents, torch.from_numpy(rays.points), sensors)
-        unit -= np.float32(share) * scale.to_unit(answers.numpy())
-    found = Reflectance.of(rays, unit, surface.surfels, config.leaf_size_m, num_threads, share)
-    return dataclasses.replace(contents, reflectance=found)
-
-
-def _report(
-    config: FitConfig,
-    field: Field,
-    training: Training,
-    counts: dict[str, Any],
-    standing: Standing,
-    threads: int,
-) -> dict[str, Any]:
-    """What the map's report says of cells and training. The training goes on to fill what counts it."""
-    skipped = skipped_parts(
-        config,
-        training.schedule,
-        returns=counts["returns_used"] + counts["ghosts"],
-        cells=len(field.cells.table.leaf_keys()),
-        rows=field.cells.table.num_rows,
-        with_intensity=field.intensity_network is not None,
-        threads=threads,
-        closed_form=standing.intensities is not None and not config.trains_intensity,
-    )
-    if standing.why_none is not None:
-        skipped.insert(0, Skipped(f"leaving out what moves: {standing.why_none}", None))
-    return {
-        "leaf_cells": len(field.cells.table.leaf_keys()),
-        "vertices": field.cells.table.num_rows,
-        "iterations": training.iterations,
-        "iterations_done": training.iterations_done,
-        "losses": training.losses,
-        "skipped": [part.words for part in skipped],
-        "skipped_s": [part.seconds for part in skipped],
-    }
-
-
-class _Clock:
-    """Wall-clock seconds of each step."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-        self.laps: dict[str, float] = {}
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = now - self._last
-        self._last = now

@@ -6,6 +6,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from radarsdf.config import FitConfig
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays
@@ -32,18 +35,22 @@ class SurfaceReturns:
     """Mean rays of the leaf cells, without ghosts. None if the training does not start from an average."""
 
     @classmethod
-    def of(cls, rays: Rays, config: FitConfig, num_threads: int) -> SurfaceReturns:
-        """Cleans `rays` as ``config.returns`` says."""
+    def of(
+        cls, rays: Rays, config: FitConfig, num_threads: int, inside: NDArray[np.bool_] | None = None
+    ) -> SurfaceReturns:
+        """Cleans `rays` as ``config.returns`` says, and keeps those that are `inside`, (N,). None: all."""
         averages = config.training.start == "average"
         # Without an sdf stage, only the average uses the surface, and it takes distances to surfels anyway.
         onto_planes = config.returns.onto_planes and config.training.sdf_iterations != 0
         means = MeanRays.of(rays, config.leaf_size_m, num_threads) if averages else None
         surfels = Surfels.of(rays, config.leaf_size_m, num_threads)
         noise = _noise(surfels, rays, means, config)
-        kept = None
+        kept = inside
         if config.returns.drop_ghosts:
-            kept = ~find_ghosts(surfels, rays, noise, means, num_threads)
-            means = None if means is None else means.select(kept[means.first])
+            true = ~find_ghosts(surfels, rays, noise, means, num_threads)
+            kept = true if inside is None else true & inside
+        if means is not None and kept is not None:
+            means = means.select(kept[means.first])
         if onto_planes:
             rays = onto_surfels(surfels, rays, noise)
         return cls(rays if kept is None else rays.select(kept), surfels, noise, means)

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import MAX_POSITION_M, not_negative, number, positive, real_array, whole_number
+from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
@@ -100,27 +101,16 @@ def extract_mesh(
     progress: bool | None,
 ) -> trimesh.Trimesh:
     """See :meth:`RadarMap.mesh`."""
-    if not 0 <= min_confidence <= 1:
-        msg = f"min_confidence must be in [0, 1], not {min_confidence}"
-        raise ValueError(msg)
-    min_detection_rate = not_negative(min_detection_rate, "min_detection_rate")
-    if max_uncertainty is None:
-        max_uncertainty = queries.max_uncertainty_m(contents)
-    max_uncertainty = number(max_uncertainty, "max_uncertainty")
-    if max_uncertainty < 0:
-        msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
-        raise ValueError(msg)
+    limits = check_limits(contents, min_confidence, max_uncertainty, min_detection_rate)
     whole_number(min_component_triangles, "min_component_triangles", 0)
     voxel_size = positive(voxel_size, "voxel_size")
     if voxel_size > MAX_POSITION_M:
         msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
         raise ValueError(msg)
-    sensor_position = None if viewpoint is None else _check_viewpoint(contents, viewpoint)
-    local_box = None if box is None else _check_box(box) - contents.origin
+    sensor_position = None if viewpoint is None else check_viewpoint(contents.intensity_scale, viewpoint)
+    local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)
-    faces = surface.faces[
-        surface.kept(min_confidence, max_uncertainty, min_detection_rate, min_component_triangles)
-    ]
+    faces = surface.faces[surface.kept(*limits, min_component_triangles)]
     kept, faces = renumbered(len(surface.vertices), faces)
     mesh = trimesh.Trimesh(surface.vertices[kept] + contents.origin, faces, process=False)
     mesh.metadata |= {
@@ -130,30 +120,43 @@ def extract_mesh(
     mesh.vertex_attributes["confidence"] = surface.confidence[kept]
     mesh.vertex_attributes["uncertainty_m"] = surface.uncertainty_m[kept]
     if sensor_position is not None:
-        _add_intensity(mesh, contents, sensor_position)
+        local = _local(contents, np.array(mesh.vertices, np.float64))
+        sensors = _local(contents, sensor_position[None]).expand(len(local), 3)
+        assert contents.intensity_scale is not None
+        add_intensity(mesh, queries.intensity(contents, local, sensors).numpy(), contents.intensity_scale)
     return mesh
+
+
+def check_limits(
+    contents: MapContents, min_confidence: float, max_uncertainty: float | None, min_detection_rate: float
+) -> tuple[float, float, float]:
+    """These arguments of :meth:`RadarMap.mesh` as numbers. Raises a ValueError if they are out of range."""
+    if not 0 <= min_confidence <= 1:
+        msg = f"min_confidence must be in [0, 1], not {min_confidence}"
+        raise ValueError(msg)
+    if max_uncertainty is None:
+        max_uncertainty = queries.max_uncertainty_m(contents)
+    max_uncertainty = number(max_uncertainty, "max_uncertainty")
+    if max_uncertainty < 0:
+        msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
+        raise ValueError(msg)
+    return float(min_confidence), max_uncertainty, not_negative(min_detection_rate, "min_detection_rate")
 
 
 def _local(contents: MapContents, world: NDArray[np.float64]) -> torch.Tensor:
     return queries.to_local(contents, torch.from_numpy(world))
 
 
-def _add_intensity(
-    mesh: trimesh.Trimesh, contents: MapContents, sensor_position: NDArray[np.float64]
-) -> None:
-    """Gives the vertices intensities predicted for `sensor_position`, (3,), world, m, and colours."""
-    vertices = np.array(mesh.vertices, np.float64)
-    sensors = np.broadcast_to(sensor_position, vertices.shape).copy()
-    intensity = queries.intensity(contents, _local(contents, vertices), _local(contents, sensors)).numpy()
+def add_intensity(mesh: trimesh.Trimesh, intensity: NDArray[np.float32], scale: IntensityScale) -> None:
+    """Gives the vertices of a mesh intensities (V,), sensor units, and colours."""
     mesh.vertex_attributes["intensity"] = intensity
-    scale = contents.intensity_scale
-    assert scale is not None
     colors = intensity_colors(intensity, scale.low, scale.high)
     mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
 
 
-def _check_viewpoint(contents: MapContents, viewpoint: ArrayLike) -> NDArray[np.float64]:
-    if contents.intensity_scale is None:
+def check_viewpoint(scale: IntensityScale | None, viewpoint: ArrayLike) -> NDArray[np.float64]:
+    """A sensor position (3,), world, m. Raises a ValueError if it is none, or there are no intensities."""
+    if scale is None:
         msg = "a viewpoint needs a map with intensities; this one was fitted without"
         raise ValueError(msg)
     sensor_position = real_array(viewpoint, "viewpoint")
@@ -163,7 +166,8 @@ def _check_viewpoint(contents: MapContents, viewpoint: ArrayLike) -> NDArray[np.
     return sensor_position
 
 
-def _check_box(box: ArrayLike) -> NDArray[np.float64]:
+def check_box(box: ArrayLike) -> NDArray[np.float64]:
+    """Lower and upper corner (2, 3), world, m. Raises a ValueError if they are none."""
     corners = real_array(box, "box")
     if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
         msg = "box must be a lower and an upper corner, (2, 3)"

@@ -10,16 +10,15 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import real_array
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
+from radarsdf.map.positions import as_positions
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.sensor import Sensor
 
@@ -372,32 +371,7 @@ class RadarMap:
 
         With `rows`, a single position (3,) is repeated so many times.
         """
-        is_tensor = isinstance(x, Tensor)
-        if is_tensor and (x.device.type != "cpu" or x.layout != torch.strided):
-            msg = f"positions must be a dense tensor on the CPU, not {x.layout} on {x.device}"
-            raise TypeError(msg)
-        # Read-only arrays are copied, because PyTorch warns of them.
-        world = (
-            x.detach()
-            if is_tensor
-            else torch.from_numpy(np.require(real_array(x, "positions"), requirements=["C", "W"]))
-        )
-        dtype = x.dtype if is_tensor else getattr(x, "dtype", None)
-        if rows is not None and world.shape == (3,):
-            world = world.expand(rows, 3)
-        if world.is_complex():
-            msg = "positions must be real numbers"
-            raise TypeError(msg)
-        if world.ndim != 2 or world.shape[1] != 3 or (rows is not None and len(world) != rows):
-            msg = f"positions must have shape (N, 3), not {tuple(world.shape)}"
-            raise ValueError(msg)
-
-        def answer(result: Tensor) -> Any:
-            if result.dtype != torch.bool:
-                keep_double = dtype in (torch.float64, np.dtype(np.float64), None)
-                result = result.double() if keep_double else result
-            return result if is_tensor else result.numpy()
-
+        world, answer = as_positions(x, rows)
         return queries.to_local(self._contents, world), answer
 
 

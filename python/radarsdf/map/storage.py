@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import math
 from os import PathLike
 from typing import Any
 
@@ -190,10 +189,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     scale = None
     if description["intensity_scale"] is not None:
         low, high = description["intensity_scale"]
-        scale = IntensityScale(float(low), float(high))
-        if not -math.inf < scale.low < scale.high < math.inf:
-            msg = f"the intensity scale must be finite and ascending, not {low} to {high}"
-            raise ValueError(msg)
+        scale = IntensityScale.between(low, high)
     rough_share = float(description["rough_share"])
     if not 0 <= rough_share <= 1:
         msg = f"rough_share must be in [0, 1], not {rough_share}"

@@ -137,6 +137,12 @@ def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return lengths
 
 
+def middle_scan(scan: int, scans: int, accumulate_scans: int) -> int:
+    """The scan from whose position the returns of a `scan` count as seen, of so many `scans`."""
+    first = scan - scan % accumulate_scans
+    return (first + min(first + accumulate_scans, scans) - 1) // 2
+
+
 def _kept(scan: NDArray[np.float64], min_range_m: float, max_range_m: float | None) -> NDArray[np.bool_]:
     """Mask (N,) of the returns of a scan (N, 3) within the ranges."""
     ranges = _lengths(scan)
@@ -153,6 +159,8 @@ def prepare(
     max_range_m: float | None = None,
     accumulate_scans: int = 1,
     origin: ArrayLike | None = None,
+    block_m: float | None = None,
+    whole: bool = True,
 ) -> Rays:
     """Checks scans and turns them into rays in the local frame.
 
@@ -170,6 +178,11 @@ def prepare(
         So many consecutive scans are treated as seen from the position of the middle one.
     origin : array_like, optional
         (3,) origin of the local frame, world, m. By default the mean sensor position.
+    block_m : float, optional
+        That default is moved to the next multiple of this, m, so that different scans share the lattice of their cells.
+    whole : bool
+        False: these are a part of the scans. None of their returns need be within the ranges, and all of their
+        intensities may be equal.
 
     Returns
     -------
@@ -186,48 +199,70 @@ def prepare(
     scans, values = check_scans(points, intensities)
     T_world_sensor = check_poses(poses, len(scans))
     positions = T_world_sensor[:, :3, 3]
-    local_origin = (
-        positions.mean(axis=0)
-        if origin is None
-        else check_positions(real_array(origin, "origin")[None], "origin")[0]
-    )
+    if origin is not None:
+        local_origin = check_positions(real_array(origin, "origin")[None], "origin")[0]
+    else:
+        local_origin = positions.mean(axis=0)
+        if block_m is not None:
+            local_origin = block_m * np.round(local_origin / block_m)
     min_range_m = number(min_range_m, "min_range_m")
     max_range_m = None if max_range_m is None else number(max_range_m, "max_range_m")
     whole_number(accumulate_scans, "accumulate_scans", 1)
 
     kept_points, kept_origins, kept_values, counts = [], [], [], []
     for i, scan in enumerate(scans):
-        first = i - i % accumulate_scans
-        middle = (first + min(first + accumulate_scans, len(scans)) - 1) // 2
+        seen_from = positions[middle_scan(i, len(scans), accumulate_scans)]
         keep = _kept(scan, min_range_m, max_range_m)
         kept = scan if keep.all() else scan[keep]
         local = kept @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
         kept_points.append(local)
         counts.append(len(local))
-        kept_origins.append(np.broadcast_to(positions[middle] - local_origin, local.shape))
+        kept_origins.append(np.broadcast_to(seen_from - local_origin, local.shape))
         if values is not None:
             kept_values.append(values[i][keep])
     local_points = np.concatenate(kept_points)
-    if len(local_points) == 0:
+    if len(local_points) == 0 and whole:
         msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
         raise ValueError(msg)
-    rays = local_points - np.concatenate(kept_origins)
-    ranges = np.maximum(_lengths(rays), 1e-6)
     intensity = np.concatenate(kept_values) if values is not None else None
-    if intensity is not None and intensity.min() == intensity.max():
+    if intensity is not None and whole and intensity.min() == intensity.max():
         msg = f"all intensities are {intensity[0]}: leave them out if the sensor does not measure them"
         raise ValueError(msg)
-    if intensity is not None and float(intensity.max()) - float(intensity.min()) > float(
-        np.finfo(np.float32).max
+    if (
+        intensity is not None
+        and len(intensity)
+        and float(intensity.max()) - float(intensity.min()) > float(np.finfo(np.float32).max)
     ):
         msg = f"intensities from {intensity.min()} to {intensity.max()} are too far apart for float32"
         raise ValueError(msg)
-    return Rays(
+    return rays_from(
+        local_points,
+        np.concatenate(kept_origins),
         origin=local_origin,
-        points=local_points.astype(np.float32),
-        directions=(rays / ranges[:, None]).astype(np.float32),
-        ranges_m=ranges.astype(np.float32),
         intensities=intensity,
         scans=np.repeat(np.arange(len(scans), dtype=np.int32), counts),
         up_of_scan=T_world_sensor[:, :3, 2].copy(),
+    )
+
+
+def rays_from(
+    points: NDArray[Any],
+    sensors: NDArray[np.float64],
+    *,
+    origin: NDArray[np.float64],
+    intensities: NDArray[np.float32] | None,
+    scans: NDArray[np.int32],
+    up_of_scan: NDArray[np.float64],
+) -> Rays:
+    """Rays from `sensors` to `points`, (N, 3) each, local frame, m. The rest is as of :class:`Rays`."""
+    rays = points - sensors
+    ranges = np.maximum(_lengths(rays), 1e-6)
+    return Rays(
+        origin=origin,
+        points=points.astype(np.float32, copy=False),
+        directions=(rays / ranges[:, None]).astype(np.float32),
+        ranges_m=ranges.astype(np.float32),
+        intensities=intensities,
+        scans=scans,
+        up_of_scan=up_of_scan,
     )

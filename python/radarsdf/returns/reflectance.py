@@ -91,6 +91,7 @@ class Reflectance:
         leaf_size_m: float,
         num_threads: int = 0,
         network_share: float = 0.0,
+        cell_of_ray: NDArray[np.int32] | None = None,
     ) -> Reflectance:
         """The reflectance of `rays`.
 
@@ -101,14 +102,16 @@ class Reflectance:
         unit : (N,) float32
             Their intensities, scaled to [0, 1]; less `network_share` times what the network answers.
         surfels : Surfels
-            Surfels of the same returns.
+            Surfels of the same returns, or of more.
         leaf_size_m : float
             Edge of a leaf cell, m.
         num_threads : int
             0: as many as OpenMP uses. The result has the same bits with any number.
+        cell_of_ray : (N,) int32, optional
+            Row of each return's cell in those of `surfels`. Default: `surfels` are of the same returns.
         """
         flat = np.flatnonzero(surfels.is_flat())
-        plane = surfels.flat_plane_of(surfels.cells.cell_of_ray)
+        plane = surfels.flat_plane_of(surfels.cells.cell_of_ray if cell_of_ray is None else cell_of_ray)
         points = np.ascontiguousarray(rays.points)
         directions = np.ascontiguousarray(rays.directions)
         incidence = _incidence(surfels.normals.astype(np.float32), plane, directions)
