@@ -26,6 +26,7 @@ ROOMS = (
     ("checking",),
     ("map",),
     ("fitting",),
+    ("tiles",),
     ("render",),
     ("view",),
     ("evaluation", "simulate"),

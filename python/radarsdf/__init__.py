@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from radarsdf.fitting.fit import fit
     from radarsdf.fitting.stopping import Diverged, Interrupted
     from radarsdf.map.isosurface import marching_cubes
-    from radarsdf.map.radar_map import RadarMap, load
+    from radarsdf.map.radar_map import RadarMap
+    from radarsdf.tiles.fit_tiles import fit_tiles, load
+    from radarsdf.tiles.tiled_map import TiledMap
 
 __all__ = [
     "Diverged",
@@ -27,10 +29,12 @@ __all__ = [
     "FitConfig",
     "Interrupted",
     "RadarMap",
+    "TiledMap",
     "check",
     "estimate",
     "evaluation",
     "fit",
+    "fit_tiles",
     "io",
     "load",
     "marching_cubes",
@@ -48,6 +52,7 @@ _PACKAGES = (
     "render",
     "returns",
     "simulate",
+    "tiles",
 )
 _MODULES = {
     "Diverged": "radarsdf.fitting.stopping",
@@ -58,8 +63,10 @@ _MODULES = {
     "RadarMap": "radarsdf.map.radar_map",
     "check": "radarsdf.checking.check",
     "estimate": "radarsdf.budget.estimate",
+    "TiledMap": "radarsdf.tiles.tiled_map",
     "fit": "radarsdf.fitting.fit",
-    "load": "radarsdf.map.radar_map",
+    "fit_tiles": "radarsdf.tiles.fit_tiles",
+    "load": "radarsdf.tiles.fit_tiles",
     "marching_cubes": "radarsdf.map.isosurface",
 } | {name: f"radarsdf.{name}" for name in _PACKAGES}
 """The module of each name that is imported when it is first used."""

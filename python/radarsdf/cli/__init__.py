@@ -23,6 +23,7 @@ COMMANDS = {
     "demo": "simulate a drive, fit it, write scans, map, mesh and picture, print the errors",
     "check": "say what is wrong with scans and poses, before a fit",
     "fit": "fit a map to scans",
+    "tiles": "fit a map that does not fit into memory, in tiles, here or on a cluster",
     "mesh": "extract the surface of a map as a triangle mesh",
     "view": "show a map in the browser, with a sensor that can be dragged",
     "render": "predict the scan that the radar would get from other poses",

@@ -45,15 +45,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the errors of the surface, the intensities, or both."""
-    import radarsdf
     from radarsdf.cli.held_out import add_intensity_errors
     from radarsdf.evaluation import format_metrics, holdout, surface_metrics
     from radarsdf.io.files import check_regular_file
     from radarsdf.io.ground_truth import read_ground_truth
     from radarsdf.io.meshes import read_mesh
+    from radarsdf.map.radar_map import load
 
     check_regular_file(options.what)
-    radar_map = radarsdf.load(options.what) if options.what.suffix == MAP_SUFFIX else None
+    radar_map = load(options.what) if options.what.suffix == MAP_SUFFIX else None
     scans = _scans(options)
     if options.holdout is not None and (radar_map is None or scans is None):
         msg = "--holdout needs a map and scans"

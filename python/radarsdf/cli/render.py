@@ -53,10 +53,10 @@ def run(options: argparse.Namespace) -> None:
     """Predict the scans, and write them."""
     import numpy as np
 
-    import radarsdf
     from radarsdf.io.cloud_writers import write_cloud
     from radarsdf.io.files import check_outputs
     from radarsdf.io.scans import write_scans
+    from radarsdf.map.radar_map import load
     from radarsdf.map.views import scans_of
     from radarsdf.render.view_picture import save_view_picture
 
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
         msg = f"a picture holds at most {_MAX_PICTURES} poses, not {len(poses)}: write .npz"
         raise ValueError(msg)
     check_outputs([options.out], [options.map])
-    radar_map = radarsdf.load(options.map)
+    radar_map = load(options.map)
     rng = np.random.default_rng(options.seed)
     views = [radar_map.render(pose, returns=options.returns, noise=options.noise, seed=rng) for pose in poses]
     seen = [view for view in views if len(view)]

@@ -43,14 +43,14 @@ def run(options: argparse.Namespace) -> None:
         msg = "--holdout needs the scans"
         raise ValueError(msg)
 
-    import radarsdf
     from radarsdf.cli.check import findings_of
     from radarsdf.evaluation import holdout
     from radarsdf.io.files import check_outputs
+    from radarsdf.map.radar_map import load
     from radarsdf.report.subject import Subject
 
     check_outputs([options.out], [options.map, *inputs_of(options)])
-    radar_map = radarsdf.load(options.map)
+    radar_map = load(options.map)
     scans = findings = held_out = None
     if options.scans is not None:
         scans = scans_of(options)

@@ -33,6 +33,11 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         help="their poses, where the scans have none: a file in TUM or KITTI format, or of 4 x 4 matrices",
     )
+    add_scan_options(parser)
+
+
+def add_scan_options(parser: argparse.ArgumentParser) -> None:
+    """Add all of them but the scans and the poses."""
     parser.add_argument(
         "--extrinsic",
         type=Path,

@@ -49,10 +49,10 @@ def run(options: argparse.Namespace) -> None:
     require_viser()
     free_port(options.host, options.port or 0, exactly=True)
 
-    import radarsdf
+    from radarsdf.map.radar_map import load
     from radarsdf.view.viewer import Viewer
 
-    radar_map = radarsdf.load(options.map)
+    radar_map = load(options.map)
     scans = None if options.scans is None else scans_of(options)
     with Viewer(
         radar_map,

@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Time and memory of `fit_tiles` over the returns of a street, each in a new process; workers are processes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+_RETURNS = ("1000000", "3000000", "10000000", "30000000", "100000000")
+_WORKERS = 2
+
+
+def rows(counts: list[str], quick: bool) -> Iterator[dict[str, Any]]:
+    """A row for each number of returns."""
+    for count in counts or (["100000"] if quick else _RETURNS):
+        words = [sys.executable, "-m", "bench.tiles.growth", str(int(float(count)))]
+        done = subprocess.run(words, check=True, capture_output=True, text=True)
+        yield json.loads(done.stdout.splitlines()[-1])
+
+
+def _measure(count: int) -> dict[str, Any]:
+    """Plans, fits and exports a street. Memory is what the kernel says that a process held at most."""
+    import multiprocessing
+    import resource
+    from concurrent.futures import ProcessPoolExecutor
+
+    from radarsdf import FitConfig
+    from radarsdf.io import Scan
+    from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
+
+    from bench.growth.street import street_scans
+
+    def scans() -> Iterator[Scan]:
+        for pose, points, intensities, *_ in street_scans(count):
+            yield Scan(points, pose, intensities)
+
+    laps = [time.perf_counter()]
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "city"
+        plan = plan_tiles((scan for scan in _geometry(scans())), out, config=FitConfig.quick(num_threads=1))
+        laps.append(time.perf_counter())
+        own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        with ProcessPoolExecutor(_WORKERS, multiprocessing.get_context("spawn")) as executor:
+            city = run_fits(out, executor=executor, progress=False)
+            laps.append(time.perf_counter())
+            vertices, triangles = city.export(out / "mesh.ply", 0.2, executor=executor, progress=False)
+            laps.append(time.perf_counter())
+        workers_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
+        disk_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
+    plan_s, fit_s, mesh_s = (after - before for before, after in zip(laps, laps[1:], strict=False))
+    return {
+        "returns": count,
+        "tiles": len(city.tiles),
+        "plan, s": round(plan_s, 1),
+        "fit, s": round(fit_s, 1),
+        "mesh, s": round(mesh_s, 1),
+        "all, µs a return": round(1e6 * (laps[-1] - laps[0]) / count, 2),
+        "plan, MB": round(own_mb),
+        "worker, MB": round(workers_mb),
+        "disk, MB": round(disk_mb),
+        "rays a return": round(sum(tile.rays for tile in plan.tiles) / count, 2),
+        "triangles": triangles,
+    }
+
+
+def _geometry(scans: Any) -> Any:
+    """Without intensities, which a quick fit would train a network for."""
+    import dataclasses
+
+    for scan in scans:
+        yield dataclasses.replace(scan, intensities=None)
+
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Seconds and memory over the returns."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    counts = [row["returns"] for row in rows]
+    for name in ("plan, s", "fit, s", "mesh, s"):
+        left.loglog(counts, [row[name] for row in rows], "o-", label=name)
+    for name in ("plan, MB", "worker, MB"):
+        right.semilogx(counts, [row[name] for row in rows], "o-", label=name)
+    right.set_ylim(0)
+    for axes in (left, right):
+        axes.set_xlabel("returns")
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    print(json.dumps(_measure(int(sys.argv[1]))))

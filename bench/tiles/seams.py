@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A map in tiles beside one fit: F-score, steps across borders, distance from the single fit's surface, open edges."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import radarsdf
+from numpy.typing import NDArray
+from radarsdf import FitConfig, TiledMap, evaluation
+from radarsdf.io import Scans
+
+from bench.growth.street import street
+from bench.paper.scenes import load_scene
+
+# Edges of the tiles: small, so that there are many borders; the default on the long street.
+_TILE_M = {"hugin": 32.0, "oculii": 51.2, "street": None}
+_RETURNS = 10_000_000
+_SIDE_M = 1e-3  # either side of a border at which answers are compared
+_NEAR_M = 1.0  # what counts as near a border
+
+_Floats = NDArray[np.float64]
+
+
+def rows(names: list[str], quick: bool) -> Iterator[dict[str, Any]]:
+    """A row for each scene."""
+    for name in names or _TILE_M:
+        scans, config = _scene(name, quick)
+        with tempfile.TemporaryDirectory() as folder:
+            yield _row(name, scans, config, Path(folder) / "city", quick)
+
+
+def _scene(name: str, quick: bool) -> tuple[Scans, FitConfig]:
+    config = FitConfig.quick() if quick else FitConfig()
+    if name == "street":
+        made = street(100_000 if quick else _RETURNS)
+        return Scans(made.points, made.poses, made.intensities, made.hits), config
+    scene = load_scene(name)
+    limits = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
+    return Scans(scene.points, scene.poses, scene.intensities, scene.ground_truth), config.override(
+        returns=limits
+    )
+
+
+def _row(name: str, scans: Scans, config: FitConfig, folder: Path, quick: bool) -> dict[str, Any]:
+    voxel_m = 0.2 if quick or name == "street" else 0.1
+    city = radarsdf.fit_tiles(scans, folder, tile_size=_TILE_M[name], config=config, progress=False)
+    scale = city.intensity_scale
+    assert scale is not None
+    one = radarsdf.fit(scans, config=config, intensity_range=(scale.low, scale.high), progress=False)
+    meshes = [map_.mesh(voxel_m, progress=False) for map_ in (one, city)]
+    truth = scans.ground_truth
+    scores = [evaluation.surface_metrics(mesh, truth, samples=500_000) for mesh in meshes]
+    vertices = np.array(meshes[1].vertices)
+    way_m, axis = _to_border(city, vertices)
+    near = way_m < _NEAR_M
+    distance_m = np.abs(one.sdf(vertices))
+    steps = _steps(city, vertices, axis)
+    row: dict[str, Any] = {
+        "scene": name,
+        "tiles": len(city.tiles),
+        "F of one fit": f"{100 * scores[0]['f_score_all']:.2f}",
+        "F of tiles": f"{100 * scores[1]['f_score_all']:.2f}",
+    }
+    for what, (border, elsewhere) in steps.items():
+        row[f"step of {what}, border"] = f"{border:.2g}"
+        row["elsewhere" if what == "sdf, m" else "elsewhere "] = f"{elsewhere:.2g}"
+    row["from one fit, border, median, 95 %, m"] = _two(distance_m[near])
+    row["elsewhere  "] = _two(distance_m[~near])
+    border, inside = _open_edges(city, meshes[1])
+    row["open edges, border"] = f"{border:.2%}"
+    row["elsewhere   "] = f"{inside:.2%}"
+    return row
+
+
+def _two(values: _Floats) -> str:
+    return ", ".join(f"{value:.3f}" for value in np.quantile(values, [0.5, 0.95]))
+
+
+def _to_border(city: TiledMap, points: _Floats) -> tuple[_Floats, NDArray[np.int64]]:
+    """Distance (N,) to the next border between tiles, m, and the axis (N,) across it."""
+    ways = np.abs(points[:, :2] - np.round(points[:, :2] / city.plan.tile_m) * city.plan.tile_m)
+    return ways.min(axis=1), ways.argmin(axis=1)
+
+
+def _steps(city: TiledMap, vertices: _Floats, axis: NDArray[np.int64]) -> dict[str, tuple[float, float]]:
+    """The 99 % quantile of the steps of answers across borders, and across planes in the middle of tiles."""
+    rng = np.random.default_rng(0)
+    tile_m = city.plan.tile_m
+    found: dict[str, list[float]] = {"sdf, m": [], "intensity, dB": []}
+    for shift_m in (0.0, tile_m / 2):
+        way_m = vertices[:, :2] - shift_m
+        way_m -= np.round(way_m / tile_m) * tile_m
+        across = np.abs(way_m).argmin(axis=1)
+        near = np.flatnonzero(np.abs(way_m).min(axis=1) < _NEAR_M)
+        near = rng.permutation(near)[:20_000]
+        points = vertices[near]
+        points[np.arange(len(points)), across[near]] -= way_m[near, across[near]]
+        side = np.zeros_like(points)
+        side[np.arange(len(points)), across[near]] = _SIDE_M
+        seen = city.observed(points - side) & city.observed(points + side)
+        points, side = points[seen], side[seen]
+        sensor = np.array(city.plan.by_tile[city.tiles[0].tile].origin_blocks) * city.config.block_m
+        for what, answer in (
+            ("sdf, m", city.sdf),
+            ("intensity, dB", lambda x: city.intensity(x, sensor)),  # noqa: B023 - used at once
+        ):
+            found[what].append(
+                float(np.quantile(np.abs(answer(points + side) - answer(points - side)), 0.99))
+            )
+    del axis
+    return {what: (border, elsewhere) for what, (border, elsewhere) in found.items()}
+
+
+def _open_edges(city: TiledMap, mesh: Any) -> tuple[float, float]:
+    """Share of the edges with one triangle: of those on borders, and of those on planes in the middle of tiles."""
+    edges, counts = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+    shares = []
+    for shift in (0.0, 0.5):
+        places = np.asarray(mesh.vertices)[edges][:, :, :2] / city.plan.tile_m + shift
+        on = (np.abs(places - np.round(places)) < 1e-9).all(axis=1).any(axis=1)
+        shares.append(float((counts[on] == 1).mean()) if on.any() else float("nan"))
+    return shares[0], shares[1]

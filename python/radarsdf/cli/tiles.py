@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``radarsdf tiles``: maps that do not fit into memory, in one go or step by step."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from radarsdf.cli.options import add_fit_options, add_json, add_voxel, config_of, progress_of
+from radarsdf.cli.results import Results
+from radarsdf.cli.saying import complain
+from radarsdf.cli.scans_in import SCANS, add_scan_options, scans_of
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from radarsdf.tiles.plan import Plan
+
+STEPS = ("plan", "fit", "mesh", "status")
+_FIRST_SCANS = 100  # that are checked before the work
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument(
+        "words",
+        nargs="+",
+        metavar="[STEP] PATH",
+        help=f"SCANS [POSES]: {SCANS}, and their poses; all steps are done. Or one step: plan SCANS [POSES], fit FOLDER, "
+        "mesh FOLDER, status FOLDER",
+    )
+    parser.add_argument("-o", "--out", type=Path, help="the folder to write; of mesh: the .ply file")
+    parser.add_argument(
+        "--tile-size", type=float, metavar="M", help="edge of a tile, m; default: 512 leaf cells"
+    )
+    parser.add_argument("--halo", type=float, metavar="M", help="what a tile knows beyond its edges, m")
+    parser.add_argument(
+        "--tile", action="append", metavar="NAME", help="of fit: only this tile; may be repeated"
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--processes", type=int, metavar="N", help="so many tiles at a time")
+    where.add_argument(
+        "--cluster", metavar="ADDRESS", help="the scheduler of dask.distributed, such as tcp://host:8786"
+    )
+    parser.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
+    parser.add_argument("--no-check", action="store_true", help="do not check the first scans")
+    add_voxel(parser)
+    add_scan_options(parser)
+    add_fit_options(parser)
+    add_json(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Do one step, or all."""
+    step, paths = None, list(options.words)
+    if paths[0] in STEPS:
+        step = paths.pop(0)
+    if step in (None, "plan"):
+        if options.out is None or not 1 <= len(paths) <= 2:
+            msg = "give SCANS, POSES if the scans have none, and -o FOLDER"
+            raise ValueError(msg)
+        options.scans, options.poses = Path(paths[0]), Path(paths[1]) if len(paths) == 2 else None
+        folder = options.out
+    else:
+        if len(paths) != 1:
+            msg = f"{step} takes one folder that radarsdf tiles plan wrote"
+            raise ValueError(msg)
+        folder = Path(paths[0])
+    results = Results(options)
+    if step in (None, "plan"):
+        _say_plan(results, _plan(options), folder)
+    if step in (None, "fit"):
+        _fit(options, results, folder)
+    if step in (None, "mesh"):
+        _mesh(options, results, folder, None if step is None else options.out)
+    status = _status(results, folder, options.tile) if step in (None, "fit", "status") else 0
+    results.end()
+    return status
+
+
+def _plan(options: argparse.Namespace) -> Plan:
+    from radarsdf.tiles.fit_tiles import plan_tiles
+
+    scans = scans_of(options)
+    if not options.no_check:
+        _check_first(scans)
+    given: Any = (_without_intensities(scan) for scan in scans) if options.geometry_only else scans
+    alone = options.processes is None and options.cluster is None
+    return plan_tiles(
+        given,
+        options.out,
+        tile_size=options.tile_size,
+        halo=options.halo,
+        config=config_of(options),
+        threads=None if alone else 1,
+    )
+
+
+def _check_first(scans: Any) -> None:
+    """A city of wrong poses would take hours."""
+    import itertools
+
+    import numpy as np
+
+    from radarsdf.cli.check import warn_or_refuse
+    from radarsdf.io import Scans
+
+    some = list(itertools.islice(iter(scans), _FIRST_SCANS))
+    if len(some) < 2:
+        return
+    given = [scan.intensities for scan in some if scan.intensities is not None]
+    values = given if len(given) == len(some) else None
+    first = Scans([scan.points for scan in some], np.stack([scan.T_world_sensor for scan in some]), values)
+    warn_or_refuse(first, values)
+
+
+def _without_intensities(scan: Any) -> Any:
+    import dataclasses
+
+    return dataclasses.replace(scan, intensities=None)
+
+
+def _executor(options: argparse.Namespace, folder: Path) -> AbstractContextManager[Executor | None]:
+    """What runs the tasks. None: this process."""
+    if options.cluster is not None:
+        from radarsdf.tiles.cluster import cluster_executor
+        from radarsdf.tiles.plan import Plan
+
+        plan = Plan.load(folder)
+        return cluster_executor(options.cluster, max(tile.memory_bytes for tile in plan.tiles))
+    if options.processes is not None:
+        import multiprocessing
+        from concurrent.futures import ProcessPoolExecutor
+
+        from radarsdf.checks import whole_number
+
+        count = whole_number(options.processes, "--processes", 1, 1024)
+        # Not forked: a child that is forked has only one of the threads of PyTorch and OpenMP.
+        return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"))
+    return nullcontext()
+
+
+def _fit(options: argparse.Namespace, results: Results, folder: Path) -> None:
+    from radarsdf.tiles.fit_tiles import run_fits
+
+    with _executor(options, folder) as executor:
+        city = run_fits(folder, executor=executor, names=options.tile, progress=progress_of(options))
+    results.add(f"{city} in {folder}", tiles_done=len(city.tiles))
+
+
+def _mesh(options: argparse.Namespace, results: Results, folder: Path, out: Path | None) -> None:
+    from radarsdf.io.files import check_outputs
+    from radarsdf.tiles.tiled_map import TiledMap
+
+    out = folder / "mesh.ply" if out is None else out
+    check_outputs([out])
+    city = TiledMap(folder)
+    with _executor(options, folder) as executor:
+        vertices, triangles = city.export(
+            out, options.voxel, executor=executor, progress=progress_of(options)
+        )
+    results.add(
+        f"{vertices} vertices and {triangles} triangles written to {out}",
+        vertices=vertices,
+        triangles=triangles,
+        out=out,
+    )
+
+
+def _say_plan(results: Results, plan: Plan, folder: Path) -> None:
+    returns, rays = (sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays"))
+    most, seconds = max(tile.memory_bytes for tile in plan.tiles), sum(tile.seconds for tile in plan.tiles)
+    results.add(
+        f"{len(plan.tiles)} tiles of {plan.tile_m:g} m with a halo of {plan.halo_m:g} m, {returns} returns in "
+        f"{plan.scans} scans, {rays / returns:.1f} rays for each; about {seconds:.0f} s in all, and "
+        f"{most / 1e9:.2f} GB for the largest",
+        tiles=len(plan.tiles),
+        tile_m=plan.tile_m,
+        halo_m=plan.halo_m,
+        returns=returns,
+        rays=rays,
+        scans=plan.scans,
+        seconds=seconds,
+        memory_bytes=most,
+        plan=folder / "plan.json",
+    )
+
+
+def _status(results: Results, folder: Path, names: list[str] | None) -> int:
+    """Name the tiles that are not done, of all or of these `names`. The exit status is 1 if there are any."""
+    from radarsdf.tiles.plan import Plan, failure_path
+    from radarsdf.tiles.tile_fit import is_done
+
+    plan = Plan.load(folder)
+    missing = {}
+    tiles = [tile for tile in plan.tiles if names is None or tile.name in names]
+    for tile in tiles:
+        if not is_done(folder, plan, tile):
+            path = failure_path(folder, tile)
+            missing[tile.name] = path.read_text(errors="replace") if path.is_file() else "not yet done"
+    results.add(f"{len(tiles) - len(missing)} of {len(tiles)} tiles are done", missing=missing)
+    for name, reason in missing.items():
+        complain(f"radarsdf tiles: {name}: {reason}")
+    return 1 if missing else 0

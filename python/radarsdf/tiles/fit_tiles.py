@@ -1,0 +1,209 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Maps of any size: scans to tiles, a fit for each, and one map."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterable
+from concurrent.futures import Executor
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from radarsdf.checks import positive
+from radarsdf.config import FitConfig
+from radarsdf.io.read import read
+from radarsdf.io.sequence import Scan, Scans
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.radar_map import load as load_map
+from radarsdf.tiles.grid import TileGrid
+from radarsdf.tiles.plan import PLAN, Plan
+from radarsdf.tiles.planning import InputDigest, make_plan
+from radarsdf.tiles.running import run_tasks
+from radarsdf.tiles.tile_fit import fit_tile, is_done
+from radarsdf.tiles.tiled_map import TiledMap
+
+_TILE_CELLS = 512  # edge of a tile, leaf cells
+_HALO_CELLS = 64  # half of it counts; see docs/tiles.md
+_OURS = {PLAN, "tiles", "scans.npy"}
+_NOT_COMPARED = ("num_threads", "max_memory_bytes")
+
+
+def fit_tiles(
+    scans: str | PathLike[str] | Scans | Iterable[Scan],
+    out: str | PathLike[str],
+    *,
+    tile_size: float | None = None,
+    halo: float | None = None,
+    executor: Executor | None = None,
+    config: FitConfig | None = None,
+    progress: bool | None = None,
+) -> TiledMap:
+    """Fits a map in tiles. Neither all returns nor all of the map are ever in memory.
+
+    If `out` holds a plan of the same scans and settings, tiles that are done are kept: call it again after anything went
+    wrong. The result has the same bits with any executor, if ``config.num_threads`` is given.
+
+    Parameters
+    ----------
+    scans : path-like, Scans, or iterable of Scan
+        A path is read by :func:`radarsdf.io.read`. Scans may come one after another; they are read once.
+    out : path-like
+        A folder, which is made.
+    tile_size : float, optional
+        Edge of a tile, m, moved to the next multiple of ``config.block_m``. Default: 512 leaf cells.
+    halo : float, optional
+        What a tile knows beyond its edges, m, likewise. Half of it overlaps with what the next tile answers. Default: 64
+        leaf cells.
+    executor : concurrent.futures.Executor, optional
+        What runs the fits: processes, or that of a cluster (``Client.get_executor(pure=False)`` of dask.distributed).
+        By default one after another in this process.
+    config : FitConfig, optional
+        Settings of the fits. With an executor, each has one thread unless ``num_threads`` says otherwise.
+    progress : bool, optional
+        Whether to show progress bars. By default only on a terminal.
+
+    Returns
+    -------
+    TiledMap
+        Its ``missing`` names the tiles that failed, and why.
+
+    Raises
+    ------
+    ValueError
+        If a scan is invalid, `out` holds something else or another plan, or all tiles failed.
+    OSError
+        If `out` cannot be written.
+    """
+    plan_tiles(
+        scans, out, tile_size=tile_size, halo=halo, config=config, threads=None if executor is None else 1
+    )
+    return run_fits(out, executor=executor, progress=progress)
+
+
+def plan_tiles(
+    scans: str | PathLike[str] | Scans | Iterable[Scan],
+    out: str | PathLike[str],
+    *,
+    tile_size: float | None = None,
+    halo: float | None = None,
+    config: FitConfig | None = None,
+    threads: int | None = None,
+) -> Plan:
+    """The first step of :func:`fit_tiles`: one pass over the scans, which writes the plan and the rays of each tile.
+
+    `threads`: of each fit, if the configuration does not say. Default: as many as PyTorch uses.
+    """
+    folder, config = Path(out), FitConfig() if config is None else config
+    grid = _grid(config, tile_size, halo)
+    given = read(scans) if isinstance(scans, (str, PathLike)) else scans
+    if (folder / PLAN).is_file():
+        plan = Plan.load(folder)
+        _check_same(folder, plan, config, grid, InputDigest.of(_checked(given)))
+        return plan
+    if folder.is_dir() and not {path.name for path in folder.iterdir()} <= _OURS:
+        msg = f"{folder} holds other files: give a new folder"
+        raise ValueError(msg)
+    folder.mkdir(exist_ok=True)
+    shutil.rmtree(folder / "tiles", ignore_errors=True)  # of a plan that was not finished
+    threads = config.num_threads or threads or torch.get_num_threads()
+    plan = make_plan(_checked(given), folder, config.override(num_threads=threads), grid)
+    plan.save(folder)
+    return plan
+
+
+def run_fits(
+    folder: str | PathLike[str],
+    *,
+    executor: Executor | None = None,
+    names: Iterable[str] | None = None,
+    progress: bool | None = None,
+) -> TiledMap:
+    """The second step: fits the tiles of a plan that are not done, all or those of these `names`."""
+    root = Path(folder)
+    plan = Plan.load(root)
+    wanted = {tile.name for tile in plan.tiles} if names is None else set(names)
+    if unknown := wanted - {tile.name for tile in plan.tiles}:
+        msg = f"{folder} has no tile {min(unknown)}"
+        raise ValueError(msg)
+    todo = [tile for tile in plan.tiles if tile.name in wanted and not is_done(root, plan, tile)]
+    failed = run_tasks(
+        fit_tile, [(str(root), tile.name) for tile in todo], executor, description="fit", progress=progress
+    )
+    if failed and len(failed) == len(plan.tiles):
+        msg = f"all {len(failed)} tiles failed, the first: {failed[0]}"
+        raise ValueError(msg)
+    return TiledMap(root)
+
+
+def load(path: str | PathLike[str]) -> RadarMap | TiledMap:
+    """Reads a map: a file of :meth:`RadarMap.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
+
+    Parameters
+    ----------
+    path : path-like
+        Written by this version.
+
+    Returns
+    -------
+    RadarMap or TiledMap
+        Its results have the same bits as those of the map that was written.
+
+    Raises
+    ------
+    ValueError
+        If it is no radarsdf map, is damaged, or comes from another version.
+    OSError
+        If it cannot be read.
+    """
+    return TiledMap(path) if Path(path).is_dir() else load_map(path)
+
+
+def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> TileGrid:
+    block_m, size_m = config.block_m, config.leaf_size_m
+
+    def blocks(value: float | None, default: float, name: str) -> float:
+        wanted = default if value is None else positive(value, name)
+        return block_m * max(1, round(wanted / block_m))
+
+    grid = TileGrid(
+        blocks(tile_size, _TILE_CELLS * size_m, "tile_size"), blocks(halo, _HALO_CELLS * size_m, "halo")
+    )
+    if grid.halo_m > grid.tile_m:
+        msg = f"the halo, {grid.halo_m:g} m, is larger than the tile, {grid.tile_m:g} m: use larger tiles"
+        raise ValueError(msg)
+    return grid
+
+
+def _checked(scans: Iterable[Any]) -> Iterable[Scan]:
+    for i, scan in enumerate(scans):
+        if not isinstance(scan, Scan):
+            msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
+            raise TypeError(msg)
+        if np.shape(scan.T_world_sensor) != (4, 4):
+            msg = f"scan {i} has no pose: T_world_sensor must be (4, 4), not {np.shape(scan.T_world_sensor)}"
+            raise ValueError(msg)
+        yield scan
+
+
+def _check_same(folder: Path, plan: Plan, config: FitConfig, grid: TileGrid, digest: str) -> None:
+    known = {
+        field.name: getattr(plan.config.returns, field.name)
+        for field in dataclasses.fields(config.returns)
+        if field.name.endswith(("noise_m", "noise_rad")) and getattr(config.returns, field.name) is None
+    }
+    ours, theirs = config.override(returns=known).to_dict(), plan.config.to_dict()
+    if config.num_threads not in (0, plan.config.num_threads):
+        msg = f"{folder} was planned for {plan.config.num_threads} threads a tile, not {config.num_threads}"
+        raise ValueError(msg)
+    different = [name for name in ours if name not in _NOT_COMPARED and ours[name] != theirs[name]]
+    different += ["tile_size"] * (grid.tile_m != plan.tile_m) + ["halo"] * (grid.halo_m != plan.halo_m)
+    different += ["scans"] * (digest != plan.input_digest)
+    if different:
+        msg = f"{folder} holds another plan: {', '.join(different)} differ; give a new folder"
+        raise ValueError(msg)

@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The mesh of a map in tiles, in memory or in a file."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from radarsdf.checks import positive, whole_number
+from radarsdf.interrupts import whole_import
+from radarsdf.io.files import whole_file
+from radarsdf.io.records import ply_header, records
+from radarsdf.map import queries
+from radarsdf.map.meshing import add_intensity, check_box, check_limits, check_viewpoint
+from radarsdf.tiles.pieces import PieceSettings, divides, mesh_tile, piece_path, write_piece
+from radarsdf.tiles.running import Task, run_tasks
+from radarsdf.tiles.tiled_map import TiledMap
+from radarsdf.tiles.welding import WeldedMesh
+
+with whole_import():
+    import trimesh
+
+
+def mesh_of(
+    city: TiledMap,
+    voxel_size: float,
+    viewpoint: ArrayLike | None,
+    min_component_triangles: int,
+    executor: Executor | None,
+    progress: bool | None,
+    **limits: Any,
+) -> trimesh.Trimesh:
+    """See :meth:`TiledMap.mesh`."""
+    sensor_position = None if viewpoint is None else check_viewpoint(city.intensity_scale, viewpoint)
+    welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
+    parts = list(welded.parts())
+    mesh = trimesh.Trimesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces for part in parts]),
+        process=False,
+    )
+    mesh.metadata |= {"leaf_cells": int(welded.cells[0]), "leaf_cells_searched": int(welded.cells[1])}
+    mesh.vertex_attributes["confidence"] = np.concatenate([part.confidence for part in parts])
+    mesh.vertex_attributes["uncertainty_m"] = np.concatenate([part.uncertainty_m for part in parts])
+    if sensor_position is not None:
+        scale = city.intensity_scale
+        assert scale is not None
+        intensity = city.intensity(np.asarray(mesh.vertices, np.float64), sensor_position)
+        add_intensity(mesh, intensity.astype(np.float32), scale)
+    return mesh
+
+
+def export_mesh(
+    city: TiledMap,
+    path: str | PathLike[str],
+    voxel_size: float,
+    min_component_triangles: int,
+    executor: Executor | None,
+    progress: bool | None,
+    **limits: Any,
+) -> tuple[int, int]:
+    """See :meth:`TiledMap.export`."""
+    if Path(path).suffix.lower() != ".ply":
+        msg = f"{path}: a mesh of tiles is written as .ply, part by part"
+        raise ValueError(msg)
+    with whole_file(path) as file:  # first: it says at once if it cannot be written
+        welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
+        columns = ("x", "y", "z", "confidence", "uncertainty_m")
+        types = ["<f8"] * 3 + ["<f4"] * 2
+        header = ply_header(np.dtype(list(zip(columns, types, strict=True))), welded.num_vertices)
+        header += [f"element face {welded.num_faces}", "property list uchar int vertex_indices", "end_header"]
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        for part in welded.parts():
+            values = (*part.vertices.T, part.confidence, part.uncertainty_m)
+            file.write(records(dict(zip(columns, values, strict=True))).data)
+        for part in welded.parts():
+            faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
+            faces["count"], faces["rows"] = 3, part.faces
+            file.write(faces.data)
+    return welded.num_vertices, welded.num_faces
+
+
+def _welded(
+    city: TiledMap,
+    voxel_size: float,
+    min_component_triangles: int,
+    executor: Executor | None,
+    progress: bool | None,
+    *,
+    box: ArrayLike | None = None,
+    min_confidence: float = 0.0,
+    max_uncertainty: float | None = None,
+    min_detection_rate: float = queries.MIN_DETECTION_RATE,
+) -> WeldedMesh:
+    """Meshes all tiles, and welds them."""
+    whole_number(min_component_triangles, "min_component_triangles", 0)
+    settings = PieceSettings(
+        divides(positive(voxel_size, "voxel_size"), city.config.leaf_size_m),
+        None if box is None else tuple(tuple(corner) for corner in check_box(box).tolist()),
+        *check_limits(city.any_contents, min_confidence, max_uncertainty, min_detection_rate),
+    )
+    tiles = [tile for tile in city.tiles if not piece_path(city, tile.tile, settings).is_file()]
+    if executor is None:  # what this map holds in memory serves all tiles
+        task: Task = lambda name, _: write_piece(city, name, settings)
+        arguments: list[tuple[str, ...]] = [(tile.name,) for tile in tiles]
+    else:
+        task = mesh_tile
+        arguments = [(str(city.folder), tile.name, settings.to_json()) for tile in tiles]
+    failed = run_tasks(task, arguments, executor, description="mesh", progress=progress)
+    if failed:
+        names = ", ".join(f"{tiles[i].name}: {reason}" for i, reason in failed.items())
+        msg = f"{len(failed)} of {len(city.tiles)} tiles could not be meshed: {names!s:.400}"
+        raise RuntimeError(msg)
+    return WeldedMesh([piece_path(city, tile.tile, settings) for tile in city.tiles], min_component_triangles)

@@ -1,0 +1,204 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The mesh of a tile: cut on the lattice of all tiles, so that those of neighbours fit to the bit."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from radarsdf.io.files import write_whole
+from radarsdf.map import queries
+from radarsdf.map.isosurface import extract_cells, sparse_lattice
+from radarsdf.map.meshing import renumbered
+from radarsdf.tiles.grid import Tile, neighbours
+from radarsdf.tiles.plan import folder_of
+from radarsdf.tiles.tiled_map import TiledMap
+
+# As in one map: cells with all corners farther from the surface than this, in leaf cells, are left out.
+_CLEARLY = 0.25
+_ON_LATTICE = 1e-4  # voxels: vertices are at least 1e-3 from the corners of their edges
+
+
+@dataclass(frozen=True)
+class PieceSettings:
+    """What the triangles of a tile depend on."""
+
+    voxels_per_cell: int
+    """Along the edge of a leaf cell."""
+    box: tuple[tuple[float, ...], ...] | None
+    """Lower and upper corner, world, m."""
+    min_confidence: float
+    """As of :meth:`RadarMap.mesh`."""
+    max_uncertainty: float
+    """Likewise, m."""
+    min_detection_rate: float
+    """Likewise."""
+
+    def to_json(self) -> str:
+        """For arguments of tasks. :meth:`from_json` is its inverse."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> PieceSettings:
+        """The settings that :meth:`to_json` wrote."""
+        values: dict[str, Any] = json.loads(text)
+        box = values.pop("box")
+        return cls(box=None if box is None else tuple(tuple(corner) for corner in box), **values)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """The triangles in one tile."""
+
+    vertices: NDArray[np.float64]
+    """(V, 3) world, m."""
+    faces: NDArray[np.int32]
+    """(F, 3) rows of the vertices."""
+    confidence: NDArray[np.float32]
+    """(V,)"""
+    uncertainty_m: NDArray[np.float32]
+    """(V,)"""
+    border_rows: NDArray[np.int64]
+    """(B,) vertices on the border of the tile, which the next tile has too."""
+    border_edges: NDArray[np.int64]
+    """(B, 4) the edge of the lattice that each of them is on: its lower corner, in voxels from the world's origin, and its
+    axis."""
+    cells: NDArray[np.int64]
+    """(2,) leaf cells, and those in which the surface can be."""
+
+    @classmethod
+    def load(cls, path: Path) -> Piece:
+        """Reads what :func:`mesh_tile` wrote."""
+        with np.load(path, allow_pickle=False) as arrays:
+            return cls(**{name: arrays[name] for name in arrays.files})
+
+
+def piece_path(city: TiledMap, tile: Tile, settings: PieceSettings) -> Path:
+    """The file of a piece. The same settings of the same plan give the same file."""
+    text = settings.to_json() + str([other for other in neighbours(tile) if city.has(other)])
+    key = hashlib.blake2b((city.plan.digest + text).encode(), digest_size=8).hexdigest()
+    return folder_of(city.folder, city.plan.by_tile[tile]) / f"mesh-{key}.npz"
+
+
+def mesh_tile(folder: str, name: str, settings: str, run: str = "") -> str:
+    """Meshes the tile of this name, unless that is done. `settings` are :meth:`PieceSettings.to_json`.
+
+    Returns the path of the piece. The other arguments are those of :func:`radarsdf.tiles.tile_fit.fit_tile`.
+    """
+    del run
+    return str(write_piece(TiledMap(folder), name, PieceSettings.from_json(settings)))
+
+
+def write_piece(city: TiledMap, name: str, settings: PieceSettings) -> Path:
+    """Writes the piece of a tile, unless it is there. Gives its path."""
+    (tile,) = (planned.tile for planned in city.plan.tiles if planned.name == name)
+    path = piece_path(city, tile, settings)
+    if not path.is_file():
+        data = io.BytesIO()
+        np.savez(data, **vars(piece_of(city, tile, settings)))
+        write_whole(path, data.getvalue())
+    return path
+
+
+def piece_of(city: TiledMap, tile: Tile, settings: PieceSettings) -> Piece:
+    """The triangles of the blended field in the leaf cells of a tile that are to be kept, before small pieces go."""
+    config, steps = city.config, settings.voxels_per_cell
+    voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
+    cells = _cells_in(city, tile)
+    if settings.box is not None:
+        lower, upper = np.array(settings.box)
+        size_m = config.leaf_size_m
+        cells = cells[(((cells + 1) * size_m >= lower) & (cells * size_m <= upper)).all(axis=1)]
+    found = len(cells)
+    if steps > 1:
+        cells = _crossed(city, cells)
+    inside = np.stack(np.meshgrid(*[np.arange(steps)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
+    voxels = (cells[:, None, :] * steps + inside).reshape(-1, 3)
+    if settings.box is not None:
+        centres = (voxels + 0.5) * voxel_m
+        voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
+    _, corners, voxel_corners = sparse_lattice(voxels, num_threads=threads)
+    vertices, faces = extract_cells(
+        corners,
+        city.distances_at(corners.astype(np.int64), voxel_m),
+        voxel_corners,
+        spacing=[voxel_m] * 3,
+        num_threads=threads,
+    )
+    evidence = city.evidence(vertices)
+    confidence = queries.confidence(city.any_contents, evidence).numpy()
+    uncertainty_m = queries.uncertainty(city.any_contents, evidence).numpy()
+    good = (confidence >= settings.min_confidence) & queries.answers(
+        evidence, settings.min_detection_rate
+    ).numpy()
+    good &= np.nan_to_num(uncertainty_m, nan=np.inf) <= settings.max_uncertainty
+    kept, faces = renumbered(len(vertices), faces[good[faces].all(axis=1)])
+    vertices = vertices[kept]
+    rows, edges = _border(vertices, voxel_m, city.plan.tile_cells * steps)
+    return Piece(
+        vertices, faces, confidence[kept], uncertainty_m[kept], rows, edges, np.array([found, len(cells)])
+    )
+
+
+def _cells_in(city: TiledMap, tile: Tile) -> NDArray[np.int64]:
+    """(C, 3) leaf cells of a tile, from the world's origin: those of its map, and of others that count there."""
+    plan = city.plan
+    edge, size_m = plan.tile_cells, plan.config.leaf_size_m
+    parts = []
+    for other in neighbours(tile):
+        if not city.has(other):
+            continue
+        cells = city.contents_of(other).field.cells.table.leaf_cells().astype(np.int64) + plan.origin_cells(
+            other
+        )
+        cells = cells[(cells[:, :2] // edge == tile).all(axis=1)]
+        weights, _ = plan.grid.weights(other, (cells + 0.5) * size_m)
+        parts.append(cells[weights > 0])
+    found: NDArray[np.int64] = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
+    return found
+
+
+def _crossed(city: TiledMap, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Those of the leaf cells (C, 3) whose corners are not all clearly on one side of the surface."""
+    size_m = city.config.leaf_size_m
+    unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
+    values = city.distances_at(corners.astype(np.int64), size_m)[cell_corners]
+    margin_m = _CLEARLY * size_m
+    crossed = (values.min(axis=1) <= margin_m) & (values.max(axis=1) >= -margin_m)
+    found: NDArray[np.int64] = unique[crossed].astype(np.int64)
+    return found
+
+
+def _border(
+    vertices: NDArray[np.float64], voxel_m: float, voxels_per_tile: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (B,) of vertices on borders between tiles, and their edges (B, 4)."""
+    places = vertices / voxel_m
+    nearest = np.round(places)
+    on_lattice = np.abs(places - nearest) < _ON_LATTICE
+    border = (on_lattice[:, :2] & (nearest[:, :2] % voxels_per_tile == 0)).any(axis=1)
+    rows = np.flatnonzero(border)
+    axis = np.argmin(on_lattice[rows], axis=1)  # the one along which the vertex is between corners
+    corners = nearest[rows].astype(np.int64)
+    along = np.arange(len(rows)), axis
+    corners[along] = np.floor(places[rows][along]).astype(np.int64)
+    return rows, np.column_stack([corners, axis])
+
+
+def divides(voxel_m: float, leaf_size_m: float) -> int:
+    """Voxels along the edge of a leaf cell. Raises a ValueError unless they fill it."""
+    steps = round(leaf_size_m / voxel_m) if voxel_m <= leaf_size_m else 0
+    if steps < 1 or not math.isclose(steps * voxel_m, leaf_size_m, rel_tol=1e-9):
+        msg = f"voxels of {voxel_m:g} m do not divide leaf cells of {leaf_size_m:g} m, as those of tiles must: use {leaf_size_m / 2:g} or {leaf_size_m:g}"
+        raise ValueError(msg)
+    return steps

@@ -1,0 +1,302 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Makes the plan: one pass over the scans, which gives each tile the rays that cross it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.budget.estimate import estimate_rays
+from radarsdf.config import FitConfig
+from radarsdf.fitting.surface import SurfaceReturns
+from radarsdf.io.sequence import Scan
+from radarsdf.returns.movers import Standing
+from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.rays import Rays, middle_scan, prepare
+from radarsdf.returns.sensor import Sensor
+from radarsdf.threads import Workers
+from radarsdf.tiles.grid import Tile, TileGrid
+from radarsdf.tiles.plan import Plan, TilePlan
+from radarsdf.tiles.ray_files import RayFiles, read_rays, write_scans
+
+_CHUNK_SCANS = 256  # in memory at a time
+_CHUNK_RETURNS = 500_000  # likewise: fewer scans of a dense sensor
+_CHUNK_M = 1000.0  # scans of a chunk share a local frame, in which float32 must be precise
+_SENSOR_SCANS = 512  # at most: those that tell what the sensor is
+_LOOKED_AT = 4  # tiles whose noise and roughness stand for all
+
+
+@dataclass
+class _Counts:
+    """What a pass counts of a tile."""
+
+    origin_blocks: tuple[int, int, int]
+    scans: list[int]
+    returns: int = 0
+    rays: int = 0
+
+
+class Planner:
+    """Takes scans one after another, and writes the rays of each tile.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the files of the tiles are written.
+    config : FitConfig
+        Settings of all fits.
+    grid : TileGrid
+        The tiles.
+    """
+
+    def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
+        self._folder, self._config, self._grid = folder, config, grid
+        self._files = RayFiles(folder)
+        self._tiles: dict[Tile, _Counts] = {}
+        self._positions: list[NDArray[np.float64]] = []
+        self._up: list[NDArray[np.float64]] = []
+        self._samples: list[Scan] = []
+        self._every = 1
+        self._range: tuple[float, float] | None = None
+        self._with_intensities: bool | None = None
+
+    def add(self, scans: list[Scan], first: int) -> None:
+        """Scans that follow each other, the number of the first of which is `first`."""
+        for number, scan in enumerate(scans, first):
+            self._check(scan, number)
+            if number % self._every == 0:
+                self._samples.append(scan)
+                if len(self._samples) > _SENSOR_SCANS:
+                    self._samples, self._every = self._samples[::2], 2 * self._every
+        rays = self._rays(scans, first)
+        self._keep_scans(scans)
+        if len(rays) == 0:
+            return
+        if rays.intensities is not None:
+            low, high = float(rays.intensities.min()), float(rays.intensities.max())
+            known = self._range or (low, high)
+            self._range = (min(known[0], low), max(known[1], high))
+        points, sensors = rays.in_world()
+        rays = dataclasses.replace(rays, scans=rays.scans + np.int32(first))
+        pairs = list(self._grid.crossed(points, sensors))
+        rows = np.concatenate([pair[0] for pair in pairs])
+        tiles = np.concatenate([pair[1] for pair in pairs])
+        order = np.lexsort((rows, tiles[:, 1], tiles[:, 0]))
+        rows, tiles = rows[order], tiles[order]
+        starts = np.flatnonzero((np.diff(tiles, axis=0, prepend=tiles[:1] - 1) != 0).any(axis=1))
+        owner = self._grid.tiles_of(points)
+        for begin, end in itertools.pairwise([*starts.tolist(), len(rows)]):
+            self._add_to(
+                (int(tiles[begin, 0]), int(tiles[begin, 1])), rows[begin:end], rays, points, owner, sensors
+            )
+
+    def _check(self, scan: Scan, number: int) -> None:
+        has = scan.intensities is not None
+        if self._with_intensities is None:
+            self._with_intensities = has
+        if has != self._with_intensities:
+            msg = f"scan {number} has {'' if has else 'no '}intensities, and those before it have {'none' if has else 'some'}"
+            raise ValueError(msg)
+
+    def _rays(self, scans: list[Scan], first: int) -> Rays:
+        """Checked, without what moves, in a frame of their own."""
+        try:
+            return self._prepared(scans)
+        except (ValueError, TypeError) as error:
+            for number, scan in enumerate(scans, first):  # which of them it is
+                try:
+                    self._prepared([scan])
+                except (ValueError, TypeError) as of_one:
+                    reason = str(of_one).replace("scan 0", "it").replace("pose 0", "its pose")
+                    msg = f"scan {number}: {reason}"
+                    raise ValueError(msg) from error
+            raise
+
+    def _prepared(self, scans: list[Scan]) -> Rays:
+        points = [scan.points for scan in scans]
+        values = [scan.intensities for scan in scans if scan.intensities is not None] or None
+        doppler = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
+        standing = Standing.of(
+            points, values, doppler if len(doppler) == len(scans) else None, self._config.returns
+        )
+        poses = np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans])
+        return prepare(standing.points, poses, standing.intensities, whole=False, **self._config.preparation)
+
+    def _keep_scans(self, scans: list[Scan]) -> None:
+        poses = np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans])
+        together = self._config.returns.accumulate_scans
+        seen_from = [middle_scan(i, len(scans), together) for i in range(len(scans))]
+        self._positions.append(poses[seen_from, :3, 3])
+        self._up.append(poses[:, :3, 2])
+
+    def _add_to(
+        self,
+        tile: Tile,
+        rows: NDArray[np.int64],
+        rays: Rays,
+        points: NDArray[np.float64],
+        owner: NDArray[np.int64],
+        sensors: NDArray[np.float64],
+    ) -> None:
+        """Gives a tile the rays in these rows."""
+        block_m, scans = self._config.block_m, rays.scans[rows]
+        if tile not in self._tiles:
+            blocks = round(self._grid.tile_m / block_m)
+            height = round(float(sensors[rows[0], 2]) / block_m)
+            middle = (tile[0] * blocks + blocks // 2, tile[1] * blocks + blocks // 2, height)
+            self._tiles[tile] = _Counts(middle, [int(scans[0]), 0])
+        counts = self._tiles[tile]
+        counts.rays += len(rows)
+        counts.returns += int((owner[rows] == tile).all(axis=1).sum())
+        counts.scans[1] = int(scans[-1])
+        local = (points[rows] - np.array(counts.origin_blocks) * block_m).astype(np.float32)
+        self._files.add(tile, local, scans, None if rays.intensities is None else rays.intensities[rows])
+
+    def plan(self, input_digest: str) -> Plan:
+        """The plan, once all scans are given. Tiles without a return of their own are left out."""
+        self._files.flush()
+        for tile in [tile for tile, counts in self._tiles.items() if counts.returns == 0]:
+            self._files.remove(tile)
+            del self._tiles[tile]
+        if not self._tiles:
+            msg = "no return of any scan lies within the ranges"
+            raise ValueError(msg)
+        if self._range is not None and self._range[0] == self._range[1]:
+            msg = f"all intensities are {self._range[0]}: leave them out if the sensor does not measure them"
+            raise ValueError(msg)
+        positions = np.concatenate(self._positions)
+        write_scans(self._folder, positions, np.concatenate(self._up))
+        tiles = [
+            TilePlan(
+                tile, counts.returns, counts.rays, counts.origin_blocks, (counts.scans[0], counts.scans[1])
+            )
+            for tile, counts in sorted(self._tiles.items())
+        ]
+        draft = Plan(
+            config=self._config,
+            tile_m=self._grid.tile_m,
+            halo_m=self._grid.halo_m,
+            intensity_range=self._range,
+            rough_share=0.0,
+            sensor=self._sensor(SensorNoise(0.0, 0.0, 0.0)),
+            scans=len(positions),
+            input_digest=input_digest,
+            tiles=tuple(tiles),
+        )
+        return self._looked_at(draft)
+
+    def _looked_at(self, plan: Plan) -> Plan:
+        """The plan with what the largest tiles tell of noise, roughness, memory and time."""
+        noises, rough, returns = [], 0.0, 0
+        bytes_per_ray = seconds_per_ray = 0.0
+        for tile in sorted(plan.tiles, key=lambda planned: -planned.returns)[:_LOOKED_AT]:
+            rays, _ = read_rays(self._folder, plan, tile)
+            with Workers(plan.config.num_threads) as workers:
+                surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
+            noises.append(dataclasses.astuple(surface.noise))
+            rough += surface.surfels.rough_share() * len(rays)
+            returns += len(rays)
+            expected = estimate_rays(rays, plan.config)
+            bytes_per_ray = max(bytes_per_ray, expected.peak_memory_bytes / len(rays))
+            seconds_per_ray = max(seconds_per_ray, expected.seconds / len(rays))
+        noise = SensorNoise(*np.median(noises, axis=0).tolist())
+        names = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
+        known = dict(zip(names, dataclasses.astuple(noise), strict=True))
+        tiles = [
+            dataclasses.replace(
+                tile,
+                memory_bytes=int(tile.rays * bytes_per_ray) + _LEAST_BYTES,
+                seconds=round(tile.rays * seconds_per_ray, 3),
+            )
+            for tile in plan.tiles
+        ]
+        return dataclasses.replace(
+            plan,
+            config=plan.config.override(returns=known),
+            rough_share=rough / returns,
+            sensor=self._sensor(noise),
+            tiles=tuple(tiles),
+        )
+
+    def _sensor(self, noise: SensorNoise) -> Sensor:
+        limits = self._config.returns
+        return Sensor.of(
+            [scan.points for scan in self._samples],
+            [scan.intensities for scan in self._samples if scan.intensities is not None] or None,
+            noise=noise,
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m,
+        )
+
+
+_LEAST_BYTES = 100_000_000  # that any fit takes, however few its rays
+
+
+def make_plan(scans: Iterable[Scan], folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
+    """Reads all scans once, writes the rays of each tile, and gives the plan.
+
+    Raises
+    ------
+    ValueError
+        If a scan is invalid; the message names it.
+    """
+    planner, digest, number = Planner(folder, config, grid), InputDigest(), 0
+    for chunk in _chunks(scans, config.returns.accumulate_scans):
+        for scan in chunk:
+            digest.add(scan)
+        planner.add(chunk, number)
+        number += len(chunk)
+    if number == 0:
+        msg = "there are no scans"
+        raise ValueError(msg)
+    return planner.plan(digest.hex())
+
+
+class InputDigest:
+    """Tells whether scans are those of a plan."""
+
+    def __init__(self) -> None:
+        self._digest = hashlib.blake2b(digest_size=16)
+
+    def add(self, scan: Scan) -> None:
+        """The next scan."""
+        for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
+            self._digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+
+    def hex(self) -> str:
+        """The digest of all scans so far."""
+        return self._digest.hexdigest()
+
+    @classmethod
+    def of(cls, scans: Iterable[Scan]) -> str:
+        """The digest of all scans."""
+        digest = cls()
+        for scan in scans:
+            digest.add(scan)
+        return digest.hex()
+
+
+def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
+    """Lists of consecutive scans, in which whole groups are accumulated."""
+    chunk: list[Scan] = []
+    returns = 0
+    for scan in scans:
+        if chunk and len(chunk) % together == 0:
+            way_m = np.abs(
+                np.asarray(scan.T_world_sensor)[:3, 3] - np.asarray(chunk[0].T_world_sensor)[:3, 3]
+            )
+            if len(chunk) >= _CHUNK_SCANS or returns >= _CHUNK_RETURNS or not (way_m < _CHUNK_M).all():
+                yield chunk
+                chunk, returns = [], 0
+        chunk.append(scan)
+        returns += len(scan)
+    if chunk:
+        yield chunk

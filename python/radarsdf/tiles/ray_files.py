@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The rays of a tile in a file: written a part at a time, read whole by the tile's fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf._core import cell_keys
+from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.rays import Rays, rays_from
+from radarsdf.tiles.grid import Tile
+from radarsdf.tiles.plan import Plan, TilePlan
+
+_RECORD = np.dtype([("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")])
+"""A return in the frame of its tile, m; its scan; its intensity, sensor units, NaN if there are none."""
+_BUFFER_BYTES = 64 << 20  # of all tiles together, before they are appended to their files
+_SCANS = "scans.npy"
+
+
+class RayFiles:
+    """Appends returns to the files of tiles. What was there before is replaced."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._buffers: dict[Tile, list[NDArray[np.void]]] = {}
+        self._begun: set[Tile] = set()
+        self._held_bytes = 0
+
+    def add(
+        self,
+        tile: Tile,
+        points: NDArray[np.float32],
+        scans: NDArray[np.int32],
+        intensities: NDArray[np.float32] | None,
+    ) -> None:
+        """Returns (N, 3) of a tile, in its frame, m, scan by scan."""
+        rows = np.zeros(len(points), _RECORD)
+        rows["point"], rows["scan"] = points, scans
+        rows["intensity"] = np.nan if intensities is None else intensities
+        self._buffers.setdefault(tile, []).append(rows)
+        self._held_bytes += rows.nbytes
+        if self._held_bytes > _BUFFER_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Writes what is held."""
+        for tile, parts in self._buffers.items():
+            path = _path(self._folder, f"{tile[0]}_{tile[1]}")
+            if tile not in self._begun:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("ab" if tile in self._begun else "wb") as file:
+                for rows in parts:
+                    file.write(rows.data)
+            self._begun.add(tile)
+        self._buffers, self._held_bytes = {}, 0
+
+    def remove(self, tile: Tile) -> None:
+        """Removes the file of a tile, and its folder if that is then empty."""
+        path = _path(self._folder, f"{tile[0]}_{tile[1]}")
+        path.unlink(missing_ok=True)
+        if not any(path.parent.iterdir()):
+            path.parent.rmdir()
+
+
+def write_scans(folder: Path, positions: NDArray[np.float64], up: NDArray[np.float64]) -> None:
+    """Writes from where each scan was seen and its z axis, (F, 3) each, world, m."""
+    np.save(folder / _SCANS, np.concatenate([positions, up], axis=1), allow_pickle=False)
+
+
+def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[np.bool_]]:
+    """The rays that cross a tile, in the frame of its map, and which of their returns (N,) are in it or its halo.
+
+    Raises
+    ------
+    ValueError
+        If the file is not what the plan says.
+    OSError
+        If it cannot be read.
+    """
+    path = _path(folder, tile.name)
+    rows = np.fromfile(path, _RECORD)
+    if len(rows) != tile.rays or path.stat().st_size != tile.rays * _RECORD.itemsize:
+        msg = f"{path} has {len(rows)} rays instead of {tile.rays}: make the plan again"
+        raise ValueError(msg)
+    table = np.load(folder / _SCANS, mmap_mode="r", allow_pickle=False)
+    if table.shape != (plan.scans, 6) or not 0 <= rows["scan"].min() <= rows["scan"].max() < plan.scans:
+        msg = f"{folder / _SCANS} does not belong to {path}: make the plan again"
+        raise ValueError(msg)
+    numbers, scans = np.unique(rows["scan"], return_inverse=True)
+    of_scans = np.asarray(table[numbers], np.float64)
+    block_m = plan.block_cells * plan.config.leaf_size_m
+    origin = np.array(tile.origin_blocks) * block_m
+    points = np.ascontiguousarray(rows["point"])
+    rays = rays_from(
+        points,
+        (of_scans[:, :3] - origin)[scans],
+        origin=origin,
+        intensities=None if plan.intensity_range is None else np.ascontiguousarray(rows["intensity"]),
+        scans=scans.astype(np.int32),
+        up_of_scan=of_scans[:, 3:],
+    )
+    cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
+    halo = round(plan.halo_m / plan.config.leaf_size_m)
+    lower = np.array(tile.tile) * plan.tile_cells - plan.origin_cells(tile.tile)[:2] - halo
+    inside: NDArray[np.bool_] = np.all(
+        (cells >= lower) & (cells < lower + plan.tile_cells + 2 * halo), axis=1
+    )
+    return rays, inside
+
+
+def _path(folder: Path, name: str) -> Path:
+    return folder / "tiles" / name / "rays.bin"

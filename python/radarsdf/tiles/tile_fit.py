@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The fit of one tile: a task that takes names and gives a name, so that it can run anywhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+
+from radarsdf.fitting.steps import FitInput, fit_rays
+from radarsdf.io.files import write_whole
+from radarsdf.tiles.plan import Plan, TilePlan, failure_path, map_path
+from radarsdf.tiles.ray_files import read_rays
+
+
+def fit_tile(folder: str, name: str, run: str = "") -> str:
+    """Fits the tile of this name, unless its map is there already.
+
+    Parameters
+    ----------
+    folder : str
+        Where the plan is.
+    name : str
+        Of the tile, as in the plan.
+    run : str
+        Anything. Schedulers that keep results by arguments run the task again if it differs.
+
+    Returns
+    -------
+    str
+        The path of the map.
+
+    Raises
+    ------
+    Exception
+        What :func:`radarsdf.fit` raises. The reason is also in ``failed.txt`` beside the rays of the tile.
+    """
+    del run
+    root = Path(folder)
+    plan = Plan.load(root)
+    (tile,) = (planned for planned in plan.tiles if planned.name == name)
+    path, failure = map_path(root, tile), failure_path(root, tile)
+    if not is_done(root, plan, tile):
+        try:
+            _fit(root, plan, tile)
+        except Exception as error:
+            write_whole(failure, (str(error) or type(error).__name__).encode())
+            raise
+    failure.unlink(missing_ok=True)
+    return str(path)
+
+
+def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
+    rays, inside = read_rays(root, plan, tile)
+    given = FitInput(
+        rays=rays,
+        scale=plan.scale,
+        sensor_of=lambda _: plan.sensor,
+        returns=len(rays),
+        movers=0,  # they were left out before
+        why_no_movers=None,
+        inside=inside,
+        rough_share=plan.rough_share,
+    )
+    radar_map = fit_rays(given, plan.config, progress=False)
+    radar_map.report["plan"] = plan.digest
+    radar_map.save(map_path(root, tile))
+
+
+def is_done(root: Path, plan: Plan, tile: TilePlan) -> bool:
+    """Whether the map of a tile is there, and of this plan. Only the beginning of its file is read."""
+    try:
+        with safe_open(map_path(root, tile), framework="np") as file:
+            description = json.loads((file.metadata() or {})["description"])
+        return bool(description["report"]["plan"] == plan.digest)
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError):
+        return False

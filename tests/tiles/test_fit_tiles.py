@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Fits in tiles: the same steps as one fit, whatever runs them and whatever goes wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import shutil
+from concurrent.futures import Future, ProcessPoolExecutor
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.io import Scan
+from radarsdf.map import storage
+from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
+from radarsdf.tiles.plan import Plan, map_path
+
+from .conftest import CONFIG, TILE_M
+
+
+def maps_of(folder):
+    """All tensors of all tiles."""
+    plan = Plan.load(folder)
+    return {
+        tile.name: storage.parts_of(storage.load_contents(map_path(folder, tile)))[0] for tile in plan.tiles
+    }
+
+
+def assert_same_bits(one, two):
+    assert one.keys() == two.keys()
+    for name in one:
+        assert one[name].keys() == two[name].keys()
+        for part, tensor in one[name].items():
+            assert tensor.equal(two[name][part]), (name, part)
+
+
+def tiles_of(drive, out, **arguments):
+    given = {"tile_size": TILE_M, "halo": 6.4, "config": CONFIG, "progress": False} | arguments
+    return radarsdf.fit_tiles(drive, out, **given)
+
+
+def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
+    city = tiles_of(drive, tmp_path / "city", tile_size=512, halo=51.2)
+    contents = {tile.tile: city.contents_of(tile.tile) for tile in city.tiles}
+    assert len(contents) == 4  # round the origin, and each knows what lies within 51 m
+    part = contents[0, 0]
+    scale = (city.intensity_scale.low, city.intensity_scale.high)
+    known = {
+        name: getattr(city.config.returns, name)
+        for name in ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
+    }
+    whole = radarsdf.fit(
+        drive,
+        config=CONFIG.override(returns=known),
+        origin=part.origin,
+        intensity_range=scale,
+        progress=False,
+    )
+    np.testing.assert_array_equal(whole.field.cells.table.leaf_keys(), part.field.cells.table.leaf_keys())
+    np.testing.assert_array_equal(whole.evidence.looks, part.evidence.looks)
+    points = np.concatenate([s.world_points for s in drive])[::50]
+    np.testing.assert_allclose(city.sdf(points), whole.sdf(points), atol=1e-4)
+    # Positions are rounded to float32 in another frame, and the regression is robust: it may weigh a return otherwise.
+    error = np.abs(city.intensity(points, [0, 0, 1]) - whole.intensity(points, [0, 0, 1]))
+    assert error.max() < 0.01 * (scale[1] - scale[0])
+
+
+def test_done_tiles_are_kept_and_others_are_made_with_the_same_bits(drive, folder, tmp_path):
+    again = tmp_path / "city"
+    shutil.copytree(folder, again)
+    plan = Plan.load(again)
+    first, second = map_path(again, plan.tiles[0]), map_path(again, plan.tiles[1])
+    first.unlink()
+    second.write_bytes(second.read_bytes()[:1000])  # as a full disk would leave it, were it not written whole
+    others = {tile.name: map_path(again, tile).stat().st_mtime_ns for tile in plan.tiles[2:]}
+    city = tiles_of(drive, again)
+    assert city.missing == {}
+    assert {tile.name: map_path(again, tile).stat().st_mtime_ns for tile in plan.tiles[2:]} == others
+    assert_same_bits(maps_of(folder), maps_of(again))
+
+
+def test_processes_give_the_same_bits(drive, folder, tmp_path):
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as executor:
+        city = tiles_of(drive, tmp_path / "city", executor=executor)
+        mesh = city.mesh(0.2, executor=executor, progress=False)
+    assert_same_bits(maps_of(folder), maps_of(tmp_path / "city"))
+    here = radarsdf.load(folder).mesh(0.2, progress=False)
+    np.testing.assert_array_equal(mesh.vertices, here.vertices)
+    np.testing.assert_array_equal(mesh.faces, here.faces)
+
+
+def test_a_tile_that_fails_is_named_and_the_others_go_on(drive, tmp_path):
+    out = tmp_path / "city"
+    plan = plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG)
+    bad = plan.tiles[2].name
+    rays = out / "tiles" / bad / "rays.bin"
+    rays.write_bytes(rays.read_bytes()[:-7])
+    city = run_fits(out, progress=False)
+    assert list(city.missing) == [bad]
+    assert "rays instead of" in city.missing[bad]
+    assert len(city.tiles) == len(plan.tiles) - 1
+    assert len(city.mesh(0.2, progress=False).faces) > 1000
+
+
+class Broken:
+    """An executor whose workers die."""
+
+    def submit(self, task, *arguments):
+        future = Future()
+        if arguments[1] == "0_0":
+            future.set_exception(multiprocessing.ProcessError("killed"))
+        else:
+            future.set_result(task(*arguments))
+        return future
+
+
+def test_a_killed_worker_loses_only_its_tile(drive, folder, tmp_path):
+    city = tiles_of(drive, tmp_path / "city", executor=Broken())
+    assert city.missing == {"0_0": ""}
+    assert tiles_of(drive, tmp_path / "city").missing == {}
+    assert_same_bits(maps_of(folder), maps_of(tmp_path / "city"))
+
+
+def test_another_plan_is_refused(drive, folder):
+    with pytest.raises(ValueError, match="another plan: seed differ"):
+        tiles_of(drive, folder, config=CONFIG.override(seed=1))
+    with pytest.raises(ValueError, match="another plan: tile_size differ"):
+        tiles_of(drive, folder, tile_size=25.6)
+    with pytest.raises(ValueError, match="another plan: scans differ"):
+        tiles_of(drive.select(np.arange(11)), folder)
+    with pytest.raises(ValueError, match="planned for 1 threads"):
+        tiles_of(drive, folder, config=CONFIG.override(num_threads=2))
+
+
+def test_a_folder_of_something_else_is_left_alone(drive, tmp_path):
+    (tmp_path / "thesis.tex").write_text("all of it")
+    with pytest.raises(ValueError, match="holds other files"):
+        tiles_of(drive, tmp_path)
+    assert (tmp_path / "thesis.tex").read_text() == "all of it"
+
+
+def test_scans_may_come_one_after_another(drive, folder, tmp_path):
+    city = tiles_of((scan for scan in drive), tmp_path / "city")
+    assert city.plan == Plan.load(folder)
+
+
+def changed(drive, number, **values):
+    for i, scan in enumerate(drive):
+        yield dataclasses.replace(scan, **values) if i == number else scan
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"T_world_sensor": None}, "scan 7 has no pose"),
+        ({"T_world_sensor": np.full((4, 4), np.nan)}, "scan 7: .*pose"),
+        ({"points": np.zeros((0, 3)), "intensities": np.zeros(0)}, "scan 7: it is empty"),
+        ({"intensities": None}, "scan 7 has no intensities"),
+    ],
+)
+def test_a_bad_scan_is_named(drive, tmp_path, values, said):
+    with pytest.raises(ValueError, match=said):
+        tiles_of(changed(drive, 7, **values), tmp_path / "city")
+    assert not (tmp_path / "city" / "plan.json").exists()
+    assert tiles_of(drive, tmp_path / "city").missing == {}  # and the folder can be used again
+
+
+def test_something_that_is_no_scan(tmp_path):
+    with pytest.raises(TypeError, match="scan 0 is ndarray"):
+        tiles_of([np.zeros((3, 3))], tmp_path / "city")
+
+
+def test_a_scan_in_another_city_has_a_tile_of_its_own(drive, folder, tmp_path):
+    away = np.eye(4)
+    away[:3, 3] = 1e7, -2e7, 100
+    scans = [*drive, Scan(drive.points[0], away @ drive.poses[0], drive.intensities[0])]
+    city = tiles_of(scans, tmp_path / "city")
+    far = [tile for tile in city.tiles if tile.tile[0] > 100_000]
+    assert far
+    assert len(city.tiles) == len(Plan.load(folder).tiles) + len(far)
+    returns = scans[-1].world_points
+    seen = city.observed(returns)
+    assert seen.mean() > 0.5
+    step = city.sdf(returns[seen] + [1e-3, 0, 0]) - city.sdf(returns[seen])
+    assert 0.2e-3 < np.median(np.abs(step)) < 5e-3  # a millimetre counts, 20,000 km from the world's origin
+
+
+def test_plans_of_nothing(tmp_path, drive):
+    with pytest.raises(ValueError, match="there are no scans"):
+        tiles_of([], tmp_path / "a")
+    with pytest.raises(ValueError, match="no return of any scan lies within the ranges"):
+        tiles_of(drive, tmp_path / "b", config=FitConfig.quick(returns={"min_range_m": 5000}))
+    with pytest.raises(ValueError, match=r"halo, 25\.6 m, is larger"):
+        tiles_of(drive, tmp_path / "c", halo=25.6)
+
+
+def test_a_damaged_plan(folder, tmp_path):
+    (tmp_path / "plan.json").write_text((folder / "plan.json").read_text()[:200])
+    with pytest.raises(ValueError, match="is not a whole plan"):
+        radarsdf.load(tmp_path)
+    (tmp_path / "plan.json").write_text((folder / "plan.json").read_text())
+    with pytest.raises(ValueError, match=r"no tile of .* is done"):
+        radarsdf.load(tmp_path)

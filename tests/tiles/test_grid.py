@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The grid of tiles: weights that add up to one, and rays that cross."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radarsdf.tiles.grid import TileGrid, neighbours
+
+GRID = TileGrid(tile_m=12.8, halo_m=6.4)
+
+
+def test_weights_add_up_to_one_and_ignore_the_outer_half_of_the_halo():
+    points = np.random.default_rng(0).uniform(0, 12.8, (500, 3))
+    weights = np.stack([GRID.weights(tile, points)[0] for tile in neighbours((0, 0))])
+    np.testing.assert_allclose(weights.sum(axis=0), 1, atol=1e-12)
+    assert (weights >= 0).all()
+    beyond = points + [12.8 + 3.2, 0, 0]
+    assert (GRID.weights((0, 0), beyond)[0] == 0).all()
+    middle = np.array([[6.4, 6.4, 0.0]])
+    assert GRID.weights((0, 0), middle)[0] == 1
+
+
+def test_slopes_are_the_derivatives_of_weights():
+    points = np.random.default_rng(1).uniform(-4, 17, (500, 3))
+    step = 1e-6
+    for axis in range(2):
+        shift = np.zeros(3)
+        shift[axis] = step
+        up, down = (GRID.weights((0, 0), points + sign * shift)[0] for sign in (1, -1))
+        np.testing.assert_allclose(
+            GRID.weights((0, 0), points)[1][:, axis], (up - down) / (2 * step), atol=1e-6
+        )
+
+
+def test_counting_are_the_tiles_with_weight():
+    points = np.array([[1.0, 6.4, 0.0], [30.0, 31.0, 5.0]])
+    everywhere = [(i, j) for i in range(-3, 6) for j in range(-3, 6)]
+    with_weight = [tile for tile in everywhere if (GRID.weights(tile, points)[0] > 0).any()]
+    assert GRID.counting(points) == with_weight
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_a_ray_goes_to_each_tile_that_it_crosses(straight):
+    rng = np.random.default_rng(2)
+    a, b = rng.uniform(-40, 40, (2, 200, 3))
+    if straight:
+        b[:, 0] = a[:, 0]  # parallel to the edges of tiles
+    found = {
+        (int(row), *tile)
+        for rows, tiles in GRID.crossed(a, b)
+        for row, tile in zip(rows, tiles.tolist(), strict=True)
+    }
+    along = np.linspace(0, 1, 4001)[:, None, None]
+    places = a + along * (b - a)
+    expected = set()
+    for i in range(-5, 5):
+        for j in range(-5, 5):
+            lower = np.array([i, j]) * GRID.tile_m - GRID.halo_m
+            upper = lower + GRID.tile_m + 2 * GRID.halo_m
+            inside = ((places[..., :2] >= lower) & (places[..., :2] <= upper)).all(axis=2).any(axis=0)
+            expected |= {(int(row), i, j) for row in np.flatnonzero(inside)}
+    assert expected <= found
+    assert len(found - expected) <= 0.01 * len(found)  # corners cut by less than a step

@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The mesh of a map in tiles, against one that is cut from all cells at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+import trimesh
+from radarsdf.map import queries
+from radarsdf.map.isosurface import extract_cells, mesh_components, sparse_lattice
+
+from .conftest import TILE_M
+
+
+def in_one_go(city, steps, min_triangles):
+    """Vertices and faces of the blended field in all cells of all tiles."""
+    plan = city.plan
+    voxel_m = city.config.leaf_size_m / steps
+    parts = []
+    for tile in city.tiles:
+        cells = city.contents_of(tile.tile).field.cells.table.leaf_cells() + plan.origin_cells(tile.tile)
+        weights, _ = plan.grid.weights(tile.tile, (cells + 0.5) * city.config.leaf_size_m)
+        parts.append(cells[weights > 0])
+    owned = {tile.tile for tile in city.tiles}
+    cells = np.concatenate(parts)
+    cells = cells[[tuple(tile) in owned for tile in (cells[:, :2] // plan.tile_cells).tolist()]]
+    inside = np.stack(np.meshgrid(*[np.arange(steps)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
+    _, corners, voxels = sparse_lattice((cells[:, None] * steps + inside).reshape(-1, 3))
+    values = city.distances_at(corners.astype(np.int64), voxel_m)
+    vertices, faces = extract_cells(corners, values, voxels, spacing=[voxel_m] * 3)
+    evidence = city.evidence(vertices)
+    contents = city.any_contents
+    good = queries.answers(evidence, queries.MIN_DETECTION_RATE).numpy()
+    uncertainty_m = queries.uncertainty(contents, evidence).numpy()
+    good &= np.nan_to_num(uncertainty_m, nan=np.inf) <= queries.max_uncertainty_m(contents)
+    faces = faces[good[faces].all(axis=1)]
+    labels, sizes = mesh_components(faces, len(vertices))
+    return vertices, faces[sizes[labels] >= min_triangles]
+
+
+def triangles(vertices, faces):
+    """The triangles as a set, each with its corners in an order that does not depend on the numbering."""
+    corners = np.ascontiguousarray(vertices[faces])
+    return {tuple(sorted(map(tuple, corner))) for corner in corners.tolist()}
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+@pytest.mark.parametrize("min_triangles", [0, 30, 1500])
+def test_the_mesh_is_that_of_all_cells_at_once(city, steps, min_triangles):
+    mesh = city.mesh(0.2 / steps, min_component_triangles=min_triangles, progress=False)
+    found, expected = triangles(mesh.vertices, mesh.faces), triangles(*in_one_go(city, steps, min_triangles))
+    assert len(expected) > 5000
+    assert found == expected
+    assert len(found) == len(mesh.faces)  # no doubled triangle
+
+
+def open_edges(vertices, faces):
+    """Number of edges with one triangle, of those whose both ends are on a border between tiles."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, counts = np.unique(edges, axis=0, return_counts=True)
+    places = vertices[edges][:, :, :2] / TILE_M
+    on_border = (np.abs(places - np.round(places)) < 1e-9).all(axis=1).any(axis=1)
+    assert on_border.sum() > 50
+    return int((counts[on_border] == 1).sum()), int((counts > 2).sum())
+
+
+def test_no_gap_at_borders(city):
+    mesh = city.mesh(0.2, min_component_triangles=0, progress=False)
+    assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)  # welded
+    # The surface itself may end on a border, and as often in a mesh that knows no tiles.
+    assert open_edges(mesh.vertices, mesh.faces) == open_edges(*in_one_go(city, 1, 0))
+
+
+def test_export_writes_the_same_mesh(city, tmp_path):
+    mesh = city.mesh(0.2, progress=False)
+    path = tmp_path / "city.ply"
+    assert city.export(path, 0.2, progress=False) == (len(mesh.vertices), len(mesh.faces))
+    read = trimesh.load_mesh(path, process=False)
+    np.testing.assert_array_equal(read.vertices, mesh.vertices)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    raw = read.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(raw["uncertainty_m"].ravel(), mesh.vertex_attributes["uncertainty_m"])
+    with pytest.raises(ValueError, match=r"written as \.ply"):
+        city.export(tmp_path / "city.obj", 0.2)
+
+
+def test_a_box_and_a_viewpoint(city):
+    box = [[-3, -2, -1], [3, 8, 4]]
+    mesh = city.mesh(0.2, box=box, viewpoint=[0, 0, 1], progress=False)
+    assert 0 < len(mesh.faces) < len(city.mesh(0.2, progress=False).faces)
+    assert (mesh.bounds[0] >= np.array(box[0]) - 0.11).all()
+    assert (mesh.bounds[1] <= np.array(box[1]) + 0.11).all()
+    values = mesh.vertex_attributes["intensity"]
+    np.testing.assert_allclose(values, city.intensity(np.array(mesh.vertices), [0, 0, 1]), rtol=1e-5)
+
+
+def test_voxels_that_do_not_divide_cells(city):
+    for size in (0.3, 0.15, 0.07):
+        with pytest.raises(ValueError, match="do not divide leaf cells"):
+            city.mesh(size)
+
+
+def test_limits_are_checked_first(city):
+    with pytest.raises(ValueError, match="min_confidence must be in"):
+        city.mesh(0.2, min_confidence=2)
+    with pytest.raises(ValueError, match="voxel_size must be"):
+        city.mesh(-1)
+    with pytest.raises(TypeError, match="boxes"):
+        city.mesh(0.2, boxes=None)
+
+
+def test_the_surface_is_where_one_map_has_it(city, drive):
+    whole = radarsdf.fit(drive, config=city.config, progress=False)
+    mesh = city.mesh(0.2, progress=False)
+    distance_m = np.abs(whole.sdf(np.array(mesh.vertices)))
+    assert np.quantile(distance_m, 0.9) < 0.01
+    at_border = np.abs(mesh.vertices[:, 1] / TILE_M - np.round(mesh.vertices[:, 1] / TILE_M)) < 0.05
+    assert np.quantile(distance_m[at_border], 0.9) < 0.01

@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""One map that answers from many tiles."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import TiledMap
+
+from .conftest import CONFIG, TILE_M
+
+
+@pytest.fixture(scope="module")
+def points(drive):
+    return np.concatenate([scan.world_points for scan in drive])[::7]
+
+
+@pytest.fixture(scope="module")
+def whole(drive):
+    return radarsdf.fit(drive, config=CONFIG, progress=False)
+
+
+def test_answers_are_those_of_one_map(city, whole, points):
+    known = whole.observed(points) & city.observed(points)
+    assert known.mean() > 0.95
+    points = points[known]
+    difference_m = np.abs(city.sdf(points) - whole.sdf(points))
+    assert np.median(difference_m) < 1e-3
+    assert np.quantile(difference_m, 0.99) < 0.03
+    ratio = city.uncertainty(points) / whole.uncertainty(points)
+    assert 0.9 < np.median(ratio) < 1.1
+    difference = np.abs(city.confidence(points) - whole.confidence(points))
+    assert np.median(difference) < 0.05
+
+
+def near_borders(points, offset_m=0.0):
+    """Points of the surface moved to the borders between tiles along y, which the wall crosses, or beside them."""
+    distance_m = points[:, 1] - np.round(points[:, 1] / TILE_M) * TILE_M
+    moved = points[np.abs(distance_m - offset_m) < 0.3].copy()
+    moved[:, 1] = np.round(moved[:, 1] / TILE_M) * TILE_M + offset_m
+    return moved
+
+
+# The border itself, inside the overlap, and where the weights begin to rise.
+@pytest.mark.parametrize("offset_m", [0.0, 1.7, 3.2, -3.2])
+def test_no_step_between_tiles(city, points, offset_m):
+    border, step = near_borders(points, offset_m), np.array([0, 1e-5, 0])
+    border = border[city.observed(border - step) & city.observed(border + step)]
+    assert len(border) > 20
+    assert np.abs(city.sdf(border + step) - city.sdf(border - step)).max() < 1e-3
+    before, after = (city.intensity(border + sign * step, [0, 0, 1]) for sign in (-1, 1))
+    assert np.median(np.abs(after - before)) < 0.01
+
+
+def test_the_gradient_is_that_of_the_blended_distance(city, points):
+    # Inside a cell, the field of a quick map is trilinear, and so is that of each tile.
+    near = near_borders(points) + [0.05, 0.03, 0.02]
+    near = near[city.observed(near)]
+    step = 1e-3
+    expected = np.stack([
+        (city.sdf(near + step * axis) - city.sdf(near - step * axis)) / (2 * step) for axis in np.eye(3)
+    ], axis=1)  # fmt: skip
+    error = np.linalg.norm(city.gradient(near) - expected, axis=1)
+    assert np.median(error) < 0.01
+    assert np.quantile(error, 0.9) < 0.1
+
+
+def test_little_memory_gives_the_same_bits(folder, city, points):
+    small = TiledMap(folder, memory_bytes=1)
+    np.testing.assert_array_equal(small.sdf(points), city.sdf(points))
+    assert len(small._held) == 1
+    assert len(city._held) == len(city.tiles)
+
+
+def test_far_from_all_tiles(city):
+    there = np.array([[1e6, 1e6, 0.0]])
+    assert np.isnan(city.sdf(there)).all()
+    assert np.isnan(city.gradient(there)).all()
+    assert np.isnan(city.intensity(there, [0, 0, 0])).all()
+    assert np.isnan(city.uncertainty(there)).all()
+    assert not city.observed(there).any()
+    assert city.confidence(there) == 0
+    assert city.sdf(np.zeros((0, 3))).shape == (0,)
+
+
+def test_tensors_and_types(city, points):
+    some = points[:10].astype(np.float32)
+    assert city.sdf(some).dtype == np.float32
+    assert city.sdf(some.tolist()).dtype == np.float64
+    answer = city.gradient(torch.from_numpy(some))
+    assert answer.dtype == torch.float32
+    assert answer.shape == (10, 3)
+    with pytest.raises(ValueError, match=r"shape \(N, 3\)"):
+        city.sdf(points[0])
+
+
+def test_pickles_and_words(city, points):
+    copy = pickle.loads(pickle.dumps(city))
+    np.testing.assert_array_equal(copy.sdf(points[:100]), city.sdf(points[:100]))
+    assert repr(city) == "TiledMap(surface and reflectance, 8 of 8 tiles of 12.8 m)"
