@@ -62,7 +62,7 @@ class TracedSurface:
         kept = surface.kept(0.0, queries.max_uncertainty_m(contents), queries.MIN_DETECTION_RATE, components)
         faces = np.ascontiguousarray(surface.faces[kept])
         return cls(
-            SurfaceTracer(surface.vertices, faces, voxel_m),
+            SurfaceTracer(surface.vertices, faces, resolve_num_threads(0)),
             centres,
             across / np.maximum(twice_m2, 1e-12)[:, None],
             twice_m2 / 2,
