@@ -346,6 +346,8 @@ class RadarMap:
         ------
         ValueError
             If the pose is not a rigid transform, or a number is out of range.
+        MemoryError
+            If the view would take more memory than there is. At most 10^6 beams are traced, and a patch has one return.
         """
         from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
 
