@@ -99,14 +99,25 @@ def test_more_returns_are_denser(sharp_map, view):
     assert len(sharp_map.render(POSE, returns=0)) == 0
 
 
-@pytest.mark.parametrize("count", [1, 7, 100, 5000])
-def test_places_are_spread_as_if_they_were_listed(count):
-    rng = np.random.default_rng(count)
-    expected = rng.exponential(size=300) * rng.integers(0, 2, 300)
+def test_places_are_spread_as_if_they_were_listed():
+    expected = np.random.default_rng(0).uniform(0.5, 1, 3000)
     sums = np.cumsum(expected)
-    places = (np.arange(count) + 0.5) * sums[-1] / count
-    np.testing.assert_array_equal(_spread(expected, count), np.unique(np.searchsorted(sums, places)))
-    assert len(_spread(np.zeros(5), count)) == len(_spread(np.zeros(0), count)) == 0
+    for count in (1, 7, 100, 1500):  # no row expects more than one
+        places = (np.arange(count) + 0.5) * sums[-1] / count
+        np.testing.assert_array_equal(_spread(expected, count), np.searchsorted(sums, places))
+
+
+def test_places_that_one_row_would_have_several_of_go_to_others():
+    rng = np.random.default_rng(1)
+    expected = rng.exponential(size=3000) ** 6 * rng.integers(0, 2, 3000)
+    once = (np.arange(400) + 0.5) * expected.sum() / 400
+    assert len(np.unique(np.searchsorted(np.cumsum(expected), once))) < 200
+    rows = _spread(expected, 400)
+    assert 396 <= len(rows) <= 400
+    likelier = expected[rows] > np.quantile(expected, 0.9)
+    assert likelier.mean() > 0.6
+    assert len(_spread(expected, 10**8)) > 0.9 * np.count_nonzero(expected)
+    assert len(_spread(np.zeros(5), 3)) == len(_spread(np.zeros(0), 3)) == len(_spread(expected, 0)) == 0
 
 
 def test_a_huge_sensor_takes_no_more_than_the_map_has(sharp_map, monkeypatch):

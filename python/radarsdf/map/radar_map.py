@@ -330,8 +330,8 @@ class RadarMap:
         sensor : Sensor, optional
             The radar. Default: that of the scans of the fit, :attr:`sensor`.
         returns : float, optional
-            Number of returns before those below the sensor's threshold are left out. Default: what the sensor gives. More
-            returns show more of what it can see.
+            Number of returns before those below the sensor's threshold are left out; at most as many as the surface in
+            view has patches. Default: what the sensor gives. More returns show more of what it can see.
         noise : bool
             Whether the returns have the sensor's noise in range, azimuth and elevation.
         seed : int or numpy.random.Generator

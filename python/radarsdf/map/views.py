@@ -32,6 +32,7 @@ _HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden
 _MIN_COSINE = 0.05
 _MIN_BEAM_RAD = 2e-3
 _MAX_BEAMS = 1_000_000
+_MOST_PLACES = 1 << 40
 _BLOCK = 1 << 20  # patches that are looked at together
 _ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
 
@@ -176,15 +177,29 @@ def _in_view(centres: _Floats, R: _Floats, position: _Floats, sensor: Sensor) ->
 
 
 def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
-    """The rows in which `count` places fall that are spread evenly over the sum of `expected` (N,), each row once.
+    """At most `count` rows, about as dense as is `expected` (N,): those where evenly spread places fall on its sums.
 
-    Places are not listed: there can be many more than rows.
+    Where a row expects more than one place, others get more of them, until there are `count` rows.
     """
     sums = np.cumsum(expected)
-    if not (len(sums) and sums[-1] > 0):
+    count = min(count, int(np.count_nonzero(expected)))
+    if count == 0:
         return np.zeros(0, np.int64)
-    places = np.minimum(np.floor(sums * (count / sums[-1]) + 0.5), count)  # up to each row's end
-    return np.flatnonzero(np.diff(places, prepend=0.0) > 0)
+
+    def rows_of(places: int) -> NDArray[np.int64]:
+        """They are not listed: there can be many more than rows."""
+        up_to = np.minimum(np.floor(sums * (places / sums[-1]) + 0.5), places)
+        return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
+
+    chosen, places, step, grows = rows_of(count), count, count, True
+    while 0 < step < _MOST_PLACES and len(chosen) < count:
+        more = rows_of(places + step)
+        if len(more) <= count:
+            chosen, places = more, places + step
+        else:
+            grows = False
+        step = 2 * step if grows else step // 2
+    return chosen
 
 
 def _intensities(contents: MapContents, points: _Floats, position: _Floats) -> NDArray[np.float32] | None:
