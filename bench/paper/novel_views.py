@@ -106,8 +106,12 @@ def errors(predicted: Returns, measured: Returns) -> Row:
 
 
 def _mean(rows: list[Row]) -> Row:
-    """Over the scans of a scene."""
-    return {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]}
+    """Over the scans of a scene. NaN: none of them has a value."""
+    means = {}
+    for key in rows[0]:
+        known = [row[key] for row in rows if not np.isnan(row[key])]
+        means[key] = float(np.mean(known)) if known else np.nan
+    return means
 
 
 def table(rows: list[Row]) -> str:

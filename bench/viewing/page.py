@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The viewer in a real browser without a screen: drags, clicks, and every frame that it draws."""
+"""A page in a real browser without a screen: drags, clicks, every frame that it draws, what it asks for and complains of."""
 
 from __future__ import annotations
 
@@ -47,24 +47,35 @@ def open_page(url: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
             executable_path=next(filter(None, map(shutil.which, BROWSERS))), args=_FLAGS
         )
         try:
-            tab = browser.new_page(viewport={"width": width, "height": height})
-            tab.goto(url)
-            yield Page(tab)
+            page = Page(browser.new_page(viewport={"width": width, "height": height}))
+            page.tab.goto(url)
+            yield page
         finally:
             browser.close()
 
 
 class Page:
-    """A tab with the viewer."""
+    """A tab."""
 
     def __init__(self, tab: Any) -> None:
         self.tab = tab
+        self.requests: list[str] = []
+        """Addresses of all that the page and its frames asked for, itself too."""
+        self.errors: list[str] = []
+        """What they wrote to the console as errors, and what their scripts did not catch."""
+        tab.on("request", lambda request: self.requests.append(request.url))
+        tab.on("pageerror", lambda error: self.errors.append(str(error)))
+        tab.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
         self._frames: list[tuple[float, str]] = []
         self._session: Any = None
 
     def screenshot(self) -> NDArray[np.uint8]:
         """(H, W, 3) what is seen now."""
         return _pixels(self.tab.screenshot())
+
+    def screenshot_of(self, selector: str) -> NDArray[np.uint8]:
+        """(H, W, 3) what is seen of an element now."""
+        return _pixels(self.tab.locator(selector).screenshot())
 
     def start_recording(self) -> None:
         """Keep each frame that the browser draws."""

@@ -13,16 +13,15 @@ void bind_ray_tracing(py::module_& m) {
   using namespace py::literals;
   using Hits = py::typing::Tuple<py::array_t<float>, py::array_t<std::int32_t>>;
   py::class_<SurfaceTracer>(m, "SurfaceTracer", "Finds where rays first meet a triangle mesh.")
-      .def(py::init([](const Array<double>& vertices, const Array<std::int32_t>& faces, double cell_size_m) {
+      .def(py::init([](const Array<double>& vertices, const Array<std::int32_t>& faces, int num_threads) {
              const std::int64_t num_vertices = check_points(vertices), num_faces = check_points(faces);
              const double* v = vertices.data();
              const std::int32_t* f = faces.data();
              const py::gil_scoped_release release;
-             return std::make_unique<SurfaceTracer>(v, num_vertices, f, num_faces, cell_size_m);
+             return std::make_unique<SurfaceTracer>(v, num_vertices, f, num_faces, num_threads);
            }),
-           "vertices"_a.noconvert(), "faces"_a.noconvert(), "cell_size_m"_a,
-           "`vertices` (V, 3) float64, local frame, m; `faces` (F, 3) int32; `cell_size_m`: edge of the cells in which "
-           "triangles are listed, best one or two edges of a triangle.")
+           "vertices"_a.noconvert(), "faces"_a.noconvert(), "num_threads"_a = 0,
+           "`vertices` (V, 3) float64, local frame, m; `faces` (F, 3) int32.")
       .def_property_readonly("nbytes", &SurfaceTracer::num_bytes)
       .def(
           "first_hits",

@@ -624,10 +624,10 @@ class SurfaceTracer:
         self,
         vertices: numpy.typing.NDArray[numpy.float64],
         faces: numpy.typing.NDArray[numpy.int32],
-        cell_size_m: typing.SupportsFloat | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
     ) -> None:
         """
-        `vertices` (V, 3) float64, local frame, m; `faces` (F, 3) int32; `cell_size_m`: edge of the cells in which triangles are listed, best one or two edges of a triangle.
+        `vertices` (V, 3) float64, local frame, m; `faces` (F, 3) int32.
         """
     def first_hits(
         self,

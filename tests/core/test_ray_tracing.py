@@ -51,17 +51,15 @@ def agree(found, expected):
     return same.mean()
 
 
-@pytest.mark.parametrize("cell_size_m", [0.05, 0.3, 2.0, 100.0])
+@pytest.mark.parametrize("size_m", [0.5, 1.0, 3.0])
 @pytest.mark.parametrize("front_only", [False, True])
 @pytest.mark.parametrize("origin", [[0.0, 0.0, 0.0], [-9.0, 3.0, 1.0]])
-def test_the_first_triangle_of_many(cell_size_m, front_only, origin):
-    vertices, faces = soup()
+def test_the_first_triangle_of_many(size_m, front_only, origin):
+    vertices, faces = soup(round(60 / size_m), size=size_m)
     # From outside, towards the triangles.
     directions = unit_vectors(600) + np.float32(0.3) * -np.array(origin, np.float32)
     directions /= np.linalg.norm(directions, axis=1)[:, None]
-    found, rows = SurfaceTracer(vertices, faces, cell_size_m).first_hits(
-        origin, directions, 50.0, front_only=front_only
-    )
+    found, rows = SurfaceTracer(vertices, faces).first_hits(origin, directions, 50.0, front_only=front_only)
     expected = reference(
         vertices, faces, np.array(origin), directions.astype(np.float64), front_only=front_only
     )
@@ -78,7 +76,7 @@ def test_the_first_triangle_of_many(cell_size_m, front_only, origin):
 
 def test_no_ray_leaves_a_closed_mesh():
     ball = trimesh.creation.icosphere(subdivisions=5, radius=5.0)
-    tracer = SurfaceTracer(np.array(ball.vertices), np.array(ball.faces, np.int32), 0.2)
+    tracer = SurfaceTracer(np.array(ball.vertices), np.array(ball.faces, np.int32))
     # Some rays go through vertices and along the axes, where all cells meet.
     directions = np.concatenate([unit_vectors(200_000), ball.vertices / 5.0, np.eye(3), -np.eye(3)]).astype(
         np.float32
@@ -96,38 +94,73 @@ def test_a_plane_at_a_grazing_angle():
     corner = (np.arange(x.shape[0] - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     lower = np.stack([corner, corner + columns, corner + 1], 1)
     upper = np.stack([corner + 1, corner + columns, corner + columns + 1], 1)
-    tracer = SurfaceTracer(vertices, np.concatenate([lower, upper]).astype(np.int32), 0.5)
+    tracer = SurfaceTracer(vertices, np.concatenate([lower, upper]).astype(np.int32))
     depression = np.linspace(0.03, 1.2, 5000)
     directions = np.stack([np.cos(depression), np.zeros(5000), -np.sin(depression)], 1).astype(np.float32)
     found, _ = tracer.first_hits([0.0, 0.3, 1.5], directions, 100.0)
-    np.testing.assert_allclose(found, 1.5 / np.sin(depression), rtol=1e-4)
+    np.testing.assert_allclose(found, 1.5 / np.sin(depression), rtol=1e-5)
 
 
 def test_ranges_end_at_the_limit():
     vertices = np.array([[5.0, -1, -1], [5, 1, -1], [5, 0, 1]])
-    tracer = SurfaceTracer(vertices, np.array([[0, 1, 2]], np.int32), 0.2)
+    tracer = SurfaceTracer(vertices, np.array([[0, 1, 2]], np.int32))
     ahead = np.array([[1, 0, 0]], np.float32)
     for limit, found in ((4.99, np.inf), (5.01, 5.0), (np.inf, 5.0), (0.0, np.inf)):
         assert tracer.first_hits([0, 0, 0], ahead, limit)[0][0] == pytest.approx(found)
     assert tracer.first_hits([0, 0, 0], -ahead, 100.0)[0][0] == np.inf
 
 
-def test_the_same_bits_with_any_number_of_threads():
+@pytest.mark.parametrize("distance_m", [0.0, 4.9, 300.0])
+def test_no_ray_slips_through_between_two_triangles(distance_m):
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=5.0)
+    vertices = np.array(ball.vertices)
+    tracer = SurfaceTracer(vertices, np.array(ball.faces, np.int32))
+    origin = np.array([0.6, 0.0, 0.8]) * distance_m
+    edges = vertices[ball.edges_unique]
+    share = np.random.default_rng(0).uniform(0, 1, (len(edges), 1))
+    share[::10] = 0  # through vertices
+    target = edges[:, 0] + share * (edges[:, 1] - edges[:, 0])
+    away = target - origin
+    ranges_m = np.linalg.norm(away, axis=1)
+    seen = (
+        np.abs(np.einsum("ni,ni->n", away, target)) > 0.1 * 5 * ranges_m
+    )  # not at the rim, where both sides end
+    seen &= (distance_m < 5) | (np.einsum("ni,ni->n", away, target) < 0)
+    away, ranges_m = away[seen], ranges_m[seen]
+    found, _ = tracer.first_hits(origin, (away / ranges_m[:, None]).astype(np.float32), 1e3)
+    assert len(found) > 10_000
+    np.testing.assert_allclose(found, ranges_m, atol=0.02)
+
+
+def test_the_same_bits_with_any_number_of_threads_and_in_any_order():
     vertices, faces = soup(400, 8.0)
-    tracer = SurfaceTracer(vertices, faces, 0.2)
+    tracer = SurfaceTracer(vertices, faces, num_threads=1)
     directions = unit_vectors(30_000)
     alone = tracer.first_hits([0, 0, 0], directions, 50.0, num_threads=1)
     for threads in (2, 5):
-        for ours, theirs in zip(
-            tracer.first_hits([0, 0, 0], directions, 50.0, num_threads=threads), alone, strict=True
-        ):
-            np.testing.assert_array_equal(ours, theirs)
+        order = np.random.default_rng(threads).permutation(len(directions))
+        shared = SurfaceTracer(vertices, faces, num_threads=threads)
+        for given in (slice(None), order):
+            found = shared.first_hits([0, 0, 0], directions[given], 50.0, num_threads=threads)
+            for ours, theirs in zip(found, alone, strict=True):
+                np.testing.assert_array_equal(ours, theirs[given])
+
+
+def test_ranges_are_exact_far_from_the_origin_of_the_frame():
+    vertices, faces = soup(50)
+    moved = np.array([40_000.0, -30_000.0, 500.0])
+    directions = unit_vectors(2000)
+    near = SurfaceTracer(vertices, faces).first_hits([0, 0, 0], directions, 50.0)
+    far = SurfaceTracer(vertices + moved, faces).first_hits(moved, directions, 50.0)
+    same = near[1] == far[1]
+    assert same.mean() > 0.999
+    np.testing.assert_allclose(near[0][same], far[0][same], atol=2e-5)
 
 
 def test_far_apart_triangles_need_little_memory():
     near, faces = soup(20)
     vertices = np.concatenate([near, near + [1e6, 1e6, 1e3]])
-    tracer = SurfaceTracer(vertices, np.concatenate([faces, faces + len(near)]).astype(np.int32), 0.1)
+    tracer = SurfaceTracer(vertices, np.concatenate([faces, faces + len(near)]).astype(np.int32))
     assert tracer.nbytes < 200e6
     directions = unit_vectors(500)
     found, _ = tracer.first_hits([0, 0, 0], directions, 50.0)
@@ -135,25 +168,24 @@ def test_far_apart_triangles_need_little_memory():
 
 
 def test_nothing_to_meet():
-    tracer = SurfaceTracer(np.zeros((0, 3)), np.zeros((0, 3), np.int32), 0.1)
+    tracer = SurfaceTracer(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     found, rows = tracer.first_hits([0, 0, 0], unit_vectors(10), 50.0)
     assert np.isinf(found).all()
     assert (rows == -1).all()
 
 
 @pytest.mark.parametrize(
-    ("vertices", "faces", "cell", "said"),
+    ("vertices", "faces", "said"),
     [
-        (np.zeros((3, 3)), np.array([[0, 1, 3]], np.int32), 0.1, "does not exist"),
-        (np.zeros((3, 3)), np.array([[0, 1, -1]], np.int32), 0.1, "does not exist"),
-        (np.full((3, 3), np.nan), np.array([[0, 1, 2]], np.int32), 0.1, "finite"),
-        (np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32), 0.0, "cell_size_m"),
-        (np.zeros((3, 2)), np.array([[0, 1, 2]], np.int32), 0.1, "shape"),
+        (np.zeros((3, 3)), np.array([[0, 1, 3]], np.int32), "does not exist"),
+        (np.zeros((3, 3)), np.array([[0, 1, -1]], np.int32), "does not exist"),
+        (np.full((3, 3), np.nan), np.array([[0, 1, 2]], np.int32), "finite"),
+        (np.zeros((3, 2)), np.array([[0, 1, 2]], np.int32), "shape"),
     ],
 )
-def test_wrong_meshes(vertices, faces, cell, said):
+def test_wrong_meshes(vertices, faces, said):
     with pytest.raises(ValueError, match=said):
-        SurfaceTracer(vertices, faces, cell)
+        SurfaceTracer(vertices, faces)
 
 
 @pytest.mark.parametrize(
@@ -163,4 +195,4 @@ def test_wrong_meshes(vertices, faces, cell, said):
 def test_wrong_rays(origin, direction, limit):
     vertices, faces = soup(3)
     with pytest.raises(ValueError, match="must be finite"):
-        SurfaceTracer(vertices, faces, 0.1).first_hits(origin, np.full((1, 3), direction, np.float32), limit)
+        SurfaceTracer(vertices, faces).first_hits(origin, np.full((1, 3), direction, np.float32), limit)

@@ -21,11 +21,13 @@
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
 #include "lattice/vertex_table.hpp"
+#include "returns/cell_means.hpp"
 #include "returns/cell_sums.hpp"
 #include "returns/looks.hpp"
 #include "returns/ray_average.hpp"
 #include "returns/surface_crossings.hpp"
 #include "surface/marching_cubes.hpp"
+#include "surface/ray_tracing.hpp"
 #include "surface/sparse_lattice.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
@@ -222,6 +224,33 @@ void sums_and_rays(int threads, Results& results) {
   results.add(distances.data(), table.num_rows());
 }
 
+// Means in cells, and rays through a soup of triangles.
+void means_and_tracing(int threads, Results& results) {
+  const auto points = random_numbers<float>(3 * kPoints, 3.0, 11),
+             directions = random_numbers<float>(3 * kPoints, 0.6, 12), values = random_numbers<float>(kPoints, 1.0, 13);
+  const radarsdf::Views views{points.data(), directions.data(), values.data(), kPoints};
+  const std::vector<radarsdf::CellKind> kinds{{1.0, 0.2, 0.0}, {2.0, 0.0, 0.5}};
+  const std::vector<float> weights(kPoints, 1.0F);
+  const auto means = radarsdf::fit_cell_means(kinds, 3, views, values.data(), weights.data(), 2.0, 2, threads);
+  const auto num_means = static_cast<std::int64_t>(means.keys.size());
+  results.add(means.explained.data(), kPoints);
+  std::vector<float> numbers(kPoints);
+  radarsdf::CellMeansAt(kinds, 3, means.keys.data(), means.means.data(), num_means)
+      .sums(views, numbers.data(), threads);
+  results.add(numbers.data(), kPoints);
+
+  const auto vertices = random_numbers<double>(3 * kPoints, 3.0, 14);
+  std::vector<std::int32_t> faces(kPoints / 3 * 3);
+  for (std::size_t i = 0; i < faces.size(); ++i) faces[i] = static_cast<std::int32_t>(i);
+  const radarsdf::SurfaceTracer tracer(vertices.data(), kPoints, faces.data(), kPoints / 3, threads);
+  const double origin[3] = {0.1, 0.2, 0.3};
+  std::vector<std::int32_t> hits(kPoints);
+  tracer.first_hits(origin, directions.data(), kPoints, 50.0, false, numbers.data(), hits.data(), threads);
+  if (std::all_of(hits.begin(), hits.end(), [](std::int32_t hit) { return hit < 0; })) std::abort();
+  results.add(numbers.data(), kPoints);
+  results.add(hits.data(), kPoints);
+}
+
 // An exception of one task ends the others and is the caller's.
 void failure(int threads) {
   bool caught = false;
@@ -269,6 +298,7 @@ Results all(int threads) {
   adam<T>(radarsdf::Encoding::kOctree, threads, results);
   networks<T>(threads, results);
   sums_and_rays(threads, results);
+  means_and_tracing(threads, results);
   failure(threads);
   surfaces<T>(threads, results);
   return results;

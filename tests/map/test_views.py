@@ -10,6 +10,8 @@ import pickle
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf.map.views import _spread
+from radarsdf.returns.noise import SensorNoise
 
 from .test_meshing import moved, surface_distance
 
@@ -95,6 +97,52 @@ def test_a_given_sensor_decides(sharp_map):
 def test_more_returns_are_denser(sharp_map, view):
     assert len(sharp_map.render(POSE, returns=4 * sharp_map.sensor.returns_per_scan)) > 1.5 * len(view)
     assert len(sharp_map.render(POSE, returns=0)) == 0
+
+
+def test_places_are_spread_as_if_they_were_listed():
+    expected = np.random.default_rng(0).uniform(0.5, 1, 3000)
+    sums = np.cumsum(expected)
+    for count in (1, 7, 100, 1500):  # no row expects more than one
+        places = (np.arange(count) + 0.5) * sums[-1] / count
+        np.testing.assert_array_equal(_spread(expected, count), np.searchsorted(sums, places))
+
+
+def test_places_that_one_row_would_have_several_of_go_to_others():
+    rng = np.random.default_rng(1)
+    expected = rng.exponential(size=3000) ** 6 * rng.integers(0, 2, 3000)
+    once = (np.arange(400) + 0.5) * expected.sum() / 400
+    assert len(np.unique(np.searchsorted(np.cumsum(expected), once))) < 200
+    rows = _spread(expected, 400)
+    assert 396 <= len(rows) <= 400
+    likelier = expected[rows] > np.quantile(expected, 0.9)
+    assert likelier.mean() > 0.6
+    assert len(_spread(expected, 10**8)) > 0.9 * np.count_nonzero(expected)
+    assert len(_spread(np.zeros(5), 3)) == len(_spread(np.zeros(0), 3)) == len(_spread(expected, 0)) == 0
+
+
+def test_a_huge_sensor_takes_no_more_than_the_map_has(sharp_map, monkeypatch):
+    everywhere = dataclasses.replace(
+        sharp_map.sensor,
+        azimuth_rad=(-3.1, 3.1),
+        elevation_rad=(-1.5, 1.5),
+        returns_per_scan=1e7,
+        noise=SensorNoise(1e-9, 1e-9, 1e-9),
+    )
+    all_patches = sharp_map.render(POSE, everywhere, returns=1e8)
+    assert len(all_patches) <= len(sharp_map._traced.centres)
+    assert all_patches.beam_ranges_m.size <= 1_000_000
+    monkeypatch.setattr("radarsdf.map.views._BLOCK", 100)
+    np.testing.assert_array_equal(sharp_map.render(POSE, everywhere, returns=1e8).points, all_patches.points)
+
+
+def test_memory_that_is_not_there_is_said_before_the_work(sharp_map, monkeypatch):
+    monkeypatch.setattr("radarsdf.budget.estimate.available_bytes", lambda: 100_000)
+    with pytest.raises(MemoryError, match=r"would take about .* GB, of 0.00: ask for fewer"):
+        sharp_map.render(POSE)
+    unseen = pickle.loads(pickle.dumps(sharp_map))  # whose surface has yet to be made for rays
+    with pytest.raises(MemoryError, match="would take about"):
+        unseen.render(POSE)
+    assert "_traced" not in vars(unseen)
 
 
 def test_noise_only_if_asked_and_from_its_own_generator(sharp_map, view):

@@ -35,6 +35,11 @@ _PER_OCTREE_ROW = 30.0  # freed when the rows are numbered
 _COPIES = 4  # of each parameter that learns: value, two moments of Adam, last finite value
 _PER_ROW = 8.0  # if only the touched rows move: marks of Adam
 _PER_VOXEL = 220.0
+# Of a view of a map: peaks of maps of 1e5 to 2e5 leaf cells.
+_PER_CELL_TRACED = 300.0  # the surface that rays meet, made once for a map
+_PER_PATCH_SEEN = 100.0
+_PER_BEAM = 100.0
+_PER_RETURN_SEEN = 50.0  # of all views that are kept
 
 _SAMPLE = 50_000  # returns, about, whose cells are counted
 _COLUMN = 16  # leaf cells: edge of the columns of space, of which some are sampled
@@ -208,6 +213,26 @@ def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> 
         msg = (
             f"voxels of {voxel_size} m would take about {voxels * _PER_VOXEL / 1e9:.2f} GB, of "
             f"{available / 1e9:.2f}: use larger ones"
+        )
+        raise MemoryError(msg)
+
+
+def check_views(
+    max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0, returns: float = 0
+) -> None:
+    """Raises a MemoryError if views of a map need more memory than there is.
+
+    `cells`: leaf cells of a map whose surface has yet to be made for views; `patches` of that surface; `beams` of one
+    view; `returns` of all views that are kept.
+    """
+    available = available_bytes() if max_memory_bytes is None else max_memory_bytes
+    needed = (
+        cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM + returns * _PER_RETURN_SEEN
+    )
+    if available is not None and needed > available:
+        msg = (
+            f"these views would take about {needed / 1e9:.2f} GB, of {available / 1e9:.2f}: ask for fewer poses or "
+            "returns, or make the map of a part of the scans"
         )
         raise MemoryError(msg)
 

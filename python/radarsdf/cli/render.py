@@ -12,8 +12,12 @@ from radarsdf.cli.options import add_json
 from radarsdf.cli.results import Results
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import numpy as np
     from numpy.typing import NDArray
+
+    from radarsdf.map.views import View
 
 _SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
@@ -53,6 +57,7 @@ def run(options: argparse.Namespace) -> None:
     """Predict the scans, and write them."""
     import numpy as np
 
+    from radarsdf.budget.estimate import check_views
     from radarsdf.io.cloud_writers import write_cloud
     from radarsdf.io.files import check_outputs
     from radarsdf.io.scans import write_scans
@@ -74,26 +79,32 @@ def run(options: argparse.Namespace) -> None:
     check_outputs([options.out], [options.map])
     radar_map = load(options.map)
     rng = np.random.default_rng(options.seed)
-    views = [radar_map.render(pose, returns=options.returns, noise=options.noise, seed=rng) for pose in poses]
-    seen = [view for view in views if len(view)]
-    if not seen:
-        msg = f"{options.map} has no surface that the sensor sees from {'this pose' if len(views) == 1 else 'these poses'}: nothing written"
+    wanted = radar_map.sensor.returns_per_scan if options.returns is None else options.returns
+    cells = len(radar_map.evidence.looks)  # about as many as there are patches, which have one return at most
+    check_views(None, returns=len(poses) * min(wanted, cells))
+    views: Iterable[View] = (
+        radar_map.render(pose, returns=options.returns, noise=options.noise, seed=rng) for pose in poses
+    )
+    if suffix == ".png":
+        views = list(views)  # a picture shows all of a view; of others, the returns are kept alone
+    scans = scans_of(view for view in views if len(view))
+    if not len(scans):
+        msg = f"{options.map} has no surface that the sensor sees from {'this pose' if len(poses) == 1 else 'these poses'}: nothing written"
         raise ValueError(msg)
-    scans = scans_of(seen)
     if suffix == ".npz":
         write_scans(options.out, scans)
     elif suffix == ".ply":
         write_cloud(options.out, scans)
     else:
-        save_view_picture(options.out, views)
-    empty = f", {len(views) - len(seen)} poses see nothing" if len(seen) < len(views) else ""
+        save_view_picture(options.out, list(views))
+    empty = f", {len(poses) - len(scans)} poses see nothing" if len(scans) < len(poses) else ""
     results = Results(options)
-    count = sum(map(len, seen))
+    count = sum(map(len, scans.points))
     results.add(
-        f"{count} returns of {len(views)} scans written to {options.out}{empty}",
+        f"{count} returns of {len(poses)} scans written to {options.out}{empty}",
         returns=count,
-        scans=len(views),
-        scans_without_returns=len(views) - len(seen),
+        scans=len(poses),
+        scans_without_returns=len(poses) - len(scans),
         out=options.out,
     )
     results.end()

@@ -329,8 +329,8 @@ class RadarMap:
         sensor : Sensor, optional
             The radar. Default: that of the scans of the fit, :attr:`sensor`.
         returns : float, optional
-            Number of returns before those below the sensor's threshold are left out. Default: what the sensor gives. More
-            returns show more of what it can see.
+            Number of returns before those below the sensor's threshold are left out; at most as many as the surface in
+            view has patches. Default: what the sensor gives. More returns show more of what it can see.
         noise : bool
             Whether the returns have the sensor's noise in range, azimuth and elevation.
         seed : int or numpy.random.Generator
@@ -345,6 +345,8 @@ class RadarMap:
         ------
         ValueError
             If the pose is not a rigid transform, or a number is out of range.
+        MemoryError
+            If the view would take more memory than there is. At most 10^6 beams are traced, and a patch has one return.
         """
         from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
 

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf._core import SurfaceTracer
+from radarsdf.budget.estimate import check_views
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.meshing import Surface
@@ -50,6 +51,7 @@ class TracedSurface:
     def of(cls, contents: MapContents) -> TracedSurface:
         """The surface in voxels of a leaf cell's size, which is finer than the noise of a radar."""
         voxel_m = contents.config.leaf_size_m
+        check_views(contents.config.max_memory_bytes, cells=len(contents.evidence.looks))
         surface = Surface.of(contents, voxel_m)
         corners = surface.vertices[surface.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -62,7 +64,7 @@ class TracedSurface:
         kept = surface.kept(0.0, queries.max_uncertainty_m(contents), queries.MIN_DETECTION_RATE, components)
         faces = np.ascontiguousarray(surface.faces[kept])
         return cls(
-            SurfaceTracer(surface.vertices, faces, voxel_m),
+            SurfaceTracer(surface.vertices, faces, resolve_num_threads(0)),
             centres,
             across / np.maximum(twice_m2, 1e-12)[:, None],
             twice_m2 / 2,

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import cell_keys
+from radarsdf.budget.estimate import check_views
 from radarsdf.checks import check_poses, number, real_array
 from radarsdf.io.sequence import Scan, Scans
 from radarsdf.map import queries
@@ -30,6 +32,8 @@ _HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden
 _MIN_COSINE = 0.05
 _MIN_BEAM_RAD = 2e-3
 _MAX_BEAMS = 1_000_000
+_MOST_PLACES = 1 << 40
+_BLOCK = 1 << 20  # patches that are looked at together
 _ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
 
 
@@ -75,13 +79,14 @@ class View:
         return scans_of([self])
 
 
-def scans_of(views: list[View]) -> Scans:
-    """The returns of views, one scan each."""
-    values = [view.intensities for view in views if view.intensities is not None]
+def scans_of(views: Iterable[View]) -> Scans:
+    """The returns of views, one scan each. Of each view nothing else is kept."""
+    kept = [(view.points, view.T_world_sensor, view.intensities) for view in views]
+    values = [intensities for _, _, intensities in kept if intensities is not None]
     return Scans(
-        [view.points for view in views],
-        np.stack([view.T_world_sensor for view in views]),
-        values if len(values) == len(views) else None,
+        [points for points, _, _ in kept],
+        np.array([pose for _, pose, _ in kept]).reshape(-1, 4, 4),
+        values if len(values) == len(kept) else None,
     )
 
 
@@ -106,6 +111,10 @@ def view_from(
     if not 0 <= wanted <= 1e8:
         msg = f"returns must be in [0, 10^8], not {returns}"
         raise ValueError(msg)
+    azimuth, elevation = _beams(sensor)
+    check_views(
+        contents.config.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation)
+    )
     position = pose[:3, 3] - contents.origin
     chosen = _answers(surface, pose[:3, :3], position, sensor, round(wanted), queries.roughness(contents))
     points = (surface.centres[chosen] - position) @ pose[:3, :3]
@@ -115,7 +124,6 @@ def view_from(
         points, intensities = points[detected], intensities[detected]
     if noise:
         points = _with_noise(points, sensor, np.random.default_rng(seed))
-    azimuth, elevation = _beams(sensor)
     ranges_m, beam_intensities = _first_surface(
         contents, surface, pose[:3, :3], position, sensor, azimuth, elevation
     )
@@ -136,32 +144,61 @@ def _answers(
     surface: TracedSurface, R: _Floats, position: _Floats, sensor: Sensor, count: int, roughness: float
 ) -> NDArray[np.int64]:
     """The patches that answer: `count` rows, spread evenly as the returns that are expected of each."""
-    offsets = (surface.centres - position) @ R
-    ranges_m, azimuth, elevation = _polar(offsets)
-    seen = np.ones(len(offsets), bool)
-    for values, (low, high) in (
-        (ranges_m, sensor.range_m),
-        (azimuth, sensor.azimuth_rad),
-        (elevation, sensor.elevation_rad),
-    ):
-        seen &= (values >= low) & (values <= high)
-    rows = np.flatnonzero(seen)
+    rows = np.concatenate(
+        [
+            first + _in_view(surface.centres[first : first + _BLOCK], R, position, sensor)
+            for first in range(0, len(surface.centres), _BLOCK)
+        ]
+        or [np.zeros(0, np.int64)]
+    )
     if len(rows) == 0 or count == 0:
         return rows[:0]
     order = cell_keys(surface.centres[rows].astype(np.float32), _ORDER_M, 1)
     rows = rows[np.argsort(order, kind="stable")]
-    to_patch = (surface.centres[rows] - position) / ranges_m[rows, None]
+    to_patch = surface.centres[rows] - position
+    ranges_m = np.sqrt(np.einsum("ni,ni->n", to_patch, to_patch))
+    to_patch /= ranges_m[:, None]
     first = surface.first_hits(position, to_patch, float(sensor.range_m[1]))
     cosine = np.abs(np.einsum("ni,ni->n", surface.normals[rows], to_patch))
     rate_power, cosine_power, range_power, hidden = _SMOOTH + roughness * (_ROUGH - _SMOOTH)
     expected = surface.areas_m2[rows] * surface.rates[rows] ** rate_power
-    expected *= np.maximum(cosine, _MIN_COSINE) ** cosine_power / ranges_m[rows] ** range_power
-    expected *= np.where(ranges_m[rows] > first.ranges_m + _HIDDEN_M, hidden, 1.0)
+    expected *= np.maximum(cosine, _MIN_COSINE) ** cosine_power / ranges_m**range_power
+    expected *= np.where(ranges_m > first.ranges_m + _HIDDEN_M, hidden, 1.0)
+    return rows[_spread(expected, count)]
+
+
+def _in_view(centres: _Floats, R: _Floats, position: _Floats, sensor: Sensor) -> NDArray[np.int64]:
+    """Rows of the patches (N, 3) that lie in the sensor's field of view and ranges."""
+    seen = np.ones(len(centres), bool)
+    limits = (sensor.range_m, sensor.azimuth_rad, sensor.elevation_rad)
+    for values, (low, high) in zip(_polar((centres - position) @ R), limits, strict=True):
+        seen &= (values >= low) & (values <= high)
+    return np.flatnonzero(seen)
+
+
+def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
+    """At most `count` rows, about as dense as is `expected` (N,): those where evenly spread places fall on its sums.
+
+    Where a row expects more than one place, others get more of them, until there are `count` rows.
+    """
     sums = np.cumsum(expected)
-    if not sums[-1] > 0:
-        return rows[:0]
-    places = np.searchsorted(sums, (np.arange(count) + 0.5) * (sums[-1] / count))
-    chosen: NDArray[np.int64] = rows[np.unique(np.minimum(places, len(rows) - 1))]
+    count = min(count, int(np.count_nonzero(expected)))
+    if count == 0:
+        return np.zeros(0, np.int64)
+
+    def rows_of(places: int) -> NDArray[np.int64]:
+        """They are not listed: there can be many more than rows."""
+        up_to = np.minimum(np.floor(sums * (places / sums[-1]) + 0.5), places)
+        return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
+
+    chosen, places, step, grows = rows_of(count), count, count, True
+    while 0 < step < _MOST_PLACES and len(chosen) < count:
+        more = rows_of(places + step)
+        if len(more) <= count:
+            chosen, places = more, places + step
+        else:
+            grows = False
+        step = 2 * step if grows else step // 2
     return chosen
 
 
