@@ -21,7 +21,7 @@ LEAF_M = 0.2
 
 def noise_of(rays, **known):
     surfels = Surfels.of(rays, LEAF_M)
-    return sensor_noise(surfels, rays, surfels.cells.cell_of_ray, ReturnsConfig(**known))
+    return sensor_noise(surfels, rays, ReturnsConfig(**known))
 
 
 @pytest.mark.parametrize(("range_m", "angle_rad"), [(0.05, 0.004), (0.05, 0.012), (0.1, 0.008)])

@@ -93,7 +93,7 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     rays = prepare([np.concatenate(pair) for pair in zip(points, passed, strict=True)], poses)
     behind = np.concatenate([np.arange(1500 + 3750) >= 1500] * len(points))
     surfels = Surfels.of(rays, LEAF_M)
-    noise = sensor_noise(surfels, rays, surfels.cells.cell_of_ray, ReturnsConfig())
+    noise = sensor_noise(surfels, rays, ReturnsConfig())
     assert find_ghosts(surfels, rays, noise)[behind].mean() < 0.05
 
 
