@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from typing import Any
 
@@ -29,7 +29,7 @@ from radarsdf.io.sequence import Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.evidence import Evidence, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import Rays, prepare
@@ -43,9 +43,9 @@ _LESS_IN_ROUGH_SCENES = 0.5
 
 
 def fit(
-    points: Sequence[ArrayLike] | Scans,
+    points: Iterable[ArrayLike] | Scans,
     poses: ArrayLike | None = None,
-    intensities: Sequence[ArrayLike] | None = None,
+    intensities: Iterable[ArrayLike] | None = None,
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
     config: FitConfig | None = None,
@@ -56,12 +56,13 @@ def fit(
 
     Parameters
     ----------
-    points : sequence of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, as they are, their
-        poses, intensities and Doppler are used where none are given here.
+    points : iterable of F arrays, or Scans
+        (N_i, 3) each: the returns of one scan, sensor frame, m. An iterator is asked for one after another, and they
+        are not kept, unless Doppler is given. Of :class:`radarsdf.io.Scans`, as they are, their poses, intensities and
+        Doppler are used where none are given here.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
-    intensities : sequence of F arrays, optional
+    intensities : iterable of F arrays, optional
         (N_i,) each, sensor units. Without them the map has no intensity network.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each: speed of each return along its ray, m/s; NaN where it was not measured. With them, returns that
@@ -122,14 +123,15 @@ def fit(
             surface = SurfaceReturns.of(rays, config, workers.num_threads)
             clock.lap("ghosts_s")
             start = STARTS[config.training.start](surface, config, workers.num_threads)
-            field = _open_cells(start.leaf_keys(), surface.rays, config, workers.num_threads)
+            returns = start.returns_of_cells()
+            field = _open_cells(start.leaf_keys(), returns, rays, config, workers.num_threads)
             clock.lap("occupied_cells_s")
             start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
             if not all(parameter.isfinite().all() for parameter in field.parameters()):
                 msg = "what the training starts from is not finite: training.sigma_cells may be too small"
                 raise Diverged(msg)
             evidence = Evidence.of(
-                start.returns_of_cells(),
+                returns,
                 rays,
                 field.cells.table.leaf_keys(),
                 config.leaf_size_m,
@@ -145,7 +147,7 @@ def fit(
             # The map is made before the training, which changes its field: Interrupted and Diverged can hand
             # it over.
             counts = {
-                "returns": sum(len(np.asarray(scan)) for scan in points),
+                "returns": rays.num_given + standing.movers,
                 "returns_used": len(surface.rays),
                 "ghosts": len(rays) - len(surface.rays),
                 "movers": standing.movers,
@@ -159,13 +161,7 @@ def fit(
                 config=config,
                 evidence=evidence,
                 rough_share=surface.surfels.rough_share(),
-                sensor=Sensor.of(
-                    standing.points,
-                    standing.intensities,
-                    noise=surface.noise,
-                    min_range_m=config.returns.min_range_m,
-                    max_range_m=config.returns.max_range_m,
-                ),
+                sensor=Sensor.of_rays(rays, poses, surface.noise),
                 report=counts | _report(config, field, training, counts, standing, workers.num_threads),
             )
             if not config.trains_intensity:
@@ -188,11 +184,11 @@ def fit(
 
 
 def _given(
-    points: Sequence[ArrayLike] | Scans,
+    points: Iterable[ArrayLike] | Scans,
     poses: ArrayLike | None,
-    intensities: Sequence[ArrayLike] | None,
+    intensities: Iterable[ArrayLike] | None,
     doppler_mps: Sequence[ArrayLike] | None,
-) -> tuple[list[ArrayLike], ArrayLike, Sequence[ArrayLike] | None, Sequence[ArrayLike] | None]:
+) -> tuple[Iterable[ArrayLike], ArrayLike, Iterable[ArrayLike] | None, Sequence[ArrayLike] | None]:
     """The same, with what is not given taken from the scans."""
     if isinstance(points, Scans):
         scans, points = points, points.points  # first: it reads all there is, in one pass
@@ -202,13 +198,14 @@ def _given(
     if poses is None:
         msg = "poses are missing: T_world_sensor (4, 4) of each scan"
         raise ValueError(msg)
-    # Points and intensities may be generators.
-    return list(points), poses, None if intensities is None else list(intensities), doppler_mps
+    return points, poses, intensities, doppler_mps
 
 
-def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, num_threads: int) -> Field:
+def _open_cells(
+    leaf_keys: NDArray[np.uint64], returns: ReturnsOfCells, rays: Rays, config: FitConfig, num_threads: int
+) -> Field:
     """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
-    leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
+    leaf_keys = bridged(leaf_keys, returns.keys, returns.counts, config.encoding.bridge_cells, num_threads)
     with_intensity = rays.intensities is not None and config.trains_intensity
     return Field(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
 

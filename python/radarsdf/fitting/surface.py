@@ -42,5 +42,5 @@ class SurfaceReturns:
             kept = ~find_ghosts(surfels, rays, noise, means, num_threads)
             means = None if means is None else means.select(kept[means.first])
         if onto_planes:
-            rays = onto_surfels(surfels, rays, noise)
+            rays = onto_surfels(surfels, rays, noise, num_threads)
         return cls(rays if kept is None else rays.select(kept), surfels, noise, means)

@@ -4,14 +4,11 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, cell_keys
-from radarsdf.returns.rays import Rays
-from radarsdf.returns.support import support_of_points
+from radarsdf._core import CellBlocks, bridge_cells
+from radarsdf.returns.support import support_at
 
 # Measured on simulated and real scans; see docs/levers.md.
 # Share of the median support. Returns with less are too often false to tell where a surface goes on.
@@ -22,7 +19,11 @@ _MAX_SUPPORT = 9.0
 
 
 def bridged(
-    leaf_keys: NDArray[np.uint64], rays: Rays, leaf_size_m: float, max_cells: int, num_threads: int = 0
+    leaf_keys: NDArray[np.uint64],
+    keys: NDArray[np.uint64],
+    counts: NDArray[np.float64],
+    max_cells: int,
+    num_threads: int = 0,
 ) -> NDArray[np.uint64]:
     """Adds the leaf cells that bridge a gap: those on the line between two cells with returns.
 
@@ -32,10 +33,11 @@ def bridged(
     ----------
     leaf_keys : ndarray
         (C,) uint64 Morton keys of the leaf cells near the surface, ascending.
-    rays : Rays
-        The returns.
-    leaf_size_m : float
-        Edge of a leaf cell, m.
+    keys : ndarray
+        (M,) uint64 Morton keys of the leaf cells that hold returns, ascending. Those that are none of `leaf_keys` do
+        not count.
+    counts : ndarray
+        (M,) float64 number of returns in each of `keys`.
     max_cells : int
         Largest number of cells between the two.
     num_threads : int
@@ -48,34 +50,12 @@ def bridged(
     """
     if max_cells == 0:
         return leaf_keys
-    points = np.ascontiguousarray(rays.points)
-    support = support_of_points(points, leaf_keys, leaf_size_m, num_threads)
-    median = float(np.median(support[support > 0])) if support.any() else 0.0
-    keys, first = np.unique(cell_keys(points, leaf_size_m, num_threads), return_index=True)
-    rows = np.minimum(np.searchsorted(leaf_keys, keys), len(leaf_keys) - 1)
-    returns = np.where(leaf_keys[rows] == keys, support[rows], 0).astype(np.float64)
-    least = max(1.0, _MIN_SUPPORT * median)
-    used = (returns >= least) & (
-        returns + least < 2 * _MAX_SUPPORT
-    )  # with more, the mean with any other end is too high
-    keys, first, returns = keys[used], first[used], returns[used]
-    cells = np.floor(points[first] * np.float32(1 / leaf_size_m))  # the same bits as in the core
-    ends = CellBlocks(keys)
-
-    def keys_at(cells: NDArray[np.float32]) -> NDArray[np.uint64]:
-        return cell_keys((cells.astype(np.float64) + 0.5) * leaf_size_m, leaf_size_m, num_threads)
-
-    found = [leaf_keys]
-    for direction in itertools.product((-1, 0, 1), repeat=3):
-        if direction <= (0, 0, 0):
-            continue  # the opposite direction finds the same pairs
-        step = np.array(direction, np.float32)
-        for distance in range(2, max_cells + 2):
-            row = ends.rows(keys_at(cells + distance * step), num_threads)
-            pair = np.flatnonzero(row >= 0)
-            pair = pair[returns[pair] + returns[row[pair]] < 2 * _MAX_SUPPORT]
-            found += [keys_at(cells[pair] + between * step) for between in range(1, distance)]
-    keys = np.concatenate(found)
-    keys.sort()  # np.unique takes ten times as long: it builds a hash table
-    different: NDArray[np.uint64] = keys[np.concatenate([[True], keys[1:] != keys[:-1]])]
-    return different
+    near = CellBlocks(leaf_keys).rows(keys, num_threads) >= 0
+    keys, counts = keys[near], counts[near]
+    support = support_at(leaf_keys, keys, counts, num_threads)
+    support = support[support > 0]
+    least = max(1.0, _MIN_SUPPORT * float(np.median(support))) if len(support) else 1.0
+    support = support_at(keys, keys, counts, num_threads)
+    # With more than the most, the mean with any other end is too high.
+    used = (support >= least) & (support + least < 2 * _MAX_SUPPORT)
+    return bridge_cells(leaf_keys, keys[used], support[used], max_cells, 2 * _MAX_SUPPORT, num_threads)

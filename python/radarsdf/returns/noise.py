@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,12 +49,6 @@ class SensorNoise:
         )
         return variances
 
-    def variances_across_m2(
-        self, rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """(M,) variance of the returns in these `rows` (M,) along the unit vectors `normals` (M, 3), m²."""
-        return _shares(rays, rows, normals) @ np.square(dataclasses.astuple(self))
-
 
 def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig) -> SensorNoise:
     """Estimates the noise of the sensor from the distances of returns to their surfels.
@@ -79,7 +72,7 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig) -> SensorN
     known = np.array([config.range_noise_m, config.azimuth_noise_rad, config.elevation_noise_rad], np.float64)
     free = np.isnan(known)
     sigma2 = np.where(free, [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD], known) ** 2
-    on_flat = surfels.cells.moments[surfels.cell_of_plane[surfels.is_flat()], 0].sum()
+    on_flat = surfels.cells.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
     rows = np.arange(0, len(rays), max(1, int(on_flat) // _RETURNS))
     plane = surfels.flat_plane_of(surfels.cells.cell_of_ray[rows])
     rows, plane = rows[plane >= 0], plane[plane >= 0]
