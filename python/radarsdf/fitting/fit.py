@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from typing import Any
 
@@ -21,7 +22,7 @@ from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.skipped import Skipped, skipped_parts
-from radarsdf.fitting.start import STARTS
+from radarsdf.fitting.start import STARTS, Start
 from radarsdf.fitting.stopping import Diverged, Interrupted
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
@@ -35,6 +36,7 @@ from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.surfels import Surfels
 from radarsdf.threads import Workers
 
 # Of rough scenes the network knows less than of smooth ones: its answer counts so much less there, and the closed form
@@ -126,10 +128,7 @@ def fit(
             returns = start.returns_of_cells()
             field = _open_cells(start.leaf_keys(), returns, rays, config, workers.num_threads)
             clock.lap("occupied_cells_s")
-            start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
-            if not all(parameter.isfinite().all() for parameter in field.parameters()):
-                msg = "what the training starts from is not finite: training.sigma_cells may be too small"
-                raise Diverged(msg)
+            _initialise(field, start, config)
             evidence = Evidence.of(
                 returns,
                 rays,
@@ -138,38 +137,44 @@ def fit(
                 workers.num_threads,
             )
             clock.lap("start_s")
-            scale = IntensityScale.of(rays.intensities)
+            noise, rough_share, kept = surface.noise, surface.surfels.rough_share(), surface.rays
+            origin, scale = rays.origin, IntensityScale.of(rays.intensities)
+            sensor = Sensor.of_rays(rays, poses, noise)
+            close = _closing(rays, surface, config, workers.num_threads)
+            counts = {
+                "returns": rays.num_given + standing.movers,
+                "returns_used": len(kept),
+                "ghosts": len(rays) - len(kept),
+                "movers": standing.movers,
+                "noise": dataclasses.asdict(noise),
+            }
+            # Of many returns, gigabytes that nobody needs any more: the training has its own copy of the rays.
+            del surface, start, returns
             training = Training(
-                field, surface.rays, rays, scale if config.trains_intensity else None, config, workers
+                field, kept, rays, scale if config.trains_intensity else None, config, workers
             )
+            del rays, kept
             if saved is not None:
                 saved.resume(training)
             # The map is made before the training, which changes its field: Interrupted and Diverged can hand
             # it over.
-            counts = {
-                "returns": rays.num_given + standing.movers,
-                "returns_used": len(surface.rays),
-                "ghosts": len(rays) - len(surface.rays),
-                "movers": standing.movers,
-                "noise": dataclasses.asdict(surface.noise),
-            }
             contents = MapContents(
                 field=field,
-                origin=rays.origin,
+                origin=origin,
                 intensity_scale=scale,
                 reflectance=None,
                 config=config,
                 evidence=evidence,
-                rough_share=surface.surfels.rough_share(),
-                sensor=Sensor.of_rays(rays, poses, surface.noise),
+                rough_share=rough_share,
+                sensor=sensor,
                 report=counts | _report(config, field, training, counts, standing, workers.num_threads),
             )
-            if not config.trains_intensity:
-                contents = _with_closed_form(contents, rays, surface, workers.num_threads)
-            radar_map = RadarMap(contents)
+            radar_map = RadarMap(
+                close(contents) if close is not None and not config.trains_intensity else contents
+            )
             training.run(progress, saved)
-            if config.trains_intensity:
-                radar_map = RadarMap(_with_closed_form(contents, rays, surface, workers.num_threads))
+            if close is not None and config.trains_intensity:
+                radar_map = RadarMap(close(contents))
     except KeyboardInterrupt as interruption:
         raise Interrupted(radar_map) from interruption
     except Diverged as error:
@@ -210,20 +215,41 @@ def _open_cells(
     return Field(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
 
 
+def _initialise(field: Field, start: Start, config: FitConfig) -> None:
+    """Sets the parameters that the training starts from. Raises Diverged if one is not finite."""
+    start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
+    if not all(parameter.isfinite().all() for parameter in field.parameters()):
+        msg = "what the training starts from is not finite: training.sigma_cells may be too small"
+        raise Diverged(msg)
+
+
+def _closing(
+    rays: Rays, surface: SurfaceReturns, config: FitConfig, num_threads: int
+) -> Callable[[MapContents], MapContents] | None:
+    """Adds intensities, or what their network leaves of them, in closed form to a map. None if they are not wanted."""
+    if rays.intensities is None or not config.closes_intensity:
+        return None
+    return functools.partial(
+        _with_closed_form,
+        rays=rays,
+        intensities=rays.intensities,
+        surfels=surface.surfels,
+        num_threads=num_threads,
+    )
+
+
 def _with_closed_form(
-    contents: MapContents, rays: Rays, surface: SurfaceReturns, num_threads: int
+    contents: MapContents, *, rays: Rays, intensities: NDArray[np.float32], surfels: Surfels, num_threads: int
 ) -> MapContents:
-    """The map with intensities, or with what its network leaves of them, in closed form, if they are wanted."""
     scale, config = contents.intensity_scale, contents.config
-    if scale is None or rays.intensities is None or not config.closes_intensity:
-        return contents
-    share, unit = 0.0, scale.to_unit(rays.intensities)
+    assert scale is not None
+    share, unit = 0.0, scale.to_unit(intensities)
     if config.trains_intensity:
         share = 1 - _LESS_IN_ROUGH_SCENES * queries.roughness(contents)
         sensors = torch.from_numpy(rays.points - rays.directions * rays.ranges_m[:, None])
         answers = queries.intensity(contents, torch.from_numpy(rays.points), sensors)
         unit -= np.float32(share) * scale.to_unit(answers.numpy())
-    found = Reflectance.of(rays, unit, surface.surfels, config.leaf_size_m, num_threads, share)
+    found = Reflectance.of(rays, unit, surfels, config.leaf_size_m, num_threads, share)
     return dataclasses.replace(contents, reflectance=found)
 
 

@@ -17,6 +17,8 @@ from radarsdf.returns.rays import Rays
 CELLS_OF_SURFACE = 9
 """A plane crosses about so many of a cell and the 26 cells round it."""
 
+_CELLS_AT_ONCE = 1 << 21  # of which there are sums in float64
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -59,7 +61,13 @@ class Evidence:
         """
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
         columns = np.stack([returns.information[near], returns.scans[near]], 1).astype(np.float64)
-        sums = CellBlocks(returns.keys[near]).sum_round(leaf_keys, columns, 1.0, num_threads)
+        cells = CellBlocks(returns.keys[near])
+        information = np.empty(len(leaf_keys), np.float32)
+        detections = np.empty(len(leaf_keys), np.uint32)
+        for first in range(0, len(leaf_keys), _CELLS_AT_ONCE):
+            part = slice(first, first + _CELLS_AT_ONCE)
+            sums = cells.sum_round(leaf_keys[part], columns, 1.0, num_threads)
+            information[part], detections[part] = sums.T
         looks = count_looks(
             leaf_keys,
             leaf_size_m,
@@ -69,7 +77,7 @@ class Evidence:
             rays.scans,
             num_threads,
         )
-        return cls(sums[:, 0].astype(np.float32), sums[:, 1].astype(np.uint32), looks)
+        return cls(information, detections, looks)
 
 
 @dataclass(frozen=True)
