@@ -29,7 +29,9 @@ _PER_RETURN = 30.0
 _PER_INTENSITY = 20.0
 _PER_RETURN_AGAIN = 110.0  # if the intensity stage uses other returns than the sdf stage
 _PER_RETURN_OF_CLOSED_FORM = 150.0  # cells of intensities in closed form
-_PER_RETURN_CHECKED = 200.0  # scans in float64, freed before the training
+_PER_RETURN_CHECKED = (
+    200.0  # rays with and without ghosts, and the training's copy, for which the others make room
+)
 _PER_CELL = 215.0
 _PER_OCTREE_ROW = 30.0  # freed when the rows are numbered
 _COPIES = 4  # of each parameter that learns: value, two moments of Adam, last finite value
