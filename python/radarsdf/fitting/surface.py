@@ -36,7 +36,8 @@ class SurfaceReturns:
         onto_planes = config.returns.onto_planes and config.training.sdf_iterations != 0
         means = MeanRays.of(rays, config.leaf_size_m, num_threads) if averages else None
         surfels = Surfels.of(rays, config.leaf_size_m, num_threads)
-        noise = sensor_noise(surfels, rays, config.returns)
+        # An average counts cells, not returns, so it needs the noise of those: one return of each.
+        noise = sensor_noise(surfels, rays, config.returns, None if means is None else means.first)
         kept = None
         if config.returns.drop_ghosts:
             kept = ~find_ghosts(surfels, rays, noise, means, num_threads)

@@ -50,7 +50,9 @@ class SensorNoise:
         return variances
 
 
-def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig) -> SensorNoise:
+def sensor_noise(
+    surfels: Surfels, rays: Rays, config: ReturnsConfig, some: NDArray[np.int64] | None = None
+) -> SensorNoise:
     """Estimates the noise of the sensor from the distances of returns to their surfels.
 
     The variance across a plane is the sum of the three variances, each times the squared share of its axis in
@@ -68,12 +70,16 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig) -> SensorN
         N rays. About `_RETURNS` of those on a flat surfel are used, evenly spread.
     config : ReturnsConfig
         Deviations that the user knows.
+    some : ndarray, optional
+        (M,) rows of `rays` of which they are taken. Default: all.
     """
     known = np.array([config.range_noise_m, config.azimuth_noise_rad, config.elevation_noise_rad], np.float64)
     free = np.isnan(known)
     sigma2 = np.where(free, [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD], known) ** 2
     on_flat = surfels.cells.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
-    rows = np.arange(0, len(rays), max(1, int(on_flat) // _RETURNS))
+    size = len(rays) if some is None else len(some)
+    step = max(1, int(on_flat / len(rays) * size) // _RETURNS)
+    rows = np.arange(0, size, step) if some is None else some[::step]
     plane = surfels.flat_plane_of(surfels.cells.cell_of_ray[rows])
     rows, plane = rows[plane >= 0], plane[plane >= 0]
     if free.any() and len(rows) >= _MIN_RETURNS:
