@@ -75,7 +75,7 @@ def row(returns: int, threads: int) -> dict[str, Any]:
 
 def _ghosts(rays: Rays, config: FitConfig, threads: int) -> NDArray[np.bool_]:
     surfels = Surfels.of(rays, config.leaf_size_m, threads)
-    noise = sensor_noise(surfels, rays, surfels.cells.cell_of_ray, config.returns)
+    noise = sensor_noise(surfels, rays, config.returns)
     return find_ghosts(surfels, rays, noise, num_threads=threads)
 
 

@@ -4,14 +4,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import json
+import multiprocessing
+import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
+
+from matplotlib.figure import Figure
+from radarsdf import FitConfig
+from radarsdf.io import Scan
+from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
+
+from bench.growth.street import street_scans
 
 _RETURNS = ("1000000", "3000000", "10000000", "30000000", "100000000")
 _WORKERS = 2
@@ -27,15 +39,6 @@ def rows(counts: list[str], quick: bool) -> Iterator[dict[str, Any]]:
 
 def _measure(count: int) -> dict[str, Any]:
     """Plans, fits and exports a street. Memory is what the kernel says that a process held at most."""
-    import multiprocessing
-    import resource
-    from concurrent.futures import ProcessPoolExecutor
-
-    from radarsdf import FitConfig
-    from radarsdf.io import Scan
-    from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
-
-    from bench.growth.street import street_scans
 
     def scans() -> Iterator[Scan]:
         for pose, points, intensities, *_ in street_scans(count):
@@ -50,11 +53,11 @@ def _measure(count: int) -> dict[str, Any]:
         with ProcessPoolExecutor(_WORKERS, multiprocessing.get_context("spawn")) as executor:
             city = run_fits(out, executor=executor, progress=False)
             laps.append(time.perf_counter())
-            vertices, triangles = city.export(out / "mesh.ply", 0.2, executor=executor, progress=False)
+            _, triangles = city.export(out / "mesh.ply", 0.2, executor=executor, progress=False)
             laps.append(time.perf_counter())
         workers_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3
         disk_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
-    plan_s, fit_s, mesh_s = (after - before for before, after in zip(laps, laps[1:], strict=False))
+    plan_s, fit_s, mesh_s = (after - before for before, after in itertools.pairwise(laps))
     return {
         "returns": count,
         "tiles": len(city.tiles),
@@ -72,16 +75,12 @@ def _measure(count: int) -> dict[str, Any]:
 
 def _geometry(scans: Any) -> Any:
     """Without intensities, which a quick fit would train a network for."""
-    import dataclasses
-
     for scan in scans:
         yield dataclasses.replace(scan, intensities=None)
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """Seconds and memory over the returns."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     counts = [row["returns"] for row in rows]

@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from distributed import LocalCluster
 from radarsdf import FitConfig, TiledMap
 from radarsdf.io import Scan
 from radarsdf.map import storage
+from radarsdf.tiles.cluster import cluster_executor
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, map_path
 from radarsdf.tiles.tile_fit import is_done
@@ -29,8 +31,6 @@ _TILE_M = 51.2
 
 def rows(names: list[str], quick: bool) -> Iterator[dict[str, Any]]:
     """A row for each thing that goes wrong."""
-    from distributed import LocalCluster
-
     count = 200_000 if quick else 2_000_000
     scans = [Scan(points, pose) for pose, points, *_ in street_scans(count)]
     with tempfile.TemporaryDirectory() as folder:
@@ -80,8 +80,6 @@ def _there(out: Path, tile: Any) -> bool:
 
 
 def _fit(cluster: Any, out: Path) -> None:
-    from radarsdf.tiles.cluster import cluster_executor
-
     with cluster_executor(cluster.scheduler_address, 0) as executor:
         run_fits(out, executor=executor, progress=False)
 

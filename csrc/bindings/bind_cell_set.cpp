@@ -3,6 +3,7 @@
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "lattice/cell_set.hpp"
+#include "util/stable_order.hpp"
 
 namespace radarsdf {
 namespace {
@@ -42,6 +43,20 @@ void bind_cell_set(py::module_& m) {
   cell_set.def(py::init<double>(), "leaf_size_m"_a)
       .def("__len__", &CellSet::size)
       .def(
+          "insert_along",
+          [](CellSet& cells, const Array<float>& points, const Array<float>& directions, const Array<float>& offsets_m,
+             int num_threads) {
+            const std::int64_t count = check_points(points), num_offsets = check_column(offsets_m, "offsets_m");
+            check_shape(directions, count, 3, "directions");
+            const float *p = points.data(), *d = directions.data(), *o = offsets_m.data();
+            const py::gil_scoped_release release;
+            cells.insert_along(p, d, count, o, num_offsets, num_threads);
+          },
+          "points"_a.noconvert(), "directions"_a.noconvert(), "offsets_m"_a.noconvert(), "num_threads"_a = 0,
+          "Marks the leaf cells of the points `offsets_m` (K,) float32 behind the points (N, 3) float32 along the "
+          "rays' "
+          "`directions` (N, 3) float32, local frame, m.")
+      .def(
           "insert_rays",
           [](CellSet& cells, const Array<float>& points, const Array<float>& directions, double reach_m,
              int num_threads) {
@@ -65,6 +80,19 @@ void bind_cell_set(py::module_& m) {
             return to_array(std::move(keys));
           },
           "num_threads"_a = 0, "Morton keys of the cells (C,) uint64, ascending.");
+  m.def(
+      "stable_order",
+      [](const Array<std::uint64_t>& keys) {
+        const std::int64_t count = check_column(keys, "keys");
+        const std::uint64_t* k = keys.data();
+        std::vector<std::int32_t> order;
+        {
+          const py::gil_scoped_release release;
+          order = stable_order(k, count);
+        }
+        return to_array(std::move(order));
+      },
+      "keys"_a.noconvert(), "Positions (N,) int32 of `keys` (N,) uint64 in ascending order; equal ones in their own.");
   bind_cells<float>(m, cell_set);
   bind_cells<double>(m, cell_set);
 }

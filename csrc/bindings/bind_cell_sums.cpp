@@ -5,6 +5,7 @@
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "lattice/cell_blocks.hpp"
+#include "returns/bridges.hpp"
 #include "returns/cell_sums.hpp"
 #include "returns/principal_axes.hpp"
 
@@ -75,6 +76,27 @@ void bind_cell_sums(py::module_& m) {
           "`values` (C, K) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 "
           "where "
           "there is no cell: (N, K).");
+  m.def(
+      "bridge_cells",
+      [](const Array<std::uint64_t>& leaf_keys, const Array<std::uint64_t>& ends, const Array<double>& support,
+         int max_cells, double least_dense, int num_threads) {
+        const std::int64_t num_leaves = check_column(leaf_keys, "leaf_keys"), num_ends = check_column(ends, "ends");
+        if (check_column(support, "support") != num_ends)
+          throw std::invalid_argument("support must be one for each end");
+        const std::uint64_t *k = leaf_keys.data(), *e = ends.data();
+        const double* s = support.data();
+        std::vector<std::uint64_t> keys;
+        {
+          const py::gil_scoped_release release;
+          keys = bridge_cells(k, num_leaves, e, s, num_ends, max_cells, least_dense, num_threads);
+        }
+        return to_array(std::move(keys));
+      },
+      "leaf_keys"_a.noconvert(), "ends"_a.noconvert(), "support"_a.noconvert(), "max_cells"_a, "least_dense"_a,
+      "num_threads"_a = 0,
+      "Keys, ascending, of `leaf_keys` (C,) and of the at most `max_cells` cells between two of `ends` (E,), in one of "
+      "13 directions, where the `support` (E,) float64 of the two, added up, is below `least_dense`. All keys uint64, "
+      "ascending, each once.");
   m.def(
       "sum_moments",
       [](const Array<float>& points, const Array<float>& directions, const Array<std::int32_t>& cells,

@@ -16,6 +16,47 @@
 #include "util/parallel_sort.hpp"
 
 namespace radarsdf {
+namespace {
+
+constexpr const char* kOutside = "points must be finite and within a million cells of the origin";
+
+template <typename T>
+class LatticeOf {
+ public:
+  explicit LatticeOf(double leaf_size_m) : inverse_(static_cast<T>(1.0 / leaf_size_m)) {}
+
+  bool holds(const T* point) const {  // NaN fails the comparison too
+    return std::abs(point[0] * inverse_) < limit_ && std::abs(point[1] * inverse_) < limit_ &&
+           std::abs(point[2] * inverse_) < limit_;
+  }
+
+  void check(const T* points, std::int64_t count, int num_threads) const {
+    std::atomic<bool> inside{true};
+    parallel_blocks(count, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
+      bool all = true;
+      for (std::int64_t i = 3 * begin; i < 3 * end; ++i) all = all & (std::abs(points[i] * inverse_) < limit_);
+      if (!all) inside = false;
+    });
+    if (!inside) throw std::invalid_argument(kOutside);
+  }
+
+  std::uint64_t key(const T* point) const {  // of a point that it holds
+    std::int32_t cell[3];
+    for (int axis = 0; axis < 3; ++axis) {  // std::floor is a call where the baseline has no instruction for it
+      const T u = point[axis] * inverse_;
+      cell[axis] = static_cast<std::int32_t>(u);
+      cell[axis] -= u < static_cast<T>(cell[axis]) ? 1 : 0;
+    }
+    return lattice_key(cell);
+  }
+
+ private:
+  T inverse_;
+  // Leaves room for the far vertex of the last cell of every level.
+  static constexpr T limit_ = static_cast<T>(kAxisBias - (1 << kMaxLevels));
+};
+
+}  // namespace
 
 CellSet::CellSet(double leaf_size_m) : leaf_size_m_(leaf_size_m) {
   if (!(leaf_size_m > 0) || !std::isfinite(leaf_size_m))
@@ -24,24 +65,11 @@ CellSet::CellSet(double leaf_size_m) : leaf_size_m_(leaf_size_m) {
 
 template <typename T>
 void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uint64_t* keys, int num_threads) {
-  // The limit leaves room for the far vertex of the last cell of every level. NaN fails the comparison too.
-  const T inverse = static_cast<T>(1.0 / leaf_size_m), limit = static_cast<T>(kAxisBias - (1 << kMaxLevels));
-  std::atomic<bool> inside{true};
+  const LatticeOf<T> lattice(leaf_size_m);
+  lattice.check(points, count, num_threads);
   parallel_blocks(count, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      std::uint32_t cell[3] = {};
-      for (int axis = 0; axis < 3; ++axis) {
-        const T u = points[3 * i + axis] * inverse;
-        if (!(std::abs(u) < limit)) {
-          inside = false;
-          return;
-        }
-        cell[axis] = static_cast<std::uint32_t>(static_cast<std::int32_t>(std::floor(u)) + kAxisBias);
-      }
-      keys[i] = morton_key(cell[0], cell[1], cell[2]);
-    }
+    for (std::int64_t i = begin; i < end; ++i) keys[i] = lattice.key(points + 3 * i);
   });
-  if (!inside) throw std::invalid_argument("points must be finite and within a million cells of the origin");
 }
 
 // By bits of the hash that FlatMap does not use. With the same bits, all keys of a partition would lie in one part of
@@ -50,60 +78,108 @@ std::size_t CellSet::partition_of(std::uint64_t block) {
   return static_cast<std::size_t>((hash_key(block) >> 16) % kPartitions);
 }
 
-void CellSet::insert_keys(const std::vector<std::vector<std::uint64_t>>& parts, int num_threads) {
-  const std::int64_t threads = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
-  parallel_tasks(threads, num_threads, [&](std::int64_t task) {
-    std::uint64_t previous = kEmptyKey;  // points along one ray often share a block
-    std::uint64_t* mask = nullptr;
-    for (const std::vector<std::uint64_t>& keys : parts) {
-      for (const std::uint64_t key : keys) {
-        const std::uint64_t block = CellBlocks::block_key(key);
-        if (block != previous) {
-          previous = block;
-          const std::size_t number = partition_of(block);
-          mask = nullptr;
-          if (static_cast<std::int64_t>(number) % threads == task) {
-            Partition& own = partitions_[number];
-            std::int32_t found = own.numbers.find(block);
+class CellSet::Marks {
+ public:
+  void add(std::uint64_t key) {
+    const std::uint64_t block = CellBlocks::block_key(key);
+    if (block != block_) {  // points along one ray often share a block
+      finish();
+      block_ = block;
+    }
+    mask_ |= std::uint64_t{1} << (key & 63);
+  }
+
+  void finish() {
+    if (mask_ != 0) of_partitions_[partition_of(block_)].push_back({block_, mask_});
+    mask_ = 0;
+  }
+
+  void clear() {
+    for (auto& entries : of_partitions_) entries.clear();
+    block_ = kEmptyKey;
+  }
+
+  struct Entry {
+    std::uint64_t block, mask;
+  };
+  const std::vector<Entry>& of_partition(std::size_t number) const { return of_partitions_[number]; }
+
+ private:
+  std::array<std::vector<Entry>, kPartitions> of_partitions_;
+  std::uint64_t block_ = kEmptyKey, mask_ = 0;
+};
+
+template <typename Mark>
+void CellSet::insert_marks(std::int64_t count, int num_threads, const Mark& mark) {
+  constexpr std::int64_t kAtOnce = 1 << 16;  // the marks of all would be much memory
+  const std::int64_t num_parts = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
+  std::vector<Marks> parts(static_cast<std::size_t>(num_parts));
+  for (std::int64_t first = 0; first < count; first += kAtOnce) {
+    const std::int64_t size = std::min(kAtOnce, count - first);
+    parallel_tasks(num_parts, num_threads, [&](std::int64_t part) {
+      Marks& own = parts[static_cast<std::size_t>(part)];
+      own.clear();
+      mark(first + size * part / num_parts, first + size * (part + 1) / num_parts, own);
+      own.finish();
+    });
+    parallel_tasks(num_parts, num_threads, [&](std::int64_t task) {
+      for (std::int64_t p = kPartitions * task / num_parts; p < kPartitions * (task + 1) / num_parts; ++p) {
+        const auto number = static_cast<std::size_t>(p);
+        Partition& own = partitions_[number];
+        for (const Marks& marks : parts) {
+          for (const Marks::Entry& entry : marks.of_partition(number)) {
+            std::int32_t found = own.numbers.find(entry.block);
             if (found < 0) {
               own.masks.push_back(0);
               found = static_cast<std::int32_t>(own.masks.size()) - 1;
-              own.numbers.insert(block, found);
+              own.numbers.insert(entry.block, found);
             }
-            mask = &own.masks[static_cast<std::size_t>(found)];
+            own.masks[static_cast<std::size_t>(found)] |= entry.mask;
           }
         }
-        if (mask != nullptr) *mask |= std::uint64_t{1} << (key & 63);
       }
-    }
-  });
+    });
+  }
 }
 
 template <typename T>
 void CellSet::insert(const T* points, std::int64_t count, int num_threads) {
-  std::vector<std::vector<std::uint64_t>> keys(1);
-  keys[0].resize(static_cast<std::size_t>(count));
-  cell_keys(points, count, leaf_size_m_, keys[0].data(), num_threads);
-  insert_keys(keys, num_threads);
+  const LatticeOf<T> lattice(leaf_size_m_);
+  lattice.check(points, count, num_threads);
+  insert_marks(count, num_threads, [&](std::int64_t begin, std::int64_t end, Marks& marks) {
+    for (std::int64_t i = begin; i < end; ++i) marks.add(lattice.key(points + 3 * i));
+  });
+}
+
+void CellSet::insert_along(const float* points, const float* directions, std::int64_t count, const float* offsets_m,
+                           std::int64_t num_offsets, int num_threads) {
+  const LatticeOf<float> lattice(leaf_size_m_);
+  std::atomic<bool> inside{true};
+  insert_marks(count, num_threads, [&](std::int64_t begin, std::int64_t end, Marks& marks) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      for (std::int64_t k = 0; k < num_offsets; ++k) {
+        float at[3];
+        for (int axis = 0; axis < 3; ++axis) at[axis] = points[3 * i + axis] + offsets_m[k] * directions[3 * i + axis];
+        if (!lattice.holds(at)) {
+          inside = false;
+          return;
+        }
+        marks.add(lattice.key(at));
+      }
+    }
+  });
+  if (!inside) throw std::invalid_argument(kOutside);
 }
 
 void CellSet::insert_rays(const float* points, const float* directions, std::int64_t count, double reach_m,
                           int num_threads) {
   check_rays(points, directions, count, leaf_size_m_, reach_m);
-  constexpr std::int64_t kRays = 1 << 15;  // at a time: the keys of all would be much memory
-  for (std::int64_t first = 0; first < count; first += kRays) {
-    const std::int64_t size = std::min(kRays, count - first);
-    const std::int64_t num_parts = std::min<std::int64_t>(resolve_num_threads(num_threads), size);
-    std::vector<std::vector<std::uint64_t>> parts(static_cast<std::size_t>(num_parts));
-    parallel_tasks(num_parts, num_threads, [&](std::int64_t part) {
-      std::vector<std::uint64_t>& keys = parts[static_cast<std::size_t>(part)];
-      for (std::int64_t i = first + size * part / num_parts; i < first + size * (part + 1) / num_parts; ++i) {
-        CellWalk cell(points + 3 * i, directions + 3 * i, -reach_m, reach_m, leaf_size_m_);
-        for (; cell.inside(); cell.next()) keys.push_back(cell.key());
-      }
-    });
-    insert_keys(parts, num_threads);
-  }
+  insert_marks(count, num_threads, [&](std::int64_t begin, std::int64_t end, Marks& marks) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      CellWalk cell(points + 3 * i, directions + 3 * i, -reach_m, reach_m, leaf_size_m_);
+      for (; cell.inside(); cell.next()) marks.add(cell.key());
+    }
+  });
 }
 
 std::int64_t CellSet::size() const {

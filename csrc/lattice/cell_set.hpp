@@ -25,6 +25,11 @@ class CellSet {
   template <typename T>
   void insert(const T* points, std::int64_t count, int num_threads);
 
+  // Marks the cells of the points at these distances behind the returns, along each ray: points, directions: (count,
+  // 3), local frame, m; offsets_m: (num_offsets,). Throws as cell_keys does; what comes before the fault may be stored.
+  void insert_along(const float* points, const float* directions, std::int64_t count, const float* offsets_m,
+                    std::int64_t num_offsets, int num_threads);
+
   // Marks the cells that rays go through within reach_m before and behind their returns. points, directions: (count,
   // 3), local frame, m, directions of unit length. Throws likewise.
   void insert_rays(const float* points, const float* directions, std::int64_t count, double reach_m, int num_threads);
@@ -44,8 +49,14 @@ class CellSet {
   // A block's partition is a function of its hash, so threads fill different partitions and need no locks.
   static constexpr int kPartitions = 64;
 
+  // Cells that are to be marked, sorted into partitions. Cells that follow each other in a block are one entry.
+  class Marks;
+
   static std::size_t partition_of(std::uint64_t block);
-  void insert_keys(const std::vector<std::vector<std::uint64_t>>& parts, int num_threads);
+
+  // Marks what mark(begin, end, marks) adds for the parts [begin, end) of `count` rays or points.
+  template <typename Mark>
+  void insert_marks(std::int64_t count, int num_threads, const Mark& mark);
 
   double leaf_size_m_;
   std::array<Partition, kPartitions> partitions_;

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <stdexcept>
 #include <utility>
@@ -249,7 +250,10 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
   if (total > static_cast<std::size_t>(std::numeric_limits<std::int32_t>::max())) {
     throw std::invalid_argument("the map needs more than 2^31 cells: use larger cells");
   }
-  cells_.assign(total, Cell{});
+  cells_.resize(total);
+  parallel_blocks(static_cast<std::int64_t>(total), 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    std::memset(static_cast<void*>(cells_.data() + begin), 0, sizeof(Cell) * static_cast<std::size_t>(end - begin));
+  });
 
   std::size_t first = 0;
   for (const auto& level_keys : keys) {

@@ -34,7 +34,7 @@ class VertexTable {
   double leaf_size_m() const { return leaf_size_m_; }
   Encoding encoding() const { return encoding_; }
   const std::vector<std::uint64_t>& leaf_keys() const { return leaf_keys_; }
-  const LargeVector<Cell>& cells() const { return cells_; }
+  const UninitialisedVector<Cell>& cells() const { return cells_; }
 
   // The occupied cell of every level, finest first, that holds each point, or -1: (count, num_levels). Points outside
   // the lattice and NaN are in no cell. Leaf cells have the numbers of their keys, from 0; coarser ones follow.
@@ -46,7 +46,7 @@ class VertexTable {
   double leaf_size_m_;
   int num_levels_;
   Encoding encoding_;
-  LargeVector<Cell> cells_;
+  UninitialisedVector<Cell> cells_;
   FlatMap roots_;
   std::int64_t num_rows_ = 0;
 };

@@ -18,6 +18,33 @@ namespace {
 
 constexpr std::int32_t kEdge = 1 << kBlockBits;
 
+constexpr std::int32_t kWide = kEdge + 2;
+
+constexpr std::int32_t part_coordinate(int part, int axis) { return (part >> axis & 1) | (part >> (axis + 2) & 2); }
+
+// Of the 27 blocks round one: which of their cells touch it; and where the cells of the one itself lie in the cube of
+// kWide cells round it.
+struct NextTo {
+  std::uint64_t masks[27] = {};
+  std::int32_t places[64] = {};
+
+  constexpr NextTo() {
+    for (int part = 0; part < 64; ++part) {
+      const std::int32_t at[3] = {part_coordinate(part, 0), part_coordinate(part, 1), part_coordinate(part, 2)};
+      places[part] = (kWide * (at[0] + 1) + at[1] + 1) * kWide + at[2] + 1;
+      for (int n = 0; n < 27; ++n) {
+        const int steps[3] = {n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1};
+        bool touches = true;
+        for (int axis = 0; axis < 3; ++axis) {
+          if (steps[axis] != 0) touches = touches && at[axis] == (steps[axis] > 0 ? 0 : kEdge - 1);
+        }
+        if (touches) masks[n] |= std::uint64_t{1} << part;
+      }
+    }
+  }
+};
+constexpr NextTo kNextTo;
+
 // The 27 blocks round one, the last coordinate fastest.
 class BlocksRound {
  public:
@@ -42,11 +69,19 @@ class BlocksRound {
     }
   }
 
-  // The middle block, where there is one.
-  const Occupancy* middle() const { return blocks_[13]; }
-
-  // How many cells the middle block has.
-  int num_cells() const { return blocks_[13] != nullptr ? count_bits(blocks_[13]->mask) : 0; }
+  // Calls visit(row, place) for the cells of the middle block and those next to it; place is the position in a cube of
+  // 6 x 6 x 6 cells, the last coordinate fastest.
+  template <typename Visit>
+  void for_each(const Visit& visit) const {
+    for (int n = 0; n < 27; ++n) {
+      if (blocks_[n] == nullptr) continue;
+      const int offset = kEdge * (kWide * kWide * (n / 9 - 1) + kWide * (n / 3 % 3 - 1) + n % 3 - 1);
+      for (std::uint64_t bits = blocks_[n]->mask & kNextTo.masks[n]; bits != 0; bits &= bits - 1) {
+        const int part = lowest_bit(bits);
+        visit(blocks_[n]->row(static_cast<std::uint64_t>(part)), kNextTo.places[part] + offset);
+      }
+    }
+  }
 
   // The row of the cell at these coordinates, counted from the middle block's first cell; -1 where there is none.
   std::int32_t row(std::int32_t x, std::int32_t y, std::int32_t z) const {
@@ -65,21 +100,24 @@ class BlocksRound {
   const Occupancy* blocks_[27] = {};
 };
 
-// From how many cells of a block on it is less work to add up round all 64, axis after axis.
-constexpr int kManyCells = 8;
+// From how many keys in a block on it is less work to add up round all 64, axis after axis.
+constexpr std::int64_t kManyKeys = 5;
 
-// sums: (64, columns), in Morton order, of the values in the 27 cells round each of a block's.
-void sum_round_block(const BlocksRound& round, const double* values, int columns, double* sums) {
-  constexpr std::int32_t kWide = kEdge + 2;
+// sums: (64, columns), in Morton order, of the values in the 27 cells round each of a block's. `cube` is scratch.
+void sum_round_block(const BlocksRound& round, const double* values, int columns, std::vector<double>& cube,
+                     double* sums) {
+  constexpr std::int32_t kPlaces = kWide * kWide * kWide;
+  cube.assign(static_cast<std::size_t>(kPlaces * columns), 0.0);
+  round.for_each([&](std::int32_t row, std::int32_t place) {
+    for (int k = 0; k < columns; ++k) {
+      cube[static_cast<std::size_t>(kPlaces * k + place)] = values[columns * std::int64_t{row} + k];
+    }
+  });
   for (int k = 0; k < columns; ++k) {
     double along_z[kWide][kWide][kEdge], along_y[kWide][kEdge][kEdge];
     for (std::int32_t x = 0; x < kWide; ++x) {
       for (std::int32_t y = 0; y < kWide; ++y) {
-        double line[kWide];
-        for (std::int32_t z = 0; z < kWide; ++z) {
-          const std::int32_t row = round.row(x - 1, y - 1, z - 1);
-          line[z] = row >= 0 ? values[columns * std::int64_t{row} + k] : 0;
-        }
+        const double* line = &cube[static_cast<std::size_t>(kPlaces * k + (kWide * x + y) * kWide)];
         for (std::int32_t z = 0; z < kEdge; ++z) along_z[x][y][z] = line[z] + line[z + 1] + line[z + 2];
       }
       for (std::int32_t y = 0; y < kEdge; ++y) {
@@ -88,11 +126,21 @@ void sum_round_block(const BlocksRound& round, const double* values, int columns
         }
       }
     }
-    for (std::uint32_t i = 0; i < 64; ++i) {
-      const std::uint32_t x = morton_coordinate(i, 0), y = morton_coordinate(i, 1), z = morton_coordinate(i, 2);
+    for (int i = 0; i < 64; ++i) {
+      const std::int32_t x = part_coordinate(i, 0), y = part_coordinate(i, 1), z = part_coordinate(i, 2);
       sums[columns * std::int64_t{i} + k] = along_y[x][y][z] + along_y[x + 1][y][z] + along_y[x + 2][y][z];
     }
   }
+}
+
+// Whether more than kManyKeys of the ascending keys round keys[i] lie in its block: it depends on the keys alone.
+bool in_crowd(const std::uint64_t* keys, std::int64_t count, std::int64_t i) {
+  const std::uint64_t block_key = CellBlocks::block_key(keys[i]);
+  std::int64_t found = 0;
+  for (std::int64_t k = i; k >= 0 && found <= kManyKeys && CellBlocks::block_key(keys[k]) == block_key; --k) ++found;
+  for (std::int64_t k = i + 1; k < count && found <= kManyKeys && CellBlocks::block_key(keys[k]) == block_key; ++k)
+    ++found;
+  return found > kManyKeys;
 }
 
 }  // namespace
@@ -123,13 +171,13 @@ void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t 
     BlocksRound round(cells);
     std::uint64_t block_key = kEmptyKey;
     bool add_up_block = false;
-    std::vector<double> block_sums(static_cast<std::size_t>(64 * columns));
+    std::vector<double> block_sums(static_cast<std::size_t>(64 * columns)), cube;
     for (std::int64_t i = begin; i < end; ++i) {
       if (CellBlocks::block_key(keys[i]) != block_key) {
         block_key = CellBlocks::block_key(keys[i]);
         round.move_to(block_key);
-        add_up_block = weight == 1 && round.num_cells() >= kManyCells;
-        if (add_up_block) sum_round_block(round, values, columns, block_sums.data());
+        add_up_block = weight == 1 && in_crowd(keys, count, i);
+        if (add_up_block) sum_round_block(round, values, columns, cube, block_sums.data());
       }
       if (add_up_block) {
         const double* own = block_sums.data() + columns * static_cast<std::int64_t>(keys[i] & 63);

@@ -8,6 +8,8 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <new>
+#include <utility>
 #include <vector>
 
 #ifdef __linux__
@@ -57,5 +59,29 @@ struct LargeAllocator : std::allocator<T> {
 
 template <typename T>
 using LargeVector = std::vector<T, LargeAllocator<T>>;
+
+// What a vector of this makes without a value is uninitialised, so that threads can write to it first: the system gives
+// each its own pages then.
+template <typename T>
+struct UninitialisedAllocator : LargeAllocator<T> {
+  template <typename U>
+  struct rebind {
+    using other = UninitialisedAllocator<U>;
+  };
+
+  UninitialisedAllocator() = default;
+  template <typename U>
+  UninitialisedAllocator(const UninitialisedAllocator<U>&) {}
+
+  template <typename U>
+  void construct(U*) noexcept {}
+  template <typename U, typename... Arguments>
+  void construct(U* at, Arguments&&... arguments) {
+    ::new (static_cast<void*>(at)) U(std::forward<Arguments>(arguments)...);
+  }
+};
+
+template <typename T>
+using UninitialisedVector = std::vector<T, UninitialisedAllocator<T>>;
 
 }  // namespace radarsdf

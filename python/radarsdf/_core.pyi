@@ -29,6 +29,7 @@ __all__: list[str] = [
     "TaskQueue",
     "VertexTable",
     "available_instruction_sets",
+    "bridge_cells",
     "cell_keys",
     "cell_rows",
     "compiler",
@@ -46,12 +47,16 @@ __all__: list[str] = [
     "mesh_components",
     "mlp",
     "mlp_backward",
+    "move_onto_planes",
     "num_threads",
     "openmp_version",
     "principal_axes",
+    "sample_cells",
+    "sample_rays",
     "set_instruction_set",
     "sparse_lattice",
     "spherical_harmonics",
+    "stable_order",
     "sum_moments",
 ]
 
@@ -78,6 +83,16 @@ class CellSet:
     ) -> None:
         """
         Marks the leaf cells that hold the points (N, 3), local frame, m.
+        """
+    def insert_along(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        directions: numpy.typing.NDArray[numpy.float32],
+        offsets_m: numpy.typing.NDArray[numpy.float32],
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> None:
+        """
+        Marks the leaf cells of the points `offsets_m` (K,) float32 behind the points (N, 3) float32 along the rays' `directions` (N, 3) float32, local frame, m.
         """
     def insert_rays(
         self,
@@ -650,6 +665,18 @@ def available_instruction_sets() -> list[str]:
     Instruction sets that were compiled in and that this processor runs, slowest first.
     """
 
+def bridge_cells(
+    leaf_keys: numpy.typing.NDArray[numpy.uint64],
+    ends: numpy.typing.NDArray[numpy.uint64],
+    support: numpy.typing.NDArray[numpy.float64],
+    max_cells: typing.SupportsInt | typing.SupportsIndex,
+    least_dense: typing.SupportsFloat | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.uint64]:
+    """
+    Keys, ascending, of `leaf_keys` (C,) and of the at most `max_cells` cells between two of `ends` (E,), in one of 13 directions, where the `support` (E,) float64 of the two, added up, is below `least_dense`. All keys uint64, ascending, each once.
+    """
+
 @typing.overload
 def cell_keys(
     points: numpy.typing.NDArray[numpy.float32],
@@ -992,6 +1019,29 @@ def mlp_backward(
     Writes the gradients of (mlp . out_grad): by weights and biases, unless these are None, and by those inputs for which there is a matrix. `hidden` is what `mlp` gave.
     """
 
+def move_onto_planes(
+    points: numpy.typing.NDArray[numpy.float32],
+    directions: numpy.typing.NDArray[numpy.float32],
+    ranges_m: numpy.typing.NDArray[numpy.float32],
+    scans: numpy.typing.NDArray[numpy.int32],
+    up_of_scan: numpy.typing.NDArray[numpy.float64],
+    planes: numpy.typing.NDArray[numpy.int32],
+    centres: numpy.typing.NDArray[numpy.float64],
+    normals: numpy.typing.NDArray[numpy.float64],
+    variances_m2: numpy.typing.NDArray[numpy.float64],
+    noise: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> tuple[
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+]:
+    """
+    Points, directions and ranges of rays whose returns are moved towards their `planes` (N,) int32, -1 for none, as far as their noise explains. Of rays: `points`, `directions` (N, 3), `ranges_m` (N,) float32, `scans` (N,) int32; `up_of_scan` (F, 3) float64. Of planes: `centres`, `normals` (P, 3), `variances_m2` (P,) of their returns, float64. `noise`: variances along the beam, m^2, in azimuth and elevation, rad^2. Local frame, m.
+    """
+
 def num_threads(num_threads: typing.SupportsInt | typing.SupportsIndex = 0) -> int:
     """
     Threads that a call with this argument uses.
@@ -1007,6 +1057,30 @@ def principal_axes(
 ) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.float64]]:
     """
     Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3), in columns, of symmetric `matrices` (N, 3, 3) float64.
+    """
+
+def sample_cells(
+    cells: numpy.typing.NDArray[numpy.int64],
+    column: typing.SupportsInt | typing.SupportsIndex,
+    share: typing.SupportsFloat | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.bool]:
+    """
+    Whether each cell is in the sample, (N,) bool: a hash chooses this `share` of all columns of `column` cells an edge. `cells` (N, K) int64, lattice coordinates.
+    """
+
+def sample_rays(
+    points: numpy.typing.NDArray[numpy.float32],
+    directions: numpy.typing.NDArray[numpy.float32],
+    offsets_m: numpy.typing.NDArray[numpy.float32],
+    axes: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex],
+    cell_size_m: typing.SupportsFloat | typing.SupportsIndex,
+    column: typing.SupportsInt | typing.SupportsIndex,
+    share: typing.SupportsFloat | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.bool]:
+    """
+    Whether a point `offsets_m` (K,) behind each of the `points` (N, 3), along the rays' `directions` (N, 3), is in the sample by these of its coordinates, (N,) bool; see `sample_cells`. All float32, local frame, m.
     """
 
 def set_instruction_set(name: str) -> None:
@@ -1037,6 +1111,11 @@ def spherical_harmonics(
 ) -> None:
     """
     Writes the real spherical harmonics of degree 0 to 3 of unit vectors (N, 3) to `out` (N, 16).
+    """
+
+def stable_order(keys: numpy.typing.NDArray[numpy.uint64]) -> numpy.typing.NDArray[numpy.int32]:
+    """
+    Positions (N,) int32 of `keys` (N,) uint64 in ascending order; equal ones in their own.
     """
 
 def sum_moments(

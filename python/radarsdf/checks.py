@@ -71,20 +71,35 @@ def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
         msg = "points holds no scans"
         raise ValueError(msg)
     for i, scan in enumerate(scans):
-        if scan.ndim != 2 or scan.shape[1] != 3:
-            msg = f"scan {i} must have shape (N, 3), not {scan.shape}"
-            raise ValueError(msg)
+        check_scan_shape(scan, i)
+
+
+def check_scan_shape(scan: NDArray[Any], number: int) -> None:
+    """Raises a ValueError unless scan `number` is an array (N, 3)."""
+    if scan.ndim != 2 or scan.shape[1] != 3:
+        msg = f"scan {number} must have shape (N, 3), not {scan.shape}"
+        raise ValueError(msg)
 
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
     """Raises a ValueError unless the values are arrays (N,) for scans (N, 3)."""
-    if len(values) != len(scans):
-        msg = f"{name} holds {len(values)} scans, points {len(scans)}"
-        raise ValueError(msg)
+    check_equal_numbers(len(values), len(scans), name)
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
-        if value.shape != (len(scan),):
-            msg = f"{name} of scan {i} must have shape ({len(scan)},), not {value.shape}"
-            raise ValueError(msg)
+        check_values_of_scan(value, scan, name, i)
+
+
+def check_equal_numbers(num_values: int, num_scans: int, name: str) -> None:
+    """Raises a ValueError unless there are as many arrays of values as scans."""
+    if num_values != num_scans:
+        msg = f"{name} holds {num_values} scans, points {num_scans}"
+        raise ValueError(msg)
+
+
+def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, number: int) -> None:
+    """Raises a ValueError unless the values are an array (N,) for scan `number`, (N, 3)."""
+    if value.shape != (len(scan),):
+        msg = f"{name} of scan {number} must have shape ({len(scan)},), not {value.shape}"
+        raise ValueError(msg)
 
 
 def pose_matrices(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:

@@ -21,9 +21,12 @@
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
 #include "lattice/vertex_table.hpp"
+#include "returns/bridges.hpp"
 #include "returns/cell_means.hpp"
 #include "returns/cell_sums.hpp"
+#include "returns/column_sample.hpp"
 #include "returns/looks.hpp"
+#include "returns/onto_planes.hpp"
 #include "returns/ray_average.hpp"
 #include "returns/surface_crossings.hpp"
 #include "surface/marching_cubes.hpp"
@@ -251,6 +254,50 @@ void means_and_tracing(int threads, Results& results) {
   results.add(hits.data(), kPoints);
 }
 
+// Returns moved onto planes, a sample of columns, cells along rays, and bridges between some of them.
+void before_the_training(int threads, Results& results) {
+  const auto points = random_numbers<float>(3 * kPoints, 3.0, 16);
+  const auto directions = random_numbers<float>(3 * kPoints, 1.0, 17);
+  const auto offsets = random_numbers<float>(5, 0.3, 18);
+  radarsdf::CellSet cells(0.2);
+  cells.insert_along(points.data(), directions.data(), kPoints, offsets.data(), 5, threads);
+  const std::vector<std::uint64_t> keys = cells.sorted_keys(threads);
+  const auto num_keys = static_cast<std::int64_t>(keys.size());
+  results.add(keys.data(), num_keys);
+  std::vector<std::uint64_t> ends;
+  for (std::size_t i = 0; i < keys.size(); i += 3) ends.push_back(keys[i]);
+  const std::vector<double> support(ends.size(), 1.0);
+  const std::vector<std::uint64_t> bridged = radarsdf::bridge_cells(
+      keys.data(), num_keys, ends.data(), support.data(), static_cast<std::int64_t>(ends.size()), 4, 9.0, threads);
+  results.add(bridged.data(), static_cast<std::int64_t>(bridged.size()));
+  std::vector<double> around(keys.size());
+  const std::vector<double> ones(keys.size(), 1.0);
+  radarsdf::sum_round(radarsdf::CellBlocks(keys.data(), num_keys), keys.data(), num_keys, ones.data(), 1, 1.0,
+                      around.data(), threads);
+  results.add(around.data(), num_keys);
+
+  std::vector<std::uint8_t> chosen(kPoints);
+  const int axes[2] = {0, 2};
+  radarsdf::sample_rays({16, 0.3}, 0.2, points.data(), directions.data(), kPoints, offsets.data(), 5, axes, 2,
+                        chosen.data(), threads);
+  results.add(chosen.data(), kPoints);
+
+  constexpr std::int64_t kPlanes = 300, kScans = 7;
+  const auto planes = random_numbers<double>(7 * kPlanes, 1.0, 19), up = random_numbers<double>(3 * kScans, 1.0, 20);
+  const std::vector<float> ranges(kPoints, 6.0F);
+  std::vector<std::int32_t> scans(kPoints), of_return(kPoints);
+  for (std::int32_t i = 0; i < kPoints; ++i) {
+    scans[static_cast<std::size_t>(i)] = i * kScans / kPoints;
+    of_return[static_cast<std::size_t>(i)] = i % (kPlanes + 1) - 1;
+  }
+  std::vector<float> moved(7 * kPoints);
+  radarsdf::move_onto_planes(
+      {points.data(), directions.data(), ranges.data(), scans.data(), of_return.data(), kPoints, up.data()},
+      {planes.data(), planes.data() + 3 * kPlanes, planes.data() + 6 * kPlanes, kPlanes}, {0.01, 1e-4, 1e-4},
+      {moved.data(), moved.data() + 3 * kPoints, moved.data() + 6 * kPoints}, threads);
+  results.add(moved.data(), 7 * kPoints);
+}
+
 // An exception of one task ends the others and is the caller's.
 void failure(int threads) {
   bool caught = false;
@@ -297,6 +344,7 @@ Results all(int threads) {
   adam<T>(radarsdf::Encoding::kTriQuadtree, threads, results);
   adam<T>(radarsdf::Encoding::kOctree, threads, results);
   networks<T>(threads, results);
+  before_the_training(threads, results);
   sums_and_rays(threads, results);
   means_and_tracing(threads, results);
   failure(threads);

@@ -158,7 +158,9 @@ def test_centimetres_for_metres_change_nothing_but_roundings():
     config = QUICK.override(networks={"log_range": False}, returns={"drop_ghosts": False})
     poses = scene.poses.copy()
     poses[:, :3, 3] *= 100
-    origin = poses[:, :3, 3].mean(axis=0)  # blocks of 6.4 m and of 640 are not at the same places, to the last bit
+    origin = poses[:, :3, 3].mean(
+        axis=0
+    )  # blocks of 6.4 m and of 640 are not at the same places, to the last bit
     metres = radarsdf.fit(
         scene.points, scene.poses, scene.intensities, config=config, origin=origin / 100, progress=False
     )

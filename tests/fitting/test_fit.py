@@ -72,6 +72,16 @@ def test_same_seed_same_bits_other_seed_other_bits(scene):
     assert not torch.equal(maps[0].field.cells.features, other.field.cells.features)
 
 
+def test_scans_may_come_one_after_another(scene):
+    config = FitConfig(num_threads=1, training={"sdf_iterations": 3, "intensity_iterations": 3})
+    given = scene.points, scene.poses, scene.intensities
+    streamed = (p for p in scene.points), scene.poses, (v for v in scene.intensities)
+    maps = [radarsdf.fit(*scans, config=config, progress=False) for scans in (given, streamed)]
+    for whole, part in zip(*(m.field.parameters() for m in maps), strict=True):
+        assert torch.equal(whole, part)
+    assert maps[0].report["returns"] == maps[1].report["returns"] == sum(map(len, scene.points))
+
+
 def test_a_fit_leaves_the_global_random_state_and_threads_alone(scene):
     torch.manual_seed(3)
     state, threads = torch.get_rng_state(), torch.get_num_threads()

@@ -81,6 +81,7 @@ def returns_of(rays, variances_m2):
         keys=np.array(found, np.uint64),
         information=np.array([information[key] for key in found], np.float32),
         scans=np.array([len(scans_of_cell[key]) for key in found], np.uint32),
+        counts=np.ones(len(found)),  # evidence does not ask for them
     )
 
 

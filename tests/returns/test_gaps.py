@@ -9,9 +9,10 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
+from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.gaps import _MAX_SUPPORT, bridged
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.support import support_of_points
+from radarsdf.returns.support import support_at
 
 from ..conftest import ground_and_wall
 
@@ -39,7 +40,9 @@ def key_of(rays, cell):
 
 def added(rays, max_cells, leaf_keys=None):
     leaf_keys = leaf_keys_of(rays) if leaf_keys is None else leaf_keys
-    result = bridged(leaf_keys, rays, LEAF_M, max_cells)
+    cells = ReturnCells.of(rays, LEAF_M)
+    result = bridged(leaf_keys, cells.keys, cells.counts, max_cells)
+    np.testing.assert_array_equal(result, bridged(leaf_keys, cells.keys, cells.counts, max_cells, 3))
     assert (np.diff(result.astype(np.int64)) > 0).all()
     assert np.isin(leaf_keys, result).all()
     return set(np.setdiff1d(result, leaf_keys).tolist())
@@ -76,8 +79,9 @@ def test_as_a_search_of_all_pairs_says(max_cells):
     leaf_keys = leaf_keys_of(rays)
     cells = np.unique(np.floor(rays.points / np.float32(LEAF_M)).astype(int), axis=0)
     keys = cell_keys(((cells + 0.5) * LEAF_M), LEAF_M)
-    support = support_of_points(rays.points, leaf_keys, LEAF_M)[np.searchsorted(leaf_keys, keys)]
-    least = 0.5 * np.median(support)
+    returns = ReturnCells.of(rays, LEAF_M)
+    support = support_at(keys, returns.keys, returns.counts)
+    least = 0.5 * np.median(support)  # every leaf cell holds returns
     expected = set()
     for i, a in enumerate(cells):
         for j, b in enumerate(cells[:i]):
@@ -108,4 +112,4 @@ def test_the_published_configuration_bridges_nothing():
     assert FitConfig.paper().encoding.bridge_cells == 0
     rays = rays_to([(0, 0, 0), (2, 0, 0)])
     leaf_keys = leaf_keys_of(rays)
-    assert bridged(leaf_keys, rays, LEAF_M, 0) is leaf_keys
+    assert bridged(leaf_keys, leaf_keys, np.ones(len(leaf_keys)), 0) is leaf_keys

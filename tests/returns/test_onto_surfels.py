@@ -24,7 +24,7 @@ def test_returns_come_onto_the_planes_that_they_make():
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
     moved = onto_surfels(surfels, rays, noise)
-    np.testing.assert_array_equal(moved.points, onto_surfels(surfels, rays, noise, chunk=777).points)
+    np.testing.assert_array_equal(moved.points, onto_surfels(surfels, rays, noise, num_threads=3).points)
 
     def error_m(rays):
         x, _, z = rays.points.T + rays.origin[:, None]
@@ -41,6 +41,32 @@ def test_returns_come_onto_the_planes_that_they_make():
     np.testing.assert_allclose(np.linalg.norm(moved.directions, axis=1), 1, atol=1e-6)
 
 
+def test_the_shift_is_the_best_linear_estimate():
+    """As in plain NumPy, one return after another."""
+    points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01, scans=2)
+    noise = SensorNoise(0.1, 0.012, 0.02)
+    rays = prepare(points, poses)
+    surfels = Surfels.of(rays, LEAF_M)
+    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray)
+    variances, of_plane = {}, {}
+    for i in np.flatnonzero(plane >= 0):
+        direction, normal = rays.directions[i].astype(float), surfels.normals[plane[i]]
+        azimuth = np.cross(rays.up_of_scan[rays.scans[i]], direction)
+        azimuth /= np.linalg.norm(azimuth)
+        axes = direction, azimuth, np.cross(direction, azimuth)
+        sigmas = noise.range_m, noise.azimuth_rad * rays.ranges_m[i], noise.elevation_rad * rays.ranges_m[i]
+        variances[i] = sum((sigma * (axis @ normal)) ** 2 for axis, sigma in zip(axes, sigmas, strict=True))
+        of_plane.setdefault(plane[i], []).append(variances[i])
+    assert len(variances) > 0.2 * len(rays)
+    expected = rays.points.astype(float)
+    for i, variance in variances.items():
+        rough = max(surfels.variances[plane[i], 0] - np.mean(of_plane[plane[i]]), 0)
+        normal = surfels.normals[plane[i]]
+        off_m = (expected[i] - surfels.centres[plane[i]]) @ normal
+        expected[i] -= off_m * variance / (variance + rough) * normal
+    np.testing.assert_allclose(onto_surfels(surfels, rays, noise).points, expected, atol=2e-6)
+
+
 def test_returns_that_make_no_plane_stay_where_they_are():
     noise = SensorNoise(0.1, 0.01, 0.01)
     points = np.random.default_rng(0).uniform([5, -3, -3], [11, 3, 3], (4000, 3))
@@ -53,6 +79,16 @@ def test_returns_that_make_no_plane_stay_where_they_are():
         np.testing.assert_array_equal(getattr(moved, name)[still], getattr(rays, name)[still])
     lone = prepare([[[5.0, 0, 0]]], np.eye(4)[None])
     assert onto_surfels(Surfels.of(lone, LEAF_M), lone, noise).points.tolist() == [[5, 0, 0]]
+
+
+def test_a_return_straight_above_its_sensor_moves_a_finite_way():
+    rng = np.random.default_rng(1)
+    ceiling = np.column_stack([rng.uniform(-1, 1, (2000, 2)), rng.normal(8, 0.05, 2000)])
+    ceiling[0] = [0, 0, 8.05]
+    rays = prepare([ceiling], np.eye(4)[None])
+    moved = onto_surfels(Surfels.of(rays, LEAF_M), rays, SensorNoise(0.05, 0.01, 0.01))
+    assert np.isfinite(moved.points).all()
+    assert abs(moved.points[0, 2] - 8) < 0.03
 
 
 def test_a_fit_to_planes_is_nearer_to_the_surface():

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 from radarsdf.checks import check_poses
@@ -135,6 +137,45 @@ def test_lists_are_arrays_too():
     rays = prepare([[[1, 2, 3], [4, 5, 6]]], np.eye(4)[None].tolist(), [[1, 2]])
     assert rays.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert rays.intensities.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("changes", [{}, {"accumulate_scans": 3}, {"min_range_m": 12.0}])
+def test_scans_one_after_another_give_the_same_bits(changes):
+    points, poses = scans()
+    values = [np.arange(len(p), dtype=float) for p in points]
+    whole = prepare(points, poses, values, **changes)
+    assert whole.num_given == sum(map(len, points))
+    streamed = prepare((p for p in points), poses, (v for v in values), **changes)
+    for name in ("points", "directions", "ranges_m", "intensities", "scans", "origin"):
+        np.testing.assert_array_equal(getattr(streamed, name), getattr(whole, name))
+
+
+def test_wrong_numbers_of_scans_one_after_another():
+    points, poses = scans()
+    for some, values, said in (
+        (points[:5], None, r"poses must have shape \(5, 4, 4\)"),
+        ([*points, points[0]], None, r"poses must have shape \(8, 4, 4\)"),
+        (points, [np.arange(len(p)) for p in points[:6]], "intensities holds 6 scans, points 7"),
+        (points[:6], [np.arange(len(p)) for p in points], "intensities holds 7 scans, points 6"),
+        ([], None, "no scans"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            prepare(iter(some), poses, None if values is None else iter(values))
+
+
+def test_no_more_than_two_scans_are_held():
+    points, poses = scans()
+    given = []
+
+    def stream():
+        for scan in points:
+            own = scan.copy()
+            given.append(weakref.ref(own))
+            yield own
+            del own
+            assert sum(scan() is not None for scan in given) <= 2
+
+    prepare(stream(), poses)
 
 
 def test_select_takes_some_rays():

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from radarsdf.io import Scans
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import Sensor
+
+from ..conftest import pose
 
 NOISE = SensorNoise(0.1, 0.01, 0.02)
 
@@ -55,6 +58,19 @@ def test_scans_bring_their_intensities():
     points, intensities = scans()
     poses = np.tile(np.eye(4), (3, 1, 1))
     assert Sensor.of(Scans(points, poses, intensities)) == Sensor.of(points, intensities)
+
+
+def test_rays_tell_what_their_scans_tell():
+    points, intensities = scans()
+    turns = np.radians([10, 80, -130])
+    poses = np.stack([pose([3.0 * i, 5, -i], turn) for i, turn in enumerate(turns)])
+    limits = {"min_range_m": 5.0, "max_range_m": 30.0}
+    expected = Sensor.of(points, intensities, noise=NOISE, **limits)
+    rays = prepare(points, poses, intensities, **limits)
+    found = Sensor.of_rays(rays, poses, NOISE)
+    for name in ("azimuth_rad", "elevation_rad", "range_m", "returns_per_scan"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), abs=1e-5)
+    np.testing.assert_allclose(found.thresholds, expected.thresholds, atol=1e-4)
 
 
 def test_json_keeps_a_sensor():

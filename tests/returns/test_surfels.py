@@ -16,7 +16,7 @@ from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.support import support_of_points
+from radarsdf.returns.support import support_at
 from radarsdf.returns.surfels import Surfels
 
 from ..conftest import ground_and_wall
@@ -93,7 +93,7 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     rays = prepare([np.concatenate(pair) for pair in zip(points, passed, strict=True)], poses)
     behind = np.concatenate([np.arange(1500 + 3750) >= 1500] * len(points))
     surfels = Surfels.of(rays, LEAF_M)
-    noise = sensor_noise(surfels, rays, surfels.cells.cell_of_ray, ReturnsConfig())
+    noise = sensor_noise(surfels, rays, ReturnsConfig())
     assert find_ghosts(surfels, rays, noise)[behind].mean() < 0.05
 
 
@@ -195,8 +195,7 @@ def test_support_counts_the_returns_in_27_cells():
     cells = np.floor(points / np.float32(0.2)).astype(int)
     leaf_keys, first = np.unique(cell_keys(points, 0.2), return_index=True)
     expected = [(np.abs(cells - cell).max(axis=1) <= 1).sum() for cell in cells[first]]
-    support = support_of_points(points, leaf_keys, 0.2)
-    assert support.dtype == np.uint16
+    counts = np.unique(cell_keys(points, 0.2), return_counts=True)[1].astype(float)
+    support = support_at(leaf_keys, leaf_keys, counts)
     np.testing.assert_array_equal(support, expected)
-    crowd = np.full((70_000, 3), 0.1, np.float32)
-    assert support_of_points(crowd, np.unique(cell_keys(crowd, 0.2)), 0.2).tolist() == [65535]
+    assert support_at(leaf_keys[:1], leaf_keys[:1], np.array([70_000.0])).tolist() == [65535]

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import FEATURE_DIM, CellSet
+from radarsdf._core import FEATURE_DIM, CellSet, sample_cells, sample_rays
 from radarsdf.budget.durations import SECONDS, shared, work_of
 from radarsdf.budget.extent import check_extent
 from radarsdf.budget.schedule import Schedule
@@ -29,7 +29,9 @@ _PER_RETURN = 30.0
 _PER_INTENSITY = 20.0
 _PER_RETURN_AGAIN = 110.0  # if the intensity stage uses other returns than the sdf stage
 _PER_RETURN_OF_CLOSED_FORM = 150.0  # cells of intensities in closed form
-_PER_RETURN_CHECKED = 200.0  # scans in float64, freed before the training
+_PER_RETURN_CHECKED = (
+    200.0  # rays with and without ghosts, and the training's copy, for which the others make room
+)
 _PER_CELL = 215.0
 _PER_OCTREE_ROW = 30.0  # freed when the rows are numbered
 _COPIES = 4  # of each parameter that learns: value, two moments of Adam, last finite value
@@ -301,10 +303,14 @@ def _distinct(
     share = min(1.0, _SAMPLE / len(rays))
     if share * len(rays) * steps > _MOST_POINTS:  # a ray is in the sample if one of its columns is
         share *= _MOST_POINTS / (len(rays) * share * steps * looks)
-    chosen = np.zeros(len(rays), bool)
-    for offset in np.linspace(-band_m, band_m, looks) if share < 1 else ():
-        chosen |= _in_sample(_lattice(rays, float(offset), axes, leaf_size_m), share)
-    used = rays.select(chosen) if share < 1 else rays
+    used = rays
+    if share < 1:
+        points, directions = np.ascontiguousarray(rays.points), np.ascontiguousarray(rays.directions)
+        offsets_m = np.linspace(-band_m, band_m, looks).astype(np.float32)
+        threads = resolve_num_threads(config.num_threads)
+        used = rays.select(
+            sample_rays(points, directions, offsets_m, axes, leaf_size_m, _COLUMN, share, threads)
+        )
     cells = CellSet(leaf_size_m)
     for points in used.along(np.linspace(-band_m, band_m, steps + 1)) if len(used) else ():
         points[:, [axis for axis in range(3) if axis not in axes]] = 0
@@ -318,26 +324,10 @@ def _distinct(
             found = _unique_rows((found[:, None, :] + steps_to).reshape(-1, len(axes)))
         # Count by the column of each cell or corner itself. Those of a return in the sample may be in another
         # column.
-        counts.append(len(found) if share == 1 else int(_in_sample(found << level, share).sum()) / share)
+        found = np.ascontiguousarray(found << level)
+        counts.append(len(found) if share == 1 else int(sample_cells(found, _COLUMN, share).sum()) / share)
     # Steps that are too long miss cells: as if there were so many times more.
     return [count * wanted / steps for count in counts]
-
-
-def _lattice(rays: Rays, offset_m: float, axes: tuple[int, ...], leaf_size_m: float) -> NDArray[np.int64]:
-    """Cells (N, any) of the points at this offset along the rays, by these of their coordinates alone."""
-    columns = list(axes)
-    points = rays.points[:, columns] + np.float32(offset_m) * rays.directions[:, columns]
-    lattice: NDArray[np.int64] = np.floor(points / leaf_size_m).astype(np.int64)
-    return lattice
-
-
-def _in_sample(lattice: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
-    """(N,) whether each cell (N, axes) is in the sample. A hash selects this share of all columns."""
-    hashed = np.zeros(len(lattice), np.uint64)
-    for coordinate in (lattice // _COLUMN).T:
-        hashed = (hashed ^ coordinate.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-        hashed ^= hashed >> np.uint64(29)
-    return (hashed >> np.uint64(40)) < np.uint64(share * 2**24)
 
 
 def _unique_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -65,7 +65,7 @@ def check_fit(recording: Recording, config: FitConfig) -> list[Finding]:
         ]
     cost = estimate_rays(rays, config)
     surfels = Surfels.of(rays, config.leaf_size_m)
-    noise = sensor_noise(surfels, rays, surfels.cells.cell_of_ray, config.returns)
+    noise = sensor_noise(surfels, rays, config.returns)
     return [
         Finding(
             "noise",

@@ -4,10 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from os import PathLike
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.config import FitConfig
@@ -17,15 +16,14 @@ from radarsdf.fitting.stopping import Interrupted
 from radarsdf.io.sequence import Scans
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.movers import Standing
-from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import Sensor
 
 
 def fit(
-    points: Sequence[ArrayLike] | Scans,
+    points: Iterable[ArrayLike] | Scans,
     poses: ArrayLike | None = None,
-    intensities: Sequence[ArrayLike] | None = None,
+    intensities: Iterable[ArrayLike] | None = None,
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
     config: FitConfig | None = None,
@@ -38,12 +36,13 @@ def fit(
 
     Parameters
     ----------
-    points : sequence of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, as they are, their
-        poses, intensities and Doppler are used where none are given here.
+    points : iterable of F arrays, or Scans
+        (N_i, 3) each: the returns of one scan, sensor frame, m. An iterator is asked for one after another, and they
+        are not kept, unless Doppler is given. Of :class:`radarsdf.io.Scans`, as they are, their poses, intensities and
+        Doppler are used where none are given here.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
-    intensities : sequence of F arrays, optional
+    intensities : iterable of F arrays, optional
         (N_i,) each, sensor units. Without them the map has no intensity network.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each: speed of each return along its ray, m/s; NaN where it was not measured. With them, returns that
@@ -103,35 +102,20 @@ def fit(
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
             scale = IntensityScale.between(*intensity_range)
+        given = FitInput(rays, scale, lambda rays, noise: Sensor.of_rays(rays, poses, noise))
+        given.movers, given.why_no_movers = standing.movers, standing.why_none
+        del rays  # the fit lets go of them when it has no more use for them
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption
-
-    def sensor_of(noise: SensorNoise) -> Sensor:
-        return Sensor.of(
-            standing.points,
-            standing.intensities,
-            noise=noise,
-            min_range_m=config.returns.min_range_m,
-            max_range_m=config.returns.max_range_m,
-        )
-
-    given = FitInput(
-        rays=rays,
-        scale=scale,
-        sensor_of=sensor_of,
-        returns=sum(len(np.asarray(scan)) for scan in points),
-        movers=standing.movers,
-        why_no_movers=standing.why_none,
-    )
     return fit_rays(given, config, progress=progress, checkpoint=checkpoint, clock=clock)
 
 
 def _given(
-    points: Sequence[ArrayLike] | Scans,
+    points: Iterable[ArrayLike] | Scans,
     poses: ArrayLike | None,
-    intensities: Sequence[ArrayLike] | None,
+    intensities: Iterable[ArrayLike] | None,
     doppler_mps: Sequence[ArrayLike] | None,
-) -> tuple[list[ArrayLike], ArrayLike, Sequence[ArrayLike] | None, Sequence[ArrayLike] | None]:
+) -> tuple[Iterable[ArrayLike], ArrayLike, Iterable[ArrayLike] | None, Sequence[ArrayLike] | None]:
     """The same, with what is not given taken from the scans."""
     if isinstance(points, Scans):
         scans, points = points, points.points  # first: it reads all there is, in one pass
@@ -141,5 +125,4 @@ def _given(
     if poses is None:
         msg = "poses are missing: T_world_sensor (4, 4) of each scan"
         raise ValueError(msg)
-    # Points and intensities may be generators.
-    return list(points), poses, None if intensities is None else list(intensities), doppler_mps
+    return points, poses, intensities, doppler_mps

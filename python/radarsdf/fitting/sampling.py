@@ -9,11 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from radarsdf._core import RAY_DIRECTION, RAY_INTENSITY, RAY_POINT, RAY_RANGE, cell_keys
+from radarsdf._core import RAY_DIRECTION, RAY_INTENSITY, RAY_POINT, RAY_RANGE, cell_keys, stable_order
 from radarsdf.config import FitConfig
 from radarsdf.returns.rays import Rays
+
+_ROWS_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -86,13 +89,7 @@ class RaySampler:
         self._config = config
         self._neighbours = neighbours
         self._generator = generator
-        order = np.argsort(cell_keys(np.ascontiguousarray(rays.points), config.leaf_size_m, 1), kind="stable")
-        # All numbers of a ray in one row of 32 bytes, half a cache line: a batch reads them by one
-        # index_select.
-        columns = [torch.from_numpy(a) for a in (rays.points, rays.directions, rays.ranges_m[:, None])]
-        if intensities is not None:
-            columns.append(intensities[:, None])
-        self._rays = torch.cat(columns, 1)[torch.from_numpy(order)]
+        self._rays = torch.from_numpy(_in_morton_order(rays, intensities, config.leaf_size_m))
         self._order = np.zeros(0, np.int64)
         self._order_from = torch.zeros_like(generator.get_state())
         """State of the generator before `_order` was drawn."""
@@ -199,6 +196,22 @@ class RaySampler:
             Samples(x, sdf, num_near, of_ray, *shares_of_part)
             for x, sdf, of_ray, num_near, *shares_of_part in zip(*columns, near, *shares, strict=True)
         ]
+
+
+def _in_morton_order(rays: Rays, intensities: Tensor | None, leaf_size_m: float) -> NDArray[np.float32]:
+    """(N, 7 or 8) numbers of the rays in Morton order of their returns; see :attr:`Samples.of_ray`.
+
+    All numbers of a ray are in one row of 32 bytes, half a cache line: a batch reads them by one index_select.
+    """
+    order = stable_order(cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, 1))
+    columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
+    if intensities is not None:
+        columns.append(intensities.numpy()[:, None])
+    rows = np.empty((len(rays), sum(column.shape[1] for column in columns)), np.float32)
+    for first in range(0, len(rows), _ROWS_AT_ONCE):  # so that nothing else is as large
+        part = slice(first, first + _ROWS_AT_ONCE)
+        np.concatenate([column[order[part]] for column in columns], axis=1, out=rows[part])
+    return rows
 
 
 def _returns(rays: Tensor) -> Tensor:

@@ -60,6 +60,7 @@ class FromNoise(Start):
             keys=cells.keys,
             information=np.bincount(cells.cell_of_ray, information, len(cells.keys)).astype(np.float32),
             scans=count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), self._num_threads),
+            counts=cells.counts,
         )
         ranges_m = np.zeros(len(cells.keys), np.float32)
         ranges_m[cells.cell_of_ray] = rays.ranges_m  # any return of the cell
@@ -84,7 +85,8 @@ class FromAverage(Start):
         # The returns of a cell are at nearly the same range if they are of the same sensor position.
         means = self._means
         information = means.counts / self._surface.noise.variances_m2(means.ranges_m)
-        found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans)
+        counts = means.counts.astype(np.float64)
+        found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans, counts)
         return found.with_uncertain_poses(means.ranges_m, self._config.returns)
 
     @property
@@ -106,8 +108,9 @@ def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[n
     """
     steps = math.ceil(2 * config.near_band_m / (config.leaf_size_m / 2))
     cells = CellSet(config.leaf_size_m)
-    for chunk in rays.along(np.linspace(-config.near_band_m, config.near_band_m, steps + 1)):
-        cells.insert(chunk, num_threads)
+    offsets_m = np.linspace(-config.near_band_m, config.near_band_m, steps + 1).astype(np.float32)
+    points, directions = np.ascontiguousarray(rays.points), np.ascontiguousarray(rays.directions)
+    cells.insert_along(points, directions, offsets_m, num_threads)
     return cells.sorted_keys(num_threads)
 
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,19 +23,20 @@ from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.skipped import Skipped, skipped_parts
-from radarsdf.fitting.start import STARTS
+from radarsdf.fitting.start import STARTS, Start
 from radarsdf.fitting.stopping import Diverged, Interrupted
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.evidence import Evidence, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.surfels import Surfels
 from radarsdf.threads import Workers
 
 # Of rough scenes the network knows less than of smooth ones: its answer counts so much less there, and the closed form
@@ -42,21 +44,19 @@ from radarsdf.threads import Workers
 _LESS_IN_ROUGH_SCENES = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass
 class FitInput:
     """What a fit starts from."""
 
-    rays: Rays
-    """All rays, scan by scan."""
+    rays: Rays | None
+    """All rays, scan by scan. A fit takes them away, so that they are in memory no longer than it needs them."""
     scale: IntensityScale | None
     """Of their intensities."""
-    sensor_of: Callable[[SensorNoise], Sensor]
+    sensor_of: Callable[[Rays, SensorNoise], Sensor]
     """The radar, once its noise is known."""
-    returns: int
-    """Number of returns that were given, with those out of range and those that move."""
-    movers: int
+    movers: int = 0
     """Number of returns that were left out because they move."""
-    why_no_movers: str | None
+    why_no_movers: str | None = None
     """See :class:`radarsdf.returns.movers.Movers`."""
     inside: NDArray[np.bool_] | None = None
     """(N,) returns that the map is learnt from, whole leaf cells of them. The other rays only tell what they passed. None:
@@ -76,6 +76,8 @@ def fit_rays(
     """Fits a map. See :func:`radarsdf.fit`, also for errors; `clock` has counted the time since the beginning."""
     clock = Clock() if clock is None else clock
     rays, inside = given.rays, given.inside
+    assert rays is not None
+    given.rays = None
     radar_map = None
     try:
         check_extent(rays, config)
@@ -88,56 +90,57 @@ def fit_rays(
             learnt = rays if inside is None else rays.select(inside)
             clock.lap("ghosts_s")
             start = STARTS[config.training.start](surface, config, workers.num_threads)
-            field = _open_cells(start.leaf_keys(), surface.rays, config, workers.num_threads)
+            returns = start.returns_of_cells()
+            field = _open_cells(start.leaf_keys(), returns, learnt, config, workers.num_threads)
             clock.lap("occupied_cells_s")
-            start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
-            if not all(parameter.isfinite().all() for parameter in field.parameters()):
-                msg = "what the training starts from is not finite: training.sigma_cells may be too small"
-                raise Diverged(msg)
+            _initialise(field, start, config)
             evidence = Evidence.of(
-                start.returns_of_cells(),
+                returns,
                 rays,
                 field.cells.table.leaf_keys(),
                 config.leaf_size_m,
                 workers.num_threads,
             )
             clock.lap("start_s")
-            scale = given.scale
+            noise, kept = surface.noise, surface.rays
+            rough_share = surface.surfels.rough_share() if given.rough_share is None else given.rough_share
+            origin, scale = rays.origin, given.scale
+            sensor = given.sensor_of(rays, noise)
+            close = _closing(learnt, inside, surface, config, workers.num_threads)
+            counts = {
+                "returns": rays.num_given + given.movers,
+                "returns_used": len(kept),
+                "ghosts": len(learnt) - len(kept),
+                "movers": given.movers,
+                "noise": dataclasses.asdict(noise),
+            }
+            # Of many returns, gigabytes that nobody needs any more: the training has its own copy of the rays.
+            del surface, start, returns, rays
             training = Training(
-                field, surface.rays, learnt, scale if config.trains_intensity else None, config, workers
+                field, kept, learnt, scale if config.trains_intensity else None, config, workers
             )
+            del learnt, kept
             if saved is not None:
                 saved.resume(training)
             # The map is made before the training, which changes its field: Interrupted and Diverged can hand
             # it over.
-            counts = {
-                "returns": given.returns,
-                "returns_used": len(surface.rays),
-                "ghosts": len(learnt) - len(surface.rays),
-                "movers": given.movers,
-                "noise": dataclasses.asdict(surface.noise),
-            }
             contents = MapContents(
                 field=field,
-                origin=rays.origin,
+                origin=origin,
                 intensity_scale=scale,
                 reflectance=None,
                 config=config,
                 evidence=evidence,
-                rough_share=(
-                    surface.surfels.rough_share() if given.rough_share is None else given.rough_share
-                ),
-                sensor=given.sensor_of(surface.noise),
+                rough_share=rough_share,
+                sensor=sensor,
                 report=counts | _report(config, field, training, counts, given, workers.num_threads),
             )
-            if not config.trains_intensity:
-                contents = _with_closed_form(contents, learnt, inside, surface, workers.num_threads)
-            radar_map = RadarMap(contents)
+            radar_map = RadarMap(
+                close(contents) if close is not None and not config.trains_intensity else contents
+            )
             training.run(progress, saved)
-            if config.trains_intensity:
-                radar_map = RadarMap(
-                    _with_closed_form(contents, learnt, inside, surface, workers.num_threads)
-                )
+            if close is not None and config.trains_intensity:
+                radar_map = RadarMap(close(contents))
     except KeyboardInterrupt as interruption:
         raise Interrupted(radar_map) from interruption
     except Diverged as error:
@@ -151,33 +154,62 @@ def fit_rays(
     return radar_map
 
 
-def _open_cells(leaf_keys: NDArray[np.uint64], rays: Rays, config: FitConfig, num_threads: int) -> Field:
+def _open_cells(
+    leaf_keys: NDArray[np.uint64], returns: ReturnsOfCells, rays: Rays, config: FitConfig, num_threads: int
+) -> Field:
     """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
-    leaf_keys = bridged(leaf_keys, rays, config.leaf_size_m, config.encoding.bridge_cells, num_threads)
+    leaf_keys = bridged(leaf_keys, returns.keys, returns.counts, config.encoding.bridge_cells, num_threads)
     with_intensity = rays.intensities is not None and config.trains_intensity
     return Field(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
 
 
-def _with_closed_form(
-    contents: MapContents,
+def _initialise(field: Field, start: Start, config: FitConfig) -> None:
+    """Sets the parameters that the training starts from. Raises Diverged if one is not finite."""
+    start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
+    if not all(parameter.isfinite().all() for parameter in field.parameters()):
+        msg = "what the training starts from is not finite: training.sigma_cells may be too small"
+        raise Diverged(msg)
+
+
+def _closing(
     rays: Rays,
     inside: NDArray[np.bool_] | None,
     surface: SurfaceReturns,
+    config: FitConfig,
+    num_threads: int,
+) -> Callable[[MapContents], MapContents] | None:
+    """Adds intensities, or what their network leaves of them, in closed form to a map. None if they are not wanted."""
+    if rays.intensities is None or not config.closes_intensity:
+        return None
+    cells = surface.surfels.cells.cell_of_ray
+    return functools.partial(
+        _with_closed_form,
+        rays=rays,
+        intensities=rays.intensities,
+        surfels=surface.surfels,
+        cell_of_ray=cells if inside is None else cells[inside],
+        num_threads=num_threads,
+    )
+
+
+def _with_closed_form(
+    contents: MapContents,
+    *,
+    rays: Rays,
+    intensities: NDArray[np.float32],
+    surfels: Surfels,
+    cell_of_ray: NDArray[np.int32],
     num_threads: int,
 ) -> MapContents:
-    """The map with intensities, or with what its network leaves of them, in closed form, if they are wanted."""
     scale, config = contents.intensity_scale, contents.config
-    if scale is None or rays.intensities is None or not config.closes_intensity:
-        return contents
-    share, unit = 0.0, scale.to_unit(rays.intensities)
+    assert scale is not None
+    share, unit = 0.0, scale.to_unit(intensities)
     if config.trains_intensity:
         share = 1 - _LESS_IN_ROUGH_SCENES * queries.roughness(contents)
         sensors = torch.from_numpy(rays.points - rays.directions * rays.ranges_m[:, None])
         answers = queries.intensity(contents, torch.from_numpy(rays.points), sensors)
         unit -= np.float32(share) * scale.to_unit(answers.numpy())
-    cells = surface.surfels.cells.cell_of_ray
-    cells = cells if inside is None else cells[inside]
-    found = Reflectance.of(rays, unit, surface.surfels, config.leaf_size_m, num_threads, share, cells)
+    found = Reflectance.of(rays, unit, surfels, config.leaf_size_m, num_threads, share, cell_of_ray)
     return dataclasses.replace(contents, reflectance=found)
 
 

@@ -17,9 +17,6 @@ from radarsdf.returns.onto_surfels import onto_surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
-# For a quick fit: so many give the noise to 2 %, which is enough.
-_NOISE_RETURNS_OF_MEANS = 20_000
-
 
 @dataclass(frozen=True)
 class SurfaceReturns:
@@ -44,7 +41,8 @@ class SurfaceReturns:
         onto_planes = config.returns.onto_planes and config.training.sdf_iterations != 0
         means = MeanRays.of(rays, config.leaf_size_m, num_threads) if averages else None
         surfels = Surfels.of(rays, config.leaf_size_m, num_threads)
-        noise = _noise(surfels, rays, means, config)
+        # An average counts cells, not returns, so it needs the noise of those: one return of each.
+        noise = sensor_noise(surfels, rays, config.returns, None if means is None else means.first)
         kept = inside
         if config.returns.drop_ghosts:
             true = ~find_ghosts(surfels, rays, noise, means, num_threads)
@@ -52,13 +50,5 @@ class SurfaceReturns:
         if means is not None and kept is not None:
             means = means.select(kept[means.first])
         if onto_planes:
-            rays = onto_surfels(surfels, rays, noise)
+            rays = onto_surfels(surfels, rays, noise, num_threads)
         return cls(rays if kept is None else rays.select(kept), surfels, noise, means)
-
-
-def _noise(surfels: Surfels, rays: Rays, means: MeanRays | None, config: FitConfig) -> SensorNoise:
-    cell_of_ray = surfels.cells.cell_of_ray
-    if means is None:
-        return sensor_noise(surfels, rays, cell_of_ray, config.returns)
-    first = means.first[:: -(-len(means.first) // _NOISE_RETURNS_OF_MEANS) or 1]
-    return sensor_noise(surfels, rays.select(first), cell_of_ray[first], config.returns)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +47,6 @@ class ReturnCells:
     """Finds the row of a cell from its key."""
     cell_of_ray: NDArray[np.int32]
     """(N,) row of each return's cell."""
-    moments: NDArray[np.float64]
-    """(C, 13) sums over the returns of each cell: of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m²,
-    and of the direction (3) of the ray."""
 
     @classmethod
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> ReturnCells:
@@ -60,6 +58,17 @@ class ReturnCells:
         del occupied  # frees memory: it can be as large as everything below
         blocks = CellBlocks(keys)
         rows = blocks.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
-        directions = np.ascontiguousarray(rays.directions)
-        moments = sum_moments(points, directions, rows, len(keys), num_threads)
-        return cls(keys, blocks, rows, moments)
+        return cls(keys, blocks, rows)
+
+    @cached_property
+    def counts(self) -> NDArray[np.float64]:
+        """(C,) number of returns in each cell."""
+        return np.bincount(self.cell_of_ray, minlength=len(self.keys)).astype(np.float64)
+
+    def moments(self, rays: Rays, num_threads: int = 0) -> NDArray[np.float64]:
+        """(C, 13) sums over the returns of each cell: of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m², and of the direction (3) of the ray.
+
+        `rays` are those that the cells are of.
+        """
+        points, directions = np.ascontiguousarray(rays.points), np.ascontiguousarray(rays.directions)
+        return sum_moments(points, directions, self.cell_of_ray, len(self.keys), num_threads)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ from radarsdf.returns.rays import Rays
 
 CELLS_OF_SURFACE = 9
 """A plane crosses about so many of a cell and the 26 cells round it."""
+
+_CELLS_AT_ONCE = 1 << 21  # of which there are sums in float64
 
 
 @dataclass(frozen=True)
@@ -56,13 +59,15 @@ class Evidence:
         num_threads : int
             0: as many as OpenMP uses.
         """
-        cells = CellBlocks(leaf_keys)
-        rows = cells.rows(returns.keys, num_threads)
-        inside = rows >= 0
-        columns = np.zeros((len(leaf_keys), 2))
-        columns[rows[inside], 0] = returns.information[inside]
-        columns[rows[inside], 1] = returns.scans[inside]
-        sums = cells.sum_round(leaf_keys, columns, 1.0, num_threads)
+        near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
+        columns = np.stack([returns.information[near], returns.scans[near]], 1).astype(np.float64)
+        cells = CellBlocks(returns.keys[near])
+        information = np.empty(len(leaf_keys), np.float32)
+        detections = np.empty(len(leaf_keys), np.uint32)
+        for first in range(0, len(leaf_keys), _CELLS_AT_ONCE):
+            part = slice(first, first + _CELLS_AT_ONCE)
+            sums = cells.sum_round(leaf_keys[part], columns, 1.0, num_threads)
+            information[part], detections[part] = sums.T
         looks = count_looks(
             leaf_keys,
             leaf_size_m,
@@ -72,7 +77,7 @@ class Evidence:
             rays.scans,
             num_threads,
         )
-        return cls(sums[:, 0].astype(np.float32), sums[:, 1].astype(np.uint32), looks)
+        return cls(information, detections, looks)
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,8 @@ class ReturnsOfCells:
     """(M,) 1 / variance of the position that the returns of a cell give together, m⁻²."""
     scans: NDArray[np.uint32]
     """(M,) number of different scans with returns."""
+    counts: NDArray[np.float64]
+    """(M,) number of returns."""
 
     def with_uncertain_poses(self, ranges_m: NDArray[np.float32], config: ReturnsConfig) -> ReturnsOfCells:
         """The same with the errors of the poses in `config`. `ranges_m` (M,): of a return in each cell, m.
@@ -96,4 +103,4 @@ class ReturnsOfCells:
             return self
         pose_m2 = config.pose_sigma_m**2 + np.square(np.float32(config.pose_sigma_rad) * ranges_m)
         variances_m2 = 1 / self.information + CELLS_OF_SURFACE * pose_m2 / self.scans
-        return ReturnsOfCells(self.keys, (1 / variances_m2).astype(np.float32), self.scans)
+        return dataclasses.replace(self, information=(1 / variances_m2).astype(np.float32))

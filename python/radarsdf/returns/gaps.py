@@ -4,15 +4,12 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, cell_keys
+from radarsdf._core import CellBlocks, bridge_cells
 from radarsdf.config import BLOCK_CELLS
-from radarsdf.returns.rays import Rays
-from radarsdf.returns.support import support_of_points
+from radarsdf.returns.support import support_at
 
 # Measured on simulated and real scans; see docs/levers.md.
 # Share of the median support of the block. Returns with less are too often false to tell where a surface goes on.
@@ -23,7 +20,11 @@ _MAX_SUPPORT = 9.0
 
 
 def bridged(
-    leaf_keys: NDArray[np.uint64], rays: Rays, leaf_size_m: float, max_cells: int, num_threads: int = 0
+    leaf_keys: NDArray[np.uint64],
+    keys: NDArray[np.uint64],
+    counts: NDArray[np.float64],
+    max_cells: int,
+    num_threads: int = 0,
 ) -> NDArray[np.uint64]:
     """Adds the leaf cells that bridge a gap: those on the line between two cells with returns.
 
@@ -33,10 +34,11 @@ def bridged(
     ----------
     leaf_keys : ndarray
         (C,) uint64 Morton keys of the leaf cells near the surface, ascending.
-    rays : Rays
-        The returns.
-    leaf_size_m : float
-        Edge of a leaf cell, m.
+    keys : ndarray
+        (M,) uint64 Morton keys of the leaf cells that hold returns, ascending. Those that are none of `leaf_keys` do
+        not count.
+    counts : ndarray
+        (M,) float64 number of returns in each of `keys`.
     max_cells : int
         Largest number of cells between the two.
     num_threads : int
@@ -49,41 +51,18 @@ def bridged(
     """
     if max_cells == 0:
         return leaf_keys
-    points = np.ascontiguousarray(rays.points)
-    support = support_of_points(points, leaf_keys, leaf_size_m, num_threads)
-    medians = _medians(leaf_keys, support)
-    keys, first = np.unique(cell_keys(points, leaf_size_m, num_threads), return_index=True)
-    rows = np.minimum(np.searchsorted(leaf_keys, keys), len(leaf_keys) - 1)
-    here = leaf_keys[rows] == keys
-    returns = np.where(here, support[rows], 0).astype(np.float64)
-    least = np.maximum(1.0, _MIN_SUPPORT * np.where(here, medians[rows], 0))
-    used = (returns >= least) & (
-        returns + least < 2 * _MAX_SUPPORT
-    )  # with more, the mean with any other end is too high
-    keys, first, returns = keys[used], first[used], returns[used]
-    cells = np.floor(points[first] * np.float32(1 / leaf_size_m))  # the same bits as in the core
-    ends = CellBlocks(keys)
-
-    def keys_at(cells: NDArray[np.float32]) -> NDArray[np.uint64]:
-        return cell_keys((cells.astype(np.float64) + 0.5) * leaf_size_m, leaf_size_m, num_threads)
-
-    found = [leaf_keys]
-    for direction in itertools.product((-1, 0, 1), repeat=3):
-        if direction <= (0, 0, 0):
-            continue  # the opposite direction finds the same pairs
-        step = np.array(direction, np.float32)
-        for distance in range(2, max_cells + 2):
-            row = ends.rows(keys_at(cells + distance * step), num_threads)
-            pair = np.flatnonzero(row >= 0)
-            pair = pair[returns[pair] + returns[row[pair]] < 2 * _MAX_SUPPORT]
-            found += [keys_at(cells[pair] + between * step) for between in range(1, distance)]
-    keys = np.concatenate(found)
-    keys.sort()  # np.unique takes ten times as long: it builds a hash table
-    different: NDArray[np.uint64] = keys[np.concatenate([[True], keys[1:] != keys[:-1]])]
-    return different
+    near = CellBlocks(leaf_keys).rows(keys, num_threads) >= 0
+    keys, counts = keys[near], counts[near]
+    of_leaves = support_at(leaf_keys, keys, counts, num_threads)
+    rows = CellBlocks(leaf_keys).rows(keys, num_threads)
+    least = np.maximum(1.0, _MIN_SUPPORT * _medians(leaf_keys, of_leaves)[rows])
+    support = of_leaves[rows]
+    # With more than the most, the mean with any other end is too high.
+    used = (support >= least) & (support + least < 2 * _MAX_SUPPORT)
+    return bridge_cells(leaf_keys, keys[used], support[used], max_cells, 2 * _MAX_SUPPORT, num_threads)
 
 
-def _medians(leaf_keys: NDArray[np.uint64], support: NDArray[np.uint16]) -> NDArray[np.float64]:
+def _medians(leaf_keys: NDArray[np.uint64], support: NDArray[np.float64]) -> NDArray[np.float64]:
     """(C,) median of the `support` (C,) of the leaf cells with returns round them in the block of each cell.
 
     Of a block, not of the map: what is added here must not depend on how many returns there are elsewhere.
@@ -92,7 +71,7 @@ def _medians(leaf_keys: NDArray[np.uint64], support: NDArray[np.uint16]) -> NDAr
     starts = np.flatnonzero(np.diff(block, prepend=~block[:1]))  # cells of a block follow each other
     # Sorted within blocks: the number of the block counts more than the support.
     number = np.repeat(np.arange(len(starts), dtype=np.uint64), np.diff(starts, append=len(block)))
-    ordered = np.sort(number << np.uint64(16) | support) & np.uint64(0xFFFF)
+    ordered = np.sort(number << np.uint64(16) | support.astype(np.uint64)) & np.uint64(0xFFFF)
     ends = np.append(starts[1:], len(block))
     zeros = np.add.reduceat(ordered == 0, starts)
     first = starts + zeros  # of those with returns; if there are none, medians are of no use

@@ -54,7 +54,7 @@ def find_ghosts(
     cells, all_cell_of_ray = surfels.cells, surfels.cells.cell_of_ray
     if means is None:
         cell_of_ray, weights = all_cell_of_ray, None
-        returns = cells.moments[:, 0]
+        returns = cells.counts
     else:
         rays, cell_of_ray, weights = rays.select(means.first), all_cell_of_ray[means.first], means.counts
         returns = np.bincount(cell_of_ray, weights, len(cells.keys)).astype(np.float64)

@@ -43,7 +43,7 @@ class MeanRays:
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> MeanRays:
         """The mean rays of cells of this size, m. `num_threads` 0: as many as OpenMP uses."""
         cells = ReturnCells.of(rays, cell_size_m, num_threads)
-        rows, moments = cells.cell_of_ray, cells.moments
+        rows, moments = cells.cell_of_ray, cells.moments(rays, num_threads)
         first = np.zeros(len(cells.keys), np.int64)
         first[rows[::-1]] = np.arange(
             len(rows) - 1, -1, -1

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,9 +76,9 @@ class Movers:
 class Standing:
     """The returns of F scans without those that move, as far as Doppler tells them."""
 
-    points: Sequence[ArrayLike]
+    points: Iterable[ArrayLike]
     """F arrays (N_i, 3), sensor frame, m."""
-    intensities: Sequence[ArrayLike] | None
+    intensities: Iterable[ArrayLike] | None
     """F arrays (N_i,), sensor units."""
     movers: int
     """Number of returns that were left out."""
@@ -88,14 +88,16 @@ class Standing:
     @classmethod
     def of(
         cls,
-        points: Sequence[ArrayLike],
-        intensities: Sequence[ArrayLike] | None,
+        points: Iterable[ArrayLike],
+        intensities: Iterable[ArrayLike] | None,
         doppler_mps: Sequence[ArrayLike] | None,
         config: ReturnsConfig,
     ) -> Standing:
         """All returns, if there is no Doppler or ``config.drop_movers`` says so; else see :meth:`Movers.of`."""
         if doppler_mps is None or not config.drop_movers:
             return cls(points, intensities, 0, None)
+        points = list(points)
+        intensities = None if intensities is None else list(intensities)
         if intensities is not None:
             check_scans(points, intensities)
         movers = Movers.of(points, doppler_mps)

@@ -8,12 +8,13 @@ import dataclasses
 
 import numpy as np
 
+from radarsdf._core import move_onto_planes
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
 
-def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, chunk: int = 1 << 17) -> Rays:
+def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: int = 0) -> Rays:
     """The rays with each return moved towards the surfel of its cell, if there is a flat one.
 
     A plane through dozens of returns has much less noise than one return. But a surface is no plane: where
@@ -30,33 +31,20 @@ def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, chunk: int = 
         N rays.
     noise : SensorNoise
         Noise of the returns.
-    chunk : int
-        Returns that are moved at a time.
+    num_threads : int
+        0: as many as OpenMP uses.
     """
-    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray)
-    moved = np.flatnonzero(plane >= 0)
-    chunks = [moved[first : first + chunk] for first in range(0, len(moved), chunk)]
-    variances = np.concatenate(
-        [
-            np.empty(0),
-            *(noise.variances_across_m2(rays, rows, surfels.normals[plane[rows]]) for rows in chunks),
-        ]
+    points, directions, ranges_m = move_onto_planes(
+        np.ascontiguousarray(rays.points),
+        np.ascontiguousarray(rays.directions),
+        np.ascontiguousarray(rays.ranges_m),
+        np.ascontiguousarray(rays.scans),
+        rays.up_of_scan,
+        surfels.flat_plane_of(surfels.cells.cell_of_ray),
+        surfels.centres,
+        surfels.normals,
+        np.ascontiguousarray(surfels.variances[:, 0]),
+        np.square(dataclasses.astuple(noise)).tolist(),
+        num_threads,
     )
-    counts = np.bincount(plane[moved], minlength=len(surfels.normals))
-    sums = np.bincount(plane[moved], variances, len(surfels.normals))
-    roughness = np.maximum(surfels.variances[:, 0] - sums / np.maximum(counts, 1), 0.0)
-    points, directions, ranges_m = rays.points.copy(), rays.directions.copy(), rays.ranges_m.copy()
-    done = 0
-    for rows in chunks:
-        variance = variances[done : done + len(rows)]
-        done += len(rows)
-        point, normal = rays.points[rows].astype(np.float64), surfels.normals[plane[rows]]
-        offset_m = np.einsum("ni,ni->n", point - surfels.centres[plane[rows]], normal)
-        offset_m *= variance / (variance + roughness[plane[rows]])
-        step_m = offset_m[:, None] * normal
-        ray = rays.directions[rows].astype(np.float64) * rays.ranges_m[rows, None] - step_m
-        range_m = np.maximum(np.linalg.norm(ray, axis=1), 1e-6)
-        points[rows] = point - step_m
-        directions[rows] = ray / range_m[:, None]
-        ranges_m[rows] = range_m
     return dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)

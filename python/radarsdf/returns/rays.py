@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import (
     MAX_POSITION_M,
+    check_equal_numbers,
     check_poses,
+    check_scan_shape,
     check_scan_shapes,
-    check_values_of_scans,
+    check_values_of_scan,
     number,
     real_array,
     whole_number,
 )
 from radarsdf.checks import positions as check_positions
 
+_MISSING: Any = object()  # where there are fewer scans of one kind
 _MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
 
 
@@ -47,6 +51,8 @@ class Rays:
     """(N,) scan of each return."""
     up_of_scan: NDArray[np.float64]
     """(F, 3) z axis of the sensor in each scan, local frame."""
+    num_given: int
+    """Number of returns that the scans hold, with those out of range."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -104,30 +110,52 @@ class Rays:
 
 
 def check_scans(
-    points: Sequence[ArrayLike], intensities: Sequence[ArrayLike] | None = None
+    points: Iterable[ArrayLike], intensities: Iterable[ArrayLike] | None = None
 ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None]:
     """Scans (N_i, 3) and intensities (N_i,) as arrays, if :func:`prepare` takes them; else its ValueError."""
-    scans = [real_array(scan, f"scan {i}") for i, scan in enumerate(points)]
-    check_scan_shapes(scans)
-    for i, scan in enumerate(scans):
+    checked = list(_checked(points, intensities))
+    values = None if intensities is None else [value for _, value in checked if value is not None]
+    return [scan for scan, _ in checked], values
+
+
+def _checked(
+    points: Iterable[ArrayLike], intensities: Iterable[ArrayLike] | None
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32] | None]]:
+    """One scan (N_i, 3) after another, with its intensities (N_i,): only one is in float64 at a time.
+
+    Raises the ValueError of :func:`prepare` where a scan is none, and in the end for returns that are not finite: it says
+    how many they are.
+    """
+    num_scans = num_values = num_returns = num_bad = first_bad = 0
+    both = zip_longest(points, () if intensities is None else intensities, fillvalue=_MISSING)
+    for i, (given, given_values) in enumerate(both):
+        num_scans += given is not _MISSING
+        num_values += given_values is not _MISSING
+        if intensities is not None and num_scans != num_values:
+            continue  # they are only counted
+        scan = real_array(given, f"scan {i}")
+        check_scan_shape(scan, i)
         if len(scan) == 0:
             msg = f"scan {i} is empty: leave out the scan and its pose"
             raise ValueError(msg)
-    values = None
+        fine, values = (np.abs(scan) <= MAX_POSITION_M).all(axis=1), None
+        if intensities is not None:
+            values = real_array(given_values, f"intensities of scan {i}", np.float32)
+            check_values_of_scan(values, scan, "intensities", i)
+            fine &= np.isfinite(values)
+        num_returns += len(scan)
+        if not fine.all():
+            first_bad = first_bad if num_bad else i
+            num_bad += len(fine) - int(fine.sum())
+        if not num_bad:
+            yield scan, values
+    if num_scans == 0:
+        check_scan_shapes([])
     if intensities is not None:
-        values = [real_array(v, f"intensities of scan {i}", np.float32) for i, v in enumerate(intensities)]
-        check_values_of_scans(values, scans, "intensities")
-    if not all((np.abs(scan) <= MAX_POSITION_M).all() for scan in scans) or not all(
-        np.isfinite(value).all() for value in values or ()
-    ):
-        bad = [~(np.abs(scan) <= MAX_POSITION_M).all(axis=1) for scan in scans]
-        if values is not None:
-            bad = [b | ~np.isfinite(v) for b, v in zip(bad, values, strict=True)]
-        count = sum(int(b.sum()) for b in bad)
-        first = next(i for i, b in enumerate(bad) if b.any())
-        msg = f"{count} of {sum(map(len, scans))} returns are not finite, the first in scan {first}: remove them"
+        check_equal_numbers(num_values, num_scans, "intensities")
+    if num_bad:
+        msg = f"{num_bad} of {num_returns} returns are not finite, the first in scan {first_bad}: remove them"
         raise ValueError(msg)
-    return scans, values
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -151,9 +179,9 @@ def _kept(scan: NDArray[np.float64], min_range_m: float, max_range_m: float | No
 
 
 def prepare(
-    points: Sequence[ArrayLike],
+    points: Iterable[ArrayLike],
     poses: ArrayLike,
-    intensities: Sequence[ArrayLike] | None = None,
+    intensities: Iterable[ArrayLike] | None = None,
     *,
     min_range_m: float = 0.0,
     max_range_m: float | None = None,
@@ -166,11 +194,11 @@ def prepare(
 
     Parameters
     ----------
-    points : sequence of F arrays
-        (N_i, 3) each, sensor frame, m.
+    points : iterable of F arrays
+        (N_i, 3) each, sensor frame, m. Each is needed only once, while it is its turn.
     poses : array_like
         (F, 4, 4) T_world_sensor, m.
-    intensities : sequence of F arrays, optional
+    intensities : iterable of F arrays, optional
         (N_i,) each, sensor units.
     min_range_m, max_range_m : float
         Returns outside these ranges are dropped, m. `max_range_m` None: no limit.
@@ -196,8 +224,11 @@ def prepare(
         not rigid, all intensities are equal or are too far apart for float32, or no return is within the
         ranges.
     """
-    scans, values = check_scans(points, intensities)
-    T_world_sensor = check_poses(poses, len(scans))
+    # Of an iterator, the number of scans is known only in the end.
+    num_scans = len(points) if isinstance(points, Sized) else len(real_array(poses, "poses"))
+    if num_scans == 0:
+        check_scan_shapes([])
+    T_world_sensor = check_poses(poses, num_scans)
     positions = T_world_sensor[:, :3, 3]
     if origin is not None:
         local_origin = check_positions(real_array(origin, "origin")[None], "origin")[0]
@@ -209,22 +240,29 @@ def prepare(
     max_range_m = None if max_range_m is None else number(max_range_m, "max_range_m")
     whole_number(accumulate_scans, "accumulate_scans", 1)
 
-    kept_points, kept_origins, kept_values, counts = [], [], [], []
-    for i, scan in enumerate(scans):
-        seen_from = positions[middle_scan(i, len(scans), accumulate_scans)]
+    kept: list[list[Any]] = [[], [], [], []]
+    number_of_scan, num_given = 0, 0
+    for i, (scan, of_scan) in enumerate(_checked(points, intensities)):
+        number_of_scan = i + 1
+        if number_of_scan > num_scans:
+            continue  # it is only counted
+        num_given += len(scan)
+        seen_from = positions[middle_scan(i, num_scans, accumulate_scans)]
         keep = _kept(scan, min_range_m, max_range_m)
-        kept = scan if keep.all() else scan[keep]
-        local = kept @ T_world_sensor[i, :3, :3].T + (positions[i] - local_origin)
-        kept_points.append(local)
-        counts.append(len(local))
-        kept_origins.append(np.broadcast_to(seen_from - local_origin, local.shape))
-        if values is not None:
-            kept_values.append(values[i][keep])
-    local_points = np.concatenate(kept_points)
-    if len(local_points) == 0 and whole:
-        msg = f"none of {sum(map(len, scans))} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
+        values = None if of_scan is None else of_scan[keep]
+        local = (scan if keep.all() else scan[keep]) @ T_world_sensor[i, :3, :3].T + (
+            positions[i] - local_origin
+        )
+        polar = _directions_and_ranges(local - (seen_from - local_origin))
+        for column, part in zip(kept, (local.astype(np.float32), *polar, values), strict=True):
+            if part is not None:
+                column.append(part)
+    check_poses(poses, number_of_scan)
+    counts = [len(part) for part in kept[0]]
+    if sum(counts) == 0 and whole:
+        msg = f"none of {num_given} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
         raise ValueError(msg)
-    intensity = np.concatenate(kept_values) if values is not None else None
+    intensity = None if intensities is None else _joined(kept[3])
     if intensity is not None and whole and intensity.min() == intensity.max():
         msg = f"all intensities are {intensity[0]}: leave them out if the sensor does not measure them"
         raise ValueError(msg)
@@ -235,13 +273,15 @@ def prepare(
     ):
         msg = f"intensities from {intensity.min()} to {intensity.max()} are too far apart for float32"
         raise ValueError(msg)
-    return rays_from(
-        local_points,
-        np.concatenate(kept_origins),
+    return Rays(
         origin=local_origin,
+        points=_joined(kept[0]),
+        directions=_joined(kept[1]),
+        ranges_m=_joined(kept[2]),
         intensities=intensity,
-        scans=np.repeat(np.arange(len(scans), dtype=np.int32), counts),
+        scans=np.repeat(np.arange(num_scans, dtype=np.int32), counts),
         up_of_scan=T_world_sensor[:, :3, 2].copy(),
+        num_given=num_given,
     )
 
 
@@ -255,14 +295,27 @@ def rays_from(
     up_of_scan: NDArray[np.float64],
 ) -> Rays:
     """Rays from `sensors` to `points`, (N, 3) each, local frame, m. The rest is as of :class:`Rays`."""
-    rays = points - sensors
-    ranges = np.maximum(_lengths(rays), 1e-6)
+    directions, ranges_m = _directions_and_ranges(points - sensors)
     return Rays(
         origin=origin,
         points=points.astype(np.float32, copy=False),
-        directions=(rays / ranges[:, None]).astype(np.float32),
-        ranges_m=ranges.astype(np.float32),
+        directions=directions,
+        ranges_m=ranges_m,
         intensities=intensities,
         scans=scans,
         up_of_scan=up_of_scan,
+        num_given=len(points),
     )
+
+
+def _directions_and_ranges(rays: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Unit vectors (N, 3) and lengths (N,) of rays (N, 3), m."""
+    ranges = np.maximum(_lengths(rays), 1e-6)
+    return (rays / ranges[:, None]).astype(np.float32), ranges.astype(np.float32)
+
+
+def _joined(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """One array of all, which are forgotten: only one column of the rays needs memory twice."""
+    whole = np.concatenate(parts)
+    parts.clear()
+    return whole

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import number, real_array
+from radarsdf.checks import check_poses, number, real_array
 from radarsdf.io.sequence import Scans
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.rays import Rays
 
 # Of the returns: what lies beyond in azimuth, in elevation or in range is taken for a stray one.
 _STRAY = 0.002
@@ -158,19 +159,43 @@ class Sensor:
         per_scan = np.bincount(np.repeat(np.arange(len(scans)), counts)[used], minlength=len(scans))
         rows = np.flatnonzero(used)
         rows = rows[:: -(-len(rows) // _MAX_RETURNS)]
-        x, y, z = returns[rows].T
-        range_m = ranges_m[rows]
-        thresholds: tuple[tuple[float, float], ...] = ()
+        values = None
         if intensities is not None:
             values = np.concatenate([real_array(v, "intensities") for v in intensities])[rows]
-            thresholds = _thresholds(range_m, values)
+        return cls._of_returns(returns[rows], values, per_scan, noise)
+
+    @classmethod
+    def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:
+        """The sensor that took `rays`, with poses (F, 4, 4) T_world_sensor, m: :meth:`of` the same returns."""
+        T_world_sensor = check_poses(poses, len(rays.up_of_scan))
+        rows = np.arange(0, len(rays), -(-len(rays) // _MAX_RETURNS))
+        of_row = T_world_sensor[rays.scans[rows]]
+        from_sensor = rays.points[rows] - (of_row[:, :3, 3] - rays.origin)
+        return cls._of_returns(
+            np.einsum("nji,nj->ni", of_row[:, :3, :3], from_sensor),
+            None if rays.intensities is None else rays.intensities[rows].astype(np.float64),
+            np.bincount(rays.scans, minlength=len(T_world_sensor)),
+            noise,
+        )
+
+    @classmethod
+    def _of_returns(
+        cls,
+        returns: NDArray[np.float64],
+        values: NDArray[np.float64] | None,
+        per_scan: NDArray[np.int64],
+        noise: SensorNoise | None,
+    ) -> Sensor:
+        """Of returns (N, 3), sensor frame, m, with their intensities (N,), and the number of returns (F,) in each scan."""
+        x, y, z = returns.T
+        range_m = np.sqrt(np.einsum("ni,ni->n", returns, returns))
         return cls(
             azimuth_rad=_limits(np.arctan2(y, x)),
             elevation_rad=_limits(np.arcsin(np.clip(z / range_m, -1, 1))),
             range_m=_limits(range_m),
             returns_per_scan=float(np.median(per_scan[per_scan > 0])),
             noise=SensorNoise(0.0, 0.0, 0.0) if noise is None else noise,
-            thresholds=thresholds,
+            thresholds=() if values is None else _thresholds(range_m, values),
         )
 
 

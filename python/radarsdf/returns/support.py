@@ -7,33 +7,31 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, cell_keys
+from radarsdf._core import CellBlocks
+
+_MOST = float(np.iinfo(np.uint16).max)
 
 
-def support_of_points(
-    points: NDArray[np.float32], leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_threads: int = 0
-) -> NDArray[np.uint16]:
+def support_at(
+    leaf_keys: NDArray[np.uint64], keys: NDArray[np.uint64], counts: NDArray[np.float64], num_threads: int = 0
+) -> NDArray[np.float64]:
     """Support of leaf cells: the number of returns in each and in the 26 cells round it.
 
     Parameters
     ----------
-    points : ndarray
-        (N, 3) float32 returns, local frame, m.
     leaf_keys : ndarray
-        (C,) uint64 Morton keys of the leaf cells, ascending.
-    leaf_size_m : float
-        Edge of a leaf cell, m.
+        (C,) uint64 Morton keys of the leaf cells.
+    keys : ndarray
+        (M,) uint64 Morton keys of the cells that hold returns, ascending.
+    counts : ndarray
+        (M,) float64 number of returns in each of `keys`.
     num_threads : int
         0: as many as OpenMP uses.
 
     Returns
     -------
     ndarray
-        (C,) uint16. A count above 65535 is stored as 65535.
+        (C,) float64. A count above 65535 counts as 65535.
     """
-    keys = cell_keys(np.ascontiguousarray(points), leaf_size_m, num_threads)
-    cells = CellBlocks(leaf_keys)
-    rows = cells.rows(keys, num_threads)
-    counts = np.bincount(rows[rows >= 0], minlength=len(leaf_keys)).astype(np.float64)
-    sums = cells.sum_round(leaf_keys, counts[:, None], 1.0, num_threads)[:, 0]
-    return np.minimum(sums, np.iinfo(np.uint16).max).astype(np.uint16)
+    sums = CellBlocks(keys).sum_round(leaf_keys, np.ascontiguousarray(counts)[:, None], 1.0, num_threads)
+    return np.minimum(sums[:, 0], _MOST)

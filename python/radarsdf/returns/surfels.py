@@ -46,13 +46,14 @@ class Surfels:
         """Surfels of the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
         cell_size_m = LEAVES_PER_SURFEL * leaf_size_m
         cells = ReturnCells.of(rays, cell_size_m, num_threads)
-        counts = cells.moments[:, :1].copy()
-        support = cells.blocks.sum_round(cells.keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
+        sums = cells.moments(rays, num_threads)
+        support = cells.blocks.sum_round(cells.keys, cells.counts[:, None], NEIGHBOUR_WEIGHT, num_threads)[
+            :, 0
+        ]
         # Most cells have few returns. Surfels for all of them would take most of the time and the memory.
         cell_of_plane = np.flatnonzero(support >= _MIN_RETURNS)
-        moments = cells.blocks.sum_round(
-            cells.keys[cell_of_plane], cells.moments, NEIGHBOUR_WEIGHT, num_threads
-        )
+        moments = cells.blocks.sum_round(cells.keys[cell_of_plane], sums, NEIGHBOUR_WEIGHT, num_threads)
+        del sums  # frees memory: a hundred bytes for each cell
         means = moments[:, 1:10] / moments[:, :1]
         centres = means[:, :3].copy()
         upper = [(i, j) for i in range(3) for j in range(i, 3)]
@@ -85,7 +86,7 @@ class Surfels:
         It tells clutter and rough ground from walls, whatever the number of returns. Measured: 0.02 to 0.06 on
         simulated scenes without clutter, whole or of every tenth scan; 0.27 to 0.44 on five real drives.
         """
-        returns = self.cells.moments[self.cell_of_plane, 0]
+        returns = self.cells.counts[self.cell_of_plane]
         total = float(returns.sum())
         return 1 - float(returns[self.is_flat()].sum()) / total if total else 0.0
 

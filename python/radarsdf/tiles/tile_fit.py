@@ -57,10 +57,7 @@ def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
     given = FitInput(
         rays=rays,
         scale=plan.scale,
-        sensor_of=lambda _: plan.sensor,
-        returns=len(rays),
-        movers=0,  # they were left out before
-        why_no_movers=None,
+        sensor_of=lambda *_: plan.sensor,
         inside=inside,
         rough_share=plan.rough_share,
     )

@@ -1,0 +1,44 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Moves noisy returns towards the planes that the returns round them lie on (Wiener 1949).
+#pragma once
+
+#include <cstdint>
+
+namespace radarsdf {
+
+// Rays in the local frame, m.
+struct NoisyRays {
+  const float* points;         ///< (count, 3)
+  const float* directions;     ///< (count, 3), unit, from the sensor
+  const float* ranges_m;       ///< (count)
+  const std::int32_t* scans;   ///< (count)
+  const std::int32_t* planes;  ///< (count), the plane of each return, -1 where it has none and stays
+  std::int64_t count;
+  const double* up_of_scan;  ///< (scans, 3), the z axis of the sensor
+};
+
+struct Planes {
+  const double* centres;       ///< (count, 3), local frame, m
+  const double* normals;       ///< (count, 3), unit
+  const double* variances_m2;  ///< (count), of the returns across each plane
+  std::int64_t count;
+};
+
+// Variances of a return's position: along the beam, m^2, in azimuth and in elevation, rad^2.
+struct ReturnVariances {
+  double range_m2, azimuth_rad2, elevation_rad2;
+};
+
+struct MovedRays {
+  float *points, *directions, *ranges_m;
+};
+
+// A return keeps the share tau^2 / (tau^2 + sigma^2) of its distance from its plane: sigma^2 is the variance of its
+// noise across the plane, tau^2 that of the plane's returns less the mean of their sigma^2. The same bits with any
+// number of threads.
+void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnVariances& noise, const MovedRays& moved,
+                      int num_threads);
+
+}  // namespace radarsdf

@@ -1,0 +1,58 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "util/stable_order.hpp"
+
+#include <algorithm>
+#include <array>
+#include <limits>
+#include <stdexcept>
+
+#include "util/large_array.hpp"
+#include "util/parallel.hpp"
+
+namespace radarsdf {
+namespace {
+
+constexpr int kDigitBits = 11;
+constexpr int kDigits = (64 + kDigitBits - 1) / kDigitBits;
+constexpr std::uint64_t kDigitMask = (1 << kDigitBits) - 1;
+
+struct Entry {
+  std::uint32_t low, high;  // of the key: with its halves apart an entry has 12 bytes instead of 16
+  std::int32_t position;
+
+  std::uint64_t digit(int number) const {
+    return ((std::uint64_t{high} << 32 | low) >> (number * kDigitBits)) & kDigitMask;
+  }
+};
+
+}  // namespace
+
+std::vector<std::int32_t> stable_order(const std::uint64_t* keys, std::int64_t count) {
+  if (count > std::numeric_limits<std::int32_t>::max()) throw std::invalid_argument("more than 2^31 - 1 keys");
+  auto from = large_array<Entry>(count), to = large_array<Entry>(count);
+  std::vector<std::array<std::int32_t, kDigitMask + 1>> counts(kDigits);
+  for (std::int64_t i = 0; i < count; ++i) {
+    from[i] = {static_cast<std::uint32_t>(keys[i]), static_cast<std::uint32_t>(keys[i] >> 32),
+               static_cast<std::int32_t>(i)};
+    for (int number = 0; number < kDigits; ++number) ++counts[static_cast<std::size_t>(number)][from[i].digit(number)];
+  }
+  for (int number = 0; number < kDigits; ++number) {
+    auto& places = counts[static_cast<std::size_t>(number)];
+    if (std::find(places.begin(), places.end(), count) != places.end()) continue;  // all have the same digit
+    check_interrupt();
+    std::int32_t next = 0;
+    for (std::int32_t& place : places) {
+      const std::int32_t size = place;
+      place = next;
+      next += size;
+    }
+    for (std::int64_t i = 0; i < count; ++i) to[places[from[i].digit(number)]++] = from[i];
+    from.swap(to);
+  }
+  std::vector<std::int32_t> order(static_cast<std::size_t>(count));
+  for (std::size_t i = 0; i < order.size(); ++i) order[i] = from[i].position;
+  return order;
+}
+
+}  // namespace radarsdf

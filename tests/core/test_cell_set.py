@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The set of cells, the sample of columns, and the order of keys, against NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radarsdf._core import CellSet, cell_keys, sample_cells, sample_rays, stable_order
+
+LEAF_M = 0.2
+OFFSETS_M = np.linspace(-0.3, 0.3, 7).astype(np.float32)
+
+
+def rays_of(count, half_m=20.0):
+    rng = np.random.default_rng(count)
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    return rng.uniform(-half_m, half_m, (count, 3)).astype(np.float32), directions.astype(np.float32)
+
+
+def along(points, directions):
+    return (points[:, None] + OFFSETS_M[:, None] * directions[:, None]).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 300, 70_000])  # the last: more than are marked at a time
+def test_points_along_rays_mark_the_cells_of_those_points(count, threads):
+    points, directions = rays_of(count)
+    expected = np.unique(cell_keys(along(points, directions), LEAF_M))
+    for cells, insert in ((CellSet(LEAF_M), "along"), (CellSet(LEAF_M), "points")):
+        if insert == "along":
+            cells.insert_along(points, directions, OFFSETS_M, threads)
+        else:
+            cells.insert(along(points, directions), threads)
+        np.testing.assert_array_equal(cells.sorted_keys(threads), expected)
+        assert len(cells) == len(expected)
+
+
+@pytest.mark.parametrize("far", [np.nan, np.inf, 3e5])
+def test_points_along_rays_that_have_no_cell_are_refused(far):
+    points, directions = rays_of(5)
+    points[3, 1] = far
+    with pytest.raises(ValueError, match="within a million cells"):
+        CellSet(LEAF_M).insert_along(points, directions, OFFSETS_M)
+
+
+def in_columns(cells, column, share):
+    """The definition: a hash of the columns' coordinates."""
+    hashed = np.zeros(len(cells), np.uint64)
+    for coordinate in (cells // column).T:
+        hashed = (hashed ^ coordinate.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        hashed ^= hashed >> np.uint64(29)
+    return (hashed >> np.uint64(40)) < np.uint64(share * 2**24)
+
+
+@pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2), (1,)])
+@pytest.mark.parametrize("share", [0.0, 0.03, 1.0])
+def test_a_sample_of_columns_is_that_of_its_hash(axes, share):
+    points, directions = rays_of(20_000, 100.0)
+    places = np.ascontiguousarray(along(points, directions)[:, axes])
+    cells = np.floor(places / np.float32(LEAF_M)).astype(np.int64)
+    expected = in_columns(cells, 16, share)
+    np.testing.assert_array_equal(sample_cells(cells, 16, share), expected)
+    assert expected.mean() == pytest.approx(share, abs=0.02)
+    for threads in (1, 2):
+        chosen = sample_rays(points, directions, OFFSETS_M, list(axes), LEAF_M, 16, share, threads)
+        np.testing.assert_array_equal(chosen, expected.reshape(-1, len(OFFSETS_M)).any(axis=1))
+
+
+def test_arguments_of_samples_are_checked():
+    points, directions = rays_of(2)
+    for axes, column, share in (([3], 16, 0.5), ([0], 0, 0.5), ([0], 16, np.nan)):
+        with pytest.raises(ValueError, match=r"axes|column"):
+            sample_rays(points, directions, OFFSETS_M, axes, LEAF_M, column, share)
+
+
+@pytest.mark.parametrize("highest", [1, 2**9, 2**40, 2**64])
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_the_order_of_keys_is_stable(highest, count):
+    keys = np.random.default_rng(count).integers(0, highest, count, np.uint64)
+    np.testing.assert_array_equal(stable_order(keys), np.argsort(keys, kind="stable"))
