@@ -2,7 +2,8 @@
 // SPDX-License-Identifier: MIT
 //
 // What a newer glibc adds under old names: with these the extension asks for nothing newer than glibc 2.28. The linker
-// sends calls of `pow` to `__wrap_pow`, which calls the version that every glibc has; the bits of the results are equal.
+// sends calls of `pow` to `__wrap_pow`, which calls the version that every glibc has; the bits of the results are
+// equal.
 #include <pthread.h>
 
 extern "C" {

@@ -29,7 +29,9 @@ def small(path: Path) -> None:
     from PIL import Image  # noqa: PLC0415 - it comes with matplotlib
 
     packed = io.BytesIO()
-    Image.open(path).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE).save(packed, "PNG", optimize=True)
+    Image.open(path).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE).save(
+        packed, "PNG", optimize=True
+    )
     path.write_bytes(packed.getvalue())
 
 
@@ -83,7 +85,12 @@ def field(radar_map: radarsdf.RadarMap, height_m: float, path: Path) -> None:
     sdf = np.where(radar_map.observed(grid), radar_map.sdf(grid), np.nan).reshape(len(y), len(x))
     shown = axes.pcolormesh(x, y, sdf, cmap="RdBu", vmin=-0.4, vmax=0.4, rasterized=True)
     axes.contour(x, y, sdf, [0.0], colors="black", linewidths=1.0)
-    axes.set(title=f"signed distance {height_m:.1f} m above the world's origin", aspect="equal", xlabel="x, m", ylabel="y, m")
+    axes.set(
+        title=f"signed distance {height_m:.1f} m above the world's origin",
+        aspect="equal",
+        xlabel="x, m",
+        ylabel="y, m",
+    )
     figure.colorbar(shown, label="m: blue in free space, red behind", shrink=0.8)
     path.write_bytes(png_of(figure, dpi=100))
 
@@ -103,7 +110,9 @@ def draw(folder: Path, frames: int) -> None:
     field(radar_map, drive.poses[0, 2, 3], folder / "field.png")
     save_picture(folder / "surface.png", mesh, **SIZE)
     save_picture(folder / "reflectance.png", mesh, scalar=answers["intensity"], label="intensity, dB", **SIZE)
-    save_picture(folder / "uncertainty.png", mesh, scalar=answers["uncertainty_m"], label="uncertainty, m", **SIZE)
+    save_picture(
+        folder / "uncertainty.png", mesh, scalar=answers["uncertainty_m"], label="uncertainty, m", **SIZE
+    )
     measured = np.column_stack([drive.points[HELD_OUT], drive.intensities[HELD_OUT]])
     save_view_picture(folder / "view.png", [radar_map.render(drive.poses[HELD_OUT])], [measured])
     for path in folder.glob("*.png"):

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Your own arrays: scans, poses and intensities in, a mesh, distances and predicted intensities out.
 
-    python examples/numpy_arrays.py [FOLDER]
+python examples/numpy_arrays.py [FOLDER]
 """
 
 import sys

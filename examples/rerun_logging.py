@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Scans, poses and the map in the viewer of rerun. It needs the extra `rerun`.
 
-    python examples/rerun_logging.py [FOLDER]      # writes drive.rrd; rerun drive.rrd shows it
+python examples/rerun_logging.py [FOLDER]      # writes drive.rrd; rerun drive.rrd shows it
 """
 
 import sys
@@ -27,7 +27,9 @@ def main(folder: Path) -> None:
     for i, (points, values) in enumerate(zip(drive.points, drive.intensities, strict=True)):
         rr.set_time("scan", sequence=i)
         T_world_sensor = drive.poses[i]
-        rr.log("world/sensor", rr.Transform3D(translation=T_world_sensor[:3, 3], mat3x3=T_world_sensor[:3, :3]))
+        rr.log(
+            "world/sensor", rr.Transform3D(translation=T_world_sensor[:3, 3], mat3x3=T_world_sensor[:3, :3])
+        )
         colors = intensity_colors(values, low, high)
         rr.log("world/sensor/returns", rr.Points3D(points, colors=colors, radii=0.05))
         rr.log("intensity/mean", rr.Scalars(values.mean()))

@@ -33,7 +33,9 @@ def header(time_ns: int, frame: str) -> object:
 def cloud(time_ns: int, points: np.ndarray, power_db: np.ndarray) -> object:
     """A PointCloud2 with the fields x, y, z and power."""
     rows = np.column_stack([points, power_db]).astype("<f4")
-    fields = [make("sensor_msgs/msg/PointField", n, 4 * i, 7, 1) for i, n in enumerate(("x", "y", "z", "power"))]
+    fields = [
+        make("sensor_msgs/msg/PointField", n, 4 * i, 7, 1) for i, n in enumerate(("x", "y", "z", "power"))
+    ]
     data, size = np.frombuffer(rows.tobytes(), np.uint8), (1, len(rows))
     head = header(time_ns, "radar")
     return make("sensor_msgs/msg/PointCloud2", head, *size, fields, False, 16, 16 * len(rows), data, True)

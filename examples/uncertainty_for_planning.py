@@ -31,7 +31,9 @@ def main() -> None:
 
     every = radar_map.mesh(0.2, max_uncertainty=np.inf, min_detection_rate=0, min_component_triangles=0)
     certain = radar_map.mesh(0.2, max_uncertainty=CERTAIN_M, min_confidence=PROBABLE)
-    print(f"{every.area:.0f} m² of surface, {certain.area:.0f} m² within {CERTAIN_M} m and with {PROBABLE:.0%}")
+    print(
+        f"{every.area:.0f} m² of surface, {certain.area:.0f} m² within {CERTAIN_M} m and with {PROBABLE:.0%}"
+    )
 
     path = drive.poses[:, :3, 3] + drive.poses[:, :3, 1] * 3.0  # y of the sensor's frame is left
     to_any, error_any = clearance(path, every)
