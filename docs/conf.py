@@ -8,6 +8,7 @@ from pathlib import Path
 
 import radarsdf
 from sphinx.application import Sphinx
+from sphinx.ext.napoleon.docstring import NumpyDocstring
 
 project = "radarsdf"
 author = "the radarsdf authors"
@@ -32,6 +33,9 @@ autodoc_preserve_defaults = True
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 python_maximum_signature_line_length = 100
+
+# Of an attribute, napoleon would take what stands before the first colon for its type.
+NumpyDocstring._consume_inline_attribute = lambda self: ("", self._dedent(self._consume_to_end()))
 
 DOCS = Path(__file__).parent
 # A page that begins so has the text of another file, and then its own. The second line is for readers on GitHub.
