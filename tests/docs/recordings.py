@@ -10,8 +10,6 @@ import numpy as np
 import radarsdf
 from scipy.spatial.transform import Rotation
 
-from bench.reading.bag_writing import BagWriter
-
 START_S = 1717252210.0
 _STEP_S = 0.1
 _FRAMES = 12
@@ -82,6 +80,8 @@ def _kitti(folder, drive, scale):
 
 
 def _bag(path, drive, kind, *, transforms=True):
+    from bench.reading.bag_writing import BagWriter  # noqa: PLC0415 - it needs rosbags, an extra
+
     T_base_radar = np.eye(4)
     T_base_radar[:3, 3] = [1.0, 0.0, 0.5]
     with BagWriter(path, kind) as bag:

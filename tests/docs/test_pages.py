@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,9 @@ def test_the_languages_of_blocks_are_known(page):
     assert {block.language for block in blocks(page)} <= RUN | TEXT
 
 
-@pytest.mark.skipif(shutil.which("bash") is None, reason="the blocks of a shell are those of bash")
+@pytest.mark.skipif(
+    sys.platform == "win32" or shutil.which("bash") is None, reason="the blocks of a shell are those of bash"
+)
 @pytest.mark.parametrize(
     "page",
     [page for page in PAGES if RUN & {block.language for block in blocks(page)}],
