@@ -7,7 +7,8 @@ function(radarsdf_compiler_options target)
   if(MSVC)
     target_compile_options(${target} PRIVATE /W4 $<$<BOOL:${RADARSDF_WERROR}>:/WX>)
   else()
-    target_compile_options(${target} PRIVATE -Wall -Wextra -Wconversion -Wshadow
+    # clang's -Wconversion has -Wsign-conversion in it, gcc's has not: the same warnings of both.
+    target_compile_options(${target} PRIVATE -Wall -Wextra -Wconversion -Wno-sign-conversion -Wshadow
                                              $<$<BOOL:${RADARSDF_WERROR}>:-Werror>)
   endif()
   if(RADARSDF_SANITIZE)

@@ -5,12 +5,15 @@
 from __future__ import annotations
 
 import inspect
+import re
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 import radarsdf
+from radarsdf import _core
 
 
 def run(code):
@@ -56,6 +59,25 @@ def test_an_unknown_name():
     with pytest.raises(AttributeError, match="module 'radarsdf' has no attribute 'fitt'"):
         radarsdf.fitt  # noqa: B018
     assert not hasattr(radarsdf, "_nothing")
+
+
+def test_the_version_is_written_once():
+    root = Path(__file__).parents[1]
+    written = re.search(
+        r'^version = "(.+)"$', (root / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert radarsdf.__version__ == _core.__version__ == written[1]
+    # The one copy, for those who cite.
+    assert f"\nversion: {written[1]}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_the_version_of_sources_that_are_not_installed_is_that_of_the_core():
+    run(
+        "import importlib.metadata as m\n"
+        "def missing(name): raise m.PackageNotFoundError(name)\n"
+        "m.version = missing\n"
+        "import radarsdf; assert radarsdf.__version__ == radarsdf.versions.versions()['radarsdf']"
+    )
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from radarsdf.tiles.fit_tiles import fit_tiles, load
     from radarsdf.tiles.tiled_map import TiledMap
 
+    __version__: str
+
 __all__ = [
     "Diverged",
     "Estimate",
@@ -75,6 +77,9 @@ if not TYPE_CHECKING:  # type checkers use the imports above, and report every o
 
     def __getattr__(name: str) -> object:
         """Import a name when it is first used."""
+        if name == "__version__":
+            globals()[name] = _version()
+            return globals()[name]
         if name not in _MODULES:
             msg = f"module {__name__!r} has no attribute {name!r}"
             raise AttributeError(msg)
@@ -84,4 +89,12 @@ if not TYPE_CHECKING:  # type checkers use the imports above, and report every o
         return value
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *_MODULES})
+        return sorted({*globals(), *_MODULES, "__version__"})
+
+    def _version() -> str:
+        from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - takes as long as the package
+
+        try:
+            return version("radarsdf")
+        except PackageNotFoundError:  # the sources on PYTHONPATH, not installed
+            return import_module("radarsdf.versions").versions()["radarsdf"]

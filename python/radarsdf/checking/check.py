@@ -15,11 +15,12 @@ from radarsdf.checking.finding import SEVERITIES, Finding
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
 from radarsdf.config import FitConfig
+from radarsdf.io.sequence import Scans
 
 
 def check(
-    points: Sequence[ArrayLike],
-    poses: ArrayLike,
+    points: Sequence[ArrayLike] | Scans,
+    poses: ArrayLike | None = None,
     intensities: Sequence[ArrayLike] | None = None,
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
@@ -34,10 +35,11 @@ def check(
 
     Parameters
     ----------
-    points : sequence of F arrays
-        (N_i, 3) each: the returns of one scan, sensor frame, m.
-    poses : array_like
-        (F, 4, 4) T_world_sensor, m, one for each scan.
+    points : sequence of F arrays, or Scans
+        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, as they are, all the
+        rest is used where it is not given here.
+    poses : array_like, optional
+        (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
     intensities : sequence of F arrays, optional
         (N_i,) each, sensor units.
     doppler_mps : sequence of F arrays, optional
@@ -66,6 +68,15 @@ def check(
     ('poses_inverted', 'error')
     """
     config = FitConfig() if config is None else config
+    if isinstance(points, Scans):
+        scans, points = points, points.points  # first: it reads all there is, in one pass
+        poses = scans.poses if poses is None else poses
+        intensities = scans.intensities if intensities is None else intensities
+        doppler_mps = scans.doppler_mps if doppler_mps is None else doppler_mps
+        times_s = scans.times_s if times_s is None else times_s
+    if poses is None:
+        msg = "poses are missing: T_world_sensor (4, 4) of each scan"
+        raise ValueError(msg)
     recording = Recording.of(points, poses, intensities, doppler_mps, times_s)
     return _sorted(_find(recording, config, frames.FULL))
 

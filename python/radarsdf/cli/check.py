@@ -50,15 +50,7 @@ def findings_of(scans: Scans, config: FitConfig) -> list[Finding]:
     """All findings about scans, the worst first."""
     from radarsdf import check
 
-    points = scans.points  # first: it reads all there is, in one pass
-    return check(
-        points,
-        scans.poses,
-        scans.intensities,
-        doppler_mps=scans.doppler_mps,
-        times_s=scans.times_s,
-        config=config,
-    )
+    return check(scans, config=config)
 
 
 def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None:

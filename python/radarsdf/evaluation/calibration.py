@@ -83,7 +83,7 @@ def uncertainty_metrics(
           Gaussian with mean zero. Perfect is 0.5, 0.68, 0.9 and 0.95. Less is overconfident.
         - `bin_predicted_m`, `bin_rmse_m`: root mean square of the uncertainties and of the errors in each bin, from the
           lowest uncertainty to the highest.
-        - `ence`, expected normalised calibration error: mean over the bins of |predicted - measured| / predicted.
+        - `ence`, expected normalised calibration error: mean over the bins of ``|predicted - measured| / predicted``.
           Perfect is 0, up to the noise of the bins. A prediction of half the true error gives 1.
         - `decile_predicted_m`, `decile_rmse_m`: the same in ten bins. `worst_decile_factor`: the largest ratio of the
           two, in either direction. `deciles_in_order`: whether the errors never fall from one decile to the next.
@@ -181,7 +181,7 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike, *, bins: int =
     ConfidenceMetrics
         - `bin_count`, `bin_confidence`, `bin_true_share`: number of points, mean confidence and share of true ones in
           each bin. The last two are None in an empty bin. A confidence of 1 is in the last bin.
-        - `worst_gap`: largest |confidence - share| of a bin with at least 1 % of the points. `mean_gap`: mean over all
+        - `worst_gap`: largest ``|confidence - share|`` of a bin with at least 1 % of the points. `mean_gap`: mean over all
           bins, weighted by their points; others call it expected calibration error.
         - `brier`: mean squared difference of confidence and truth. Lower is better.
         - `auc`: probability that a true point has a higher confidence than a false one; 0.5 tells nothing. None if all

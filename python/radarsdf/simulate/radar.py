@@ -89,9 +89,9 @@ class RadarSensor:
     + speckle + noise. Speckle is the fading of ``Material.looks`` independent scatterers: a Gamma distribution, with its
     median at 0 dB.
 
-    The standard deviation of a position is √(``sigma_range_m``² + (``sigma_range_per_m`` · range)²) along the beam, and
+    The standard deviation of a position is √(``sigma_range_m²`` + (``sigma_range_per_m`` · range)²) along the beam, and
     ``sigma_azimuth_rad`` · range and ``sigma_elevation_rad`` · range across it. Each is multiplied by
-    √(1 + ``weak_noise``² · threshold power / power of the return). So a weak return is the worst, and a strong one has
+    √(1 + ``weak_noise²`` · threshold power / power of the return). So a weak return is the worst, and a strong one has
     the standard deviations of the sensor; the part of weak returns falls as the Cramér-Rao bound does.
 
     There are four kinds of false returns: clutter in free space; phantoms behind surfaces, of which a share stays at its

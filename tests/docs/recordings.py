@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The files that the pages speak of, of a short simulated drive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import radarsdf
+from scipy.spatial.transform import Rotation
+
+START_S = 1717252210.0
+_STEP_S = 0.1
+_FRAMES = 12
+
+
+def write_demo(folder: Path) -> None:
+    """The scans that `radarsdf demo` writes, but fewer."""
+    drive = radarsdf.simulate.hugin(frames=_FRAMES)
+    (folder / "radarsdf_demo").mkdir()
+    scans = radarsdf.io.Scans(drive.points, drive.poses, drive.intensities)
+    radarsdf.io.write_scans(folder / "radarsdf_demo" / "scans.npz", scans)
+
+
+def write_recordings(folder: Path) -> None:
+    """A drive as a folder of PCD, as KITTI has it, and as bags of ROS 2; and the broken ones."""
+    drive = radarsdf.simulate.hugin(frames=_FRAMES)
+    _pcd(folder / "drive", drive)
+    _tum(folder / "drive.tum", drive.poses)
+    _tum(folder / "inverted.tum", np.linalg.inv(drive.poses))
+    _kitti(folder / "kitti", drive, 1.0)
+    _kitti(folder / "kitti_mm", drive, 1000.0)
+    for kind in ("mcap", "sqlite3"):
+        _bag(folder / f"drive_{kind}", drive, kind)
+        _cut_off(folder / f"drive_{kind}", folder / f"cut_{kind}")
+    _bag(folder / "no_tf", drive, "mcap", transforms=False)
+
+
+def _pcd(folder, drive):
+    folder.mkdir()
+    for i, (points, values) in enumerate(zip(drive.points, drive.intensities, strict=True)):
+        n = len(points)
+        header = (
+            f"VERSION .7\nFIELDS x y z power\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {n}\nHEIGHT 1\n"
+            f"POINTS {n}\nDATA binary\n"
+        )
+        columns = np.column_stack([points, values]).astype("<f4")
+        name = f"{START_S + i * _STEP_S:.6f}.pcd"
+        (folder / name).write_bytes(header.encode() + columns.tobytes())
+
+
+def _tum(path, poses):
+    rows = [
+        [START_S + i * _STEP_S, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        for i, pose in enumerate(poses)
+    ]
+    path.write_text("\n".join(" ".join(f"{x:.9f}" for x in row) for row in rows) + "\n", encoding="utf-8")
+
+
+def _kitti(folder, drive, scale):
+    """The poses are those of a camera: P with T_world_sensor = inv(Tr) P Tr, relative to the first scan."""
+    clouds = folder / "velodyne"
+    clouds.mkdir(parents=True)
+    Tr = np.eye(4)
+    Tr[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    Tr[:3, 3] = [0.1, -0.2, -0.3]
+    first = np.linalg.inv(drive.poses[0])
+    poses = [Tr @ first @ pose @ np.linalg.inv(Tr) for pose in drive.poses]
+    for i, (points, values) in enumerate(zip(drive.points, drive.intensities, strict=True)):
+        np.column_stack([points * scale, values]).astype("<f4").tofile(clouds / f"{i:06d}.bin")
+
+    def line(matrix):
+        return " ".join(f"{x:.9f}" for x in matrix[:3].ravel())
+
+    (folder / "poses.txt").write_text("\n".join(map(line, poses)) + "\n", encoding="utf-8")
+    (folder / "calib.txt").write_text(f"Tr: {line(Tr)}\n", encoding="utf-8")
+    times = "\n".join(f"{i * _STEP_S:.6f}" for i in range(len(drive)))
+    (folder / "times.txt").write_text(times + "\n", encoding="utf-8")
+
+
+def _bag(path, drive, kind, *, transforms=True):
+    from bench.reading.bag_writing import BagWriter  # noqa: PLC0415 - it needs rosbags, an extra
+
+    T_base_radar = np.eye(4)
+    T_base_radar[:3, 3] = [1.0, 0.0, 0.5]
+    with BagWriter(path, kind) as bag:
+        if transforms:
+            bag.write("/tf_static", bag.transforms(START_S, {("base_link", "radar"): T_base_radar}), START_S)
+        for i, (points, values) in enumerate(zip(drive.points, drive.intensities, strict=True)):
+            now = START_S + i * _STEP_S
+            if transforms:
+                T_odom_base = drive.poses[i] @ np.linalg.inv(T_base_radar)
+                bag.write("/tf", bag.transforms(now, {("odom", "base_link"): T_odom_base}), now)
+            x, y, z = points.T
+            bag.write("/radar/points", bag.cloud2(now, {"x": x, "y": y, "z": z, "power": values}), now)
+
+
+def _cut_off(bag, cut):
+    """A copy of a bag whose recording ended in the middle."""
+    cut.mkdir()
+    for file in bag.iterdir():
+        data = file.read_bytes()
+        (cut / file.name).write_bytes(data if file.suffix == ".yaml" else data[: len(data) * 2 // 3])

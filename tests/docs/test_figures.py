@@ -1,0 +1,21 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The figures of the pages are drawn by code that runs."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def test_all_figures_are_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    runpy.run_path(str(DOCS / "draw.py"))["draw"](tmp_path, frames=6)
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert drawn == {path.name for path in (DOCS / "figures").iterdir()}
+    pages = "".join(page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+    assert [name for name in drawn if f"figures/{name}" not in pages] == []

@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Each example runs as a user runs it, writes what it says, and is short."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+# What an example needs beside the package, and what it writes.
+NEEDS = {"ros_bag": "rosbags", "novel_views": "matplotlib", "rerun_logging": "rerun"}
+WRITES = {
+    "numpy_arrays": {"mesh.ply", "map.safetensors"},
+    "folder": {"drive", "poses.tum", "map.safetensors"},
+    "ros_bag": {"drive_bag", "map.safetensors"},
+    "novel_views": {"view.png", "aside.ply"},
+    "uncertainty_for_planning": set(),
+    "rerun_logging": {"drive.rrd"},
+}
+MAX_LINES = 80
+FILES = sorted(EXAMPLES.glob("*.py"))
+
+
+def test_each_example_is_known_and_in_the_table():
+    table = (EXAMPLES / "README.md").read_text(encoding="utf-8")
+    assert {path.stem for path in FILES} == set(WRITES)
+    assert [
+        path.name
+        for path in EXAMPLES.iterdir()
+        if path.name not in table and path.suffix in (".py", ".ipynb")
+    ] == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_an_example_is_short(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) < MAX_LINES
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_an_example_runs(path, tmp_path, monkeypatch, capsys):
+    if path.stem in NEEDS:
+        pytest.importorskip(NEEDS[path.stem])
+    monkeypatch.setattr(sys, "argv", [str(path), *([str(tmp_path)] if WRITES[path.stem] else [])])
+    runpy.run_path(str(path), run_name="__main__")
+    assert {written.name for written in tmp_path.iterdir()} == WRITES[path.stem]
+    assert capsys.readouterr().out
+
+
+def test_the_notebook_runs(tmp_path, monkeypatch):
+    """Its cells run in order as a script: no kernel is needed, and nothing is left in the file."""
+    display = pytest.importorskip("IPython.display", reason="a notebook needs IPython")
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((EXAMPLES / "map.ipynb").read_text(encoding="utf-8"))
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
+    names = {"__name__": "notebook"}
+    for cell in cells:
+        exec("".join(cell["source"]), names)  # noqa: S102
+    assert isinstance(names["Image"]("mesh.png"), display.Image)
