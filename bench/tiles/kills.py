@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import distributed
 import numpy as np
-from distributed import LocalCluster
 from radarsdf import FitConfig, TiledMap
 from radarsdf.io import Scan
 from radarsdf.map import storage
@@ -42,7 +42,7 @@ def rows(names: list[str], quick: bool) -> Iterator[dict[str, Any]]:
             plan_tiles(scans, out, tile_size=_TILE_M, config=_CONFIG)
             started_s = time.perf_counter()
             kept = 0
-            with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+            with _cluster() as cluster:
                 if name == "the scheduler":
                     kept = _until_the_scheduler_dies(cluster, out, plan)
                 else:
@@ -57,7 +57,7 @@ def rows(names: list[str], quick: bool) -> Iterator[dict[str, Any]]:
                     for tile in plan.tiles
                     if _there(out, tile)
                 }
-                with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+                with _cluster() as cluster:
                     _fit(cluster, out)
                 redone = sum(
                     map_path(out, tile).stat().st_mtime_ns != times.get(tile.name, -1)
@@ -73,6 +73,11 @@ def rows(names: list[str], quick: bool) -> Iterator[dict[str, Any]]:
                 "same bits as in one process": _bits(out) == expected,
                 "s": round(time.perf_counter() - started_s, 1),
             }
+
+
+def _cluster() -> Any:
+    local: Any = distributed.LocalCluster  # without types
+    return local(n_workers=2, threads_per_worker=1, dashboard_address=None)
 
 
 def _there(out: Path, tile: Any) -> bool:
@@ -119,7 +124,7 @@ def _quietly(call: Callable[[], None]) -> None:
 
 def _bits(folder: Path) -> dict[str, bytes]:
     plan = Plan.load(folder)
-    found = {}
+    found: dict[str, bytes] = {}
     for tile in plan.tiles:
         tensors, _ = storage.parts_of(storage.load_contents(map_path(folder, tile)))
         found |= {f"{tile.name}.{name}": np.asarray(tensor).tobytes() for name, tensor in tensors.items()}

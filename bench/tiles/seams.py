@@ -55,6 +55,7 @@ def _row(name: str, scans: Scans, config: FitConfig, folder: Path, quick: bool) 
     one = radarsdf.fit(scans, config=config, intensity_range=(scale.low, scale.high), progress=False)
     meshes = [map_.mesh(voxel_m, progress=False) for map_ in (one, city)]
     truth = scans.ground_truth
+    assert truth is not None
     scores = [evaluation.surface_metrics(mesh, truth, samples=500_000) for mesh in meshes]
     vertices = np.array(meshes[1].vertices)
     way_m, axis = _to_border(city, vertices)

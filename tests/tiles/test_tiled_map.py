@@ -99,6 +99,20 @@ def test_tensors_and_types(city, points):
         city.sdf(points[0])
 
 
+def test_views_are_those_of_one_map(city, whole, drive):
+    one, other = (map_.render(drive.poses[5], whole.sensor) for map_ in (whole, city))
+    assert len(other) == pytest.approx(len(one), rel=0.05)
+    both = np.isfinite(one.beam_ranges_m) & np.isfinite(other.beam_ranges_m)
+    assert both.sum() > 0.95 * np.isfinite(one.beam_ranges_m).sum()
+    difference_m = np.abs(one.beam_ranges_m - other.beam_ranges_m)[both]
+    assert np.median(difference_m) < 1e-3
+    assert np.quantile(difference_m, 0.95) < 0.1
+    away = np.eye(4)
+    away[0, 3] = 1e6
+    with pytest.raises(ValueError, match="no tile within"):
+        city.render(away)
+
+
 def test_pickles_and_words(city, points):
     copy = pickle.loads(pickle.dumps(city))
     np.testing.assert_array_equal(copy.sdf(points[:100]), city.sdf(points[:100]))

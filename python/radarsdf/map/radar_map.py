@@ -348,10 +348,15 @@ class RadarMap:
         MemoryError
             If the view would take more memory than there is. At most 10^6 beams are traced, and a patch has one return.
         """
-        from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
+        from radarsdf.map.views import ViewedMap, view_from  # noqa: PLC0415 - it imports trimesh, which is slow
 
         return view_from(
-            self._contents, self._traced, T_world_sensor, sensor, returns=returns, noise=noise, seed=seed
+            ViewedMap.of(self._contents, self._traced),
+            T_world_sensor,
+            sensor,
+            returns=returns,
+            noise=noise,
+            seed=seed,
         )
 
     @cached_property

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -52,16 +53,31 @@ class TracedSurface:
         """The surface in voxels of a leaf cell's size, which is finer than the noise of a radar."""
         voxel_m = contents.config.leaf_size_m
         check_views(contents.config.max_memory_bytes, cells=len(contents.evidence.looks))
-        surface = Surface.of(contents, voxel_m)
+        return cls.of_surface(
+            Surface.of(contents, voxel_m),
+            voxel_m,
+            queries.max_uncertainty_m(contents),
+            lambda points: queries.evidence(contents, torch.from_numpy(points.astype(np.float32))),
+        )
+
+    @classmethod
+    def of_surface(
+        cls,
+        surface: Surface,
+        voxel_m: float,
+        max_uncertainty_m: float,
+        evidence_at: Callable[[NDArray[np.float64]], queries.EvidenceAt],
+    ) -> TracedSurface:
+        """All triangles of a surface in voxels of this edge, m. `evidence_at`: of points (N, 3), local frame, m."""
         corners = surface.vertices[surface.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         twice_m2 = np.sqrt(np.einsum("ni,ni->n", across, across))
         centres = corners.mean(axis=1)
-        evidence = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
+        evidence = evidence_at(centres)
         rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
         # A component is as large as one that a mesh of the default's finer voxels keeps.
         components = round(queries.MIN_COMPONENT_TRIANGLES * min(1.0, (queries.VOXEL_M / voxel_m) ** 2))
-        kept = surface.kept(0.0, queries.max_uncertainty_m(contents), queries.MIN_DETECTION_RATE, components)
+        kept = surface.kept(0.0, max_uncertainty_m, queries.MIN_DETECTION_RATE, components)
         faces = np.ascontiguousarray(surface.faces[kept])
         return cls(
             SurfaceTracer(surface.vertices, faces, resolve_num_threads(0)),

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,9 +90,45 @@ def scans_of(views: Iterable[View]) -> Scans:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class ViewedMap:
+    """What views of a map need of it."""
+
+    surface: TracedSurface
+    """What beams meet, local frame."""
+    origin: _Floats
+    """(3,) of the local frame, world, m."""
+    sensor: Sensor
+    """The radar that made the map."""
+    roughness: float
+    """See :func:`radarsdf.map.queries.roughness`."""
+    intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None
+    """Intensities (N,) of returns from points (N, 3) to a sensor (3,), local frame, m. None: the map has none."""
+    max_memory_bytes: int | None
+    """What views may take. None: what the system has left."""
+
+    @classmethod
+    def of(cls, contents: MapContents, surface: TracedSurface) -> ViewedMap:
+        """Of one map."""
+
+        def intensity(points: _Floats, position: _Floats) -> NDArray[np.float32]:
+            x = torch.from_numpy(points.astype(np.float32))
+            sensors = torch.from_numpy(position.astype(np.float32)).expand(len(x), 3)
+            values: NDArray[np.float32] = queries.intensity(contents, x, sensors).numpy()
+            return values
+
+        return cls(
+            surface,
+            contents.origin,
+            contents.sensor,
+            queries.roughness(contents),
+            None if contents.intensity_scale is None else intensity,
+            contents.config.max_memory_bytes,
+        )
+
+
 def view_from(
-    contents: MapContents,
-    surface: TracedSurface,
+    viewed: ViewedMap,
     T_world_sensor: ArrayLike,
     sensor: Sensor | None = None,
     *,
@@ -106,27 +142,26 @@ def view_from(
         msg = f"T_world_sensor must have shape (4, 4), not {pose.shape}"
         raise ValueError(msg)
     pose = check_poses(pose[None], 1)[0]
-    sensor = contents.sensor if sensor is None else sensor
+    surface = viewed.surface
+    sensor = viewed.sensor if sensor is None else sensor
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
     if not 0 <= wanted <= 1e8:
         msg = f"returns must be in [0, 10^8], not {returns}"
         raise ValueError(msg)
     azimuth, elevation = _beams(sensor)
-    check_views(
-        contents.config.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation)
-    )
-    position = pose[:3, 3] - contents.origin
-    chosen = _answers(surface, pose[:3, :3], position, sensor, round(wanted), queries.roughness(contents))
+    check_views(viewed.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation))
+    position = pose[:3, 3] - viewed.origin
+    chosen = _answers(surface, pose[:3, :3], position, sensor, round(wanted), viewed.roughness)
     points = (surface.centres[chosen] - position) @ pose[:3, :3]
-    intensities = _intensities(contents, surface.centres[chosen], position)
+    intensities = None
+    if viewed.intensity is not None:
+        intensities = viewed.intensity(surface.centres[chosen], position)
     if intensities is not None:
         detected = intensities >= sensor.threshold(np.linalg.norm(points, axis=1))
         points, intensities = points[detected], intensities[detected]
     if noise:
         points = _with_noise(points, sensor, np.random.default_rng(seed))
-    ranges_m, beam_intensities = _first_surface(
-        contents, surface, pose[:3, :3], position, sensor, azimuth, elevation
-    )
+    ranges_m, beam_intensities = _first_surface(viewed, pose[:3, :3], position, sensor, azimuth, elevation)
     return View(
         pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, ranges_m, beam_intensities
     )
@@ -202,16 +237,6 @@ def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
     return chosen
 
 
-def _intensities(contents: MapContents, points: _Floats, position: _Floats) -> NDArray[np.float32] | None:
-    """(N,) intensities of returns from points (N, 3) to `position` (3,), local frame, m."""
-    if contents.intensity_scale is None:
-        return None
-    x = torch.from_numpy(points.astype(np.float32))
-    sensors = torch.from_numpy(position.astype(np.float32)).expand(len(x), 3)
-    values: NDArray[np.float32] = queries.intensity(contents, x, sensors).numpy()
-    return values
-
-
 def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _Floats:
     ranges_m, azimuth, elevation = _polar(points)
     errors = rng.standard_normal((3, len(points)))
@@ -237,8 +262,7 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
 
 
 def _first_surface(
-    contents: MapContents,
-    surface: TracedSurface,
+    viewed: ViewedMap,
     R: _Floats,
     position: _Floats,
     sensor: Sensor,
@@ -249,13 +273,12 @@ def _first_surface(
     shape = (len(elevation), len(azimuth))
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
     directions = sensor.directions(grid[1].ravel(), grid[0].ravel()) @ R.T
-    hits = surface.first_hits(position, directions, float(sensor.range_m[1]))
+    hits = viewed.surface.first_hits(position, directions, float(sensor.range_m[1]))
     met = np.isfinite(hits.ranges_m) & (hits.ranges_m >= sensor.range_m[0])
     ranges_m = np.where(met, hits.ranges_m, np.float32(np.nan))
     places = position + directions[met] * hits.ranges_m[met, None]
-    of_hits = _intensities(contents, places, position)
-    if of_hits is None:
+    if viewed.intensity is None:
         return ranges_m.reshape(shape), None
     intensities = np.full(len(ranges_m), np.nan, np.float32)
-    intensities[met] = of_hits
+    intensities[met] = viewed.intensity(places, position)
     return ranges_m.reshape(shape), intensities.reshape(shape)

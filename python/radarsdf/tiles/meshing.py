@@ -17,10 +17,10 @@ from radarsdf.interrupts import whole_import
 from radarsdf.io.files import whole_file
 from radarsdf.io.records import ply_header, records
 from radarsdf.map import queries
-from radarsdf.map.meshing import add_intensity, check_box, check_limits, check_viewpoint
+from radarsdf.map.meshing import check_box, check_limits
+from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.pieces import PieceSettings, divides, mesh_tile, piece_path, write_piece
 from radarsdf.tiles.running import Task, run_tasks
-from radarsdf.tiles.tiled_map import TiledMap
 from radarsdf.tiles.welding import WeldedMesh
 
 with whole_import():
@@ -28,16 +28,14 @@ with whole_import():
 
 
 def mesh_of(
-    city: TiledMap,
+    city: TileBlend,
     voxel_size: float,
-    viewpoint: ArrayLike | None,
     min_component_triangles: int,
     executor: Executor | None,
     progress: bool | None,
     **limits: Any,
 ) -> trimesh.Trimesh:
     """See :meth:`TiledMap.mesh`."""
-    sensor_position = None if viewpoint is None else check_viewpoint(city.intensity_scale, viewpoint)
     welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
     parts = list(welded.parts())
     mesh = trimesh.Trimesh(
@@ -48,16 +46,11 @@ def mesh_of(
     mesh.metadata |= {"leaf_cells": int(welded.cells[0]), "leaf_cells_searched": int(welded.cells[1])}
     mesh.vertex_attributes["confidence"] = np.concatenate([part.confidence for part in parts])
     mesh.vertex_attributes["uncertainty_m"] = np.concatenate([part.uncertainty_m for part in parts])
-    if sensor_position is not None:
-        scale = city.intensity_scale
-        assert scale is not None
-        intensity = city.intensity(np.asarray(mesh.vertices, np.float64), sensor_position)
-        add_intensity(mesh, intensity.astype(np.float32), scale)
     return mesh
 
 
 def export_mesh(
-    city: TiledMap,
+    city: TileBlend,
     path: str | PathLike[str],
     voxel_size: float,
     min_component_triangles: int,
@@ -87,7 +80,7 @@ def export_mesh(
 
 
 def _welded(
-    city: TiledMap,
+    city: TileBlend,
     voxel_size: float,
     min_component_triangles: int,
     executor: Executor | None,

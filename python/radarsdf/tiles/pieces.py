@@ -20,9 +20,9 @@ from radarsdf.io.files import write_whole
 from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import renumbered
+from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
 from radarsdf.tiles.plan import folder_of
-from radarsdf.tiles.tiled_map import TiledMap
 
 # As in one map: cells with all corners farther from the surface than this, in leaf cells, are left out.
 _CLEARLY = 0.25
@@ -83,7 +83,7 @@ class Piece:
             return cls(**{name: arrays[name] for name in arrays.files})
 
 
-def piece_path(city: TiledMap, tile: Tile, settings: PieceSettings) -> Path:
+def piece_path(city: TileBlend, tile: Tile, settings: PieceSettings) -> Path:
     """The file of a piece. The same settings of the same plan give the same file."""
     text = settings.to_json() + str([other for other in neighbours(tile) if city.has(other)])
     key = hashlib.blake2b((city.plan.digest + text).encode(), digest_size=8).hexdigest()
@@ -96,10 +96,10 @@ def mesh_tile(folder: str, name: str, settings: str, run: str = "") -> str:
     Returns the path of the piece. The other arguments are those of :func:`radarsdf.tiles.tile_fit.fit_tile`.
     """
     del run
-    return str(write_piece(TiledMap(folder), name, PieceSettings.from_json(settings)))
+    return str(write_piece(TileBlend(folder), name, PieceSettings.from_json(settings)))
 
 
-def write_piece(city: TiledMap, name: str, settings: PieceSettings) -> Path:
+def write_piece(city: TileBlend, name: str, settings: PieceSettings) -> Path:
     """Writes the piece of a tile, unless it is there. Gives its path."""
     (tile,) = (planned.tile for planned in city.plan.tiles if planned.name == name)
     path = piece_path(city, tile, settings)
@@ -110,7 +110,7 @@ def write_piece(city: TiledMap, name: str, settings: PieceSettings) -> Path:
     return path
 
 
-def piece_of(city: TiledMap, tile: Tile, settings: PieceSettings) -> Piece:
+def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
     """The triangles of the blended field in the leaf cells of a tile that are to be kept, before small pieces go."""
     config, steps = city.config, settings.voxels_per_cell
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
@@ -150,7 +150,7 @@ def piece_of(city: TiledMap, tile: Tile, settings: PieceSettings) -> Piece:
     )
 
 
-def _cells_in(city: TiledMap, tile: Tile) -> NDArray[np.int64]:
+def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
     """(C, 3) leaf cells of a tile, from the world's origin: those of its map, and of others that count there."""
     plan = city.plan
     edge, size_m = plan.tile_cells, plan.config.leaf_size_m
@@ -168,7 +168,7 @@ def _cells_in(city: TiledMap, tile: Tile) -> NDArray[np.int64]:
     return found
 
 
-def _crossed(city: TiledMap, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def _crossed(city: TileBlend, cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Those of the leaf cells (C, 3) whose corners are not all clearly on one side of the surface."""
     size_m = city.config.leaf_size_m
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())

@@ -4,55 +4,32 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
-from functools import cached_property
 from os import PathLike
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import positive
-from radarsdf.config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
-from radarsdf.map import queries, storage
-from radarsdf.map.contents import MapContents
+from radarsdf.checks import check_poses, real_array
+from radarsdf.map import queries
 from radarsdf.map.positions import as_positions
-from radarsdf.returns.sensor import Sensor
-from radarsdf.tiles.grid import Tile
-from radarsdf.tiles.plan import Plan, TilePlan, failure_path, map_path
-from radarsdf.tiles.tile_fit import is_done
+from radarsdf.tiles.blend import Share, TileBlend
 
 if TYPE_CHECKING:
     import trimesh
 
+    from radarsdf.map.views import View, ViewedMap
+    from radarsdf.returns.sensor import Sensor
+    from radarsdf.tiles.grid import Tile
+
 _Floats = NDArray[np.float64]
-_MEMORY_BYTES = 1 << 30
-_BYTES_OF_FILE = 3  # in memory for each on the disk: tables of cells, besides what is read
 
 
-class Share(NamedTuple):
-    """What one tile adds to answers at some of N positions."""
-
-    contents: MapContents
-    """The map of the tile."""
-    rows: NDArray[np.int64]
-    """(M,) of the positions at which the tile counts."""
-    weights: _Floats
-    """(M,) there."""
-    slopes: _Floats
-    """(M, 2) derivatives of the weights by x and y, 1/m."""
-    local: Tensor
-    """(M, 3) the positions in the frame of the tile, m."""
-
-
-class TiledMap:
+class TiledMap(TileBlend):
     """A map in tiles, made by :func:`radarsdf.fit_tiles` or ``radarsdf.load(folder)``.
 
     It answers as :class:`RadarMap` does. Where tiles overlap, their answers are averaged with weights that fall smoothly
@@ -73,16 +50,7 @@ class TiledMap:
         If it cannot be read.
     """
 
-    def __init__(self, folder: str | PathLike[str], *, memory_bytes: float = _MEMORY_BYTES) -> None:
-        self.folder = Path(folder)
-        self.plan = Plan.load(self.folder)
-        self.memory_bytes = positive(memory_bytes, "memory_bytes")
-        self._known: dict[Tile, bool] = {}
-        self._held: OrderedDict[Tile, tuple[MapContents, int]] = OrderedDict()
-        self._lock = threading.Lock()
-        if not any(self.has(tile.tile) for tile in self.plan.tiles):
-            msg = f"no tile of {self.folder} is done: radarsdf tiles fit {self.folder} makes them"
-            raise ValueError(msg)
+    _viewed: tuple[list[Tile], ViewedMap] | None = None
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
@@ -93,62 +61,10 @@ class TiledMap:
     def __reduce__(self) -> tuple[Callable[..., TiledMap], tuple[Any, ...]]:
         return _opened, (str(self.folder), self.memory_bytes)
 
-    @property
-    def tiles(self) -> list[TilePlan]:
-        """The tiles that are done."""
-        return [tile for tile in self.plan.tiles if self.has(tile.tile)]
-
-    @property
-    def missing(self) -> dict[str, str]:
-        """The others by name, and why their fit failed; empty if it was not tried or was killed."""
-        reasons = {}
-        for tile in self.plan.tiles:
-            if not self.has(tile.tile):
-                path = failure_path(self.folder, tile)
-                reasons[tile.name] = path.read_text(errors="replace") if path.is_file() else ""
-        return reasons
-
-    def has(self, tile: Tile) -> bool:
-        """Whether there is such a tile, and it is done. What was found stays so for this object."""
-        if tile not in self._known:
-            planned = self.plan.by_tile.get(tile)
-            self._known[tile] = planned is not None and is_done(self.folder, self.plan, planned)
-        return self._known[tile]
-
-    @property
-    def config(self) -> FitConfig:
-        """Settings of the fits."""
-        return self.plan.config
-
-    @property
-    def intensity_scale(self) -> IntensityScale | None:
-        """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
-        return self.plan.scale
-
-    @property
-    def has_intensity(self) -> bool:
-        """Whether intensities were given to the fit."""
-        return self.plan.intensity_range is not None
-
-    @property
-    def sensor(self) -> Sensor:
-        """The radar, as the scans of the fit show it."""
-        return self.plan.sensor
-
-    @property
-    def rough_share(self) -> float:
-        """Share of the returns that lie on no thin surface, in [0, 1]: clutter, vegetation, rough ground."""
-        return self.plan.rough_share
-
-    @cached_property
-    def any_contents(self) -> MapContents:
-        """The map of a tile, for what all have in common."""
-        return self.contents_of(next(tile.tile for tile in self.plan.tiles if self.has(tile.tile)))
-
     def sdf(self, x: Any) -> Any:
         """Signed distance, m; see :meth:`RadarMap.sdf`. NaN where there is no tile."""
         world, answer = _given(x)
-        return answer(torch.from_numpy(self._averages(world, _distance)[:, 0]))
+        return answer(torch.from_numpy(self.averages(world, _distance)[:, 0]))
 
     def gradient(self, x: Any) -> Any:
         """Gradient of :meth:`sdf`, (N, 3); see :meth:`RadarMap.gradient`. NaN where there is no tile."""
@@ -161,7 +77,7 @@ class TiledMap:
             np.zeros((len(world), 2)),
         )
         totals = np.zeros(len(world))
-        for share in self._shares(world):
+        for share in self.shares(world):
             values = np.column_stack([
                 queries.signed_distance(share.contents, share.local).numpy(),
                 queries.gradient(share.contents, share.local).numpy(),
@@ -182,7 +98,7 @@ class TiledMap:
         """Whether x (N, 3) is in a leaf cell of the map, (N,) bool; see :meth:`RadarMap.observed`."""
         world, answer = _given(x)
         found = np.zeros(len(world), bool)
-        for share in self._shares(world):
+        for share in self.shares(world):
             found[share.rows] |= queries.occupied(share.contents, share.local).numpy()
         return answer(torch.from_numpy(found))
 
@@ -211,17 +127,7 @@ class TiledMap:
             values = queries.intensity(share.contents, share.local, there).numpy()
             return values[:, None].astype(np.float64), queries.occupied(share.contents, share.local).numpy()
 
-        return answer(torch.from_numpy(self._averages(world, of_tile)[:, 0]))
-
-    def evidence(self, world: _Floats) -> queries.EvidenceAt:
-        """Evidence of a surface at positions (N, 3), world, m. 0 without tiles."""
-
-        def of_tile(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:
-            columns = torch.stack(list(queries.evidence(share.contents, share.local)), 1)
-            return columns.numpy().astype(np.float64), np.ones(len(share.rows), bool)
-
-        found = np.nan_to_num(self._averages(world, of_tile, columns=3)).astype(np.float32)
-        return queries.EvidenceAt(*torch.from_numpy(found).unbind(1))
+        return answer(torch.from_numpy(self.averages(world, of_tile)[:, 0]))
 
     def mesh(
         self,
@@ -241,15 +147,56 @@ class TiledMap:
         Each tile is a task for the `executor`. `voxel_size` must divide the leaf cell's edge. :meth:`export` writes a mesh
         that does not fit into memory.
         """
-        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.map.meshing import add_intensity, check_viewpoint  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - likewise
 
-        return mesh_of(
-            self, voxel_size, viewpoint, min_component_triangles, executor, progress,
+        sensor_position = None if viewpoint is None else check_viewpoint(self.intensity_scale, viewpoint)
+        mesh = mesh_of(
+            self, voxel_size, min_component_triangles, executor, progress,
             box=box,
             min_confidence=min_confidence,
             max_uncertainty=max_uncertainty,
             min_detection_rate=min_detection_rate,
         )  # fmt: skip
+        if sensor_position is not None and self.intensity_scale is not None:
+            values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position)
+            add_intensity(mesh, values.astype(np.float32), self.intensity_scale)
+        return mesh
+
+    def render(
+        self,
+        T_world_sensor: ArrayLike,
+        sensor: Sensor | None = None,
+        *,
+        returns: float | None = None,
+        noise: bool = False,
+        seed: int | np.random.Generator = 0,
+    ) -> View:
+        """The returns that a radar would get from a pose; see :meth:`RadarMap.render`.
+
+        The surface of the tiles within the sensor's range is held until a view needs others.
+
+        Raises
+        ------
+        ValueError
+            If the pose is not a rigid transform, a number is out of range, or there is no tile within the range.
+        """
+        from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
+        from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - likewise
+
+        pose = check_poses(np.asarray(real_array(T_world_sensor, "T_world_sensor"))[None], 1)[0]
+        range_m = (self.sensor if sensor is None else sensor).range_m[1]
+        tiles = tiles_within(self, pose[:3, 3], range_m)
+        if not tiles:
+            msg = f"there is no tile within {range_m:.0f} m of the pose"
+            raise ValueError(msg)
+        held = self._viewed
+        if held is None or held[0] != tiles:
+            held = self._viewed = (
+                tiles,
+                viewed_tiles(self, tiles, self.intensity if self.has_intensity else None),
+            )
+        return view_from(held[1], pose, sensor, returns=returns, noise=noise, seed=seed)
 
     def export(
         self,
@@ -276,88 +223,6 @@ class TiledMap:
         from radarsdf.tiles.meshing import export_mesh  # noqa: PLC0415 - as above
 
         return export_mesh(self, path, voxel_size, min_component_triangles, executor, progress, **limits)
-
-    def contents_of(self, tile: Tile) -> MapContents:
-        """The map of a tile that is done. It is read, unless it is in memory."""
-        with self._lock:
-            if tile not in self._held:
-                path = map_path(self.folder, self.plan.by_tile[tile])
-                size = _BYTES_OF_FILE * path.stat().st_size
-                while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
-                    self._held.popitem(last=False)
-                self._held[tile] = storage.load_contents(path), size
-            self._held.move_to_end(tile)
-            return self._held[tile][0]
-
-    def _shares(self, world: _Floats) -> Iterator[Share]:
-        """What each tile adds at positions (N, 3), world, m: in ascending order, on which the bits of sums depend."""
-        for tile in self.plan.grid.counting(world) if len(world) else ():
-            if not self.has(tile):
-                continue
-            weights, slopes = self.plan.grid.weights(tile, world)
-            rows = np.flatnonzero(weights > 0)
-            if len(rows):
-                contents = self.contents_of(tile)
-                local = queries.to_local(contents, torch.from_numpy(world[rows]))
-                yield Share(contents, rows, weights[rows], slopes[rows], local)
-
-    def _averages(
-        self,
-        world: _Floats,
-        of_tile: Callable[[Share], tuple[_Floats, NDArray[np.bool_]]],
-        columns: int = 1,
-    ) -> _Floats:
-        """(N, columns) weighted averages of what the tiles say. NaN where there is none.
-
-        `of_tile` gives values (M, columns), and which of them (M,) are observed. Others count only where none is.
-        """
-        sums, totals = np.zeros((2, len(world), columns)), np.zeros((2, len(world)))
-        for share in self._shares(world):
-            values, observed = of_tile(share)
-            for kind, chosen in enumerate((observed, ~observed)):
-                weights = share.weights[chosen]
-                sums[kind, share.rows[chosen]] += weights[:, None] * values[chosen]
-                totals[kind, share.rows[chosen]] += weights
-        with np.errstate(invalid="ignore", divide="ignore"):
-            seen, others = sums / totals[:, :, None]
-        found: _Floats = np.where((totals[0] > 0)[:, None], seen, others)
-        return found
-
-    def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
-        """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, numbered from the world's origin.
-
-        They have the same bits whichever tile asks. NaN where no tile has an adjacent cell.
-        """
-        steps = round(self.config.leaf_size_m / voxel_m)
-
-        def of_tile(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:
-            # From integers: the same float32 position for every tile that asks.
-            tile_lattice = (
-                lattice[share.rows]
-                - np.round(share.contents.origin / self.config.leaf_size_m).astype(np.int64) * steps
-            )
-            points = torch.from_numpy((tile_lattice * voxel_m).astype(np.float32))
-            inside = queries.occupied(share.contents, points)
-            # A corner on the border of the map may be in a cell beyond it, which has no features. It is moved a little into
-            # the first cell of this tile that touches it.
-            for shift in _SHIFTS:
-                left = torch.nonzero(~inside)[:, 0]
-                moved = points[left] + torch.tensor(shift, dtype=torch.float32, device="cpu") * (
-                    _INWARD * voxel_m
-                )
-                found = queries.occupied(share.contents, moved)
-                points[left[found]] = moved[found]
-                inside[left[found]] = True
-            values = np.full((len(points), 1), np.nan)
-            values[inside.numpy(), 0] = queries.signed_distance(share.contents, points[inside]).numpy()
-            return values, inside.numpy()
-
-        world = np.asarray(lattice * voxel_m, np.float64)
-        return self._averages(world, of_tile)[:, 0].astype(np.float32)
-
-
-_INWARD = 1e-3  # edges of a voxel
-_SHIFTS = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
 
 
 def _distance(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:

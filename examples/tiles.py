@@ -1,0 +1,37 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Fits a street in tiles, continues after a tile was lost, and exports one mesh."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import radarsdf
+from radarsdf.io import Scans
+
+
+def main(folder: Path) -> None:
+    """Writes the tiles and the mesh to a folder."""
+    street = radarsdf.simulate.hugin(frames=30)
+    scans = Scans(street.points, street.poses)
+    config = radarsdf.FitConfig.quick(num_threads=1)
+    city = radarsdf.fit_tiles(scans, folder / "city", tile_size=32, config=config, progress=False)
+    print(city)
+
+    # What a crash leaves behind: one tile is missing. The same call makes it again, with the same bits.
+    lost = folder / "city" / "tiles" / city.tiles[0].name / "map.safetensors"
+    lost.unlink()
+    city = radarsdf.fit_tiles(scans, folder / "city", tile_size=32, config=config, progress=False)
+    print(f"{len(city.missing)} tiles are missing")
+
+    # One map answers: here, how far each sensor position is from what the nearest tiles know.
+    distance_m = city.sdf(street.poses[:, :3, 3])
+    print(f"{np.isfinite(distance_m).sum()} of {len(distance_m)} positions are in a tile")
+    vertices, triangles = city.export(folder / "city.ply", 0.2, progress=False)
+    print(f"{vertices} vertices and {triangles} triangles")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
