@@ -25,7 +25,8 @@ from .scenes import Scene
 Row = dict[str, Any]
 """One result: numbers, words and arrays. It always has `scene`, and `why_not` if a result is missing."""
 
-_SHORT: Changes = {"training": {"sdf_iterations": 20, "intensity_iterations": 40}}
+# After 20 iterations, some scenes have no surface yet.
+_SHORT: Changes = {"training": {"sdf_iterations": 60, "intensity_iterations": 60}}
 
 
 @dataclass(frozen=True)

@@ -99,9 +99,9 @@ def test_a_mesh_beyond_the_budget_is_refused(scene):
     radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(max_memory_bytes=10**9))
     radar_map.mesh(0.1)
     with pytest.raises(
-        MemoryError, match=r"voxels of 0\.004 m would take about \d+\.\d\d GB, of 1\.00: use larger"
+        MemoryError, match=r"voxels of 0\.005 m would take about \d+\.\d\d GB, of 1\.00: use larger"
     ):
-        radar_map.mesh(0.004)
+        radar_map.mesh(0.005)
 
 
 class TestAvailable:

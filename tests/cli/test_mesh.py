@@ -36,7 +36,7 @@ def test_less_is_left_where_more_is_asked(map_file, tmp_path):
         return len(trimesh.load_mesh(path, process=False).faces)
 
     everything = triangles()
-    assert 0 < triangles("--min-confidence", 0.99) < everything
+    assert 0 < triangles("--min-confidence", 0.995) < everything
     assert 0 < triangles("--min-detection-rate", 0.3) < everything
     assert 0 < triangles("--max-uncertainty", 0.015) < everything
     assert triangles("--min-detection-rate", 0.028) == everything  # the default

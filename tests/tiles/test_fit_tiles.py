@@ -68,6 +68,19 @@ def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
     assert error.max() < 0.01 * (scale[1] - scale[0])
 
 
+def test_trained_tiles(drive, tmp_path):
+    config = FitConfig(num_threads=1, training={"sdf_iterations": 60, "intensity_iterations": 30})
+    some = drive.select(np.arange(4))
+    city = tiles_of(some, tmp_path / "city", config=config)
+    whole = radarsdf.fit(some, config=config, progress=False)
+    assert city.missing == {}
+    points = np.concatenate([scan.world_points for scan in some])
+    points = points[whole.observed(points) & city.observed(points)]
+    assert (
+        np.median(np.abs(city.sdf(points) - whole.sdf(points))) < 0.05
+    )  # of different networks after few iterations
+
+
 def test_done_tiles_are_kept_and_others_are_made_with_the_same_bits(drive, folder, tmp_path):
     again = tmp_path / "city"
     shutil.copytree(folder, again)

@@ -174,7 +174,8 @@ def test_a_map_far_away_without_intensities():
         mesh = mesh_of(client.wait_for(is_mesh))
         assert np.abs(mesh.vertices).max() < 50  # of the local frame, which float32 can hold
         assert not any(message.name in (CLOUD, "/sensor") for message in client.received())
-        viewer._on_click(SimpleNamespace(ray_origin=[0.0, 0.0, 2.0], ray_direction=[8.0, 0.0, -3.0]))
+        sensor = scene.poses[:, :3, 3].mean(axis=0) - radar_map.origin + [0, 0, 2]
+        viewer._on_click(SimpleNamespace(ray_origin=sensor.tolist(), ray_direction=[8.0, 0.0, -3.0]))
         said = client.wait_for(lambda m: "signed distance" in str(m.message))
         assert "position | 5000" in str(said.message)
         assert "intensity" not in str(said.message)

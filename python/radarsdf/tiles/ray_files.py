@@ -101,7 +101,7 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
         origin=origin,
         intensities=None if plan.intensity_range is None else np.ascontiguousarray(rows["intensity"]),
         scans=scans.astype(np.int32),
-        up_of_scan=of_scans[:, 3:],
+        up_of_scan=np.ascontiguousarray(of_scans[:, 3:]),
     )
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
     halo = round(plan.halo_m / plan.config.leaf_size_m)
