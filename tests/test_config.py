@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from radarsdf import FitConfig, _core
 from radarsdf import config as module
+from radarsdf.lattice import WorldLattice
 
 GROUPS = ("returns", "encoding", "networks", "sampling", "training")
 TINY = sys.float_info.min
@@ -438,8 +439,8 @@ def test_quick_averages_and_trains_no_surface():
 
 def test_what_is_told_to_prepare():
     config = FitConfig(returns={"min_range_m": 1.0, "max_range_m": 50.0, "accumulate_scans": 3})
-    told = {"min_range_m": 1.0, "max_range_m": 50.0, "accumulate_scans": 3, "block_m": 6.4}
-    assert config.preparation == told
+    told = {"min_range_m": 1.0, "max_range_m": 50.0, "accumulate_scans": 3}
+    assert config.preparation == told | {"lattice": WorldLattice(0.2, 32)}
 
 
 def test_rows_move_unless_normals_are_learnt_with_the_geometry():

@@ -85,7 +85,8 @@ def _two(values: _Floats) -> str:
 
 def _to_border(city: TiledMap, points: _Floats) -> tuple[_Floats, NDArray[np.int64]]:
     """Distance (N,) to the next border between tiles, m, and the axis (N,) across it."""
-    ways = np.abs(points[:, :2] - np.round(points[:, :2] / city.plan.tile_m) * city.plan.tile_m)
+    way_m = points[:, :2] - city.plan.grid.corner_m
+    ways = np.abs(way_m - np.round(way_m / city.plan.tile_m) * city.plan.tile_m)
     return ways.min(axis=1), ways.argmin(axis=1)
 
 
@@ -95,7 +96,7 @@ def _steps(city: TiledMap, vertices: _Floats, axis: NDArray[np.int64]) -> dict[s
     tile_m = city.plan.tile_m
     found: dict[str, list[float]] = {"sdf, m": [], "intensity, dB": []}
     for shift_m in (0.0, tile_m / 2):
-        way_m = vertices[:, :2] - shift_m
+        way_m = vertices[:, :2] - city.plan.grid.corner_m - shift_m
         way_m -= np.round(way_m / tile_m) * tile_m
         across = np.abs(way_m).argmin(axis=1)
         near = np.flatnonzero(np.abs(way_m).min(axis=1) < _NEAR_M)
@@ -106,7 +107,7 @@ def _steps(city: TiledMap, vertices: _Floats, axis: NDArray[np.int64]) -> dict[s
         side[np.arange(len(points)), across[near]] = _SIDE_M
         seen = city.observed(points - side) & city.observed(points + side)
         points, side = points[seen], side[seen]
-        sensor = np.array(city.plan.by_tile[city.tiles[0].tile].origin_blocks) * city.config.block_m
+        sensor = city.config.lattice.position(city.tiles[0].origin_cells)
         for what, answer in (
             ("sdf, m", city.sdf),
             ("intensity, dB", lambda x: city.intensity(x, sensor)),  # noqa: B023 - used at once
@@ -123,7 +124,8 @@ def _open_edges(city: TiledMap, mesh: Any) -> tuple[float, float]:
     edges, counts = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
     shares = []
     for shift in (0.0, 0.5):
-        places = np.asarray(mesh.vertices)[edges][:, :, :2] / city.plan.tile_m + shift
+        way_m = np.asarray(mesh.vertices)[edges][:, :, :2] - city.plan.grid.corner_m
+        places = way_m / city.plan.tile_m + shift
         on = (np.abs(places - np.round(places)) < 1e-9).all(axis=1).any(axis=1)
         shares.append(float((counts[on] == 1).mean()) if on.any() else float("nan"))
     return shares[0], shares[1]

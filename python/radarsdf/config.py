@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+from radarsdf.lattice import WorldLattice
 from radarsdf.settings import by_name, settings
 
 MAX_LEVELS = 12  # levels of cells that the compiled core allows; a test compares the two numbers
@@ -314,15 +315,15 @@ class FitConfig:
         return self._metres(self.encoding.fourier_half_width_cells)
 
     @property
-    def block_m(self) -> float:
-        """Edge of a block, m: fits whose origins are multiples of it share all cells, from leaf cells to the coarsest."""
-        return self._metres(max(BLOCK_CELLS, 2 ** (self.encoding.num_levels - 1)))
+    def lattice(self) -> WorldLattice:
+        """Where cells lie in the world, from leaf cells to the coarsest."""
+        return WorldLattice(self.leaf_size_m, max(BLOCK_CELLS, 2 ** (self.encoding.num_levels - 1)))
 
     @property
     def preparation(self) -> dict[str, Any]:
         """Keyword arguments of :func:`radarsdf.returns.rays.prepare`."""
         names = ("min_range_m", "max_range_m", "accumulate_scans")
-        return {name: getattr(self.returns, name) for name in names} | {"block_m": self.block_m}
+        return {name: getattr(self.returns, name) for name in names} | {"lattice": self.lattice}
 
     @property
     def trains_intensity(self) -> bool:

@@ -46,8 +46,8 @@ def test_a_folder_with_a_file_of_poses(folder, scans_file):
     assert radar_map.intensity_scale.high == pytest.approx(
         max(v.max() for v in expected.intensities), rel=1e-6
     )
-    block_m = radar_map.config.block_m
-    origin = block_m * np.round(expected.poses[:, :3, 3].mean(axis=0) / block_m)
+    lattice = radar_map.config.lattice
+    origin = lattice.position(lattice.nearest_block(expected.poses[:, :3, 3].mean(axis=0)))
     np.testing.assert_allclose(radar_map.origin, origin, atol=1e-6)
 
 

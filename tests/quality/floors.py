@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 import radarsdf
+from numpy.typing import NDArray
 from radarsdf import FitConfig
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 
@@ -50,93 +51,95 @@ class Quality:
     """Mean absolute error of the intensity, dB."""
 
 
-# Six fits of each scene, by the seeds 1 to 6. The tests fit with seed 0.
+# Six fits of each scene, by the seeds 1 to 6, each on a lattice of its own: where the cells lie matters more than the
+# seed (12 lattices, default: F-scores of hugin have a deviation of 0.42 %, outliers of r0309_0320 of 2.0 %). The tests fit
+# with seed 0 on the lattice of the world.
 MEASURED: dict[tuple[str, str], tuple[Quality, ...]] = {
     # F-score in %, outliers in %, MAE in dB
     ("hugin", "default"): (
-        Quality(91.33, 0.81, 5.051),
-        Quality(91.71, 0.65, 5.150),
-        Quality(91.57, 0.73, 4.807),
-        Quality(91.93, 0.77, 4.617),
-        Quality(91.87, 0.77, 4.868),
-        Quality(91.86, 0.77, 4.580),
+        Quality(91.27, 0.73, 5.090),
+        Quality(92.00, 0.74, 4.746),
+        Quality(91.54, 0.79, 4.715),
+        Quality(91.71, 0.88, 4.441),
+        Quality(92.08, 0.66, 5.265),
+        Quality(92.19, 0.73, 4.510),
     ),
     ("hugin", "quick"): (
-        Quality(89.98, 0.44, 5.955),
-        Quality(89.98, 0.44, 5.996),
-        Quality(89.98, 0.44, 5.959),
-        Quality(89.98, 0.44, 6.002),
-        Quality(89.98, 0.44, 5.860),
-        Quality(89.98, 0.44, 5.980),
+        Quality(89.99, 0.61, 5.985),
+        Quality(89.90, 0.67, 5.950),
+        Quality(89.99, 0.54, 5.929),
+        Quality(89.96, 0.76, 5.900),
+        Quality(90.06, 0.49, 5.843),
+        Quality(89.86, 0.60, 6.038),
     ),
     ("oculii", "default"): (
-        Quality(90.10, 4.32, 3.659),
-        Quality(89.97, 4.16, 3.667),
-        Quality(89.66, 4.31, 3.667),
-        Quality(89.95, 4.17, 3.662),
-        Quality(89.95, 4.10, 3.642),
-        Quality(89.76, 4.14, 3.643),
+        Quality(90.27, 3.74, 3.593),
+        Quality(89.75, 4.22, 3.704),
+        Quality(89.53, 4.64, 3.699),
+        Quality(89.57, 4.15, 3.620),
+        Quality(89.99, 4.32, 3.677),
+        Quality(89.88, 3.98, 3.654),
     ),
     ("oculii", "quick"): (
-        Quality(86.26, 2.55, 3.944),
-        Quality(86.26, 2.55, 4.018),
-        Quality(86.26, 2.55, 3.990),
-        Quality(86.26, 2.55, 3.984),
-        Quality(86.26, 2.55, 4.000),
-        Quality(86.26, 2.55, 3.952),
+        Quality(86.70, 2.21, 3.968),
+        Quality(86.40, 2.36, 3.987),
+        Quality(86.05, 2.45, 3.982),
+        Quality(86.19, 2.43, 3.998),
+        Quality(86.21, 2.46, 3.954),
+        Quality(86.42, 2.63, 4.012),
     ),
     ("wall", "default"): (
-        Quality(99.43, 0.09, 2.774),
-        Quality(99.42, 0.01, 2.789),
-        Quality(99.34, 0.02, 2.801),
-        Quality(99.48, 0.02, 2.871),
-        Quality(99.46, 0.01, 2.749),
-        Quality(99.45, 0.03, 2.782),
+        Quality(99.37, 0.08, 2.786),
+        Quality(99.25, 0.10, 2.727),
+        Quality(99.13, 0.12, 2.811),
+        Quality(99.55, 0.01, 2.878),
+        Quality(99.38, 0.07, 2.780),
+        Quality(99.45, 0.01, 2.795),
     ),
     ("wall", "quick"): (
-        Quality(98.96, 0.02, 3.753),
-        Quality(98.96, 0.02, 3.591),
-        Quality(98.96, 0.02, 3.644),
-        Quality(98.96, 0.02, 3.641),
-        Quality(98.96, 0.02, 3.603),
-        Quality(98.96, 0.02, 3.684),
+        Quality(98.94, 0.08, 3.667),
+        Quality(98.60, 0.11, 3.578),
+        Quality(98.65, 0.21, 3.612),
+        Quality(98.85, 0.02, 3.574),
+        Quality(98.91, 0.11, 3.584),
+        Quality(99.18, 0.04, 3.638),
     ),
     ("r0144_0167", "default"): (
-        Quality(33.08, 29.84, 4.242),
-        Quality(33.43, 29.65, 4.190),
-        Quality(33.38, 29.70, 4.221),
-        Quality(33.02, 29.50, 4.202),
-        Quality(33.73, 29.79, 4.188),
-        Quality(33.43, 29.50, 4.227),
+        Quality(33.20, 30.14, 4.273),
+        Quality(32.56, 31.76, 4.211),
+        Quality(33.30, 30.55, 4.266),
+        Quality(33.08, 29.41, 4.236),
+        Quality(33.12, 30.10, 4.222),
+        Quality(33.12, 29.00, 4.261),
     ),
     ("r0144_0167", "quick"): (
-        Quality(27.14, 27.20, 4.748),
-        Quality(27.14, 27.20, 4.739),
-        Quality(27.14, 27.20, 4.752),
-        Quality(27.14, 27.20, 4.741),
-        Quality(27.14, 27.20, 4.753),
-        Quality(27.14, 27.20, 4.810),
+        Quality(26.97, 27.47, 4.753),
+        Quality(26.92, 27.98, 4.753),
+        Quality(27.00, 27.08, 4.762),
+        Quality(26.39, 27.89, 4.784),
+        Quality(27.22, 26.51, 4.738),
+        Quality(25.85, 24.93, 4.818),
     ),
     ("r0309_0320", "default"): (
-        Quality(40.57, 16.29, 3.733),
-        Quality(42.06, 16.14, 3.759),
-        Quality(43.60, 16.10, 3.916),
-        Quality(43.15, 15.93, 3.967),
-        Quality(42.30, 15.53, 3.794),
-        Quality(42.55, 16.45, 3.843),
+        Quality(39.91, 12.78, 3.747),
+        Quality(41.81, 14.94, 3.781),
+        Quality(42.58, 15.84, 3.766),
+        Quality(41.37, 17.53, 3.950),
+        Quality(42.15, 16.97, 3.841),
+        Quality(42.62, 16.43, 3.742),
     ),
     ("r0309_0320", "quick"): (
-        Quality(38.56, 10.34, 4.249),
-        Quality(38.56, 10.34, 4.197),
-        Quality(38.56, 10.34, 4.199),
-        Quality(38.56, 10.34, 4.194),
-        Quality(38.56, 10.34, 4.226),
-        Quality(38.56, 10.34, 4.264),
+        Quality(38.21, 4.53, 4.203),
+        Quality(37.64, 8.50, 4.163),
+        Quality(38.23, 8.49, 4.171),
+        Quality(37.97, 7.70, 4.204),
+        Quality(37.98, 7.35, 4.186),
+        Quality(38.43, 9.20, 4.376),
     ),
 }
 
-# What became of fits that are bad on purpose, at commit 528cec0; * marks what its limits refused. Each limit refused
-# some of them.
+# What became of fits that are bad on purpose, on the lattice of the world; * marks what its limits refused. Each limit
+# refused some of them.
 # - jitter: errors of the sensor's positions along each axis
 # - ghosts: no return is dropped as a ghost, and no piece of surface for its size or want of evidence
 # - untrained: 5 iterations of the surface, after which there is no mesh, and 1 of the intensities; the quick fit
@@ -144,16 +147,16 @@ MEASURED: dict[tuple[str, str], tuple[Quality, ...]] = {
 #
 #                        limits               jitter 10 cm   jitter 30 cm   ghosts         untrained
 #                        F      out.   MAE    F      out.    F      out.    F      out.    F       out.    MAE
-# hugin, default         90.8   0.6    5.28   89.5*  0.8*    59.5*  10.7*   89.7*  5.3*    0.0*    100.0*  8.15*
-# hugin, quick           89.8   0.5    6.03   87.7*  0.7*    59.6*  12.5*   87.3*  6.4*    90.2    0.2     11.77*
-# oculii, default        90.1   3.7    3.75   89.4*  3.4     62.9*  13.1*   86.0*  13.2*   0.0*    100.0*  7.54*
-# oculii, quick          85.6   2.1    4.09   84.9*  2.3*    57.6*  13.8*   82.6*  13.7*   86.1    1.8     11.77*
-# wall, default          98.9   0.3    3.04   98.7*  0.0     73.3*  2.7*    98.8*  0.6*    0.0*    100.0*  8.28*
-# wall, quick            98.7   0.3    3.75   98.5*  0.0     75.1*  6.4*    96.5*  4.0*    99.2    0.0     18.15*
-# r0144_0167, default    30.2   44.7   4.35   31.5   43.2    28.8*  46.7*   30.1*  53.1*   0.0*    100.0*  5.24*
-# r0144_0167, quick      26.7   39.3   4.86   27.6   39.7*   25.2*  44.0*   28.1   53.1*   27.2    39.0    5.47*
-# r0309_0320, default    22.5   63.9   4.50   22.8   66.9*   22.6   66.8*   21.7*  71.2*   0.0*    100.0*  4.64*
-# r0309_0320, quick      28.8   52.8   4.30   29.1   52.8*   27.0*  55.5*   23.4*  67.8*   29.3    52.5    4.67*
+# hugin, default         90.7   1.1    5.77   89.5*  0.9     59.3*  10.7*   89.5*  5.9*    0.0*    100.0*  8.34*
+# hugin, quick           89.5   0.9    6.14   87.4*  0.9     57.0*  11.4*   87.5*  6.4*    90.1    0.5     11.77*
+# oculii, default        89.0   5.1    3.79   88.2*  4.6     60.0*  12.8*   84.7*  14.3*   0.0*    100.0*  7.57*
+# oculii, quick          85.6   2.8    4.08   84.0*  2.9*    51.3*  12.7*   82.6*  13.8*   86.4    2.2     11.75*
+# wall, default          98.9   0.4    2.94   99.2   0.1     76.4*  1.0*    98.8*  0.5*    0.0*    100.0*  8.23*
+# wall, quick            98.2   0.4    3.72   98.5   0.2     79.1*  1.5*    96.4*  4.1*    98.9    0.1     18.13*
+# r0144_0167, default    32.3   33.1   4.35   31.5*  26.5    25.5*  25.6    29.9*  53.7*   0.0*    100.0*  5.25*
+# r0144_0167, quick      25.2   30.4   4.87   24.0*  23.2    17.2*  21.8    28.2   53.1*   26.5    27.1    5.48*
+# r0309_0320, default    38.7   20.9   4.04   42.1   10.2    38.9   8.5     21.3*  71.8*   0.0*    100.0*  4.69*
+# r0309_0320, quick      37.3   12.6   4.46   35.8*  5.5     31.3*  4.1     23.4*  68.1*   39.2    5.7     4.68*
 
 # The quick fit's surface does not depend on the seed, but on roundings: no margin is smaller than these.
 MARGIN_DEVIATIONS = 3.0
@@ -201,7 +204,13 @@ def config_of(kind: str, scene: Scene, seed: int = 0) -> FitConfig:
 
 
 def measure(
-    scene: Scene, config: FitConfig, voxel_m: float, *, intensities: bool = True, **of_the_mesh: Any
+    scene: Scene,
+    config: FitConfig,
+    voxel_m: float,
+    *,
+    origin: NDArray[np.float64] | None = None,
+    intensities: bool = True,
+    **of_the_mesh: Any,
 ) -> Quality:
     """Fits all frames but those held out, and compares with the ground truth and with those.
 
@@ -214,6 +223,7 @@ def measure(
         train.intensities if intensities else None,
         config=config,
         progress=False,
+        origin=origin,
     )
     mesh = radar_map.mesh(voxel_m, progress=False, **of_the_mesh)
     assert scene.ground_truth is not None
@@ -278,7 +288,10 @@ def main() -> None:
                 continue
             print(f'    ("{name}", "{kind}"): (')
             for seed in range(1, 7):
-                q = measure(scene, config_of(kind, scene, seed), VOXEL_M[kind])
+                config = config_of(kind, scene, seed)
+                shift = np.random.default_rng(seed).uniform(0, config.lattice.block_m, 3)
+                origin = scene.poses[:, :3, 3].mean(axis=0) + shift
+                q = measure(scene, config, VOXEL_M[kind], origin=origin)
                 print(f"        Quality({q.f_score:.2f}, {q.outliers:.2f}, {q.mae:.3f}),", flush=True)
             print("    ),")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from radarsdf.tiles.grid import TileGrid, neighbours
 
-GRID = TileGrid(tile_m=12.8, halo_m=6.4)
+GRID = TileGrid(tile_m=12.8, halo_m=6.4, corner_m=-2.0)
 
 
 def test_weights_add_up_to_one_and_ignore_the_outer_half_of_the_halo():

@@ -21,7 +21,7 @@ def in_one_go(city, steps, min_triangles):
     parts = []
     for tile in city.tiles:
         cells = city.contents_of(tile.tile).field.cells.table.leaf_cells() + plan.origin_cells(tile.tile)
-        weights, _ = plan.grid.weights(tile.tile, (cells + 0.5) * city.config.leaf_size_m)
+        weights, _ = plan.grid.weights(tile.tile, city.config.lattice.position(cells + 0.5))
         parts.append(cells[weights > 0])
     owned = {tile.tile for tile in city.tiles}
     cells = np.concatenate(parts)
@@ -29,7 +29,9 @@ def in_one_go(city, steps, min_triangles):
     inside = np.stack(np.meshgrid(*[np.arange(steps)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     _, corners, voxels = sparse_lattice((cells[:, None] * steps + inside).reshape(-1, 3))
     values = city.distances_at(corners.astype(np.int64), voxel_m)
-    vertices, faces = extract_cells(corners, values, voxels, spacing=[voxel_m] * 3)
+    vertices, faces = extract_cells(
+        corners, values, voxels, origin=city.config.lattice.position([0, 0, 0]), spacing=[voxel_m] * 3
+    )
     evidence = city.evidence(vertices)
     contents = city.any_contents
     good = queries.answers(evidence, queries.MIN_DETECTION_RATE).numpy()
@@ -56,11 +58,11 @@ def test_the_mesh_is_that_of_all_cells_at_once(city, steps, min_triangles):
     assert len(found) == len(mesh.faces)  # no doubled triangle
 
 
-def open_edges(vertices, faces):
+def open_edges(vertices, faces, corner_m):
     """Number of edges with one triangle, of those whose both ends are on a border between tiles."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     edges, counts = np.unique(edges, axis=0, return_counts=True)
-    places = vertices[edges][:, :, :2] / TILE_M
+    places = (vertices[edges][:, :, :2] - corner_m) / TILE_M
     on_border = (np.abs(places - np.round(places)) < 1e-9).all(axis=1).any(axis=1)
     assert on_border.sum() > 50
     return int((counts[on_border] == 1).sum()), int((counts > 2).sum())
@@ -70,7 +72,8 @@ def test_no_gap_at_borders(city):
     mesh = city.mesh(0.2, min_component_triangles=0, progress=False)
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)  # welded
     # The surface itself may end on a border, and as often in a mesh that knows no tiles.
-    assert open_edges(mesh.vertices, mesh.faces) == open_edges(*in_one_go(city, 1, 0))
+    corner_m = city.plan.grid.corner_m
+    assert open_edges(mesh.vertices, mesh.faces, corner_m) == open_edges(*in_one_go(city, 1, 0), corner_m)
 
 
 def test_export_writes_the_same_mesh(city, tmp_path):

@@ -57,8 +57,8 @@ def fit(
         threads goes on from it, and ends with the same bits as one without a stop. It is not removed when the
         fit is done.
     origin : (3,) array_like, optional
-        Origin of the map's local frame, world, m. By default the sensors' mean position, moved to the next multiple of
-        ``config.block_m``: fits whose origins are such multiples share their cells.
+        Origin of the map's local frame, world, m. By default the sensors' mean position, moved to the next corner of a
+        block of ``config.lattice``: fits whose origins are such corners share their cells.
     intensity_range : (low, high), optional
         Intensities that become 0 and 1 for the network, sensor units; those beyond are moved to its ends. By default the
         lowest and the highest.

@@ -25,6 +25,7 @@ from radarsdf.checks import (
     whole_number,
 )
 from radarsdf.checks import positions as check_positions
+from radarsdf.lattice import WorldLattice
 
 _MISSING: Any = object()  # where there are fewer scans of one kind
 _MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
@@ -187,7 +188,7 @@ def prepare(
     max_range_m: float | None = None,
     accumulate_scans: int = 1,
     origin: ArrayLike | None = None,
-    block_m: float | None = None,
+    lattice: WorldLattice | None = None,
     whole: bool = True,
 ) -> Rays:
     """Checks scans and turns them into rays in the local frame.
@@ -206,8 +207,8 @@ def prepare(
         So many consecutive scans are treated as seen from the position of the middle one.
     origin : array_like, optional
         (3,) origin of the local frame, world, m. By default the mean sensor position.
-    block_m : float, optional
-        That default is moved to the next multiple of this, m, so that different scans share the lattice of their cells.
+    lattice : WorldLattice, optional
+        That default is moved to the next corner of a block of it, so that different scans share their cells.
     whole : bool
         False: these are a part of the scans. None of their returns need be within the ranges, and all of their
         intensities may be equal.
@@ -234,8 +235,8 @@ def prepare(
         local_origin = check_positions(real_array(origin, "origin")[None], "origin")[0]
     else:
         local_origin = positions.mean(axis=0)
-        if block_m is not None:
-            local_origin = block_m * np.round(local_origin / block_m)
+        if lattice is not None:
+            local_origin = lattice.position(lattice.nearest_block(local_origin))
     min_range_m = number(min_range_m, "min_range_m")
     max_range_m = None if max_range_m is None else number(max_range_m, "max_range_m")
     whole_number(accumulate_scans, "accumulate_scans", 1)

@@ -187,7 +187,7 @@ class TileBlend:
         return found
 
     def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
-        """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, numbered from the world's origin.
+        """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, numbered from the lattice's first corner.
 
         They have the same bits whichever tile asks. NaN where no tile has an adjacent cell.
         """
@@ -195,10 +195,8 @@ class TileBlend:
 
         def of_tile(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:
             # From integers: the same float32 position for every tile that asks.
-            tile_lattice = (
-                lattice[share.rows]
-                - np.round(share.contents.origin / self.config.leaf_size_m).astype(np.int64) * steps
-            )
+            origin_cells = np.round(self.config.lattice.cells(share.contents.origin)).astype(np.int64)
+            tile_lattice = lattice[share.rows] - origin_cells * steps
             points = torch.from_numpy((tile_lattice * voxel_m).astype(np.float32))
             inside = queries.occupied(share.contents, points)
             # A corner on the border of the map may be in a cell beyond it, which has no features. It is moved a little into

@@ -56,7 +56,7 @@ def fit_tiles(
     out : path-like
         A folder, which is made.
     tile_size : float, optional
-        Edge of a tile, m, moved to the next multiple of ``config.block_m``. Default: 512 leaf cells.
+        Edge of a tile, m, moved to the next multiple of a block of ``config.lattice``. Default: 512 leaf cells.
     halo : float, optional
         What a tile knows beyond its edges, m, likewise. Half of it overlaps with what the next tile answers. Default: 64
         leaf cells.
@@ -165,14 +165,16 @@ def load(path: str | PathLike[str]) -> RadarMap | TiledMap:
 
 
 def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> TileGrid:
-    block_m, size_m = config.block_m, config.leaf_size_m
+    lattice = config.lattice
 
     def blocks(value: float | None, default: float, name: str) -> float:
         wanted = default if value is None else positive(value, name)
-        return block_m * max(1, round(wanted / block_m))
+        return lattice.block_m * max(1, round(wanted / lattice.block_m))
 
     grid = TileGrid(
-        blocks(tile_size, _TILE_CELLS * size_m, "tile_size"), blocks(halo, _HALO_CELLS * size_m, "halo")
+        tile_m=blocks(tile_size, _TILE_CELLS * lattice.cell_m, "tile_size"),
+        halo_m=blocks(halo, _HALO_CELLS * lattice.cell_m, "halo"),
+        corner_m=float(lattice.position(0)),
     )
     if grid.halo_m > grid.tile_m:
         msg = f"the halo, {grid.halo_m:g} m, is larger than the tile, {grid.tile_m:g} m: use larger tiles"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Tile = tuple[int, int]
-"""Number of a tile along x and along y. Tile (0, 0) has a corner in the world's origin."""
+"""Number of a tile along x and along y. Tile (0, 0) begins where the lattice of the world does."""
 
 _Floats = NDArray[np.float64]
 
@@ -26,10 +26,16 @@ class TileGrid:
     """Edge of a tile, m: a multiple of the block."""
     halo_m: float
     """What a tile knows beyond its edges, m: at most its edge."""
+    corner_m: float
+    """Where tile (0, 0) begins along x and along y, world, m."""
+
+    def lower_corner(self, tile: Tile) -> _Floats:
+        """(2,) where a tile begins, world, m."""
+        return self.corner_m + np.array(tile) * self.tile_m
 
     def tiles_of(self, positions: NDArray[Any]) -> NDArray[np.int64]:
         """(N, 2) the tile that each position (N, 3), world, m, belongs to."""
-        tiles: NDArray[np.int64] = np.floor(positions[:, :2] / self.tile_m).astype(np.int64)
+        tiles: NDArray[np.int64] = np.floor(self._along(positions) / self.tile_m).astype(np.int64)
         return tiles
 
     def crossed(
@@ -39,7 +45,7 @@ class TileGrid:
 
         A segment crosses a tile if it comes into it or its halo. Each pair comes once.
         """
-        a, b = ends[:, :2], others[:, :2]
+        a, b = self._along(ends), self._along(others)
         first = np.floor((np.minimum(a, b) - self.halo_m) / self.tile_m).astype(np.int64)
         last = np.floor((np.maximum(a, b) + self.halo_m) / self.tile_m).astype(np.int64)
         most = (last - first).max(axis=0, initial=-1)
@@ -50,7 +56,7 @@ class TileGrid:
             yield rows[meets], tiles[meets]
 
     def _meets(self, a: _Floats, b: _Floats, tiles: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether segments meet the boxes of their tiles, both (M, 2), by slabs."""
+        """Whether segments, from the corner of tile (0, 0), meet the boxes of their tiles, all (M, 2), by slabs."""
         lower = tiles * self.tile_m - self.halo_m
         upper = (tiles + 1) * self.tile_m + self.halo_m
         way = b - a
@@ -70,9 +76,10 @@ class TileGrid:
         The weights of all tiles add up to one. They rise smoothly within half a halo round each edge, so that the outer
         half of a halo does not count: what is known there is less than what its owner knows.
         """
+        along = self._along(positions)
         factors, slopes = np.ones((len(positions), 2)), np.zeros((len(positions), 2))
         for axis in range(2):
-            x = positions[:, axis]
+            x = along[:, axis]
             for edge, sign in ((tile[axis], 1.0), (tile[axis] + 1, -1.0)):
                 t = np.clip(sign * (x - edge * self.tile_m) / self.halo_m + 0.5, 0.0, 1.0)
                 rise = t * t * (3 - 2 * t)
@@ -86,11 +93,14 @@ class TileGrid:
         """The tiles that count at any of the positions (N, 3), world, m, in ascending order."""
         found: set[Tile] = set()
         for shift in itertools.product((-0.5, 0.5), repeat=2):
-            tiles = np.floor((positions[:, :2] + np.array(shift) * self.halo_m) / self.tile_m).astype(
-                np.int64
-            )
+            tiles = self.tiles_of(positions[:, :2] + np.array(shift) * self.halo_m)
             found |= set(map(tuple, np.unique(tiles, axis=0).tolist()))
         return sorted(found)
+
+    def _along(self, positions: NDArray[Any]) -> _Floats:
+        """(N, 2) from the corner of tile (0, 0) to positions (N, 3), world, m."""
+        along: _Floats = positions[:, :2] - self.corner_m
+        return along
 
 
 def neighbours(tile: Tile) -> list[Tile]:

@@ -71,7 +71,7 @@ class Piece:
     border_rows: NDArray[np.int64]
     """(B,) vertices on the border of the tile, which the next tile has too."""
     border_edges: NDArray[np.int64]
-    """(B, 4) the edge of the lattice that each of them is on: its lower corner, in voxels from the world's origin, and its
+    """(B, 4) the edge of the lattice that each of them is on: its lower corner, in voxels of the lattice, and its
     axis."""
     cells: NDArray[np.int64]
     """(2,) leaf cells, and those in which the surface can be."""
@@ -117,21 +117,22 @@ def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
     cells = _cells_in(city, tile)
     if settings.box is not None:
         lower, upper = np.array(settings.box)
-        size_m = config.leaf_size_m
-        cells = cells[(((cells + 1) * size_m >= lower) & (cells * size_m <= upper)).all(axis=1)]
+        position = config.lattice.position
+        cells = cells[((position(cells + 1) >= lower) & (position(cells) <= upper)).all(axis=1)]
     found = len(cells)
     if steps > 1:
         cells = _crossed(city, cells)
     inside = np.stack(np.meshgrid(*[np.arange(steps)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     voxels = (cells[:, None, :] * steps + inside).reshape(-1, 3)
     if settings.box is not None:
-        centres = (voxels + 0.5) * voxel_m
+        centres = config.lattice.position((voxels + 0.5) / steps)
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     _, corners, voxel_corners = sparse_lattice(voxels, num_threads=threads)
     vertices, faces = extract_cells(
         corners,
         city.distances_at(corners.astype(np.int64), voxel_m),
         voxel_corners,
+        origin=config.lattice.position([0, 0, 0]),
         spacing=[voxel_m] * 3,
         num_threads=threads,
     )
@@ -144,16 +145,16 @@ def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
     good &= np.nan_to_num(uncertainty_m, nan=np.inf) <= settings.max_uncertainty
     kept, faces = renumbered(len(vertices), faces[good[faces].all(axis=1)])
     vertices = vertices[kept]
-    rows, edges = _border(vertices, voxel_m, city.plan.tile_cells * steps)
+    rows, edges = _border(config.lattice.cells(vertices) * steps, city.plan.tile_cells * steps)
     return Piece(
         vertices, faces, confidence[kept], uncertainty_m[kept], rows, edges, np.array([found, len(cells)])
     )
 
 
 def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
-    """(C, 3) leaf cells of a tile, from the world's origin: those of its map, and of others that count there."""
+    """(C, 3) leaf cells of a tile, as the lattice numbers them: those of its map, and of others that count there."""
     plan = city.plan
-    edge, size_m = plan.tile_cells, plan.config.leaf_size_m
+    edge = plan.tile_cells
     parts = []
     for other in neighbours(tile):
         if not city.has(other):
@@ -162,7 +163,7 @@ def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
             other
         )
         cells = cells[(cells[:, :2] // edge == tile).all(axis=1)]
-        weights, _ = plan.grid.weights(other, (cells + 0.5) * size_m)
+        weights, _ = plan.grid.weights(other, plan.config.lattice.position(cells + 0.5))
         parts.append(cells[weights > 0])
     found: NDArray[np.int64] = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
     return found
@@ -179,11 +180,8 @@ def _crossed(city: TileBlend, cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def _border(
-    vertices: NDArray[np.float64], voxel_m: float, voxels_per_tile: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows (B,) of vertices on borders between tiles, and their edges (B, 4)."""
-    places = vertices / voxel_m
+def _border(places: NDArray[np.float64], voxels_per_tile: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (B,) of vertices (V, 3), in voxels of the lattice, on borders between tiles, and their edges (B, 4)."""
     nearest = np.round(places)
     on_lattice = np.abs(places - nearest) < _ON_LATTICE
     border = (on_lattice[:, :2] & (nearest[:, :2] % voxels_per_tile == 0)).any(axis=1)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from radarsdf.config import BLOCK_CELLS, FitConfig
+from radarsdf.config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.returns.sensor import Sensor
@@ -35,8 +35,8 @@ class TilePlan:
     """Returns that it owns: those in the tile itself."""
     rays: int
     """Rays that cross it or its halo."""
-    origin_blocks: tuple[int, int, int]
-    """Origin of its map, in blocks from the world's origin."""
+    origin_cells: tuple[int, int, int]
+    """Origin of its map: the corner of a block, in leaf cells of the lattice."""
     scans: tuple[int, int]
     """The first and the last scan with a ray here."""
     memory_bytes: int = 0
@@ -76,7 +76,7 @@ class Plan:
     @cached_property
     def grid(self) -> TileGrid:
         """Of the tiles."""
-        return TileGrid(self.tile_m, self.halo_m)
+        return TileGrid(self.tile_m, self.halo_m, float(self.config.lattice.position(0)))
 
     @cached_property
     def by_tile(self) -> dict[Tile, TilePlan]:
@@ -89,18 +89,13 @@ class Plan:
         return None if self.intensity_range is None else IntensityScale.between(*self.intensity_range)
 
     @property
-    def block_cells(self) -> int:
-        """Edge of a block, leaf cells."""
-        return max(BLOCK_CELLS, 1 << (self.config.encoding.num_levels - 1))
-
-    @property
     def tile_cells(self) -> int:
         """Edge of a tile, leaf cells."""
         return round(self.tile_m / self.config.leaf_size_m)
 
     def origin_cells(self, tile: Tile) -> np.ndarray[Any, np.dtype[np.int64]]:
-        """(3,) origin of a tile's map, leaf cells from the world's origin."""
-        return np.array(self.by_tile[tile].origin_blocks, np.int64) * self.block_cells
+        """(3,) origin of a tile's map, leaf cells of the lattice."""
+        return np.array(self.by_tile[tile].origin_cells, np.int64)
 
     @cached_property
     def digest(self) -> str:
@@ -147,7 +142,7 @@ class Plan:
                 raise ValueError(msg)
             tiles = [
                 TilePlan(
-                    **planned | {name: tuple(planned[name]) for name in ("tile", "origin_blocks", "scans")}
+                    **planned | {name: tuple(planned[name]) for name in ("tile", "origin_cells", "scans")}
                 )
                 for planned in described.pop("tiles")
             ]

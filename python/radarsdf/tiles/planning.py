@@ -38,7 +38,7 @@ _LOOKED_AT = 4  # tiles whose noise and roughness stand for all
 class _Counts:
     """What a pass counts of a tile."""
 
-    origin_blocks: tuple[int, int, int]
+    origin_cells: tuple[int, int, int]
     scans: list[int]
     returns: int = 0
     rays: int = 0
@@ -147,17 +147,16 @@ class Planner:
         sensors: NDArray[np.float64],
     ) -> None:
         """Gives a tile the rays in these rows."""
-        block_m, scans = self._config.block_m, rays.scans[rows]
+        lattice, scans = self._config.lattice, rays.scans[rows]
         if tile not in self._tiles:
-            blocks = round(self._grid.tile_m / block_m)
-            height = round(float(sensors[rows[0], 2]) / block_m)
-            middle = (tile[0] * blocks + blocks // 2, tile[1] * blocks + blocks // 2, height)
-            self._tiles[tile] = _Counts(middle, [int(scans[0]), 0])
+            corner, height_m = self._grid.lower_corner(tile), float(sensors[rows[0], 2])
+            middle = lattice.nearest_block([*(corner + self._grid.tile_m / 2), height_m]).tolist()
+            self._tiles[tile] = _Counts((middle[0], middle[1], middle[2]), [int(scans[0]), 0])
         counts = self._tiles[tile]
         counts.rays += len(rows)
         counts.returns += int((owner[rows] == tile).all(axis=1).sum())
         counts.scans[1] = int(scans[-1])
-        local = (points[rows] - np.array(counts.origin_blocks) * block_m).astype(np.float32)
+        local = (points[rows] - lattice.position(counts.origin_cells)).astype(np.float32)
         self._files.add(tile, local, scans, None if rays.intensities is None else rays.intensities[rows])
 
     def plan(self, input_digest: str) -> Plan:
@@ -176,7 +175,7 @@ class Planner:
         write_scans(self._folder, positions, np.concatenate(self._up))
         tiles = [
             TilePlan(
-                tile, counts.returns, counts.rays, counts.origin_blocks, (counts.scans[0], counts.scans[1])
+                tile, counts.returns, counts.rays, counts.origin_cells, (counts.scans[0], counts.scans[1])
             )
             for tile, counts in sorted(self._tiles.items())
         ]

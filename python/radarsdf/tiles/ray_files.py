@@ -92,8 +92,7 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
         raise ValueError(msg)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
     of_scans = np.asarray(table[numbers], np.float64)
-    block_m = plan.block_cells * plan.config.leaf_size_m
-    origin = np.array(tile.origin_blocks) * block_m
+    origin = plan.config.lattice.position(tile.origin_cells)
     points = np.ascontiguousarray(rows["point"])
     rays = rays_from(
         points,

@@ -30,7 +30,7 @@ def tiles_within(city: TileBlend, position: _Floats, range_m: float) -> list[Til
     for planned in city.plan.tiles:
         tile = planned.tile
         if (np.array(tile) >= first).all() and (np.array(tile) <= last).all() and city.has(tile):
-            lower = np.array(tile) * grid.tile_m
+            lower = grid.lower_corner(tile)
             nearest = np.clip(position[:2], lower, lower + grid.tile_m)
             if np.linalg.norm(nearest - position[:2]) <= range_m:
                 found.append(tile)
@@ -44,7 +44,7 @@ def viewed_tiles(
     config = city.config
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(config.max_memory_bytes, cells=cells)
-    origin = np.asarray(city.plan.origin_cells(tiles[0]) * config.leaf_size_m, np.float64)
+    origin = config.lattice.position(city.plan.origin_cells(tiles[0]))
     everything = PieceSettings(1, None, 0.0, math.inf, 0.0)
     pieces = [piece_of(city, tile, everything) for tile in tiles]
     before = np.cumsum([0, *[len(piece.vertices) for piece in pieces]])
