@@ -43,8 +43,8 @@ class Street:
     """(M, 3) positions of the sensor for `hits`, world frame, m."""
 
 
-def street(count: int, size_m: float | None = None) -> Street:
-    """A street with `count` returns, and the truth about some of them, approximately `_NUM_HITS`.
+def street(count: int, size_m: float | None = None, num_hits: int = _NUM_HITS) -> Street:
+    """A street with `count` returns, and the truth about some of them, approximately `num_hits`.
 
     It is `size_m` long. The default is 200 m + 1 m for every 5,000 returns, which keeps their density almost constant.
     """
@@ -54,7 +54,7 @@ def street(count: int, size_m: float | None = None) -> Street:
         points.append(scan)
         intensities.append(intensity)
         truths.append(truth)
-    some = slice(-(-_NUM_HITS // len(poses)))
+    some = slice(-(-num_hits // len(poses)))
     truths = [[part[some] for part in truth] for truth in truths]
     hits, hit_intensities, hit_sensors = (np.concatenate(parts) for parts in zip(*truths, strict=True))
     return Street(points, np.stack(poses), intensities, hits, hit_intensities, hit_sensors)

@@ -217,7 +217,9 @@ def test_very_many_returns_in_one_cell():
     points = np.random.default_rng(0).uniform([5.0, 0.01, 0.01], [5.15, 0.19, 0.19], (1_000_000, 3))
     points = points.astype(np.float32)
     config = QUICK.override(training={"sdf_iterations": 30})
-    radar_map = radarsdf.fit(np.split(points, 100), np.tile(np.eye(4), (100, 1, 1)), config=config)
+    radar_map = radarsdf.fit(
+        np.split(points, 100), np.tile(np.eye(4), (100, 1, 1)), config=config, origin=(0, 0, 0)
+    )
     finite(radar_map, np.zeros(3))
     assert radar_map.report["leaf_cells"] < 60
     evidence = radar_map.evidence

@@ -29,7 +29,9 @@ def plane(rng, x_m, half_m, count):
 def fit(points):
     """Seen from the origin."""
     config = FitConfig.quick(num_threads=2)
-    return radarsdf.fit(points, np.tile(np.eye(4), (len(points), 1, 1)), config=config, progress=False)
+    poses = np.tile(np.eye(4), (len(points), 1, 1))
+    # Wall and patch are in the middle of cells.
+    return radarsdf.fit(points, poses, config=config, origin=(0, 0, 0), progress=False)
 
 
 def wall_and_patch(scans):

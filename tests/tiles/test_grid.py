@@ -57,7 +57,7 @@ def test_a_ray_goes_to_each_tile_that_it_crosses(straight):
     expected = set()
     for i in range(-5, 5):
         for j in range(-5, 5):
-            lower = np.array([i, j]) * GRID.tile_m - GRID.halo_m
+            lower = GRID.lower_corner((i, j)) - GRID.halo_m
             upper = lower + GRID.tile_m + 2 * GRID.halo_m
             inside = ((places[..., :2] >= lower) & (places[..., :2] <= upper)).all(axis=2).any(axis=0)
             expected |= {(int(row), i, j) for row in np.flatnonzero(inside)}

@@ -116,4 +116,4 @@ def test_views_are_those_of_one_map(city, whole, drive):
 def test_pickles_and_words(city, points):
     copy = pickle.loads(pickle.dumps(city))
     np.testing.assert_array_equal(copy.sdf(points[:100]), city.sdf(points[:100]))
-    assert repr(city) == "TiledMap(surface and reflectance, 8 of 8 tiles of 12.8 m)"
+    assert repr(city) == "TiledMap(surface and reflectance, 4 of 4 tiles of 12.8 m)"

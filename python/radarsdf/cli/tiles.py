@@ -32,7 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"SCANS [POSES]: {SCANS}, and their poses; all steps are done. Or one step: plan SCANS [POSES], fit FOLDER, "
         "mesh FOLDER, status FOLDER",
     )
-    parser.add_argument("-o", "--out", type=Path, help="the folder to write; of mesh: the .ply file")
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        help="the folder to write; of mesh: a .ply file, or a .json file for 3D Tiles",
+    )
     parser.add_argument(
         "--tile-size", type=float, metavar="M", help="edge of a tile, m; default: 512 leaf cells"
     )

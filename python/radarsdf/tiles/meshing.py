@@ -21,6 +21,7 @@ from radarsdf.map.meshing import check_box, check_limits
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.pieces import PieceSettings, divides, mesh_tile, piece_path, write_piece
 from radarsdf.tiles.running import Task, run_tasks
+from radarsdf.tiles.tileset import content_folder, write_tileset
 from radarsdf.tiles.welding import WeldedMesh
 
 with whole_import():
@@ -59,9 +60,14 @@ def export_mesh(
     **limits: Any,
 ) -> tuple[int, int]:
     """See :meth:`TiledMap.export`."""
-    if Path(path).suffix.lower() != ".ply":
-        msg = f"{path}: a mesh of tiles is written as .ply, part by part"
+    suffix = Path(path).suffix.lower()
+    if suffix not in {".ply", ".json"}:
+        msg = f"{path}: a mesh of tiles is written as .ply, or as .json for 3D Tiles"
         raise ValueError(msg)
+    if suffix == ".json":
+        content_folder(Path(path))  # first: it says at once if it cannot be written
+        welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
+        return write_tileset(city, Path(path), welded)
     with whole_file(path) as file:  # first: it says at once if it cannot be written
         welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
         columns = ("x", "y", "z", "confidence", "uncertainty_m")

@@ -213,7 +213,8 @@ class TiledMap(TileBlend):
         Parameters
         ----------
         path : path-like
-            A ``.ply`` file, binary, in double precision.
+            ``NAME.ply``: one file, binary, in double precision. ``NAME.json``: 3D Tiles 1.1, a GLB file for each tile in a
+            folder ``NAME`` beside it, in the frame of the world. To place it on the earth, set the ``transform`` of its root.
 
         Returns
         -------

@@ -83,6 +83,12 @@ class WeldedMesh:
                 piece.vertices[kept], piece.confidence[kept], piece.uncertainty_m[kept], of_all[faces]
             )
 
+    def pieces(self) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int32]]]:
+        """Vertices (V, 3), world, m, and faces (F, 3) of each piece alone, with all vertices on its borders."""
+        for i in range(len(self._paths)):
+            piece, used, faces = self._used(i)
+            yield piece.vertices[used], faces
+
     def _used(self, i: int) -> tuple[Piece, NDArray[np.bool_], NDArray[np.int32]]:
         """A piece, which of its vertices are used, and the faces as rows of these."""
         piece = Piece.load(self._paths[i])
