@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
@@ -152,6 +153,13 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
     except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} is not a whole radarsdf map: {error}"
         raise ValueError(msg) from error
+
+
+def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
+    """(C,) Morton keys of the leaf cells of a map, ascending. Nothing else of its file is read or checked."""
+    with safe_open(path, framework="np") as file:
+        keys: NDArray[np.uint64] = file.get_tensor("leaf_keys").astype(np.uint64)
+    return keys
 
 
 class _OtherFileError(ValueError):

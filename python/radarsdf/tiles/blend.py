@@ -29,7 +29,7 @@ from radarsdf.tiles.tile_fit import is_done
 
 _Floats = NDArray[np.float64]
 MEMORY_BYTES = 1 << 30
-_BYTES_OF_FILE = 3  # in memory for each on the disk: tables of cells, besides what is read
+_BYTES_OF_FILE = 2.1  # in memory for each on the disk: measured; tables of cells, besides what is read
 _INWARD = 1e-3  # edges of a voxel
 _SHIFTS = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
 
@@ -145,7 +145,7 @@ class TileBlend:
         with self._lock:
             if tile not in self._held:
                 path = map_path(self.folder, self.plan.by_tile[tile])
-                size = _BYTES_OF_FILE * path.stat().st_size
+                size = round(_BYTES_OF_FILE * path.stat().st_size)
                 while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
                     self._held.popitem(last=False)
                 self._held[tile] = storage.load_contents(path), size
@@ -157,12 +157,12 @@ class TileBlend:
         for tile in self.plan.grid.counting(world) if len(world) else ():
             if not self.has(tile):
                 continue
-            weights, slopes = self.plan.grid.weights(tile, world)
-            rows = np.flatnonzero(weights > 0)
+            rows = self.plan.grid.within_half_a_halo(tile, world)
+            weights, slopes = self.plan.grid.weights(tile, world[rows])
             if len(rows):
                 contents = self.contents_of(tile)
                 local = queries.to_local(contents, torch.from_numpy(world[rows]))
-                yield Share(contents, rows, weights[rows], slopes[rows], local)
+                yield Share(contents, rows, weights, slopes, local)
 
     def averages(
         self,

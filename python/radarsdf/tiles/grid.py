@@ -94,8 +94,16 @@ class TileGrid:
         found: set[Tile] = set()
         for shift in itertools.product((-0.5, 0.5), repeat=2):
             tiles = self.tiles_of(positions[:, :2] + np.array(shift) * self.halo_m)
-            found |= set(map(tuple, np.unique(tiles, axis=0).tolist()))
+            # Neighbours in the list are mostly of one tile: what is left to sort is a thousandth.
+            changes = np.any(tiles[1:] != tiles[:-1], axis=1).nonzero()[0] + 1
+            found |= set(map(tuple, np.unique(tiles[np.append(0, changes)], axis=0).tolist()))
         return sorted(found)
+
+    def within_half_a_halo(self, tile: Tile, positions: _Floats) -> NDArray[np.int64]:
+        """(M,) rows of positions (N, 3), world, m, outside of which a tile does not count."""
+        from_corner = self._along(positions) - np.array(tile) * self.tile_m
+        half_m = self.halo_m / 2
+        return np.flatnonzero(((from_corner > -half_m) & (from_corner < self.tile_m + half_m)).all(axis=1))
 
     def _along(self, positions: NDArray[Any]) -> _Floats:
         """(N, 2) from the corner of tile (0, 0) to positions (N, 3), world, m."""

@@ -9,6 +9,7 @@ import io
 import json
 import math
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.io.files import write_whole
-from radarsdf.map import queries
+from radarsdf.map import queries, storage
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import renumbered
+from radarsdf.returns.cells import lattice_of
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
-from radarsdf.tiles.plan import folder_of
+from radarsdf.tiles.plan import folder_of, map_path
 
 # As in one map: cells with all corners farther from the surface than this, in leaf cells, are left out.
 _CLEARLY = 0.25
@@ -95,8 +97,15 @@ def mesh_tile(folder: str, name: str, settings: str, run: str = "") -> str:
 
     Returns the path of the piece. The other arguments are those of :func:`radarsdf.tiles.tile_fit.fit_tile`.
     """
+    city = _opened(folder, run) if run else TileBlend(folder)
+    return str(write_piece(city, name, PieceSettings.from_json(settings)))
+
+
+@lru_cache(maxsize=1)
+def _opened(folder: str, run: str) -> TileBlend:
+    """One for all tasks of a run in a process: the next tile mostly needs the same neighbours in memory."""
     del run
-    return str(write_piece(TileBlend(folder), name, PieceSettings.from_json(settings)))
+    return TileBlend(folder)
 
 
 def write_piece(city: TileBlend, name: str, settings: PieceSettings) -> Path:
@@ -159,12 +168,10 @@ def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
     for other in neighbours(tile):
         if not city.has(other):
             continue
-        cells = city.contents_of(other).field.cells.table.leaf_cells().astype(np.int64) + plan.origin_cells(
-            other
-        )
+        keys = storage.load_leaf_keys(map_path(city.folder, plan.by_tile[other]))
+        cells = lattice_of(keys).astype(np.int64) + plan.origin_cells(other)
         cells = cells[(cells[:, :2] // edge == tile).all(axis=1)]
-        weights, _ = plan.grid.weights(other, plan.config.lattice.position(cells + 0.5))
-        parts.append(cells[weights > 0])
+        parts.append(cells[plan.grid.within_half_a_halo(other, plan.config.lattice.position(cells + 0.5))])
     found: NDArray[np.int64] = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
     return found
 
