@@ -51,5 +51,9 @@ def cluster_executor(address: str, memory_bytes: int) -> Iterator[Executor]:
             raise MemoryError(msg)
         resources = {"resources": {_RESOURCE: needed}} if any(said) else {}
         # pure: a second task with the same arguments would get the first one's result, although its file may be gone.
-        with client.get_executor(pure=False, **resources) as executor:
+        executor = client.get_executor(pure=False, **resources)
+        try:
             yield executor
+        finally:
+            if client.status == "running":
+                executor.shutdown(wait=False)  # what an error or Ctrl-C left in work is cancelled

@@ -8,6 +8,7 @@ import dataclasses
 import shutil
 from collections.abc import Iterable
 from concurrent.futures import Executor
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,13 @@ import torch
 
 from radarsdf.checks import positive
 from radarsdf.config import FitConfig
+from radarsdf.io.files import write_whole
 from radarsdf.io.read import read
 from radarsdf.io.sequence import Scan, Scans
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.radar_map import load as load_map
 from radarsdf.tiles.grid import TileGrid
-from radarsdf.tiles.plan import PLAN, Plan
+from radarsdf.tiles.plan import PLAN, Plan, failure_path
 from radarsdf.tiles.planning import InputDigest, make_plan
 from radarsdf.tiles.running import run_tasks
 from radarsdf.tiles.tile_fit import fit_tile, is_done
@@ -135,6 +137,11 @@ def run_fits(
     failed = run_tasks(
         fit_tile, [(str(root), tile.name) for tile in todo], executor, description="fit", progress=progress
     )
+    for i, reason in failed.items():
+        # What a task could not write itself: its worker or the scheduler was killed. A disk that is full has said so.
+        if not failure_path(root, todo[i]).is_file() and not is_done(root, plan, todo[i]):
+            with suppress(OSError):
+                write_whole(failure_path(root, todo[i]), reason.encode())
     if failed and len(failed) == len(plan.tiles):
         msg = f"all {len(failed)} tiles failed, the first: {failed[0]}"
         raise ValueError(msg)

@@ -22,6 +22,7 @@ from radarsdf.map import queries, storage
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import renumbered
 from radarsdf.returns.cells import lattice_of
+from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
 from radarsdf.tiles.plan import folder_of, map_path
@@ -98,7 +99,8 @@ def mesh_tile(folder: str, name: str, settings: str, run: str = "") -> str:
     Returns the path of the piece. The other arguments are those of :func:`radarsdf.tiles.tile_fit.fit_tile`.
     """
     city = _opened(folder, run) if run else TileBlend(folder)
-    return str(write_piece(city, name, PieceSettings.from_json(settings)))
+    with torch_threads(city.config.num_threads):
+        return str(write_piece(city, name, PieceSettings.from_json(settings)))
 
 
 @lru_cache(maxsize=1)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, as_completed
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, wait
 from typing import Any
 
 from tqdm import tqdm
@@ -14,6 +14,8 @@ from tqdm import tqdm
 from radarsdf.progress import hides_bar
 
 Task = Callable[..., Any]
+_LOOK_S = 2.0  # how often the executor itself is looked at
+_NO_SCHEDULER = "the scheduler is gone: call again, what is done is kept"
 
 
 def run_tasks(
@@ -61,17 +63,27 @@ def run_tasks(
         futures = {}
         try:
             futures = {executor.submit(task, *own, run): i for i, own in enumerate(arguments)}
-            for future in as_completed(futures):
-                try:
-                    future.result()
-                except (Exception, CancelledError) as error:  # noqa: BLE001 - likewise
-                    failed[futures[future]] = _reason(error)
-                bar.update()
+            waiting = set(futures)
+            while waiting:
+                done, waiting = wait(waiting, _LOOK_S, FIRST_COMPLETED)
+                for future in done:
+                    try:
+                        future.result()
+                    except (Exception, CancelledError) as error:  # noqa: BLE001 - likewise
+                        failed[futures[future]] = _reason(error)
+                    bar.update()
+                if _has_no_scheduler(executor):
+                    return failed | {futures[future]: _NO_SCHEDULER for future in waiting}
         except BaseException:
             for future in futures:
                 future.cancel()
             raise
     return failed
+
+
+def _has_no_scheduler(executor: Executor) -> bool:
+    """Whether this is an executor of dask.distributed that is cut off. Its futures are then never done."""
+    return getattr(getattr(executor, "_client", None), "status", None) == "closed"
 
 
 def _reason(error: BaseException) -> str:
