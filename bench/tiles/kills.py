@@ -34,7 +34,7 @@ from bench.growth.street import street_scans
 _CONFIG = FitConfig.quick(num_threads=1)
 _TILE_M = 51.2
 _WORKERS = 2
-_START_S = 60.0
+_START_S = 300.0
 
 
 class Cluster:

@@ -17,7 +17,7 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.io import files
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from ..settings import grouped
 
@@ -111,7 +111,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "7"
+    assert metadata["format_version"] == "8"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -404,3 +404,16 @@ def test_damaged_intensities_in_closed_form_are_refused(saved_closed_form, tmp_p
     spoilt = write(tmp_path / "map.safetensors", tensors | {name: spoil(tensors[name])}, metadata)
     with pytest.raises(ValueError, match="is not a whole radarsdf map"):
         radarsdf.load(spoilt)
+
+
+def test_columns_of_features_that_are_zero_are_not_in_the_file(saved, tmp_path):
+    """A quick map uses one of eight. It is the same when it is read, and a map that uses all is written whole."""
+    scans = radarsdf.simulate.wall(frames=4)
+    quick = radarsdf.fit(scans.points, scans.poses, config=FitConfig.quick(), progress=False)
+    quick.save(tmp_path / "quick.safetensors")
+    tensors = load_file(tmp_path / "quick.safetensors")
+    assert tensors["field.cells.features"].shape == (quick.report["vertices"], 1)
+    again = radarsdf.load(tmp_path / "quick.safetensors")
+    assert again.field.cells.features.equal(quick.field.cells.features)
+    assert saved[2]["field.cells.features"].shape[1] == 8
+    assert again.nbytes == quick.nbytes > 3 * (tmp_path / "quick.safetensors").stat().st_size / 2

@@ -5,9 +5,12 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import multiprocessing
+import os
 import shutil
 from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -132,7 +135,7 @@ class Broken:
 
 def test_a_killed_worker_loses_only_its_tile(drive, folder, tmp_path):
     city = tiles_of(drive, tmp_path / "city", executor=Broken())
-    assert city.missing == {"0_0": ""}
+    assert city.missing == {"0_0": "killed"}
     assert tiles_of(drive, tmp_path / "city").missing == {}
     assert_same_bits(maps_of(folder), maps_of(tmp_path / "city"))
 
@@ -217,3 +220,36 @@ def test_a_damaged_plan(folder, tmp_path):
     (tmp_path / "plan.json").write_text((folder / "plan.json").read_text())
     with pytest.raises(ValueError, match=r"no tile of .* is done"):
         radarsdf.load(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("written", ["rays.bin", "map.safetensors"])
+def test_a_full_disk_is_said_and_what_was_done_is_kept(drive, folder, tmp_path, monkeypatch, written):
+    out = tmp_path / "city"
+    if written == "rays.bin":
+        monkeypatch.setattr("radarsdf.tiles.ray_files._path", lambda *_: Path("/dev/full"))
+        with pytest.raises(OSError, match="No space left"):
+            plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG)
+        monkeypatch.undo()
+    else:
+        plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG)
+        names = [tile.name for tile in Plan.load(out).tiles]
+        run_fits(out, names=names[:1], progress=False)
+
+        def full(*_):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr("radarsdf.map.storage.write_whole", full)
+        city = run_fits(out, progress=False)
+        assert list(city.missing) == names[1:]
+        assert set(city.missing.values()) == {"[Errno 28] No space left on device"}
+        monkeypatch.undo()
+    assert tiles_of(drive, out).missing == {}
+    assert_same_bits(maps_of(folder), maps_of(out))
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written(drive, tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(PermissionError):
+        tiles_of(drive, tmp_path / "city")

@@ -29,7 +29,7 @@ from radarsdf.tiles.tile_fit import is_done
 
 _Floats = NDArray[np.float64]
 MEMORY_BYTES = 1 << 30
-_BYTES_OF_FILE = 2.1  # in memory for each on the disk: measured; tables of cells, besides what is read
+_OF_FEATURES = 2.4  # bytes in memory for each of the features: measured; tables of cells, evidence
 _INWARD = 1e-3  # edges of a voxel
 _SHIFTS = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
 
@@ -144,11 +144,11 @@ class TileBlend:
         """The map of a tile that is done. It is read, unless it is in memory."""
         with self._lock:
             if tile not in self._held:
-                path = map_path(self.folder, self.plan.by_tile[tile])
-                size = round(_BYTES_OF_FILE * path.stat().st_size)
+                contents = storage.load_contents(map_path(self.folder, self.plan.by_tile[tile]))
+                size = round(_OF_FEATURES * contents.field.cells.features.nbytes)
                 while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
                     self._held.popitem(last=False)
-                self._held[tile] = storage.load_contents(path), size
+                self._held[tile] = contents, size
             self._held.move_to_end(tile)
             return self._held[tile][0]
 

@@ -1,0 +1,83 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Tiles on dask.distributed: the same bits, and what was done is kept. `bench.tiles kills` kills real workers."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+
+import pytest
+
+pytest.importorskip("distributed", reason="the extra cluster is not installed")
+
+import radarsdf
+from radarsdf.tiles.cluster import cluster_executor
+from radarsdf.tiles.plan import map_path
+
+from bench.tiles.kills import bits_of, cluster_in
+
+from .conftest import CONFIG, TILE_M
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    with cluster_in(tmp_path_factory.mktemp("cluster") / "first") as found:
+        yield found
+
+
+def test_fits_and_meshes_have_the_bits_of_one_process(cluster, drive, folder, tmp_path):
+    with cluster_executor(cluster.address, 0) as executor:
+        city = radarsdf.fit_tiles(
+            drive,
+            tmp_path / "city",
+            tile_size=TILE_M,
+            halo=6.4,
+            executor=executor,
+            config=CONFIG,
+            progress=False,
+        )
+        city.export(tmp_path / "there.ply", 0.2, executor=executor, progress=False)
+    assert bits_of(tmp_path / "city") == bits_of(folder)
+    radarsdf.load(folder).export(tmp_path / "here.ply", 0.2, progress=False)
+    assert (tmp_path / "there.ply").read_bytes() == (tmp_path / "here.ply").read_bytes()
+
+
+def test_a_tile_that_no_worker_can_hold_is_refused(cluster):
+    with (
+        pytest.raises(MemoryError, match="make the plan with smaller tiles"),
+        cluster_executor(cluster.address, 10**15),
+    ):
+        pass
+
+
+def test_an_address_without_a_cluster(monkeypatch):
+    monkeypatch.setattr("radarsdf.tiles.cluster._CONNECT_S", 0.5)
+    with pytest.raises(OSError, match="Timed out"), cluster_executor("tcp://127.0.0.1:9", 0):
+        pass
+
+
+class CutOff:
+    """What dask.distributed gives after its scheduler is gone: futures that are never done, and a closed client."""
+
+    class _client:
+        status = "running"
+
+    def submit(self, task, *arguments):
+        future = Future()
+        if arguments[1] == "0_0":
+            future.set_result(task(*arguments))
+        else:
+            self._client.status = "closed"
+        return future
+
+
+def test_without_a_scheduler_it_ends_and_keeps_what_was_done(drive, folder, tmp_path):
+    out = tmp_path / "city"
+    arguments = {"tile_size": TILE_M, "halo": 6.4, "config": CONFIG, "progress": False}
+    city = radarsdf.fit_tiles(drive, out, executor=CutOff(), **arguments)
+    assert [tile.name for tile in city.tiles] == ["0_0"]
+    assert set(city.missing.values()) == {"the scheduler is gone: call again, what is done is kept"}
+    written_ns = map_path(out, city.tiles[0]).stat().st_mtime_ns
+    assert radarsdf.fit_tiles(drive, out, **arguments).missing == {}
+    assert map_path(out, city.tiles[0]).stat().st_mtime_ns == written_ns
+    assert bits_of(out) == bits_of(folder)
