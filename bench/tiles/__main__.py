@@ -26,7 +26,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     module = _COMMANDS[options.what]
     rows: list[dict[str, Any]] = []
-    for row in module.rows(options.cases, options.quick):
+    for row in module.rows(options.cases, options.quick, options.out):
         if not rows:
             print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
         print("| " + " | ".join(str(value) for value in row.values()) + " |", flush=True)

@@ -29,8 +29,9 @@ _RETURNS = ("1000000", "3000000", "10000000", "30000000", "100000000")
 _WORKERS = 2
 
 
-def rows(counts: list[str], quick: bool) -> Iterator[dict[str, Any]]:
+def rows(counts: list[str], quick: bool, out: Path) -> Iterator[dict[str, Any]]:
     """A row for each number of returns."""
+    del out
     for count in counts or (["100000"] if quick else _RETURNS):
         words = [sys.executable, "-m", "bench.tiles.growth", str(int(float(count)))]
         done = subprocess.run(words, check=True, capture_output=True, text=True)

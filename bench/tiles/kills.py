@@ -80,8 +80,9 @@ def cluster_in(folder: Path) -> Iterator[Cluster]:
         cluster.close()
 
 
-def rows(names: list[str], quick: bool) -> Iterator[dict[str, Any]]:
+def rows(names: list[str], quick: bool, out: Path) -> Iterator[dict[str, Any]]:
     """A row for each thing that goes wrong."""
+    del out
     count = 200_000 if quick else 2_000_000
     scans = [Scan(points, pose) for pose, points, *_ in street_scans(count)]
     with tempfile.TemporaryDirectory() as scratch:
@@ -90,24 +91,24 @@ def rows(names: list[str], quick: bool) -> Iterator[dict[str, Any]]:
         run_fits(folder / "alone", progress=False)
         expected = bits_of(folder / "alone")
         for name in names or ("nothing", "a worker", "the scheduler"):
-            out = folder / name.replace(" ", "-")
-            plan_tiles(scans, out, tile_size=_TILE_M, config=_CONFIG)
+            city = folder / name.replace(" ", "-")
+            plan_tiles(scans, city, tile_size=_TILE_M, config=_CONFIG)
             started_s = time.perf_counter()
-            with cluster_in(folder / f"{out.name}-first") as cluster:
-                missing, said, done = _fit_and_kill(cluster, out, plan, name)
-            times = _times(out, plan)
+            with cluster_in(folder / f"{city.name}-first") as cluster:
+                missing, said, done = _fit_and_kill(cluster, city, plan, name)
+            times = _times(city, plan)
             if missing:
-                with cluster_in(folder / f"{out.name}-second") as cluster:
-                    _fit(cluster, out)
+                with cluster_in(folder / f"{city.name}-second") as cluster:
+                    _fit(cluster, city)
             yield {
                 "killed": name,
                 "tiles": len(plan.tiles),
                 "done then": done,
                 "missing after that call": missing,
                 "said": said,
-                "made again by the next": sum(_times(out, plan)[tile] != at for tile, at in times.items()),
-                "missing in the end": len(TiledMap(out).missing),
-                "same bits as in one process": bits_of(out) == expected,
+                "made again by the next": sum(_times(city, plan)[tile] != at for tile, at in times.items()),
+                "missing in the end": len(TiledMap(city).missing),
+                "same bits as in one process": bits_of(city) == expected,
                 "s": round(time.perf_counter() - started_s, 1),
             }
 

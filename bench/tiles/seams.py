@@ -17,6 +17,7 @@ from radarsdf.io import Scans
 
 from bench.growth.street import street
 from bench.paper.scenes import load_scene
+from bench.tiles import border
 
 # Edges of the tiles: small, so that there are many borders; the default on the long street.
 _TILE_M = {"hugin": 32.0, "oculii": 51.2, "street": None}
@@ -27,12 +28,12 @@ _NEAR_M = 1.0  # what counts as near a border
 _Floats = NDArray[np.float64]
 
 
-def rows(names: list[str], quick: bool) -> Iterator[dict[str, Any]]:
+def rows(names: list[str], quick: bool, out: Path) -> Iterator[dict[str, Any]]:
     """A row for each scene."""
     for name in names or _TILE_M:
         scans, config = _scene(name, quick)
         with tempfile.TemporaryDirectory() as folder:
-            yield _row(name, scans, config, Path(folder) / "city", quick)
+            yield _row(name, scans, config, Path(folder) / "city", quick, out / f"tiles-border-{name}.png")
 
 
 def _scene(name: str, quick: bool) -> tuple[Scans, FitConfig]:
@@ -48,7 +49,9 @@ def _scene(name: str, quick: bool) -> tuple[Scans, FitConfig]:
     )
 
 
-def _row(name: str, scans: Scans, config: FitConfig, folder: Path, quick: bool) -> dict[str, Any]:
+def _row(
+    name: str, scans: Scans, config: FitConfig, folder: Path, quick: bool, picture: Path
+) -> dict[str, Any]:
     voxel_m = 0.2 if quick or name == "street" else 0.1
     city = radarsdf.fit_tiles(scans, folder, tile_size=_TILE_M[name], config=config, progress=False)
     scale = city.intensity_scale
@@ -61,6 +64,7 @@ def _row(name: str, scans: Scans, config: FitConfig, folder: Path, quick: bool) 
     vertices = np.array(meshes[1].vertices)
     way_m, axis = _to_border(city, vertices)
     near = way_m < _NEAR_M
+    border.draw(city, one, vertices, picture)
     distance_m = np.abs(one.sdf(vertices))
     steps = _steps(city, vertices, axis)
     row: dict[str, Any] = {
@@ -69,13 +73,13 @@ def _row(name: str, scans: Scans, config: FitConfig, folder: Path, quick: bool) 
         "F of one fit": f"{100 * scores[0]['f_score_all']:.2f}",
         "F of tiles": f"{100 * scores[1]['f_score_all']:.2f}",
     }
-    for what, (border, elsewhere) in steps.items():
-        row[f"step of {what}, border"] = f"{border:.2g}"
+    for what, (on_border, elsewhere) in steps.items():
+        row[f"step of {what}, border"] = f"{on_border:.2g}"
         row["elsewhere" if what == "sdf, m" else "elsewhere "] = f"{elsewhere:.2g}"
     row["from one fit, border, median, 95 %, m"] = _two(distance_m[near])
     row["elsewhere  "] = _two(distance_m[~near])
-    border, inside = _open_edges(city, meshes[1])
-    row["open edges, border"] = f"{border:.2%}"
+    on_borders, inside = _open_edges(city, meshes[1])
+    row["open edges, border"] = f"{on_borders:.2%}"
     row["elsewhere   "] = f"{inside:.2%}"
     return row
 
