@@ -433,8 +433,9 @@ def test_quick_averages_and_trains_no_surface():
         "octree",
     )
     assert (quick.near_band_m, quick.truncation_m, quick.seed) == (0.4, 0.6, 4)
-    assert not FitConfig(networks={"reflectance": "closed-form"}).trains_intensity
-    assert quick.trains_intensity
+    assert quick.closes_intensity
+    assert not quick.trains_intensity
+    assert FitConfig().trains_intensity
 
 
 def test_what_is_told_to_prepare():

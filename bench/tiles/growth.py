@@ -77,7 +77,7 @@ def _measure(count: int) -> dict[str, Any]:
 
 
 def _geometry(scans: Any) -> Any:
-    """Without intensities, which a quick fit would train a network for."""
+    """Without intensities: the surface is what is measured."""
     for scan in scans:
         yield dataclasses.replace(scan, intensities=None)
 

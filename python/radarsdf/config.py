@@ -117,14 +117,13 @@ class NetworksConfig:
     % less error."""
     geometry_feature_dim: Annotated[int, Field(ge=0, le=_MAX_WIDTH)] = 0
     """Numbers that the SDF network passes to the intensity network (3QFPI: 15; its ablation shows no gain)."""
-    reflectance: Literal["network", "closed-form", "both"] = "network"
-    """What answers for intensities: the intensity network, or a regression on range and incidence and means in
-    cells of what that leaves, in closed form. Measured: the closed form has 3 to 12 % more error on simulated
-    scenes and 2 % less to 0.3 % more on real drives, in 0.03 to 0.1 s instead of seconds; but where scans are few
-    and far apart up to 40 % more. "both":
-    the network, and in closed form what it leaves of the training returns. Measured: 0.3 % more to 2 % less error
-    than the network on simulated scenes and 2 to 3 % less on real drives; the file is 1.4 to 2.5 times as
-    large."""
+    reflectance: Literal["network", "closed-form", "both"] = "both"
+    """What answers for intensities: the intensity network (3QFPI); regressions on range, elevation and
+    incidence, and means in cells of what these leave, in closed form; or the mean of the network, and of half of
+    it with what that leaves in closed form. Measured: both have 2 to 3 % less error than the network on real
+    drives, and 7 % less to 0.4 % more on simulated scenes; the file is a fifth to two fifths larger. The closed
+    form alone takes 0.03 to 0.1 s instead of seconds. It has 0 to 2 % less error than the network on real drives,
+    and mostly 1 to 10 % more on simulated scenes."""
     normals: bool = False
     """Whether the intensity network sees the surface normal (3QFPI: yes; its own ablation shows no gain)."""
     sdf_input: bool = True
@@ -350,12 +349,12 @@ class FitConfig:
         """Settings for a surface that is averaged over the rays instead of trained.
 
         The fit takes a fraction of the time; the surface is rougher and the map larger. Mesh it with voxels of the
-        size of its leaf cells, since smaller ones show no more detail. Intensities still train a network, for
-        seconds, unless ``networks={"reflectance": "closed-form"}``. `changes`: as for :meth:`override`.
+        size of its leaf cells, since smaller ones show no more detail. Intensities are in closed form, and take a
+        quarter to a half of the time without them. `changes`: as for :meth:`override`.
         """
         return cls(
             encoding=EncodingConfig(kind="octree", num_levels=1, fourier_count=0, bridge_cells=0),
-            networks=NetworksConfig(sdf_hidden=(2,)),
+            networks=NetworksConfig(sdf_hidden=(2,), reflectance="closed-form"),
             sampling=SamplingConfig(near_band_cells=2.0),
             training=TrainingConfig(start="average", sdf_iterations=0, joint=False),
         ).override(**changes)
@@ -374,6 +373,7 @@ class FitConfig:
             networks=NetworksConfig(
                 intensity_hidden=(64, 64),
                 geometry_feature_dim=15,
+                reflectance="network",
                 normals=True,
                 log_range=False,
                 feature_dropout=0.0,

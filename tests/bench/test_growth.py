@@ -64,7 +64,9 @@ def test_a_row_that_fails_says_why(tmp_path, capsys):
 
 def test_a_map_of_another_street_is_refused():
     scans = street(10_000, 50.0)
-    config = FitConfig(training={"sdf_iterations": 60, "intensity_iterations": 1})
+    config = FitConfig(
+        training={"sdf_iterations": 60, "intensity_iterations": 1}, networks={"reflectance": "network"}
+    )
     points = [-scan for scan in scans.points]
     radar_map = fit(points, scans.poses, scans.intensities, config=config, progress=False)
     assert isinstance(radar_map, RadarMap)

@@ -359,7 +359,7 @@ def test_saving_overwrites_and_takes_strings(saved, tmp_path):
 @pytest.fixture(scope="module")
 def saved_closed_form(scene, tmp_path_factory):
     """A quick map with intensities, its file, and the file's parts."""
-    config = FitConfig.quick(networks={"reflectance": "closed-form"})
+    config = FitConfig.quick()
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
     return saved_parts(radar_map, tmp_path_factory.mktemp("map"))
 
@@ -394,6 +394,7 @@ def test_what_the_network_leaves_is_added_and_kept(scene, tmp_path):
         ("reflectance.means", lambda t: t * math.nan),
         ("reflectance.means", lambda t: t[1:]),
         ("reflectance.coefficients", lambda t: t[1:]),
+        ("reflectance.table", lambda t: t[1:]),
         ("reflectance.normals", lambda t: t.double()),
         ("reflectance.plane_keys", lambda t: t.flip(0)),
         ("reflectance.mean_keys", lambda t: t * 0),

@@ -77,13 +77,35 @@ def test_outliers_move_it_little(rays):
     assert moved < 0.6 * np.abs(struck - values).mean()
 
 
+def test_with_a_network_the_answer_is_the_mean_of_two(rays):
+    """That of the network, and of half of it with what that leaves in closed form."""
+    answers = np.linspace(0.2, 0.6, len(rays), dtype=np.float32)
+    surfels = Surfels.of(rays, LEAF_M, 1)
+    found = Reflectance.of(rays, unit(rays), surfels, LEAF_M, 1, answers)
+    closed = Reflectance.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1)
+    whole, leaves = (r.at(rays.points, rays.directions, rays.ranges_m, 1) for r in (found, closed))
+    assert closed.network_share == 0
+    expected = (answers + (answers / 2 + leaves)) / 2
+    np.testing.assert_allclose(found.network_share * answers + whole, expected, rtol=0, atol=1e-4)
+
+
+def test_means_that_tell_nothing_are_left_out(rays, monkeypatch):
+    train, test = split(rays)
+    found = learnt(train, unit(train))
+    monkeypatch.setattr(reflectance, "_LEAST_MEAN", 0.0)
+    whole = learnt(train, unit(train))
+    assert len(found.means) < 0.8 * len(whole.means)
+    errors = [np.abs(at(r, test) - unit(test)).mean() for r in (found, whole)]
+    assert errors[0] < 1.005 * errors[1]
+
+
 @pytest.mark.parametrize("most", [1000, 10**9], ids=["groups", "returns"])
 def test_any_number_of_threads_has_the_same_bits(rays, monkeypatch, most):
     monkeypatch.setattr(reflectance, "_MOST_RETURNS", most)
     values = unit(rays)
     first, other = learnt(rays, values, 1), learnt(rays, values, 3)
     assert len(first.means) > 1000
-    for name in ("coefficients", "plane_keys", "normals", "mean_keys", "means"):
+    for name in ("coefficients", "table", "plane_keys", "normals", "mean_keys", "means"):
         np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
 
 
@@ -104,7 +126,7 @@ def test_answers_are_numbers_everywhere(rays):
 
 def test_few_returns_have_no_planes_and_still_answer():
     points = [np.array([[5.0, 0, 0], [6.0, 1, 0]]), np.array([[7.0, 2, 0]])]
-    config = FitConfig.quick(networks={"reflectance": "closed-form"})
+    config = FitConfig.quick()
     radar_map = radarsdf.fit(
         points, np.stack([np.eye(4)] * 2), [[1.0, 2.0], [3.0]], config=config, progress=False
     )

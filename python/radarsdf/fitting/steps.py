@@ -39,10 +39,6 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.surfels import Surfels
 from radarsdf.threads import Workers
 
-# Of rough scenes the network knows less than of smooth ones: its answer counts so much less there, and the closed form
-# the more. Measured on five real drives, which are rough, and on simulated scenes, which are not.
-_LESS_IN_ROUGH_SCENES = 0.5
-
 
 @dataclass
 class FitInput:
@@ -203,13 +199,12 @@ def _with_closed_form(
 ) -> MapContents:
     scale, config = contents.intensity_scale, contents.config
     assert scale is not None
-    share, unit = 0.0, scale.to_unit(intensities)
+    answers = None
     if config.trains_intensity:
-        share = 1 - _LESS_IN_ROUGH_SCENES * queries.roughness(contents)
         sensors = torch.from_numpy(rays.points - rays.directions * rays.ranges_m[:, None])
-        answers = queries.intensity(contents, torch.from_numpy(rays.points), sensors)
-        unit -= np.float32(share) * scale.to_unit(answers.numpy())
-    found = Reflectance.of(rays, unit, surfels, config.leaf_size_m, num_threads, share, cell_of_ray)
+        answers = scale.to_unit(queries.intensity(contents, torch.from_numpy(rays.points), sensors).numpy())
+    unit = scale.to_unit(intensities)
+    found = Reflectance.of(rays, unit, surfels, config.leaf_size_m, num_threads, answers, cell_of_ray)
     return dataclasses.replace(contents, reflectance=found)
 
 

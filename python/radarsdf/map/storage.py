@@ -34,11 +34,12 @@ _UNITS = "positions and distances in m, world frame; signed distance positive in
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
 # Types and numbers of dimensions of the arrays of `Reflectance`. Keys have at most 63 bits, as those of leaf cells.
 _REFLECTANCE = {
-    "coefficients": (torch.float64, 1),
+    "coefficients": (torch.float64, 2),
+    "table": (torch.float32, 2),
     "plane_keys": (torch.int64, 1),
     "normals": (torch.float32, 2),
     "mean_keys": (torch.int64, 1),
-    "means": (torch.float32, 1),
+    "means": (torch.float16, 1),
 }
 
 

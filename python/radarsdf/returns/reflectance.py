@@ -14,57 +14,63 @@ from numpy.typing import NDArray
 from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means, sum_moments
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.response import NUM_COEFFICIENTS, NUM_KINDS, TABLE_SHAPE, Response, kinds_of
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
 
 Float32 = NDArray[np.float32]
 
 # Kinds of cells: edge in leaf cells, step of the direction's components, step of the incidence in rad. Materials differ
 # in how the echo falls with the incidence, so cells by incidence are what helps most on simulated scenes, cells by
-# direction on real drives. Chosen on `hugin`, `oculii` and `wall` of seeds 1 and 2 and on three drives.
+# direction on real drives. Chosen on `hugin`, `oculii` and `wall` of seeds 1 and 2, on a few scans of them, and on three
+# drives.
 _KINDS = np.array([
-    [40, 0, 0], [10, 0, 0], [2, 0, 0],
-    [40, 0, 0.07], [16, 0, 0.1], [6, 0, 0.1],
-    [12, 0.2, 0], [5, 0.2, 0], [2.5, 0.12, 0],
+    [40, 0, 0], [6, 0, 0], [2, 0, 0],
+    [80, 0, 0.07], [16, 0, 0.1], [6, 0, 0.1],
+    [20, 0.2, 0], [5, 0.2, 0],
 ])  # fmt: skip
 _TILINGS = 4  # two have 1 to 2 % more error, eight 0 to 1 % less
-_SHRINKAGE = 5.0  # 3 to 10 differ by less than 1 %
+_SHRINKAGE = 4.0  # 3 to 10 differ by less than 1 %
 _ROUNDS = 2  # four are no better
 # Of more returns, those that are close and seen alike are one: means of so many would take too long for a quick fit.
 _MOST_RETURNS = 50_000
 _GROUPS = np.array([[2.5, 0.25, 0.12]])  # a kind of cells, as above
 _CORRELATION = 0.1  # of the returns in a group: n of them count n / (1 + 0.1 (n - 1)) times
+_LEAST_MEAN = 0.005  # of the range of intensities. A third of the means are smaller: they tell nothing
 
-_LOBES_RAD = np.radians([3, 6, 12, 25, 50])  # standard deviations of specular lobes
-_MIN_COSINE = 0.02
-_MOST_REGRESSED = 12_000  # returns, evenly spread: enough for fourteen numbers
-_REWEIGHTINGS = 3
-_REFERENCE_RANGE_M = 10.0
-_ANGLES_RAD = np.linspace(0, np.pi / 2, 2001)  # at which the response to the incidence is tabulated
-_BASE = 5  # coefficients that do not belong to the incidence
-NUM_COEFFICIENTS = _BASE + 4 + len(_LOBES_RAD)
+# With a network, the answer is the mean of two: the network's, and `_NETWORK_TIMES` that with what it leaves in closed
+# form. Half of what it leaves, since the rest is noise of the returns that it was trained on; and half of its answer,
+# since it is no better than the closed form on real drives.
+_NETWORK_TIMES = 0.5
+_CLOSED_TIMES = 0.5
 
 
 @dataclass(frozen=True)
 class Reflectance:
     """A quantity of the returns of a fit, as a function of place, direction, range and incidence.
 
-    It is their intensity in [0, 1], or what a network leaves of it.
+    It is their intensity in [0, 1], or what is added to the answer of a network.
     """
 
     leaf_size_m: float
     """Edge of a leaf cell, m."""
     coefficients: NDArray[np.float64]
-    """(14,) of the regression."""
+    """(3, 14) of the regressions: see :class:`~radarsdf.returns.response.Response`."""
+    table: Float32
+    """(48, 96) of what the first of them leaves, by range and elevation."""
     plane_keys: NDArray[np.uint64]
     """(P,) Morton keys of the surfels' cells with a plane, ascending."""
     normals: Float32
     """(P, 3) unit normals of these planes, local frame."""
     mean_keys: NDArray[np.uint64]
     """(M,) keys of the cells with means."""
-    means: Float32
+    means: NDArray[np.float16]
     """(M,) means in them of what the regression leaves."""
     network_share: float = 0.0
-    """The answer of the intensity network counts so many times; the quantity is what that leaves."""
+    """The answer of the intensity network counts so many times; the quantity is added to that."""
+
+    @cached_property
+    def _response(self) -> Response:
+        return Response(self.coefficients, self.table)
 
     @cached_property
     def _planes(self) -> CellBlocks:
@@ -73,11 +79,13 @@ class Reflectance:
     @cached_property
     def _cells(self) -> CellMeans:
         """Finds the means. Made by the first query: a fit has no need of it."""
-        return CellMeans(_in_metres(_KINDS, self.leaf_size_m), _TILINGS, self.mean_keys, self.means)
+        means = self.means.astype(np.float32)
+        return CellMeans(_in_metres(_KINDS, self.leaf_size_m), _TILINGS, self.mean_keys, means)
 
     def check(self) -> None:
         """Raises a ValueError if keys are not in order, or shapes do not match."""
-        if self.coefficients.shape != (NUM_COEFFICIENTS,) or self.normals.shape != (len(self.plane_keys), 3):
+        shapes = self.coefficients.shape, self.table.shape, self.normals.shape
+        if shapes != ((NUM_KINDS, NUM_COEFFICIENTS), TABLE_SHAPE, (len(self.plane_keys), 3)):
             msg = "the reflectance has arrays of wrong shapes"
             raise ValueError(msg)
         _ = self._planes, self._cells  # which check the keys
@@ -90,7 +98,7 @@ class Reflectance:
         surfels: Surfels,
         leaf_size_m: float,
         num_threads: int = 0,
-        network_share: float = 0.0,
+        answers: Float32 | None = None,
         cell_of_ray: NDArray[np.int32] | None = None,
     ) -> Reflectance:
         """The reflectance of `rays`.
@@ -100,40 +108,45 @@ class Reflectance:
         rays : Rays
             All returns, with ghosts: a sensor sees these again.
         unit : (N,) float32
-            Their intensities, scaled to [0, 1]; less `network_share` times what the network answers.
+            Their intensities, scaled to [0, 1].
         surfels : Surfels
             Surfels of the same returns, or of more.
         leaf_size_m : float
             Edge of a leaf cell, m.
         num_threads : int
             0: as many as OpenMP uses. The result has the same bits with any number.
+        answers : (N,) float32, optional
+            The intensities that a network answers for them, scaled alike. Default: there is no network.
         cell_of_ray : (N,) int32, optional
             Row of each return's cell in those of `surfels`. Default: `surfels` are of the same returns.
         """
         flat = np.flatnonzero(surfels.is_flat())
+        normals = surfels.normals.astype(np.float32)
         plane = surfels.flat_plane_of(surfels.cells.cell_of_ray if cell_of_ray is None else cell_of_ray)
         points = np.ascontiguousarray(rays.points)
         directions = np.ascontiguousarray(rays.directions)
-        incidence = _incidence(surfels.normals.astype(np.float32), plane, directions)
-
-        some = slice(None, None, -(-len(rays) // _MOST_REGRESSED))
-        design = _design(directions[some], rays.ranges_m[some], incidence[some])
-        coefficients = _regression(design, unit[some].astype(np.float64))
-        left = unit - _response(coefficients, directions, rays.ranges_m, incidence)
+        incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
+        times, share = 1.0, 0.0
+        if answers is not None:
+            unit = unit - np.float32(_NETWORK_TIMES) * answers
+            times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
+        response = Response.of(unit, directions, rays.ranges_m, incidence, kinds)
+        left = unit - response.at(directions, rays.ranges_m, incidence, kinds)
         rows, groups = _grouped(points, directions, incidence, left, leaf_size_m, num_threads)
-        kinds = _in_metres(_KINDS, leaf_size_m)
-        keys, means, explained = fit_cell_means(kinds, _TILINGS, *groups, _SHRINKAGE, _ROUNDS, num_threads)
+        cells = _in_metres(_KINDS, leaf_size_m)
+        keys, means, explained = fit_cell_means(cells, _TILINGS, *groups, _SHRINKAGE, _ROUNDS, num_threads)
         # The cells have means, and the error that counts is the absolute one, whose centre is the median.
-        coefficients[0] += np.median(left[some] - explained[rows[some]])
-        plane_keys = surfels.cells.keys[surfels.cell_of_plane[flat]]
+        response.coefficients[:, 0] += np.median(left - explained[rows])
+        kept = np.abs(means) >= _LEAST_MEAN
         return cls(
             leaf_size_m,
-            coefficients,
-            plane_keys,
-            surfels.normals[flat].astype(np.float32),
-            keys,
-            means,
-            network_share,
+            times * response.coefficients,
+            np.float32(times) * response.table,
+            surfels.cells.keys[surfels.cell_of_plane[flat]],
+            normals[flat],
+            keys[kept],
+            (np.float32(times) * means[kept]).astype(np.float16),
+            share,
         )
 
     def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
@@ -144,9 +157,9 @@ class Reflectance:
         directions = np.ascontiguousarray(directions)
         rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
         incidence = _incidence(self.normals, rows, directions)
-        response = _response(self.coefficients, directions, ranges_m, incidence)
-        response += self._cells.sums(near, directions, incidence, num_threads)
-        return response
+        found = self._response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
+        found += self._cells.sums(near, directions, incidence, num_threads)
+        return found
 
 
 def _in_metres(kinds: NDArray[np.float64], leaf_size_m: float) -> NDArray[np.float64]:
@@ -161,54 +174,6 @@ def _incidence(normals: Float32, plane: NDArray[np.int32], directions: Float32) 
     angle: Float32 = np.arccos(np.minimum(cosine, np.float32(1)))
     angle[plane < 0] = np.nan
     return angle
-
-
-def _of_incidence(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Columns (N, 9): 1, the cosine, its square and logarithm, and the lobes."""
-    cosine = np.maximum(np.cos(angle_rad), _MIN_COSINE)
-    lobes = [np.exp(-0.5 * (angle_rad / width) ** 2) for width in _LOBES_RAD]
-    return np.stack([np.ones_like(cosine), cosine, cosine**2, np.log10(cosine), *lobes], axis=-1)
-
-
-def _of_ray(directions: Float32, ranges_m: Float32) -> list[Float32]:
-    """Columns (N,): 1, the logarithm of the range and its square, the elevation's sine and its square."""
-    log_range = np.log10(np.maximum(ranges_m, np.float32(1e-6)) / np.float32(_REFERENCE_RANGE_M))
-    up = directions[:, 2]
-    return [np.ones_like(up), log_range, log_range**2, up, up**2]
-
-
-def _design(directions: Float32, ranges_m: Float32, incidence_rad: Float32) -> NDArray[np.float64]:
-    known = ~np.isnan(incidence_rad)
-    of_incidence = _of_incidence(np.where(known, incidence_rad, 0).astype(np.float64)) * known[:, None]
-    return np.concatenate(
-        [np.stack(_of_ray(directions, ranges_m), axis=1), of_incidence], axis=1, dtype=np.float64
-    )
-
-
-def _response(
-    coefficients: NDArray[np.float64], directions: Float32, ranges_m: Float32, incidence_rad: Float32
-) -> Float32:
-    """What the regression says, (N,)."""
-    table = (_of_incidence(_ANGLES_RAD) @ coefficients[_BASE:]).astype(np.float32)
-    # The nearest angle of the table: to interpolate would take more time than all else.
-    nearest = np.nan_to_num(incidence_rad * np.float32((len(table) - 1) / _ANGLES_RAD[-1])) + np.float32(0.5)
-    response: Float32 = table[nearest.astype(np.int32)]
-    response[np.isnan(incidence_rad)] = 0
-    for coefficient, column in zip(coefficients[:_BASE], _of_ray(directions, ranges_m), strict=True):
-        response += np.float32(coefficient) * column
-    return response
-
-
-def _regression(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients with the least absolute error, nearly: least squares, in which what is far off counts less."""
-    weights = np.ones(len(values))
-    ridge = np.eye(design.shape[1]) * (1e-3 * np.sqrt(len(values)) + 1e-6 * float((design**2).sum()))
-    for _ in range(_REWEIGHTINGS):
-        weighted = design * weights[:, None]
-        coefficients: NDArray[np.float64] = np.linalg.solve(design.T @ weighted + ridge, weighted.T @ values)
-        error = np.abs(values - design @ coefficients)
-        weights = 1 / np.maximum(1, error / max(float(np.median(error)), 1e-9))
-    return coefficients
 
 
 _Groups = tuple[Float32, Float32, Float32, Float32, Float32]
