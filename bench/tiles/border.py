@@ -18,19 +18,22 @@ _STEP_M = 0.02
 _Floats = NDArray[np.float64]
 
 
-def draw(city: TiledMap, one: RadarMap, vertices: _Floats, path: Path) -> None:
+def draw(city: TiledMap, one: RadarMap, mesh: Any, positions: _Floats, path: Path) -> None:
     """Draws where the surface of the tiles, and that of one fit, cut a vertical plane across a border.
 
     Parameters
     ----------
     city, one : TiledMap, RadarMap
         Of the same scans.
-    vertices : (V, 3) ndarray
-        Of the mesh of the tiles, world, m. The border is drawn where most of them are.
+    mesh : trimesh.Trimesh
+        Of the tiles. The border is drawn where most of it crosses one.
+    positions : (F, 3) ndarray
+        Of the sensor, world, m. The intensities are for the nearest.
     path : Path
         A PNG file.
     """
-    centre, across = _busiest(city, vertices)
+    centre, across = _busiest(city, mesh)
+    sensor = positions[np.linalg.norm(positions - centre, axis=1).argmin()]
     s = np.arange(-_HALF_M, _HALF_M, _STEP_M)
     along, height = np.meshgrid(s, s, indexing="ij")
     grid = np.tile(centre, (along.size, 1))
@@ -44,10 +47,11 @@ def draw(city: TiledMap, one: RadarMap, vertices: _Floats, path: Path) -> None:
         left.contour(s, s, distance_m.T, [0.0], colors=color, linewidths=width)
         left.plot([], [], color=color, lw=width, label=label)
         if city.has_intensity:
-            sensor = city.config.lattice.position(city.tiles[0].origin_cells)
-            near = np.abs(np.nan_to_num(distance_m, nan=np.inf)).argmin(axis=1)
-            points = grid.reshape(*along.shape, 3)[np.arange(len(s)), near]
-            right.plot(s, map_.intensity(points, sensor), color=color, lw=width, label=label)
+            size_m = np.abs(np.nan_to_num(distance_m, nan=np.inf))
+            rows = np.arange(len(s)), size_m.argmin(axis=1)
+            values = map_.intensity(grid.reshape(*along.shape, 3)[rows], sensor)
+            values[size_m[rows] > 2 * _STEP_M] = np.nan  # no surface is there
+            right.plot(s, values, color=color, lw=width, label=label)
     for axes in (left, right):
         axes.axvline(0, color="#888888", lw=0.8, ls="--")
         axes.set_xlabel("across the border, m")
@@ -58,12 +62,14 @@ def draw(city: TiledMap, one: RadarMap, vertices: _Floats, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _busiest(city: TiledMap, vertices: _Floats) -> tuple[_Floats, int]:
-    """(3,) the place on a border, world, m, with most vertices within a metre, and the axis across the border."""
+def _busiest(city: TiledMap, mesh: Any) -> tuple[_Floats, int]:
+    """(3,) the place on a border, world, m, where most surface crosses it, and the axis across the border."""
+    vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     way_m = vertices[:, :2] - city.plan.grid.corner_m
     way_m -= np.round(way_m / city.plan.tile_m) * city.plan.tile_m
-    across = int(np.abs(way_m).min(axis=0).argmin())
-    near = vertices[np.abs(way_m[:, across]) < 0.5]
+    crosses = (np.abs(way_m) < 0.5) & (np.abs(normals[:, :2]) < 0.3)
+    across = int(crosses.sum(axis=0).argmax())
+    near = vertices[crosses[:, across]]
     cells, counts = np.unique(np.round(near), axis=0, return_counts=True)
     centre = cells[counts.argmax()]
     own = near[np.abs(near - centre).max(axis=1) < 1]

@@ -64,7 +64,7 @@ def _row(
     vertices = np.array(meshes[1].vertices)
     way_m, axis = _to_border(city, vertices)
     near = way_m < _NEAR_M
-    border.draw(city, one, vertices, picture)
+    border.draw(city, one, meshes[1], scans.poses[:, :3, 3], picture)
     distance_m = np.abs(one.sdf(vertices))
     steps = _steps(city, vertices, axis)
     row: dict[str, Any] = {
