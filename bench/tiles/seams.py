@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import radarsdf
 from numpy.typing import NDArray
-from radarsdf import FitConfig, TiledMap, evaluation
+from radarsdf import FitConfig, RadarMap, TiledMap, evaluation
 from radarsdf.io import Scans
 
 from bench.growth.street import street
@@ -62,20 +62,20 @@ def _row(
     assert truth is not None
     scores = [evaluation.surface_metrics(mesh, truth, samples=500_000) for mesh in meshes]
     vertices = np.array(meshes[1].vertices)
-    way_m, axis = _to_border(city, vertices)
-    near = way_m < _NEAR_M
+    near = _to_border(city, vertices) < _NEAR_M
     border.draw(city, one, meshes[1], scans.poses[:, :3, 3], picture)
     distance_m = np.abs(one.sdf(vertices))
-    steps = _steps(city, vertices, axis)
+    steps = _steps(city, one, vertices)
     row: dict[str, Any] = {
         "scene": name,
         "tiles": len(city.tiles),
         "F of one fit": f"{100 * scores[0]['f_score_all']:.2f}",
         "F of tiles": f"{100 * scores[1]['f_score_all']:.2f}",
     }
-    for what, (on_border, elsewhere) in steps.items():
-        row[f"step of {what}, border"] = f"{on_border:.2g}"
-        row["elsewhere" if what == "sdf, m" else "elsewhere "] = f"{elsewhere:.2g}"
+    for what, (tiles, single, elsewhere) in steps.items():
+        row[f"step of {what}: tiles, one fit, tiles elsewhere"] = (
+            f"{tiles:.2g}, {single:.2g}, {elsewhere:.2g}"
+        )
     row["from one fit, border, median, 95 %, m"] = _two(distance_m[near])
     row["elsewhere  "] = _two(distance_m[~near])
     on_borders, inside = _open_edges(city, meshes[1])
@@ -88,40 +88,44 @@ def _two(values: _Floats) -> str:
     return ", ".join(f"{value:.3f}" for value in np.quantile(values, [0.5, 0.95]))
 
 
-def _to_border(city: TiledMap, points: _Floats) -> tuple[_Floats, NDArray[np.int64]]:
-    """Distance (N,) to the next border between tiles, m, and the axis (N,) across it."""
+def _to_border(city: TiledMap, points: _Floats) -> _Floats:
+    """Distance (N,) to the next border between tiles, m."""
     way_m = points[:, :2] - city.plan.grid.corner_m
-    ways = np.abs(way_m - np.round(way_m / city.plan.tile_m) * city.plan.tile_m)
-    return ways.min(axis=1), ways.argmin(axis=1)
+    nearest: _Floats = np.abs(way_m - np.round(way_m / city.plan.tile_m) * city.plan.tile_m).min(axis=1)
+    return nearest
 
 
-def _steps(city: TiledMap, vertices: _Floats, axis: NDArray[np.int64]) -> dict[str, tuple[float, float]]:
-    """The 99 % quantile of the steps of answers across borders, and across planes in the middle of tiles."""
-    rng = np.random.default_rng(0)
-    tile_m = city.plan.tile_m
-    found: dict[str, list[float]] = {"sdf, m": [], "intensity, dB": []}
-    for shift_m in (0.0, tile_m / 2):
-        way_m = vertices[:, :2] - city.plan.grid.corner_m - shift_m
-        way_m -= np.round(way_m / tile_m) * tile_m
-        across = np.abs(way_m).argmin(axis=1)
-        near = np.flatnonzero(np.abs(way_m).min(axis=1) < _NEAR_M)
-        near = rng.permutation(near)[:20_000]
-        points = vertices[near]
-        points[np.arange(len(points)), across[near]] -= way_m[near, across[near]]
-        side = np.zeros_like(points)
-        side[np.arange(len(points)), across[near]] = _SIDE_M
-        seen = city.observed(points - side) & city.observed(points + side)
-        points, side = points[seen], side[seen]
-        sensor = city.config.lattice.position(city.tiles[0].origin_cells)
-        for what, answer in (
-            ("sdf, m", city.sdf),
-            ("intensity, dB", lambda x: city.intensity(x, sensor)),  # noqa: B023 - used at once
-        ):
-            found[what].append(
-                float(np.quantile(np.abs(answer(points + side) - answer(points - side)), 0.99))
+def _steps(city: TiledMap, one: RadarMap, vertices: _Floats) -> dict[str, tuple[float, ...]]:
+    """The 99 % quantiles of the steps of answers: of the tiles and of the single fit across borders, and of the tiles
+    across planes in the middle of tiles.
+    """
+    found: dict[str, tuple[float, ...]] = {}
+    sensor = city.config.lattice.position(city.tiles[0].origin_cells)
+    places = [_sides(city, vertices, shift_m) for shift_m in (0.0, city.plan.tile_m / 2)]
+    for what in ("sdf, m", "intensity, dB"):
+        steps = []
+        for map_, (points, side) in ((city, places[0]), (one, places[0]), (city, places[1])):
+            here, there = (
+                map_.sdf(at) if what == "sdf, m" else map_.intensity(at, sensor)
+                for at in (points - side, points + side)
             )
-    del axis
-    return {what: (border, elsewhere) for what, (border, elsewhere) in found.items()}
+            steps.append(float(np.quantile(np.abs(here - there), 0.99)))
+        found[what] = tuple(steps)
+    return found
+
+
+def _sides(city: TiledMap, vertices: _Floats, shift_m: float) -> tuple[_Floats, _Floats]:
+    """Points (N, 3) of the surface moved onto borders that are shifted, and steps (N, 3) across, where both are known."""
+    rng = np.random.default_rng(0)
+    way_m = vertices[:, :2] - city.plan.grid.corner_m - shift_m
+    way_m -= np.round(way_m / city.plan.tile_m) * city.plan.tile_m
+    near = rng.permutation(np.flatnonzero(np.abs(way_m).min(axis=1) < _NEAR_M))[:20_000]
+    rows = np.arange(len(near)), np.abs(way_m[near]).argmin(axis=1)
+    points, side = vertices[near], np.zeros((len(near), 3))
+    points[rows] -= way_m[near, rows[1]]
+    side[rows] = _SIDE_M
+    seen = city.observed(points - side) & city.observed(points + side)
+    return points[seen], side[seen]
 
 
 def _open_edges(city: TiledMap, mesh: Any) -> tuple[float, float]:
