@@ -83,17 +83,18 @@ class Response:
         `incidence_rad` (N,): angle to the normal of the surface, not used without one. `kinds` (N,): of the surface.
         """
         found = np.empty(len(kinds), np.float32)
-        tables = (self.coefficients[:, _BASE:] @ _of_incidence(_ANGLES_RAD).T).astype(np.float32)
+        of_angles = _of_incidence(_ANGLES_RAD).T
         for kind in range(NUM_KINDS):
             own = np.flatnonzero(kinds == kind)
             columns = _of_ray(directions[own], ranges_m[own])
-            values = columns @ self.coefficients[kind, :_BASE].astype(np.float32)
+            values = _weighted_sum(self.coefficients[kind, :_BASE], columns.T)
             if kind == NO_SURFACE:
                 values += self.table.ravel()[_bins(columns[:, 1], columns[:, 3])]
             else:
                 # The nearest angle of the table: to interpolate would take more time than all else.
                 nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
-                values += tables[kind][(nearest + np.float32(0.5)).astype(np.int32)]
+                table = _weighted_sum(self.coefficients[kind, _BASE:], of_angles.astype(np.float32))
+                values += table[np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
             found[own] = values
         return found
 
@@ -105,6 +106,15 @@ def kinds_of(normals: Float32, plane: NDArray[np.int32]) -> NDArray[np.int8]:
     of_plane[:-1] = np.where(np.abs(normals[:, 2]) > _LEVEL_COSINE, LEVEL, STEEP)
     kinds: NDArray[np.int8] = of_plane[plane]
     return kinds
+
+
+def _weighted_sum(weights: NDArray[np.float64], columns: Float32) -> Float32:
+    """(N,) sum of `columns` (K, N). Not a product of matrices: that has other last bits for other N or other threads."""
+    found = np.zeros(columns.shape[1], np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):  # a query that is not finite has an answer that is not
+        for weight, column in zip(weights.astype(np.float32), columns, strict=True):
+            found += weight * column
+    return found
 
 
 def _of_incidence(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
