@@ -115,6 +115,8 @@ class Finder:
         if name in ("torch", "radarsdf._core"):
             os._exit(name != "torch")
 
+# What most of them need, before the forks, or each would import it again.
+import numpy, pydantic, safetensors, scipy.sparse.csgraph, scipy.spatial, tqdm, trimesh
 sys.meta_path.insert(0, Finder)
 for name in sys.argv[1:]:
     if (child := os.fork()) == 0:
