@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from radarsdf.fitting.stopping import Diverged, Interrupted
     from radarsdf.map.isosurface import marching_cubes
     from radarsdf.map.radar_map import RadarMap
-    from radarsdf.tiles.fit_tiles import fit_tiles, load
+    from radarsdf.tiles.any_map import load
+    from radarsdf.tiles.fit_tiles import fit_tiles
     from radarsdf.tiles.tiled_map import TiledMap
 
     __version__: str
@@ -68,7 +69,7 @@ _MODULES = {
     "TiledMap": "radarsdf.tiles.tiled_map",
     "fit": "radarsdf.fitting.fit",
     "fit_tiles": "radarsdf.tiles.fit_tiles",
-    "load": "radarsdf.tiles.fit_tiles",
+    "load": "radarsdf.tiles.any_map",
     "marching_cubes": "radarsdf.map.isosurface",
 } | {name: f"radarsdf.{name}" for name in _PACKAGES}
 """The module of each name that is imported when it is first used."""

@@ -77,7 +77,7 @@ def test_help_of_a_command_imports_this_one_only(command):
         (["view", "map", "--port", "x"], "invalid int value: 'x'"),
         (["eval", "mesh"], "arguments are required: truth"),
         (["demo", "--scene", "moon"], "invalid choice: 'moon'"),
-        (["info", "more"], "unrecognized arguments: more"),
+        (["info", "map", "more"], "unrecognized arguments: more"),
     ],
 )
 def test_wrong_usage_is_status_2(words, said):

@@ -8,7 +8,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from radarsdf.cli.options import MAP_SUFFIX, add_box, add_json, box_of
+from radarsdf.cli.map_in import MAP, is_map, load_map
+from radarsdf.cli.options import add_box, add_json, add_voxel, box_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.scans_in import SCANS, add_poses, scans_of
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument("what", type=Path, help="a mesh, or a map (.safetensors)")
+    parser.add_argument("what", type=Path, help=f"a mesh, or {MAP}")
     parser.add_argument(
         "scans",
         metavar="truth",
@@ -33,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="also print the intensity errors on the scans that radarsdf fit --holdout N left out",
     )
+    add_voxel(parser)
     add_box(parser)
     parser.add_argument(
         "--samples",
@@ -50,10 +52,10 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.files import check_regular_file
     from radarsdf.io.ground_truth import read_ground_truth
     from radarsdf.io.meshes import read_mesh
-    from radarsdf.map.radar_map import load
 
-    check_regular_file(options.what)
-    radar_map = load(options.what) if options.what.suffix == MAP_SUFFIX else None
+    radar_map = load_map(options.what) if is_map(options.what) else None
+    if radar_map is None:
+        check_regular_file(options.what)
     scans = _scans(options)
     if options.holdout is not None and (radar_map is None or scans is None):
         msg = "--holdout needs a map and scans"
@@ -67,7 +69,7 @@ def run(options: argparse.Namespace) -> None:
         raise ValueError(msg)
     results = Results(options)
     if ground_truth is not None:
-        mesh = radar_map.mesh() if radar_map else read_mesh(options.what)
+        mesh = read_mesh(options.what) if radar_map is None else radar_map.mesh(options.voxel)
         metrics = surface_metrics(mesh, ground_truth, box=box_of(options), samples=options.samples)
         results.add(format_metrics(metrics), surface=metrics)
     if options.holdout is not None and radar_map is not None and scans is not None:

@@ -11,7 +11,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from radarsdf.cli.options import MAP_SUFFIX, add_fit_options, add_json, config_of, progress_of
+from radarsdf.cli.map_in import MAP_SUFFIX
+from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.returns.movers import rays_as_measured
+from radarsdf.tiles.any_map import AnyMap, predicted
 
 if TYPE_CHECKING:
-    from radarsdf import RadarMap
     from radarsdf.cli.results import Results
     from radarsdf.io.scans import Scans
 
 
-def add_intensity_errors(results: Results, radar_map: RadarMap, test: Scans, train: Scans) -> None:
+def add_intensity_errors(results: Results, radar_map: AnyMap, test: Scans, train: Scans) -> None:
     """Add the errors of a map, and of a kNN baseline that is as good as these scans allow; nothing if map or scans have no intensities.
 
     Parameters
@@ -32,10 +32,17 @@ def add_intensity_errors(results: Results, radar_map: RadarMap, test: Scans, tra
     if not radar_map.has_intensity or test.intensities is None:
         return
     tested, known = (rays_as_measured(scans, radar_map.config) for scans in (test, train))
+    given = len(tested)
+    tested, found = predicted(radar_map, tested)
+    if len(tested) < given:
+        results.add(
+            f"{given - len(tested)} of {given} held-out returns are in no tile",
+            in_no_tile=given - len(tested),
+        )
     (x, sensors), measured = tested.in_world(), tested.intensities
     assert measured is not None
     assert known.intensities is not None
-    errors = intensity_metrics(radar_map.intensity(x, sensors), measured)
+    errors = intensity_metrics(found, measured)
     results.add("held-out " + format_metrics(errors), held_out=errors)
     knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
     metrics = intensity_metrics(knn.predict(x, sensors), measured)

@@ -1,17 +1,24 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf info``: what a bug report needs."""
+"""``radarsdf info``: what a bug report needs, and what a map holds."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+from radarsdf.cli.map_in import MAP, load_map
 from radarsdf.cli.options import add_json
 from radarsdf.cli.results import Results
+
+if TYPE_CHECKING:
+    from radarsdf.tiles.any_map import AnyMap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
+    parser.add_argument("map", type=Path, nargs="?", help=f"say also what is in {MAP}")
     add_json(parser)
 
 
@@ -21,5 +28,30 @@ def run(options: argparse.Namespace) -> None:
 
     results = Results(options)
     for name, value in versions().items():
-        results.add(f"{name:<16}{value}", **{name.replace(" ", "_"): value})
+        results.add(_line(name, value), **{name.replace(" ", "_"): value})
+    if options.map is not None:
+        _add_map(results, load_map(options.map))
     results.end()
+
+
+def _add_map(results: Results, radar_map: AnyMap) -> None:
+    scale, sensor = radar_map.intensity_scale, radar_map.sensor
+    limits = None if scale is None else (scale.low, scale.high)
+    cells, edge_m, size = radar_map.num_cells, radar_map.config.leaf_size_m, radar_map.nbytes
+    results.add(_line("map", repr(radar_map)), map=repr(radar_map))
+    results.add(_line("size", f"{size / 1e6:.1f} MB"), bytes=size)
+    results.add(_line("leaf cells", f"{cells} of {edge_m:g} m"), leaf_cells=cells, leaf_size_m=edge_m)
+    results.add(
+        _line("origin", "({:.2f}, {:.2f}, {:.2f}) m".format(*radar_map.origin)), origin=radar_map.origin
+    )
+    results.add(_line("ranges", "{:.1f} to {:.1f} m".format(*sensor.range_m)), range_m=sensor.range_m)
+    results.add(
+        _line("intensities", "none" if limits is None else "{:g} to {:g}".format(*limits)), intensities=limits
+    )
+    results.add(_line("rough returns", f"{radar_map.rough_share:.0%}"), rough_share=radar_map.rough_share)
+    if missing := radar_map.report.get("missing_tiles"):
+        results.add(_line("missing tiles", ", ".join(missing)), missing_tiles=missing)
+
+
+def _line(name: str, value: str) -> str:
+    return f"{name:<16}{value}"

@@ -8,6 +8,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from radarsdf.cli.map_in import add_map, load_map
 from radarsdf.cli.options import add_box, add_json, add_quiet, add_voxel, box_of, progress_of
 from radarsdf.cli.results import Results
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument("map", type=Path, help="the map that radarsdf fit wrote, .safetensors")
+    add_map(parser)
     parser.add_argument(
         "-o", "--out", type=Path, required=True, help="the mesh to write: .ply, .obj, .stl, .glb"
     )
@@ -66,14 +67,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Extract the mesh, write it, draw it."""
-    import radarsdf
     from radarsdf.io.files import check_outputs
     from radarsdf.io.meshes import check_mesh_path, write_mesh
     from radarsdf.render.picture import save_picture
 
     check_mesh_path(options.out)
     check_outputs([options.out, options.picture], [options.map])
-    radar_map = radarsdf.load(options.map)
+    radar_map = load_map(options.map)
     mesh = radar_map.mesh(
         options.voxel,
         box=box_of(options),

@@ -13,10 +13,6 @@ if TYPE_CHECKING:
     from radarsdf import FitConfig
 
 
-MAP_SUFFIX = ".safetensors"
-"""By which a map is known from a mesh."""
-
-
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that :func:`config_of` reads, and ``--quiet``."""
     add_config_options(parser)

@@ -8,6 +8,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from radarsdf.cli.map_in import add_map, load_map
 from radarsdf.cli.options import add_json
 from radarsdf.cli.results import Results
 
@@ -25,7 +26,7 @@ _MAX_PICTURES = 20
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument("map", type=Path, help="the map that radarsdf fit wrote, .safetensors")
+    add_map(parser)
     parser.add_argument(
         "--pose",
         nargs="+",
@@ -61,7 +62,6 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.cloud_writers import write_cloud
     from radarsdf.io.files import check_outputs
     from radarsdf.io.scans import write_scans
-    from radarsdf.map.radar_map import load
     from radarsdf.map.views import scans_of
     from radarsdf.render.view_picture import save_view_picture
 
@@ -77,10 +77,10 @@ def run(options: argparse.Namespace) -> None:
         msg = f"a picture holds at most {_MAX_PICTURES} poses, not {len(poses)}: write .npz"
         raise ValueError(msg)
     check_outputs([options.out], [options.map])
-    radar_map = load(options.map)
+    radar_map = load_map(options.map)
     rng = np.random.default_rng(options.seed)
     wanted = radar_map.sensor.returns_per_scan if options.returns is None else options.returns
-    cells = len(radar_map.evidence.looks)  # about as many as there are patches, which have one return at most
+    cells = radar_map.num_cells  # about as many as there are patches, which have one return at most
     check_views(None, returns=len(poses) * min(wanted, cells))
     views: Iterable[View] = (
         radar_map.render(pose, returns=options.returns, noise=options.noise, seed=rng) for pose in poses
@@ -97,11 +97,11 @@ def run(options: argparse.Namespace) -> None:
         write_cloud(options.out, scans)
     else:
         save_view_picture(options.out, list(views))
-    empty = f", {len(poses) - len(scans)} poses see nothing" if len(scans) < len(poses) else ""
+    empty = f", {len(poses) - len(scans)} of them without any" if len(scans) < len(poses) else ""
     results = Results(options)
     count = sum(map(len, scans.points))
     results.add(
-        f"{count} returns of {len(poses)} scans written to {options.out}{empty}",
+        f"{count} returns of {len(poses)} scan{'s' * (len(poses) > 1)} written to {options.out}{empty}",
         returns=count,
         scans=len(poses),
         scans_without_returns=len(poses) - len(scans),

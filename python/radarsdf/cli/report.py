@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from radarsdf.cli.map_in import add_map, load_map
 from radarsdf.cli.options import add_box, add_json, add_quiet, add_voxel, box_of, progress_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument("map", type=Path, help="the map that radarsdf fit wrote, .safetensors")
+    add_map(parser)
     add_scans(parser, required=False)
     parser.add_argument("-o", "--out", type=Path, required=True, help="the page to write, .html")
     parser.add_argument(
@@ -46,11 +47,10 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.cli.check import findings_of
     from radarsdf.evaluation import holdout
     from radarsdf.io.files import check_outputs
-    from radarsdf.map.radar_map import load
     from radarsdf.report.subject import Subject
 
     check_outputs([options.out], [options.map, *inputs_of(options)])
-    radar_map = load(options.map)
+    radar_map = load_map(options.map)
     scans = findings = held_out = None
     if options.scans is not None:
         scans = scans_of(options)
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
     results = Results(options)
     subject = Subject(
         radar_map,
-        options.map.name,
+        options.map.absolute().name,
         scans,
         held_out,
         findings,

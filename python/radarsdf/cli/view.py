@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from radarsdf.cli.map_in import add_map, load_map
 from radarsdf.cli.options import add_box, add_quiet, add_voxel, box_of, progress_of
 from radarsdf.cli.saying import say
 from radarsdf.cli.scans_in import add_scans, scans_of
@@ -14,7 +14,7 @@ from radarsdf.cli.scans_in import add_scans, scans_of
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument("map", type=Path, help="the map that radarsdf fit wrote, .safetensors")
+    add_map(parser)
     add_scans(parser, required=False)
     add_voxel(parser)
     add_box(parser)
@@ -49,10 +49,9 @@ def run(options: argparse.Namespace) -> None:
     require_viser()
     free_port(options.host, options.port or 0, exactly=True)
 
-    from radarsdf.map.radar_map import load
     from radarsdf.view.viewer import Viewer
 
-    radar_map = load(options.map)
+    radar_map = load_map(options.map)
     scans = None if options.scans is None else scans_of(options)
     with Viewer(
         radar_map,

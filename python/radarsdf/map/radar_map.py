@@ -43,7 +43,7 @@ class RadarMap:
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
-        return f"RadarMap({kind}, {len(self.evidence.looks)} cells, {self.nbytes / 1e6:.1f} MB)"
+        return f"RadarMap({kind}, {self.num_cells} cells, {self.nbytes / 1e6:.1f} MB)"
 
     def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
         return _from_pickle, storage.to_pickle(self._contents)
@@ -87,6 +87,11 @@ class RadarMap:
     def has_intensity(self) -> bool:
         """Whether intensities were given to the fit."""
         return self.intensity_scale is not None
+
+    @property
+    def num_cells(self) -> int:
+        """Number of leaf cells."""
+        return len(self.evidence.looks)
 
     @property
     def nbytes(self) -> int:

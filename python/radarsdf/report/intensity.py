@@ -12,6 +12,7 @@ from radarsdf.report import plots
 from radarsdf.report.page import Section, grid, image, note, paragraph, table
 from radarsdf.report.subject import Subject
 from radarsdf.returns.movers import rays_as_measured
+from radarsdf.tiles.any_map import predicted
 
 _Floats = NDArray[np.float64]
 
@@ -34,11 +35,12 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]
     rays = rays_as_measured(scans, config)
     total = len(rays)
     rays = rays.select(np.linspace(0, total - 1, min(total, _MOST_RETURNS)).astype(np.int64))
+    chosen = len(rays)
+    rays, found = predicted(radar_map, rays)
     (x, sensors), values = rays.in_world(), rays.intensities
     assert values is not None
     measured = values.astype(np.float64)
-    predicted = np.asarray(radar_map.intensity(x, sensors), np.float64)
-    metrics = intensity_metrics(predicted, measured)
+    metrics = intensity_metrics(found, measured)
     rows = [("This map", f"{metrics['mae']:.2f}", f"{metrics['medae']:.2f}")]
     if subject.held_out is not None and subject.scans is not None:
         known = rays_as_measured(subject.scans, config)
@@ -57,6 +59,8 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]
     known_angle = np.isfinite(angle_deg)
     farthest_m = float(np.percentile(rays.ranges_m, 99.5))
     count = f"all {total:,}" if len(rays) == total else f"{len(rays):,} of the {total:,}"
+    if chosen > len(rays):
+        which += f"; {chosen - len(rays):,} more are in no tile"
     honest = (
         ""
         if subject.held_out is not None
@@ -67,7 +71,7 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]
         table("", (f"error, {_UNIT}", "mean", "median"), rows),
         grid(
             image(
-                plots.measured_predicted(measured, predicted, _UNIT),
+                plots.measured_predicted(measured, found, _UNIT),
                 "Density of predicted over measured intensities.",
                 "Predicted over measured. On the line, both are equal.",
             ),
@@ -76,7 +80,7 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]
                     np.arange(0, 90 + _ANGLE_BIN_DEG, _ANGLE_BIN_DEG),
                     angle_deg[known_angle],
                     measured[known_angle],
-                    predicted[known_angle],
+                    found[known_angle],
                     label="angle of incidence, degrees",
                     unit=_UNIT,
                 ),
@@ -88,7 +92,7 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]
                     np.linspace(0, farthest_m, _RANGE_BINS + 1),
                     rays.ranges_m.astype(np.float64),
                     measured,
-                    predicted,
+                    found,
                     label="range, m",
                     unit=_UNIT,
                 ),

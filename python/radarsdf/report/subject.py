@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf.checking.finding import Finding
 from radarsdf.io.sequence import Scans
-from radarsdf.map.radar_map import RadarMap
+from radarsdf.tiles.any_map import AnyMap
 
 MOST_FACES = 300_000
 """Triangles in the 3D scene and the pictures. Of a larger mesh, one with larger voxels is shown."""
@@ -26,7 +26,7 @@ MOST_FACES = 300_000
 class Subject:
     """A map, and what is known besides it."""
 
-    radar_map: RadarMap
+    radar_map: AnyMap
     name: str
     """Of the map, for the heading."""
     scans: Scans | None = None

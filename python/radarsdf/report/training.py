@@ -22,6 +22,14 @@ _STEPS = {
     "start_s": "start values, evidence of the cells",
     "training_s": "training",
 }
+_COUNTS = {
+    "tiles": "Tiles",
+    "returns": "Returns",
+    "ghosts": "of these false, and left out of the surface",
+    "movers": "of these moving, and left out",
+    "leaf_cells": "Leaf cells",
+    "vertices": "Vertices of cells",
+}
 _LOSSES = {"sdf": "surface", "intensity": "intensity"}
 
 
@@ -42,9 +50,7 @@ def training_section(subject: Subject) -> Section:
             )
         )
     else:
-        body.append(
-            paragraph("No losses: nothing was trained, or the map comes from a version that kept none.")
-        )
+        body.append(paragraph("No losses: nothing was trained, or each tile has losses of its own."))
     took = [
         (words, f"{report[key]:.2f}\N{NO-BREAK SPACE}s") for key, words in _STEPS.items() if key in report
     ]
@@ -53,13 +59,9 @@ def training_section(subject: Subject) -> Section:
 
 
 def _counts(report: dict[str, Any]) -> list[tuple[str, str]]:
-    rows = []
-    if "returns" in report:
-        rows.append(("Returns", f"{report['returns']:,}"))
-        rows.append(("of these false, and left out of the surface", f"{report['ghosts']:,}"))
-        rows.append(("of these moving, and left out", f"{report.get('movers', 0):,}"))
-        rows.append(("Leaf cells", f"{report['leaf_cells']:,}"))
-        rows.append(("Vertices of cells", f"{report['vertices']:,}"))
+    rows = [(words, f"{report[key]:,}") for key, words in _COUNTS.items() if key in report]
+    if missing := report.get("missing_tiles"):
+        rows.append(("Tiles that are missing", ", ".join(missing)))
     for name, count in report.get("iterations_done", {}).items():
         wanted = report["iterations"][name]
         stopped = "" if count == wanted else f" of {wanted:,}"

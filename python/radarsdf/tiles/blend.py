@@ -22,6 +22,7 @@ from radarsdf.config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
+from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.plan import Plan, TilePlan, failure_path, map_path
@@ -151,6 +152,13 @@ class TileBlend:
                 self._held[tile] = contents, size
             self._held.move_to_end(tile)
             return self._held[tile][0]
+
+    def leaf_cells(self, of: Tile, within: Tile) -> NDArray[np.int64]:
+        """(C, 3) leaf cells, as the lattice numbers them, of the map of one tile that is done, which lie in another."""
+        keys = storage.load_leaf_keys(map_path(self.folder, self.plan.by_tile[of]))
+        cells = lattice_of(keys).astype(np.int64) + self.plan.origin_cells(of)
+        inside: NDArray[np.bool_] = (cells[:, :2] // self.plan.tile_cells == within).all(axis=1)
+        return cells[inside]
 
     def shares(self, world: _Floats) -> Iterator[Share]:
         """What each tile adds at positions (N, 3), world, m: in ascending order, on which the bits of sums depend."""

@@ -21,8 +21,6 @@ from radarsdf.config import FitConfig
 from radarsdf.io.files import write_whole
 from radarsdf.io.read import read
 from radarsdf.io.sequence import Scan, Scans
-from radarsdf.map.radar_map import RadarMap
-from radarsdf.map.radar_map import load as load_map
 from radarsdf.tiles.grid import TileGrid
 from radarsdf.tiles.plan import PLAN, Plan, failure_path
 from radarsdf.tiles.planning import InputDigest, make_plan
@@ -146,29 +144,6 @@ def run_fits(
         msg = f"all {len(failed)} tiles failed, the first: {failed[0]}"
         raise ValueError(msg)
     return TiledMap(root)
-
-
-def load(path: str | PathLike[str]) -> RadarMap | TiledMap:
-    """Reads a map: a file of :meth:`RadarMap.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
-
-    Parameters
-    ----------
-    path : path-like
-        Written by this version.
-
-    Returns
-    -------
-    RadarMap or TiledMap
-        Its results have the same bits as those of the map that was written.
-
-    Raises
-    ------
-    ValueError
-        If it is no radarsdf map, is damaged, or comes from another version.
-    OSError
-        If it cannot be read.
-    """
-    return TiledMap(path) if Path(path).is_dir() else load_map(path)
 
 
 def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> TileGrid:

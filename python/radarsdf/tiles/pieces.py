@@ -18,14 +18,13 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.io.files import write_whole
-from radarsdf.map import queries, storage
+from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import renumbered
-from radarsdf.returns.cells import lattice_of
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
-from radarsdf.tiles.plan import folder_of, map_path
+from radarsdf.tiles.plan import folder_of
 
 # As in one map: cells with all corners farther from the surface than this, in leaf cells, are left out.
 _CLEARLY = 0.25
@@ -165,15 +164,12 @@ def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
 def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
     """(C, 3) leaf cells of a tile, as the lattice numbers them: those of its map, and of others that count there."""
     plan = city.plan
-    edge = plan.tile_cells
     parts = []
     for other in neighbours(tile):
-        if not city.has(other):
-            continue
-        keys = storage.load_leaf_keys(map_path(city.folder, plan.by_tile[other]))
-        cells = lattice_of(keys).astype(np.int64) + plan.origin_cells(other)
-        cells = cells[(cells[:, :2] // edge == tile).all(axis=1)]
-        parts.append(cells[plan.grid.within_half_a_halo(other, plan.config.lattice.position(cells + 0.5))])
+        if city.has(other):
+            cells = city.leaf_cells(other, within=tile)
+            centres = plan.config.lattice.position(cells + 0.5)
+            parts.append(cells[plan.grid.within_half_a_halo(other, centres)])
     found: NDArray[np.int64] = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
     return found
 

@@ -129,11 +129,14 @@ class Plan:
         Raises
         ------
         ValueError
-            If it is damaged, or of another version.
+            If the folder has none, or it is damaged, or of another version.
         OSError
-            If there is none.
+            If it cannot be read.
         """
         path = folder / PLAN
+        if folder.is_dir() and not path.exists():
+            msg = f"{folder} is no map: a folder that radarsdf tiles wrote has a {PLAN}"
+            raise ValueError(msg)
         check_regular_file(path)
         try:
             described = json.loads(path.read_bytes())

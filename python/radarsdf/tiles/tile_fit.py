@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
@@ -69,8 +70,13 @@ def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
 def is_done(root: Path, plan: Plan, tile: TilePlan) -> bool:
     """Whether the map of a tile is there, and of this plan. Only the beginning of its file is read."""
     try:
-        with safe_open(map_path(root, tile), framework="np") as file:
-            description = json.loads((file.metadata() or {})["description"])
-        return bool(description["report"]["plan"] == plan.digest)
+        return bool(report_of(root, tile)["plan"] == plan.digest)
     except (OSError, SafetensorError, KeyError, TypeError, ValueError):
         return False
+
+
+def report_of(root: Path, tile: TilePlan) -> dict[str, Any]:
+    """The report of the fit of a tile that is done; see :attr:`RadarMap.report`. Nothing else is read."""
+    with safe_open(map_path(root, tile), framework="np") as file:
+        report: dict[str, Any] = json.loads((file.metadata() or {})["description"])["report"]
+    return report

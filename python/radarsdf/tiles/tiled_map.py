@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from radarsdf.checks import check_poses, real_array
 from radarsdf.map import queries
 from radarsdf.map.positions import as_positions
 from radarsdf.tiles.blend import Share, TileBlend
+from radarsdf.tiles.plan import map_path
+from radarsdf.tiles.tile_fit import report_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -60,6 +63,48 @@ class TiledMap(TileBlend):
 
     def __reduce__(self) -> tuple[Callable[..., TiledMap], tuple[Any, ...]]:
         return _opened, (str(self.folder), self.memory_bytes)
+
+    @property
+    def origin(self) -> _Floats:
+        """(3,) that of the tile in the middle, world, m, for those who need coordinates near zero."""
+        tiles = self.tiles
+        return self.config.lattice.position(tiles[len(tiles) // 2].origin_cells)
+
+    @cached_property
+    def report(self) -> dict[str, Any]:
+        """Counts, noise of the sensor, parts of the method that were skipped, and seconds, of all fits together.
+
+        `missing_tiles`: names.
+        """
+        reports = [report_of(self.folder, tile) for tile in self.tiles]
+        skipped: dict[str, list[float | None]] = {}
+        for report in reports:
+            for words, seconds in zip(report["skipped"], report["skipped_s"], strict=True):
+                skipped.setdefault(words, []).append(seconds)
+        return {
+            "tiles": len(reports),
+            "missing_tiles": list(self.missing),
+            "returns": sum(tile.returns for tile in self.plan.tiles),
+            "leaf_cells": self.num_cells,
+            "noise": reports[0]["noise"],
+            "skipped": list(skipped),
+            "skipped_s": [sum(filter(None, seconds)) or None for seconds in skipped.values()],
+            **{
+                step: sum(report[step] for report in reports)
+                for step, seconds in reports[0].items()
+                if step.endswith("_s") and isinstance(seconds, float)
+            },
+        }
+
+    @cached_property
+    def num_cells(self) -> int:
+        """Number of leaf cells, each of them in the tile that it lies in."""
+        return sum(len(self.leaf_cells(tile.tile, tile.tile)) for tile in self.tiles)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the files of the tiles, bytes."""
+        return sum(map_path(self.folder, tile).stat().st_size for tile in self.tiles)
 
     def sdf(self, x: Any) -> Any:
         """Signed distance, m; see :meth:`RadarMap.sdf`. NaN where there is no tile."""
@@ -179,17 +224,15 @@ class TiledMap(TileBlend):
         Raises
         ------
         ValueError
-            If the pose is not a rigid transform, a number is out of range, or there is no tile within the range.
+            If the pose is not a rigid transform, or a number is out of range.
         """
         from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
         from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - likewise
 
         pose = check_poses(np.asarray(real_array(T_world_sensor, "T_world_sensor"))[None], 1)[0]
         range_m = (self.sensor if sensor is None else sensor).range_m[1]
-        tiles = tiles_within(self, pose[:3, 3], range_m)
-        if not tiles:
-            msg = f"there is no tile within {range_m:.0f} m of the pose"
-            raise ValueError(msg)
+        # Of a pose far away from all tiles, any will do to see nothing.
+        tiles = tiles_within(self, pose[:3, 3], range_m) or [self.tiles[0].tile]
         held = self._viewed
         if held is None or held[0] != tiles:
             held = self._viewed = (

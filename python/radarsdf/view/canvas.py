@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.map.colors import NEUTRAL, intensity_colors
-from radarsdf.map.radar_map import RadarMap
+from radarsdf.tiles.any_map import AnyMap
 from radarsdf.view.glb import glb
 from radarsdf.view.painter import Wish
 from radarsdf.view.serving import wait_until_drawn
@@ -68,7 +68,7 @@ class SurfaceCanvas:
     def __init__(
         self,
         server: Any,
-        radar_map: RadarMap,
+        radar_map: AnyMap,
         surface: Surface,
         colors: Colors | None,
         walk: Walk | None,

@@ -15,7 +15,7 @@ from radarsdf.checks import whole_number
 from radarsdf.map.meshing import renumbered
 
 if TYPE_CHECKING:
-    from radarsdf.map.radar_map import RadarMap
+    from radarsdf.tiles.any_map import AnyMap
 
 _Floats = NDArray[np.float64]
 _Rows = NDArray[np.int64]
@@ -46,7 +46,7 @@ class Surface:
     @classmethod
     def of(
         cls,
-        radar_map: RadarMap,
+        radar_map: AnyMap,
         voxel_size: float,
         *,
         max_vertices: int,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.io.sequence import Scans
-from radarsdf.map.radar_map import RadarMap
+from radarsdf.tiles.any_map import AnyMap
 from radarsdf.view.canvas import DRAG_POINTS, Colors, SurfaceCanvas
 from radarsdf.view.controls import Controls
 from radarsdf.view.painter import HELD_S, SLID_S, Painter, Wish
@@ -41,7 +41,7 @@ class Viewer:
 
     Parameters
     ----------
-    radar_map : RadarMap
+    radar_map : RadarMap or TiledMap
         The map.
     scans : Scans, optional
         Scans with poses, to walk through. Their returns are kept in memory.
@@ -70,7 +70,7 @@ class Viewer:
 
     def __init__(
         self,
-        radar_map: RadarMap,
+        radar_map: AnyMap,
         scans: Scans | None = None,
         *,
         voxel_size: float = 0.1,

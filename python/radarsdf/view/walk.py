@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from radarsdf.io.sequence import Scan, Scans
 from radarsdf.map.colors import NEUTRAL
-from radarsdf.map.radar_map import RadarMap
+from radarsdf.tiles.any_map import AnyMap
 
 ALL_RETURNS = 200_000
 """Returns of all scans that are shown together at most."""
@@ -42,7 +42,7 @@ class Walk:
     def __init__(
         self,
         server: Any,
-        radar_map: RadarMap,
+        radar_map: AnyMap,
         scans: Scans,
         colors: Callable[[NDArray[Any]], NDArray[np.uint8]] | None,
         say: Callable[[str], None],
