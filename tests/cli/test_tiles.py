@@ -49,6 +49,18 @@ def test_step_by_step_gives_the_same_mesh(city, scans_file, tmp_path, capsys):
     assert values(capsys, "tiles", "status", out)["missing"] == {}
 
 
+def test_a_clean_folder(city, tmp_path, capsys):
+    out, ply = tmp_path / "city", tmp_path / "mesh.ply"
+    shutil.copytree(city, out)
+    freed = values(capsys, "tiles", "clean", out)["bytes"]
+    assert freed > 20 * 9000  # at least a ray for each return
+    assert not list(out.glob("tiles/*/rays.bin"))
+    assert values(capsys, "tiles", "status", out)["missing"] == {}
+    assert call("tiles", "fit", out, "--quiet") == 0
+    assert call("tiles", "mesh", out, "-o", ply, "--voxel", 0.2, "--quiet") == 0
+    assert ply.read_bytes() == (city / "mesh.ply").read_bytes()
+
+
 def test_a_tile_that_failed_is_named(city, tmp_path, capsys):
     out = tmp_path / "city"
     shutil.copytree(city, out)
@@ -69,6 +81,8 @@ def test_a_tile_that_failed_is_named(city, tmp_path, capsys):
         (["fit"], "takes one folder"),
         (["status", "nowhere"], "no such file or folder"),
         (["mesh", "nowhere"], "there is no folder"),
+        (["clean", "nowhere"], "no such file or folder"),
+        (["clean"], "takes one folder"),
         (["a.npz", "b.txt", "c", "-o", "city"], "give SCANS"),
         (["nowhere.npz", "-o", "city"], "does not exist"),
     ],

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from radarsdf.tiles.plan import Plan
 
-STEPS = ("plan", "fit", "mesh", "status")
+STEPS = ("plan", "fit", "mesh", "status", "clean")
 _FIRST_SCANS = 100  # that are checked before the work
 
 
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="[STEP] PATH",
         help=f"SCANS [POSES]: {SCANS}, and their poses; all steps are done. Or one step: plan SCANS [POSES], fit FOLDER, "
-        "mesh FOLDER, status FOLDER",
+        "mesh FOLDER, status FOLDER, clean FOLDER, which removes the rays of tiles that are done and pieces of meshes",
     )
     parser.add_argument(
         "-o",
@@ -81,6 +81,8 @@ def run(options: argparse.Namespace) -> int:
         _fit(options, results, folder)
     if step in (None, "mesh"):
         _mesh(options, results, folder, None if step is None else options.out)
+    if step == "clean":
+        _clean(results, folder)
     status = _status(results, folder, options.tile) if step in (None, "fit", "status") else 0
     results.end()
     return status
@@ -173,6 +175,13 @@ def _mesh(options: argparse.Namespace, results: Results, folder: Path, out: Path
         triangles=triangles,
         out=out,
     )
+
+
+def _clean(results: Results, folder: Path) -> None:
+    from radarsdf.tiles.tiled_map import TiledMap
+
+    freed = TiledMap(folder).clean()
+    results.add(f"{freed / 1e6:.1f} MB of rays and pieces of meshes removed from {folder}", bytes=freed)
 
 
 def _say_plan(results: Results, plan: Plan, folder: Path) -> None:

@@ -28,6 +28,7 @@ from radarsdf.tiles.plan import folder_of
 
 # As in one map: cells with all corners farther from the surface than this, in leaf cells, are left out.
 _CLEARLY = 0.25
+_FILES = "mesh-*.npz"
 _ON_LATTICE = 1e-4  # voxels: vertices are at least 1e-3 from the corners of their edges
 
 
@@ -89,7 +90,12 @@ def piece_path(city: TileBlend, tile: Tile, settings: PieceSettings) -> Path:
     """The file of a piece. The same settings of the same plan give the same file."""
     text = settings.to_json() + str([other for other in neighbours(tile) if city.has(other)])
     key = hashlib.blake2b((city.plan.digest + text).encode(), digest_size=8).hexdigest()
-    return folder_of(city.folder, city.plan.by_tile[tile]) / f"mesh-{key}.npz"
+    return folder_of(city.folder, city.plan.by_tile[tile]) / _FILES.replace("*", key)
+
+
+def pieces_in(folder: Path) -> list[Path]:
+    """The files of all pieces in the folder of a tile, of whatever settings."""
+    return list(folder.glob(_FILES))
 
 
 def mesh_tile(folder: str, name: str, settings: str, run: str = "") -> str:

@@ -49,7 +49,7 @@ class RayFiles:
     def flush(self) -> None:
         """Writes what is held."""
         for tile, parts in self._buffers.items():
-            path = _path(self._folder, f"{tile[0]}_{tile[1]}")
+            path = rays_path(self._folder, f"{tile[0]}_{tile[1]}")
             if tile not in self._begun:
                 path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("ab" if tile in self._begun else "wb") as file:
@@ -60,7 +60,7 @@ class RayFiles:
 
     def remove(self, tile: Tile) -> None:
         """Removes the file of a tile, and its folder if that is then empty."""
-        path = _path(self._folder, f"{tile[0]}_{tile[1]}")
+        path = rays_path(self._folder, f"{tile[0]}_{tile[1]}")
         path.unlink(missing_ok=True)
         if not any(path.parent.iterdir()):
             path.parent.rmdir()
@@ -77,11 +77,14 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
     Raises
     ------
     ValueError
-        If the file is not what the plan says.
+        If the file is gone, or is not what the plan says.
     OSError
         If it cannot be read.
     """
-    path = _path(folder, tile.name)
+    path = rays_path(folder, tile.name)
+    if not path.exists():
+        msg = f"{path} is gone, as after radarsdf tiles clean: fit the scans again in a new folder"
+        raise ValueError(msg)
     rows = np.fromfile(path, _RECORD)
     if len(rows) != tile.rays or path.stat().st_size != tile.rays * _RECORD.itemsize:
         msg = f"{path} has {len(rows)} rays instead of {tile.rays}: make the plan again"
@@ -111,5 +114,6 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
     return rays, inside
 
 
-def _path(folder: Path, name: str) -> Path:
+def rays_path(folder: Path, name: str) -> Path:
+    """The rays of the tile of this name."""
     return folder / "tiles" / name / "rays.bin"

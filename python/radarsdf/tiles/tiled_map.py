@@ -16,10 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from radarsdf.checks import check_poses, real_array
-from radarsdf.map import queries
+from radarsdf.map import queries, storage
 from radarsdf.map.positions import as_positions
 from radarsdf.tiles.blend import Share, TileBlend
 from radarsdf.tiles.plan import map_path
+from radarsdf.tiles.ray_files import rays_path
 from radarsdf.tiles.tile_fit import report_of
 
 if TYPE_CHECKING:
@@ -267,6 +268,35 @@ class TiledMap(TileBlend):
         from radarsdf.tiles.meshing import export_mesh  # noqa: PLC0415 - as above
 
         return export_mesh(self, path, voxel_size, min_component_triangles, executor, progress, **limits)
+
+    def clean(self) -> int:
+        """Removes the rays of the tiles that are done, which only their fits need, and the pieces of meshes.
+
+        Without its rays, a tile cannot be fitted again, so its map is read whole before. A mesh makes its pieces again.
+        No other step may run on the folder meanwhile.
+
+        Returns
+        -------
+        int
+            Bytes that are free now.
+
+        Raises
+        ------
+        ValueError
+            If a map is damaged, or of another version. Its rays are kept.
+        OSError
+            If a file cannot be read or removed.
+        """
+        from radarsdf.tiles.pieces import pieces_in  # noqa: PLC0415 - as above
+
+        freed = 0
+        for tile in self.tiles:
+            storage.load_contents(map_path(self.folder, tile))
+            rays = rays_path(self.folder, tile.name)
+            for path in [*pieces_in(rays.parent), *([rays] if rays.exists() else [])]:
+                freed += path.stat().st_size
+                path.unlink()
+        return freed
 
 
 def _distance(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:
