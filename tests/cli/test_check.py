@@ -32,7 +32,7 @@ def test_good_scans_have_notes_and_a_next_command(folder, capsys):
     *findings, following = capsys.readouterr().out.splitlines()
     assert findings
     assert all(line.startswith("note: ") for line in findings)
-    assert following == f"next: radarsdf fit {folder / 'good.npz'} -o {folder / 'good.safetensors'}"
+    assert following == f"next: radarsdf fit {folder / 'good.npz'} -o good.safetensors"
 
 
 def test_an_error_is_the_first_line_and_the_status(folder, capsys):

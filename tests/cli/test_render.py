@@ -27,10 +27,12 @@ def test_scans_of_several_poses(map_file, tmp_path, capsys):
     assert scans.intensities is not None
 
 
-def test_points_and_a_picture(map_file, tmp_path):
+def test_points_and_a_picture(map_file, tmp_path, capsys):
     ply, png = tmp_path / "view.ply", tmp_path / "view.png"
+    capsys.readouterr()
     assert call("render", map_file, *POSE, "-o", ply, "--returns", 40, "--noise", "--seed", 3) == 0
     cloud = trimesh.load(ply)
+    assert capsys.readouterr().out == f"{len(cloud.vertices)} returns of 1 scan written to {ply}\n"
     assert 0 < len(cloud.vertices) <= 40
     assert call("render", map_file, *POSE, "-o", png) == 0
     assert png.read_bytes().startswith(b"\x89PNG")

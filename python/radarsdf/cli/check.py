@@ -5,9 +5,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from radarsdf.cli.map_in import MAP_SUFFIX
 from radarsdf.cli.options import add_config_options, add_json, config_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
@@ -34,7 +37,8 @@ def run(options: argparse.Namespace) -> int:
     config = config_of(options)
     findings = findings_of(scans_of(options), config)
     failed = any(finding.severity == "error" for finding in findings)
-    target = shlex.quote(str(options.scans.with_suffix(".safetensors")))
+    # Here, and not beside the data: those may be on a disk that nobody should write to.
+    target = shlex.quote(Path(os.path.abspath(options.scans)).stem + MAP_SUFFIX)  # noqa: PTH100 - links keep their names
     words = words_of(options)
     following = f"radarsdf check {words}" if failed else f"radarsdf fit {words} -o {target}"
     results = Results(options)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from radarsdf.cli.options import add_json, add_quiet, progress_of
-from radarsdf.cli.results import Results
+from radarsdf.cli.results import Results, counted
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def _convert_scans(options: argparse.Namespace, results: Results) -> None:
 
 def _say(results: Results, scans: Scans, returns: int, path: Path) -> None:
     results.add(
-        f"{returns} returns of {len(scans)} scans written to {path}",
+        f"{returns} returns of {counted(len(scans), 'scan')} written to {path}",
         returns=returns,
         scans=len(scans),
         out=path,

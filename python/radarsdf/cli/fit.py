@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from radarsdf.cli.map_in import MAP_SUFFIX
 from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
-from radarsdf.cli.results import Results
+from radarsdf.cli.results import Results, counted
 from radarsdf.cli.saying import complain
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
 
@@ -144,7 +144,7 @@ def _say(results: Results, radar_map: RadarMap, scans: int, seconds: float, out:
     left_out["are out of range"] = returns - used - movers - ghosts
     parts = [f"{count} {why}" for why, count in left_out.items() if count]
     results.add(
-        f"{used} of {returns} returns in {scans} scans make the surface"
+        f"{used} of {returns} returns in {counted(scans, 'scan')} make the surface"
         + "".join(f", {part}" for part in parts),
         scans=scans,
         **{name: report[name] for name in ("returns", "returns_used", "movers", "ghosts")},

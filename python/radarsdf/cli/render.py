@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from radarsdf.cli.map_in import add_map, load_map
 from radarsdf.cli.options import add_json
-from radarsdf.cli.results import Results
+from radarsdf.cli.results import Results, counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -101,7 +101,7 @@ def run(options: argparse.Namespace) -> None:
     results = Results(options)
     count = sum(map(len, scans.points))
     results.add(
-        f"{count} returns of {len(poses)} scan{'s' * (len(poses) > 1)} written to {options.out}{empty}",
+        f"{count} returns of {counted(len(poses), 'scan')} written to {options.out}{empty}",
         returns=count,
         scans=len(poses),
         scans_without_returns=len(poses) - len(scans),

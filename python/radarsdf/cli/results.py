@@ -38,6 +38,11 @@ class Results:
             say(json.dumps(_plain(self._values), indent=2, allow_nan=False))
 
 
+def counted(count: int, what: str) -> str:
+    """Such as "1 scan" or "2 scans"."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
 def _plain(value: Any) -> Any:
     """The same in types that JSON has."""
     if hasattr(value, "tolist"):  # an array or a number of NumPy
