@@ -9,7 +9,8 @@ import pytest
 import trimesh
 from radarsdf.view.glb import glb
 from radarsdf.view.picking import first_hit
-from radarsdf.view.surface import Surface, spread_evenly
+from radarsdf.view.surface import Surface
+from radarsdf.view.thinning import spread_evenly, thinned
 from scipy.spatial import cKDTree
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
@@ -18,12 +19,30 @@ TWO = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
 
 def test_a_surface_has_no_more_vertices_than_allowed(sharp_map):
     full = Surface.of(sharp_map, 0.1, max_vertices=10**9, progress=False)
-    assert full.voxel_size_m == 0.1
+    assert full.spacing_m == 0.1
     most = len(full.vertices) // 3
     thin = Surface.of(sharp_map, 0.1, max_vertices=most, progress=False)
     assert most / 2 < len(thin.vertices) <= most
-    assert thin.voxel_size_m > 0.1
+    assert thin.spacing_m > 0.1
     np.testing.assert_allclose(np.ptp(thin.vertices, axis=0), np.ptp(full.vertices, axis=0), atol=0.5)
+
+
+def test_a_thinned_mesh_is_the_same_surface_with_the_same_attributes(sharp_map):
+    full = sharp_map.mesh(0.1, viewpoint=[1, 0, 1.5], progress=False)
+    thin, spacing_m = thinned(full, len(full.vertices) // 4, 0.1)
+    assert len(full.vertices) / 8 < len(thin.vertices) <= len(full.vertices) / 4
+    distance_m, row = cKDTree(full.vertices).query(thin.vertices)
+    assert (distance_m == 0).all()
+    for name in ("confidence", "uncertainty_m", "intensity"):
+        np.testing.assert_array_equal(thin.vertex_attributes[name], full.vertex_attributes[name][row])
+    assert set(np.unique(thin.faces)) == set(range(len(thin.vertices)))
+    assert (np.sort(thin.faces, axis=1)[:, 1:] != np.sort(thin.faces, axis=1)[:, :-1]).all()
+    assert thin.area == pytest.approx(full.area, rel=0.15)
+    # No hole: the surface is nowhere farther than a cube. And it faces the same way.
+    samples, _ = trimesh.sample.sample_surface(thin, 50_000, seed=0)
+    assert cKDTree(samples).query(full.vertices)[0].max() < 2 * spacing_m
+    assert (thin.vertex_normals * full.vertex_normals[row]).sum(axis=1).mean() > 0.8
+    assert thinned(full, len(full.vertices), 0.1)[0] is full
 
 
 def test_a_map_without_a_surface_here(sharp_map):
@@ -52,12 +71,14 @@ def test_points_are_spread_evenly():
     points = np.zeros((20_000, 3))
     points[:, :2] = rng.uniform(0, 10, (20_000, 2))
     points[:15_000, :2] *= 0.1  # most of them in a corner
-    rows, edge_m = spread_evenly(points, 1000, 0.05)
+    rows, of_point, edge_m = spread_evenly(points, 1000, 0.05)
     assert 500 < len(rows) <= 1000
     assert len(set(rows)) == len(rows)
     gaps = cKDTree(points[rows]).query(points)[0]
     assert gaps.max() < 1.8 * edge_m  # within the diagonal of a cube: no place is left out
-    everything, edge_m = spread_evenly(points, len(points), 0.05)
+    away_m = np.linalg.norm(points - points[rows[of_point]], axis=1)
+    assert away_m.max() < 1.8 * edge_m
+    everything, _, edge_m = spread_evenly(points, len(points), 0.05)
     assert (everything == np.arange(len(points))).all()
     assert edge_m == 0.05
 

@@ -37,6 +37,7 @@ _PER_OCTREE_ROW = 30.0  # freed when the rows are numbered
 _COPIES = 4  # of each parameter that learns: value, two moments of Adam, last finite value
 _PER_ROW = 8.0  # if only the touched rows move: marks of Adam
 _PER_VOXEL = 220.0
+_PER_TRIANGLE = 320.0  # of a welded mesh and its normals: measured on hugin in tiles
 # Of a view of a map: peaks of maps of 1e5 to 2e5 leaf cells.
 _PER_CELL_TRACED = 300.0  # the surface that rays meet, made once for a map
 _PER_PATCH_SEEN = 100.0
@@ -215,6 +216,17 @@ def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> 
         msg = (
             f"voxels of {voxel_size} m would take about {voxels * _PER_VOXEL / 1e9:.2f} GB, of "
             f"{available / 1e9:.2f}: use larger ones"
+        )
+        raise MemoryError(msg)
+
+
+def check_triangles(count: int, max_memory_bytes: int | None) -> None:
+    """Raises a MemoryError if the mesh of a map in tiles has more triangles than memory holds."""
+    available = available_bytes() if max_memory_bytes is None else max_memory_bytes
+    if available is not None and count * _PER_TRIANGLE > available:
+        msg = (
+            f"a mesh of {count} triangles would take about {count * _PER_TRIANGLE / 1e9:.2f} GB, of "
+            f"{available / 1e9:.2f}: take a part, by a box, or write it tile by tile (radarsdf tiles mesh)"
         )
         raise MemoryError(msg)
 

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=500_000,
         metavar="N",
-        help="take larger voxels if the mesh would have more than N vertices; default: 500000",
+        help="thin the mesh if it has more than N vertices; default: 500000",
     )
     parser.add_argument(
         "--host",

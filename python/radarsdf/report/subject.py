@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,9 +16,10 @@ from scipy.spatial import cKDTree
 from radarsdf.checking.finding import Finding
 from radarsdf.io.sequence import Scans
 from radarsdf.tiles.any_map import AnyMap
+from radarsdf.view.thinning import thinned
 
-MOST_FACES = 300_000
-"""Triangles in the 3D scene and the pictures. Of a larger mesh, one with larger voxels is shown."""
+MOST_VERTICES = 160_000
+"""In the 3D scene and the pictures. A larger mesh is thinned for them."""
 
 
 @dataclass(frozen=True)
@@ -52,22 +52,15 @@ class Subject:
     @cached_property
     def mesh(self) -> Any:
         """The mesh that is measured, with intensities if the map has any."""
-        return self._mesh(self.voxel_size_m)
+        viewpoint = self.viewpoint if self.radar_map.has_intensity else None
+        return self.radar_map.mesh(
+            self.voxel_size_m, box=self.box, viewpoint=viewpoint, progress=self.progress
+        )
 
     @cached_property
     def shown(self) -> tuple[Any, float]:
-        """The mesh that is shown, and the edge of its voxels, m."""
-        mesh, voxel_size_m = self.mesh, self.voxel_size_m
-        while len(mesh.faces) > MOST_FACES:
-            voxel_size_m *= 1.05 * math.sqrt(
-                len(mesh.faces) / MOST_FACES
-            )  # triangles are as many as area / edge²
-            mesh = self._mesh(voxel_size_m)
-        return mesh, voxel_size_m
-
-    def _mesh(self, voxel_size_m: float) -> Any:
-        viewpoint = self.viewpoint if self.radar_map.has_intensity else None
-        return self.radar_map.mesh(voxel_size_m, box=self.box, viewpoint=viewpoint, progress=self.progress)
+        """The mesh that is shown, and how far apart its vertices are, m."""
+        return thinned(self.mesh, MOST_VERTICES, self.voxel_size_m)
 
     @cached_property
     def ground_truth(self) -> NDArray[np.float64] | None:

@@ -28,7 +28,7 @@ _SIDES = {
 
 def surface_section(subject: Subject) -> Section:
     """The surface that is shown, coloured by intensity if the map has any."""
-    mesh, voxel_size_m = subject.shown
+    mesh, spacing_m = subject.shown
     anchor, title = "surface", "Surface"
     if len(mesh.faces) == 0:
         return Section(anchor, title, [paragraph("The map has no surface here.")])
@@ -57,10 +57,10 @@ def surface_section(subject: Subject) -> Section:
         ),
         paragraph(f"The surface is {painted}. Frame: world, with z up."),
     ]
-    if voxel_size_m != subject.voxel_size_m:
+    if spacing_m != subject.voxel_size_m:
         body.append(
             note(
-                f"Shown are {len(mesh.faces):,} triangles, made with voxels of {voxel_size_m:.3g} m. With the voxels of "
+                f"Shown are {len(mesh.faces):,} triangles, with corners about {spacing_m:.3g} m apart. With the voxels of "
                 f"{subject.voxel_size_m:g} m that all numbers of this page are of, there are "
                 f"{len(subject.mesh.faces):,}: too many for a page that opens fast."
             )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from radarsdf.budget.estimate import check_triangles
 from radarsdf.checks import positive, whole_number
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import whole_file
@@ -38,6 +39,7 @@ def mesh_of(
 ) -> trimesh.Trimesh:
     """See :meth:`TiledMap.mesh`."""
     welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
+    check_triangles(welded.num_faces, city.config.max_memory_bytes)
     parts = list(welded.parts())
     mesh = trimesh.Trimesh(
         np.concatenate([part.vertices for part in parts]),

@@ -20,7 +20,8 @@ from radarsdf.tiles.any_map import AnyMap
 from radarsdf.view.glb import glb
 from radarsdf.view.painter import Wish
 from radarsdf.view.serving import wait_until_drawn
-from radarsdf.view.surface import Surface, spread_evenly
+from radarsdf.view.surface import Surface
+from radarsdf.view.thinning import spread_evenly
 from radarsdf.view.walk import Walk
 
 DRAG_POINTS = 30_000
@@ -77,7 +78,7 @@ class SurfaceCanvas:
         self._server, self._map, self._surface, self._colors = server, radar_map, surface, colors
         self._walk, self._shown = walk, shown
         self._local = (surface.vertices - radar_map.origin).astype(np.float32)
-        self._spread, edge_m = spread_evenly(surface.vertices, DRAG_POINTS, surface.voxel_size_m)
+        self._spread, _, edge_m = spread_evenly(surface.vertices, DRAG_POINTS, surface.spacing_m)
         self._rows = self._spread
         self._limits: tuple[float, float] | None = None  # of what is in the cloud
         self._meshes: list[Any] = []  # the newest is last; others are removed when the page has drawn that

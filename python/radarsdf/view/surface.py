@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import whole_number
 from radarsdf.map.meshing import renumbered
+from radarsdf.view.thinning import thinned
 
 if TYPE_CHECKING:
     from radarsdf.tiles.any_map import AnyMap
@@ -21,7 +21,6 @@ _Floats = NDArray[np.float64]
 _Rows = NDArray[np.int64]
 
 _FEWEST = 1000  # vertices: less is not worth a look
-_COARSER = 1.1  # a step towards fewer points
 _TO_LIGHT = (-0.35, -0.5, 0.79)
 _SHADE = 0.6  # brightness where the light does not come: colours must still tell the intensity
 
@@ -40,8 +39,8 @@ class Surface:
     """(V,) see `RadarMap.confidence`."""
     brightness: NDArray[np.float32]
     """(V,) how bright the surface is to be drawn, 0 to 1, so that its shape is seen."""
-    voxel_size_m: float
-    """Edge of the voxels that it was made with."""
+    spacing_m: float
+    """How far apart vertices are: the edge of the voxels, or more if the mesh was thinned."""
 
     @classmethod
     def of(
@@ -53,7 +52,7 @@ class Surface:
         box: ArrayLike | None = None,
         progress: bool | None = None,
     ) -> Surface:
-        """Mesh a map, with larger voxels than asked for if there would be more than `max_vertices`.
+        """Mesh a map, and thin the mesh if it has more than `max_vertices`.
 
         Raises
         ------
@@ -61,13 +60,9 @@ class Surface:
             If there is no surface, or as `RadarMap.mesh`.
         """
         whole_number(max_vertices, "max_vertices", _FEWEST)
-        while True:
-            mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress)
-            count = len(mesh.vertices)
-            if count <= max_vertices:
-                break
-            voxel_size *= _COARSER * math.sqrt(count / max_vertices)  # vertices are as many as area / edge²
-        if count == 0:
+        mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress)
+        mesh, edge_m = thinned(mesh, max_vertices, voxel_size)
+        if len(mesh.vertices) == 0:
             msg = "the map has no surface here"
             raise ValueError(msg)
         attributes = mesh.vertex_attributes
@@ -77,7 +72,7 @@ class Surface:
             np.asarray(attributes["uncertainty_m"], np.float32),
             np.asarray(attributes["confidence"], np.float32),
             _brightness(np.asarray(mesh.vertex_normals, np.float64)),
-            voxel_size,
+            edge_m,
         )
 
     def kept(self, max_uncertainty_m: float, min_confidence: float) -> NDArray[np.bool_]:
@@ -93,22 +88,3 @@ class Surface:
 def _brightness(normals: _Floats) -> NDArray[np.float32]:
     light: NDArray[np.float64] = np.clip(normals @ np.array(_TO_LIGHT), 0.0, 1.0)
     return (_SHADE + (1 - _SHADE) * light).astype(np.float32)
-
-
-def spread_evenly(points: _Floats, count: int, edge_m: float) -> tuple[_Rows, float]:
-    """Rows of at most `count` of N points (N, 3), m: one of each cube of a grid; and the edge of the cubes, m.
-
-    `edge_m`: distance of neighbouring points, where the search begins. All points if there are no more than `count`.
-    """
-    rows = np.arange(len(points))
-    if len(points) <= count:
-        return rows, edge_m
-    edge_m *= math.sqrt(len(points) / count)
-    while len(rows) > count:
-        cells = np.floor((points - points.min(axis=0)) / edge_m).astype(np.int64)
-        shape = cells.max(axis=0) + 1
-        rows = np.unique((cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2], return_index=True)[
-            1
-        ]
-        edge_m *= _COARSER
-    return rows, edge_m / _COARSER

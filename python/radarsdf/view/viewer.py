@@ -50,7 +50,7 @@ class Viewer:
     box : (2, 3) array_like, optional
         Lower and upper corner of the part to be shown, world, m.
     max_vertices : int
-        A mesh of more vertices is made with larger voxels.
+        A mesh of more vertices is thinned.
     host : str
         Address to listen on. Others than those of this machine alone let everyone in who can reach it.
     port : int, optional
@@ -193,7 +193,7 @@ class Viewer:
             return
         self._clicked = point + self._map.origin
         self._server.scene.add_icosphere(
-            _CLICKED, 1.5 * self.surface.voxel_size_m, (214, 39, 40), position=tuple(point)
+            _CLICKED, 1.5 * self.surface.spacing_m, (214, 39, 40), position=tuple(point)
         )
         self._describe(self._painter.newest)
 
@@ -215,10 +215,10 @@ class Viewer:
 
     def _notes(self, voxel_size: float) -> list[str]:
         notes = []
-        if self.surface.voxel_size_m > voxel_size:
+        if self.surface.spacing_m > voxel_size:
             notes.append(
-                f"the mesh has voxels of {self.surface.voxel_size_m:.2g} m, not {voxel_size:g} m, and so "
-                f"{len(self.surface.vertices)} vertices: --max-vertices allows more"
+                f"the mesh is thinned to {len(self.surface.vertices)} vertices, {self.surface.spacing_m:.2g} m apart: "
+                "--max-vertices allows more, --box shows a part"
             )
         if self._walk is not None and self._walk.every > 1:
             notes.append(f"of all returns together, one in {self._walk.every} is shown")
