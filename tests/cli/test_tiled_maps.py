@@ -163,3 +163,27 @@ def test_folders_that_are_no_map(city, tmp_path, capsys, command):
 def test_voxels_that_tiles_cannot_have(city, tmp_path, capsys):
     said = refusal(capsys, tmp_path, "mesh", city, "-o", tmp_path / "x.ply", "--voxel", 0.15)
     assert "use 0.1 or 0.2" in said
+
+
+@pytest.mark.parametrize("command", ["mesh", "view", "render"])
+def test_a_tile_that_is_damaged_is_named(city, tmp_path, capsys, command):
+    if command == "view":
+        pytest.importorskip("viser", reason="the extra view is not installed")
+    out = tmp_path / "city"
+    shutil.copytree(city, out, ignore=shutil.ignore_patterns("mesh-*"))
+    path = max(out.glob("tiles/*/map.safetensors"), key=lambda path: path.stat().st_size)
+    data = bytearray(path.read_bytes())
+    tenth = len(data) // 10
+    data[-tenth:] = b"\xff" * tenth  # its beginning is whole, so it counts as done
+    path.write_bytes(data)
+    more = {
+        "mesh": ["-o", tmp_path / "x.ply"],
+        "view": ["--no-open"],
+        "render": [*POSE, "-o", tmp_path / "x.npz"],
+    }
+    capsys.readouterr()
+    assert call(command, out, *more[command], *(VOXEL if command != "render" else [])) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"radarsdf {command}: ")
+    assert f"{path} is not a whole radarsdf map" in said
+    assert said.count("\n") == 1

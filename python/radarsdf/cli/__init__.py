@@ -31,7 +31,7 @@ COMMANDS = {
     "eval": "print the errors of a mesh or a map",
     "convert": "write scans as one file or one point cloud, or a mesh in another format",
     "config": "print every setting of a fit with its meaning, as a file for --config",
-    "info": "print versions, compiler, instruction set and threads, for bug reports",
+    "info": "print versions, compiler, instruction set and threads, for bug reports, and what a map holds",
     "completion": "print what bash, zsh or fish need to complete commands and options",
 }
 """Name of each command, which is also the name of its module, and its help in one line."""

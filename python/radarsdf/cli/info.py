@@ -26,11 +26,12 @@ def run(options: argparse.Namespace) -> None:
     """Print one line for each part."""
     from radarsdf.versions import versions
 
+    radar_map = None if options.map is None else load_map(options.map)
     results = Results(options)
     for name, value in versions().items():
         results.add(_line(name, value), **{name.replace(" ", "_"): value})
-    if options.map is not None:
-        _add_map(results, load_map(options.map))
+    if radar_map is not None:
+        _add_map(results, radar_map)
     results.end()
 
 

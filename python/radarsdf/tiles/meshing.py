@@ -117,5 +117,5 @@ def _welded(
     if failed:
         names = ", ".join(f"{tiles[i].name}: {reason}" for i, reason in failed.items())
         msg = f"{len(failed)} of {len(city.tiles)} tiles could not be meshed: {names!s:.400}"
-        raise RuntimeError(msg)
+        raise ValueError(msg)
     return WeldedMesh([piece_path(city, tile.tile, settings) for tile in city.tiles], min_component_triangles)
