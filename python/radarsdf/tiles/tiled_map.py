@@ -78,10 +78,10 @@ class TiledMap(TileBlend):
         `missing_tiles`: names.
         """
         reports = [report_of(self.folder, tile) for tile in self.tiles]
-        skipped: dict[str, list[float | None]] = {}
+        skipped: dict[str, float | None] = {}
         for report in reports:
             for words, seconds in zip(report["skipped"], report["skipped_s"], strict=True):
-                skipped.setdefault(words, []).append(seconds)
+                skipped[words] = None if seconds is None else (skipped.get(words) or 0.0) + seconds
         return {
             "tiles": len(reports),
             "missing_tiles": list(self.missing),
@@ -89,7 +89,7 @@ class TiledMap(TileBlend):
             "leaf_cells": self.num_cells,
             "noise": reports[0]["noise"],
             "skipped": list(skipped),
-            "skipped_s": [sum(filter(None, seconds)) or None for seconds in skipped.values()],
+            "skipped_s": list(skipped.values()),
             **{
                 step: sum(report[step] for report in reports)
                 for step, seconds in reports[0].items()
