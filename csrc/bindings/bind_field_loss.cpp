@@ -98,17 +98,17 @@ LossBatch<T> points_of(const Array<T>& points, const Array<T>& sdf_m) {
 
 template <typename T>
 LossBatch<T> rays_of(const FieldLoss<T>& loss, const Array<T>& points, const Array<T>& sdf_m, const Rows<T>& rays,
-                     std::int64_t num_near, const std::vector<Bytes>& dropout) {
+                     std::int64_t num_labelled, const std::vector<Bytes>& dropout) {
   LossBatch<T> batch = points_of(points, sdf_m);
   check_shape(rays, batch.count, kRayColumns, "rays");
   batch.rays = rays.data();
   batch.ray_stride = row_stride(rays, "rays");
-  if (num_near < 0 || num_near > batch.count) throw std::invalid_argument("num_near must be of the batch");
-  batch.num_near = num_near;
+  if (num_labelled < 0 || num_labelled > batch.count) throw std::invalid_argument("num_labelled must be of the batch");
+  batch.num_labelled = num_labelled;
   const std::int64_t columns[] = {loss.parameters().cells(), loss.parameters().waves()};
   if (dropout.size() > 2) throw std::invalid_argument("only the two encodings can have a dropout");
   for (std::size_t i = 0; i < dropout.size(); ++i) {
-    check_shape(dropout[i].first, loss.num_seen(batch.count, num_near), columns[i], "dropout");
+    check_shape(dropout[i].first, loss.num_seen(batch.count, num_labelled), columns[i], "dropout");
     if (dropout[i].second < 1) throw std::invalid_argument("a dropout must keep something");
     batch.dropout[i] = {dropout[i].first.data(), dropout[i].second};
   }
@@ -158,31 +158,32 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
   cls.def(
       "joint",
       [](const AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Rows<T>& rays,
-         std::int64_t num_near, const std::vector<Bytes>& dropout, const std::pair<double, double>& weights,
+         std::int64_t num_labelled, const std::vector<Bytes>& dropout, const std::pair<double, double>& weights,
          Array<std::int32_t>& located, Array<T>& interpolated_grad) {
         const FieldLoss<T>& loss = self.of<T>().loss();
-        const LossBatch<T> batch = rays_of(loss, points, sdf_m, rays, num_near, dropout);
+        const LossBatch<T> batch = rays_of(loss, points, sdf_m, rays, num_labelled, dropout);
         const FeatureGradients<T> gradients = by_features(loss, batch.count, located, interpolated_grad);
         const py::gil_scoped_release release;
         const FieldLosses losses = loss.joint(batch, {weights.first, weights.second}, gradients);
         return std::pair(losses.sdf, losses.intensity);
       },
-      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_near"_a, "dropout"_a, "weights"_a,
+      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_labelled"_a, "dropout"_a, "weights"_a,
       "located"_a.noconvert(), "interpolated_grad"_a.noconvert(),
       "Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. "
-      "`rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two "
+      "`rays` (N, 8) are the samples' rays; the intensities of the first `num_labelled` are labels. `dropout` has up "
+      "to two "
       "pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of "
       "cells and positions.");
   cls.def(
       "intensity",
       [](const AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Rows<T>& rays,
-         std::int64_t num_near, const std::vector<Bytes>& dropout, double weight) {
+         std::int64_t num_labelled, const std::vector<Bytes>& dropout, double weight) {
         const FieldLoss<T>& loss = self.of<T>().loss();
-        const LossBatch<T> batch = rays_of(loss, points, sdf_m, rays, num_near, dropout);
+        const LossBatch<T> batch = rays_of(loss, points, sdf_m, rays, num_labelled, dropout);
         const py::gil_scoped_release release;
         return loss.intensity(batch, weight);
       },
-      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_near"_a, "dropout"_a, "weight"_a,
+      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_labelled"_a, "dropout"_a, "weight"_a,
       "Like `joint`, of the intensities alone while the SDF network and the features are frozen: writes to "
       "`intensity_gradients` only.");
 }

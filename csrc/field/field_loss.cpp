@@ -165,7 +165,7 @@ class Pass {
     double sum = 0;
     for (std::int64_t i = 0; i < count; ++i) {
       // No return is expected from free space (3QFPI).
-      const T label = i < batch_.num_near ? batch_.rays[i * batch_.ray_stride + kRayIntensity] : T(0);
+      const T label = i < batch_.num_labelled ? batch_.rays[i * batch_.ray_stride + kRayIntensity] : T(0);
       const T error = predicted[i] - label;
       sum += static_cast<double>(std::abs(error));
       predicted[i] = error > 0 ? share : error < 0 ? -share : T(0);
@@ -283,7 +283,7 @@ FieldLosses FieldLoss<T>::joint(const LossBatch<T>& batch, FieldLosses weights,
                                 const FeatureGradients<T>& by_features) const {
   check_intensity();
   const Request<T> request{weights, &gradients_.sdf, &gradients_.intensity, by_features};
-  return Pass<T>(parameters_, options_, batch, request, num_seen(batch.count, batch.num_near)).run();
+  return Pass<T>(parameters_, options_, batch, request, num_seen(batch.count, batch.num_labelled)).run();
 }
 
 template <typename T>
@@ -291,7 +291,7 @@ double FieldLoss<T>::intensity(const LossBatch<T>& batch, double weight) const {
   check_intensity();
   const auto located = large_array<std::int32_t>(batch.count * parameters_.table->num_levels());
   const Request<T> request{{0, weight}, nullptr, &gradients_.intensity, {located.get(), nullptr}};
-  return Pass<T>(parameters_, options_, batch, request, num_seen(batch.count, batch.num_near)).run().intensity;
+  return Pass<T>(parameters_, options_, batch, request, num_seen(batch.count, batch.num_labelled)).run().intensity;
 }
 
 template class FieldLoss<float>;

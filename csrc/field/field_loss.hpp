@@ -76,8 +76,8 @@ struct LossBatch {
   std::int64_t count;
   const T* rays = nullptr;  // (count, kRayColumns), rows ray_stride apart
   std::int64_t ray_stride = 0;
-  std::int64_t num_near = 0;  // the first are near a return, the others in free space
-  Dropout dropout[2] = {};    // of the cells' encoding and of the Fourier encoding: (num_seen, columns)
+  std::int64_t num_labelled = 0;  // the first have the intensity of their return as a label
+  Dropout dropout[2] = {};        // of the cells' encoding and of the Fourier encoding: (num_seen, columns)
 };
 
 // By the features, which only few points touch: what `scatter` and `adam_step` take.
@@ -102,8 +102,8 @@ class FieldLoss {
 
   const FieldParameters<T>& parameters() const { return parameters_; }
   // The intensity network sees the first so many samples of a batch.
-  std::int64_t num_seen(std::int64_t count, std::int64_t num_near) const {
-    return options_.intensity_in_free_space ? count : num_near;
+  std::int64_t num_seen(std::int64_t count, std::int64_t num_labelled) const {
+    return options_.intensity_in_free_space ? count : num_labelled;
   }
 
   // The loss of the signed distances alone.

@@ -427,7 +427,7 @@ class FieldLoss:
         points: numpy.typing.NDArray[numpy.float32],
         sdf_m: numpy.typing.NDArray[numpy.float32],
         rays: numpy.typing.NDArray[numpy.float32],
-        num_near: typing.SupportsInt | typing.SupportsIndex,
+        num_labelled: typing.SupportsInt | typing.SupportsIndex,
         dropout: collections.abc.Sequence[
             tuple[
                 typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
@@ -445,7 +445,7 @@ class FieldLoss:
         points: numpy.typing.NDArray[numpy.float64],
         sdf_m: numpy.typing.NDArray[numpy.float64],
         rays: numpy.typing.NDArray[numpy.float64],
-        num_near: typing.SupportsInt | typing.SupportsIndex,
+        num_labelled: typing.SupportsInt | typing.SupportsIndex,
         dropout: collections.abc.Sequence[
             tuple[
                 typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
@@ -463,7 +463,7 @@ class FieldLoss:
         points: numpy.typing.NDArray[numpy.float32],
         sdf_m: numpy.typing.NDArray[numpy.float32],
         rays: numpy.typing.NDArray[numpy.float32],
-        num_near: typing.SupportsInt | typing.SupportsIndex,
+        num_labelled: typing.SupportsInt | typing.SupportsIndex,
         dropout: collections.abc.Sequence[
             tuple[
                 typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
@@ -477,7 +477,7 @@ class FieldLoss:
         interpolated_grad: numpy.typing.NDArray[numpy.float32],
     ) -> tuple[float, float]:
         """
-        Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
+        Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays; the intensities of the first `num_labelled` are labels. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
         """
     @typing.overload
     def joint(
@@ -485,7 +485,7 @@ class FieldLoss:
         points: numpy.typing.NDArray[numpy.float64],
         sdf_m: numpy.typing.NDArray[numpy.float64],
         rays: numpy.typing.NDArray[numpy.float64],
-        num_near: typing.SupportsInt | typing.SupportsIndex,
+        num_labelled: typing.SupportsInt | typing.SupportsIndex,
         dropout: collections.abc.Sequence[
             tuple[
                 typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
@@ -499,7 +499,7 @@ class FieldLoss:
         interpolated_grad: numpy.typing.NDArray[numpy.float64],
     ) -> tuple[float, float]:
         """
-        Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays, of which the first `num_near` are near a return. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
+        Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays; the intensities of the first `num_labelled` are labels. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
         """
     @typing.overload
     def sdf(

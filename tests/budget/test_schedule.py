@@ -33,21 +33,21 @@ def test_batches_grow_where_iterations_would_be_too_many():
     assert schedule(10**6).neighbours == 1
 
 
-def test_large_batches_of_a_joint_beginning_count_for_the_intensities():
-    assert schedule(10**7).intensity_iterations == schedule(10**7).sdf_iterations
-    alone = schedule(10**6, joint=False)
-    assert alone.intensity_iterations == pytest.approx(6e6 / 2048, abs=1)
+def test_joint_iterations_count_for_the_intensities():
+    alone, joint = schedule(3 * 10**5, joint=False), schedule(3 * 10**5)
+    assert alone.intensity_iterations == joint.intensity_iterations
+    assert alone.intensity_iterations == pytest.approx(1.25 * 6 * 3e5 / 1024, abs=1)
 
 
 def test_many_returns_do_not_train_the_intensities_for_ever():
-    assert schedule(10**8, joint=False).intensity_iterations == 4000
-    dense = schedule(10**8, vertices=10**6)
-    assert dense.intensity_iterations == dense.sdf_iterations + 4000
+    assert schedule(10**8, joint=False).intensity_iterations == 2500
+    large = schedule(10**7)
+    assert large.intensity_iterations == large.sdf_iterations + 500
 
 
 def test_a_small_scene_trains_its_intensities_for_long_and_with_more_dropout():
     small, large = schedule(10_000), schedule(10**6)
-    assert small.intensity_iterations == 1200
+    assert small.intensity_iterations == 1000
     assert 0 < large.dropout_scale < 0.5 < small.dropout_scale < 1
     assert schedule(10_000, with_intensity=False).iterations["intensity"] == 0
 

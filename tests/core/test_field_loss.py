@@ -71,7 +71,9 @@ def make_batch(rays, dtype=torch.float32, batch_size=400, **changes):
     )
     (samples,) = sampler.batch()
     exact = {name: getattr(samples, name).to(dtype) for name in ("points", "sdf_m", "of_ray")}
-    return Batch(field.to(dtype), config, dataclasses.replace(samples, share=0.5, near_share=0.4, **exact))
+    return Batch(
+        field.to(dtype), config, dataclasses.replace(samples, share=0.5, labelled_share=0.4, **exact)
+    )
 
 
 @pytest.fixture
@@ -146,7 +148,12 @@ def test_extreme_logits_and_no_samples(rays, stage):
         assert all(np.isfinite(loss) for loss in found.losses.values())
         assert all(p.isfinite().all() for p in found.by_parameters)
         none = dataclasses.replace(
-            samples, points=samples.points[:0], sdf_m=samples.sdf_m[:0], of_ray=samples.of_ray[:0], num_near=0
+            samples,
+            points=samples.points[:0],
+            sdf_m=samples.sdf_m[:0],
+            of_ray=samples.of_ray[:0],
+            num_near=0,
+            num_labelled=0,
         )
         found = getattr(backend, stage)(none)
     assert set(found.losses.values()) == {0.0}
@@ -211,8 +218,8 @@ def test_the_core_refuses_networks_that_do_not_fit(rays, changes, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"num_near": 401}, "of the batch"),
-        ({"num_near": -1}, "of the batch"),
+        ({"num_labelled": 401}, "of the batch"),
+        ({"num_labelled": -1}, "of the batch"),
         ({"points": np.zeros((400, 2), np.float32)}, "points must have shape"),
         ({"sdf_m": np.zeros(399, np.float32)}, "sdf_m must have shape"),
         ({"sdf_m": np.zeros((400, 1), np.float32)}, "sdf_m must have shape"),
@@ -233,7 +240,7 @@ def test_the_core_refuses_batches_that_do_not_fit(rays, changes, message):
         "points": samples.points.numpy(),
         "sdf_m": samples.sdf_m.numpy(),
         "rays": samples.of_ray.numpy(),
-        "num_near": 200,
+        "num_labelled": 200,
         "dropout": [],
     }
     outputs = {

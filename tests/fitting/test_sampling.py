@@ -164,6 +164,28 @@ def test_shares_of_near_and_free_samples(rays, near_samples, free_samples, num_n
             assert np.ptp(x) > 0.6 * np.ptp(rays.points[:, 0])
 
 
+@pytest.mark.parametrize("parts", [1, 3])
+def test_only_so_many_intensities_are_labels(rays, parts):
+    """They are spread over the batch, and over the neighbours that it takes together."""
+    config = FitConfig(training={"intensity_batch_size": 24})
+    generator, unit = torch.Generator().manual_seed(0), torch.linspace(0, 1, NUM_RAYS)
+    draw = RaySampler(rays, config, 288, generator, 6, unit)
+    batches = [draw.batch(parts) for _ in range(NUM_RAYS // 24 * 12)]
+    assert {sum(part.num_labelled for part in batch) for batch in batches} == {24}
+    assert {sum(part.num_near for part in batch) for batch in batches} == {144}
+    for batch in batches[:5]:
+        for part in batch:
+            assert (part.sdf_m[: part.num_near].abs() <= config.near_band_m).all()
+            assert (part.sdf_m[part.num_near :].abs() > config.near_band_m).float().mean() > 0.8
+            assert 0 <= part.num_labelled - 24 // parts <= 1
+    labelled = torch.cat([part.intensities[: part.num_labelled] for batch in batches for part in batch])
+    assert len(torch.unique(labelled)) > 0.9 * NUM_RAYS
+    # All near samples are labelled where there are no intensities, and where free space has a label of its own.
+    assert RaySampler(rays, config, 288, generator).batch()[0].num_labelled == 144
+    free = config.override(training={"intensity_in_free_space": True})
+    assert RaySampler(rays, free, 288, generator, 1, unit).batch()[0].num_labelled == 144
+
+
 def test_the_rarer_kind_reaches_every_ray_in_the_long_run(rays):
     draw = sampler(rays, 240, near_samples=5, free_samples=1)
     free = torch.cat([rows_of(rays.points, s := draw.batch()[0])[s.num_near :] for _ in range(400)])

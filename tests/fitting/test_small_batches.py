@@ -60,8 +60,8 @@ def test_parts_count_by_their_samples(scene, batch_size, parts):
     rays = prepare(scene.points, scene.poses)
     draw = RaySampler(rays, FitConfig(), batch_size, torch.Generator().manual_seed(0))
     for batch in (draw.batch(parts), draw.spread(batch_size, parts)):
-        sizes, near = [len(part.points) for part in batch], [part.num_near for part in batch]
+        sizes, labelled = [len(part.points) for part in batch], [part.num_labelled for part in batch]
         assert [part.share for part in batch] == [size / sum(sizes) for size in sizes]
-        assert [part.near_share for part in batch] == [count / sum(near) for count in near]
+        assert [part.labelled_share for part in batch] == [count / sum(labelled) for count in labelled]
         if len(set(sizes)) == 1:  # as it was when a part was taken for the parts-th of a batch
             assert {part.share for part in batch} == {1 / parts}

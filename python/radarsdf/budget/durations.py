@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 
-from radarsdf.budget.schedule import Schedule
+from radarsdf.budget.schedule import Schedule, near_and_labelled
 from radarsdf.config import FitConfig
 from radarsdf.field.widths import intensity_widths, sdf_widths, weights_of
 
@@ -30,12 +30,12 @@ def work_of(
 
     `returns`, `cells`, `rows`: numbers of returns, leaf cells and rows of features.
     """
-    sampling, training, normals = config.sampling, config.training, config.networks.normals
+    training, normals = config.training, config.networks.normals
     iterations = schedule.sdf_iterations
     joint = iterations if with_intensity and training.joint else 0
     later = max(0, schedule.intensity_iterations - joint)
-    near_share = sampling.near_samples / (sampling.near_samples + sampling.free_samples)
-    of_both = schedule.batch_size * (1 if training.intensity_in_free_space else near_share)
+    _, labelled = near_and_labelled(config, schedule.batch_size)
+    of_both = schedule.batch_size if training.intensity_in_free_space else labelled
     # Units: a forward pass of a sample. Forward and backward take 3. Normals take a backward pass of their
     # own, and their gradient two more: 9 in all, or 3 if the field is frozen.
     passes, frozen_passes = (9, 3) if normals and with_intensity else (3, 1)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf._core import FEATURE_DIM, CellSet, sample_cells, sample_rays
 from radarsdf.budget.durations import SECONDS, shared, work_of
 from radarsdf.budget.extent import check_extent
-from radarsdf.budget.schedule import Schedule
+from radarsdf.budget.schedule import Schedule, near_and_labelled
 from radarsdf.config import FitConfig
 from radarsdf.field.widths import fourier_width, intensity_widths, parameters_of, sdf_widths
 from radarsdf.returns.cells import lattice_of
@@ -161,11 +161,14 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
     memory += 4 * networks * (_COPIES + resolve_num_threads(config.num_threads))
     learns_features = schedule.sdf_iterations > 0
     memory += moves_rows * learns_features * rows * _PER_ROW
-    samples = max(
-        learns_features * schedule.batch_size,
-        (schedule.intensity_iterations > 0) * config.training.intensity_batch_size,
-    )
-    memory += samples * _sample_bytes(config)
+    samples = learns_features * schedule.batch_size
+    seen = 0
+    if schedule.intensity_iterations:
+        seen = config.training.intensity_batch_size
+        if config.training.joint and samples:
+            _, labelled = near_and_labelled(config, samples)
+            seen = max(seen, samples if config.training.intensity_in_free_space else labelled)
+    memory += _batch_bytes(config, max(samples, seen), seen)
     if with_intensity:
         memory += count * (_PER_INTENSITY + config.returns.drop_ghosts * _PER_RETURN_AGAIN)
     if rays.intensities is not None and config.closes_intensity:
@@ -285,10 +288,11 @@ def available_bytes(root: Path = Path("/")) -> int | None:
     return min(found) if found else None
 
 
-def _sample_bytes(config: FitConfig) -> float:
-    """Bytes that a sample of a batch takes in encodings, hidden layers and their gradients."""
+def _batch_bytes(config: FitConfig, samples: int, seen: int) -> float:
+    """Bytes of a batch in encodings, hidden layers and their gradients. The intensity network has `seen` samples of it."""
     encoding = config.encoding.num_levels * FEATURE_DIM + fourier_width(config)
-    numbers = 2 * encoding + sum(config.networks.sdf_hidden) + sum(config.networks.intensity_hidden)
+    numbers = samples * (encoding + sum(config.networks.sdf_hidden))
+    numbers += seen * (encoding + sum(config.networks.intensity_hidden))
     return 4.0 * numbers * (3 if config.networks.normals else 1)  # normals need gradients of gradients
 
 

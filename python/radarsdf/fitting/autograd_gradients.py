@@ -56,7 +56,7 @@ class AutogradGradients(GradientBackend):
     def _intensity_loss(self, geometry: Geometry, samples: Samples) -> Tensor:
         count = self._num_seen(samples)
         labels = samples.intensities[:count].clone()
-        labels[samples.num_near :] = 0  # free space returns nothing (3QFPI)
+        labels[samples.num_labelled :] = 0  # free space returns nothing (3QFPI)
         predicted = self._field.intensity(
             geometry.first(count),
             samples.directions[:count],

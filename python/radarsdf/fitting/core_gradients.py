@@ -76,7 +76,7 @@ class CoreGradients(GradientBackend):
             "points": samples.points.numpy(),
             "sdf_m": samples.sdf_m.numpy(),
             "rays": samples.of_ray.numpy(),
-            "num_near": samples.num_near,
+            "num_labelled": samples.num_labelled,
             "dropout": [(dropout.bytes.numpy(), dropout.keep) for dropout in dropouts],
         }
 

@@ -95,11 +95,11 @@ class GradientBackend(ABC):
     def _num_seen(self, samples: Samples) -> int:
         """Number of samples, the first ones, that the intensity network sees."""
         in_free_space = self._config.training.intensity_in_free_space
-        return len(samples.points) if in_free_space else samples.num_near
+        return len(samples.points) if in_free_space else samples.num_labelled
 
     def _seen_share(self, samples: Samples) -> float:
         """What the mean over them counts in that of the whole batch."""
-        return samples.share if self._config.training.intensity_in_free_space else samples.near_share
+        return samples.share if self._config.training.intensity_in_free_space else samples.labelled_share
 
     def _draw_dropouts(self, count: int) -> list[Dropout]:
         """Dropout of each part of the encoding of `count` samples, for the intensity network alone."""

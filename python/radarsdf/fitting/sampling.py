@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from radarsdf._core import RAY_DIRECTION, RAY_INTENSITY, RAY_POINT, RAY_RANGE, cell_keys, stable_order
+from radarsdf.budget.schedule import near_and_labelled
 from radarsdf.config import FitConfig
 from radarsdf.returns.rays import Rays
 
 _ROWS_AT_ONCE = 1 << 16
+_GOLDEN = 0.6180339887498949  # multiples of it are spread evenly over an interval of length 1
 
 
 @dataclass(frozen=True)
@@ -29,13 +31,15 @@ class Samples:
     """(B,) label: distance along the ray to the return, m, positive in front of it."""
     num_near: int
     """The first `num_near` samples are near the surface, the others in free space."""
+    num_labelled: int
+    """The intensities of the first `num_labelled` of them are labels."""
     of_ray: Tensor
     """(B, 7 or 8) for the ray of each sample: return (3), local frame, m; direction (3); range, m; and scaled
     intensity if there are intensities."""
     share: float = 1.0
     """Of a part of a batch: what its mean counts in the mean of the whole batch. 0 where it has no samples."""
-    near_share: float = 1.0
-    """The same of the samples near the surface."""
+    labelled_share: float = 1.0
+    """The same of the samples with labels."""
 
     @property
     def directions(self) -> Tensor:
@@ -94,11 +98,9 @@ class RaySampler:
         self._order_from = torch.zeros_like(generator.get_state())
         """State of the generator before `_order` was drawn."""
         self._next = 0
-        near_share = config.sampling.near_samples / (
-            config.sampling.near_samples + config.sampling.free_samples
-        )
-        self._num_near = max(1, round(batch_size * near_share))
-        self._num_free = batch_size - self._num_near
+        near, labelled = near_and_labelled(config, batch_size)
+        # Samples with labels come first, and a batch without them is in Morton order.
+        self._counts = (near if intensities is None else labelled, near, batch_size - near)
         self._layouts: dict[int, _Layout] = {}
 
     def state(self) -> dict[str, Tensor]:
@@ -161,14 +163,14 @@ class RaySampler:
             noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
             points += noise * (config.sampling.cross_range_noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
-        return self._split(points, sdf_m, ray, near, near)
+        return self._split(points, sdf_m, ray, near, near, near)
 
     def batch(self, parts: int = 1) -> list[Samples]:
         """`batch_size` samples, in `parts` for the threads, each with its share of near and free samples."""
         if parts not in self._layouts:
-            self._layouts[parts] = _Layout.of(self._num_near, self._num_free, parts, self._config)
+            self._layouts[parts] = _Layout.of(self._counts, parts, self._config)
         layout = self._layouts[parts]
-        places = self._take(max(self._num_near, self._num_free)).index_select(0, layout.index)
+        places = self._take(max(self._counts)).index_select(0, layout.index)
         ray = self._rays.index_select(0, places)
         range_m = ray[:, RAY_RANGE]
         start_m, length_m = (
@@ -177,7 +179,7 @@ class RaySampler:
         # Random numbers are drawn for the whole batch and then divided, so samples do not depend on `parts`.
         sdf_m = torch.addcmul(start_m, length_m, self._uniform(len(places)).index_select(0, layout.order))
         points = torch.addcmul(_returns(ray), sdf_m[:, None], _directions(ray), value=-1)
-        return self._split(points, sdf_m, ray, layout.sizes, layout.near)
+        return self._split(points, sdf_m, ray, layout.sizes, layout.near, layout.labelled)
 
     def _split(
         self,
@@ -186,15 +188,18 @@ class RaySampler:
         ray: Tensor,
         sizes: Sequence[int],
         near: Sequence[int],
+        labelled: Sequence[int],
     ) -> list[Samples]:
         if len(sizes) == 1:
-            return [Samples(points, sdf_m, near[0], ray)]
+            return [Samples(points, sdf_m, near[0], labelled[0], ray)]
         columns = [torch.split_with_sizes(column, sizes) for column in (points, sdf_m, ray)]
         # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
-        shares = ([count / sum(counts) for count in counts] for counts in (sizes, near))
+        shares = ([count / sum(counts) for count in counts] for counts in (sizes, labelled))
         return [
-            Samples(x, sdf, num_near, of_ray, *shares_of_part)
-            for x, sdf, of_ray, num_near, *shares_of_part in zip(*columns, near, *shares, strict=True)
+            Samples(x, sdf, num_near, num_labelled, of_ray, *shares_of_part)
+            for x, sdf, of_ray, num_near, num_labelled, *shares_of_part in zip(
+                *columns, near, labelled, *shares, strict=True
+            )
         ]
 
 
@@ -247,18 +252,24 @@ class _Layout:
     """Number of samples in each part."""
     near: list[int]
     """Number of near samples in each part."""
+    labelled: list[int]
+    """The first of these, whose intensities are labels."""
 
     @classmethod
-    def of(cls, num_near: int, num_free: int, parts: int, config: FitConfig) -> _Layout:
+    def of(cls, counts: tuple[int, int, int], parts: int, config: FitConfig) -> _Layout:
+        """`counts`: near samples whose intensities are labels, all near samples, free samples."""
+        num_labelled, num_near, num_free = counts
         taken = max(num_near, num_free)
-        shares = [[share(n, part, parts) for part in range(parts)] for n in (num_near, num_free)]
-        sizes = [size for part in zip(*shares, strict=True) for size in part]  # near, free, near, free, ...
-        kinds = torch.from_numpy(np.repeat(np.tile([0, 1], parts), sizes))
-        order = kinds.argsort(stable=True).argsort()
         # Fewer samples of one kind are spread evenly over the rays, so that they cover the whole scene too.
-        index = torch.cat([torch.arange(n, device="cpu") * taken // max(n, 1) for n in (num_near, num_free)])[
-            order
-        ]
+        near_rays, free_rays = (np.arange(n) * taken // max(n, 1) for n in (num_near, num_free))
+        chosen = np.zeros(num_near, np.bool_)
+        chosen[_spread(num_labelled, num_near)] = True
+        of_kinds = [near_rays[chosen], near_rays[~chosen], free_rays]
+        shares = [[share(len(kind), part, parts) for part in range(parts)] for kind in of_kinds]
+        sizes = [size for part in zip(*shares, strict=True) for size in part]
+        kinds = torch.from_numpy(np.repeat(np.tile([0, 1, 2], parts), sizes))
+        order = kinds.argsort(stable=True).argsort()
+        index = torch.from_numpy(np.concatenate(of_kinds))[order]
         # From the sensor: near samples in range ± near_band, free ones in [free_from · range, range +
         # free_beyond].
         band_m, before = config.near_band_m, 1 - config.sampling.free_from
@@ -266,10 +277,20 @@ class _Layout:
             [[-band_m, 0, 2 * band_m, 0], [-config.free_beyond_m, 0, config.free_beyond_m, before]],
             dtype=torch.float32,
             device="cpu",
-        )[kinds]
+        )[(kinds == 2).long()]
         start, of_range, length, length_of_range = ends.T.contiguous()
         sums = [sum(part) for part in zip(*shares, strict=True)]
-        return cls(index, order, (start, of_range), (length, length_of_range), sums, shares[0])
+        labelled, others, _ = shares
+        near = [sum(pair) for pair in zip(labelled, others, strict=True)]
+        return cls(index, order, (start, of_range), (length, length_of_range), sums, near, labelled)
+
+
+def _spread(count: int, of: int) -> NDArray[np.int64]:
+    """`count` numbers of range(`of`), evenly spread, ascending. With jitter, since rays are taken in runs."""
+    numbers = np.arange(count)
+    jittered = numbers + numbers * _GOLDEN % 1
+    spread: NDArray[np.int64] = np.minimum(jittered * of // max(count, 1), of - 1).astype(np.int64)
+    return spread
 
 
 @dataclass(frozen=True)
