@@ -21,6 +21,8 @@ def schedule(returns, vertices=10**9, *, with_intensity=True, **changes):
 def test_many_returns_in_few_cells_take_no_more_iterations_than_their_vertices_need():
     assert schedule(10**6).sdf_iterations == pytest.approx(12e6 / 4096, abs=1)
     assert schedule(10**6, vertices=50_000).sdf_iterations == pytest.approx(32 * 50_000 / 4096, abs=1)
+    assert schedule(10**6, vertices=100_000).sdf_iterations == 500
+    assert schedule(10**6, vertices=300_000).sdf_iterations == pytest.approx(16 * 300_000 / 4096, abs=1)
     assert schedule(10**6, vertices=100).sdf_iterations == 150
 
 
@@ -40,7 +42,7 @@ def test_joint_iterations_count_for_the_intensities():
 
 
 def test_many_returns_do_not_train_the_intensities_for_ever():
-    assert schedule(10**8, joint=False).intensity_iterations == 2500
+    assert schedule(10**8, joint=False).intensity_iterations == 3500
     large = schedule(10**7)
     assert large.intensity_iterations == large.sdf_iterations + 500
 
