@@ -106,12 +106,12 @@ def _say(line: str) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m bench.report", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    measure = commands.add_parser("run", help="run the experiments, about 20 minutes on two cores")
+    measure = commands.add_parser("run", help="run the experiments, about 25 minutes on two cores")
     measure.add_argument("--out", type=Path, default=_RESULTS, help="the JSON; default: bench/results.json")
     measure.add_argument("--only", nargs="+", choices=NAMES, default=[], help="these, merged into the JSON")
     size = measure.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="only see that everything runs")
-    size.add_argument("--long", action="store_true", help="also 3QFPI, ten million returns, all scenes")
+    size.add_argument("--long", action="store_true", help="also 3QFPI, all scenes")
     measure.add_argument(
         "--real",
         type=Path,

@@ -112,7 +112,7 @@ def _paper(experiment: str, *words: str, peers: Sequence[str] = ()) -> tuple[str
 
 def _experiments() -> dict[str, Experiment]:
     fits = ("bench.growth", "fits", "--threads", "2", "--out", "{folder}")
-    sizes = ("--sizes", "500", "--returns", "1e4", "1e5", "1e6")
+    sizes = ("--sizes", "500", "--returns", "1e4", "1e5", "1e6", "1e7")
     once, quick = ("--repetitions", "1"), ("wall", "--quick")
     two = ("VDBFusion", "radarsdf")
     return {
@@ -145,10 +145,10 @@ def _experiments() -> dict[str, Experiment]:
         ),
         "growth": Experiment(
             "time and memory over the number of returns",
-            2,
+            5,
             (*fits, *sizes),
             (*fits, "--quick"),
-            (*fits, *sizes, "1e7"),
+            (*fits, *sizes),
             "growth_fits.json",
             _kept("growth"),
         ),
