@@ -83,12 +83,14 @@ def _geometry(scans: Any) -> Any:
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Seconds and memory over the returns."""
+    """Seconds and memory over the returns. Processor time is of all steps and workers."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     counts = [row["returns"] for row in rows]
     for name in ("plan, s", "fit, s", "mesh, s"):
         left.loglog(counts, [row[name] for row in rows], "o-", label=name)
+    processor_s = [1e-6 * row["returns"] * row["processor, µs a return"] for row in rows]
+    left.loglog(counts, processor_s, "k.--", label="processor, s")
     for name in ("plan, MB", "worker, MB"):
         right.semilogx(counts, [row[name] for row in rows], "o-", label=name)
     right.set_ylim(0)

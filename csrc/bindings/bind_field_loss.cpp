@@ -171,9 +171,8 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       "located"_a.noconvert(), "interpolated_grad"_a.noconvert(),
       "Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. "
       "`rays` (N, 8) are the samples' rays; the intensities of the first `num_labelled` are labels. `dropout` has up "
-      "to two "
-      "pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of "
-      "cells and positions.");
+      "to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the "
+      "encodings of cells and positions.");
   cls.def(
       "intensity",
       [](const AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Rows<T>& rays,

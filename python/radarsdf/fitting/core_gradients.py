@@ -77,7 +77,7 @@ class CoreGradients(GradientBackend):
             "sdf_m": samples.sdf_m.numpy(),
             "rays": samples.of_ray.numpy(),
             "num_labelled": samples.num_labelled,
-            "dropout": [(dropout.bytes.numpy(), dropout.keep) for dropout in dropouts],
+            "dropout": [(dropout.bytes, dropout.keep) for dropout in dropouts],
         }
 
     def _untouched(self, samples: Samples) -> Touched:

@@ -300,7 +300,7 @@ class Dropout:
     PyTorch's dropout draws from the global generator, so the same seed would not give the same bits.
     """
 
-    bytes: Tensor
+    bytes: NDArray[np.uint8]
     """(rows, columns) uint8, a random byte for each number of the matrix."""
     keep: int
     """Numbers whose byte is below this are kept. From 0 to 256."""
@@ -309,10 +309,11 @@ class Dropout:
     def draw(cls, rows: int, columns: int, dropout: float, generator: torch.Generator) -> Dropout:
         """Draws a dropout of a matrix (rows, columns). `dropout`: probability that a number is dropped."""
         # Each random int64 gives eight bytes. To draw bytes one by one would take a tenth of an iteration.
-        words = torch.empty(-(-rows * columns // 8), dtype=torch.int64, device="cpu").random_(
-            -(2**63), None, generator=generator
-        )
-        return cls(words.view(torch.uint8)[: rows * columns].view(rows, columns), round(256 * (1 - dropout)))
+        # PyTorch lets go of the interpreter's lock in each operation, NumPy does not. Two threads that draw at once waited
+        # for each other ten times: 0.35 ms in place of 0.04.
+        words = np.empty(-(-rows * columns // 8), np.int64)
+        torch.from_numpy(words).random_(-(2**63), None, generator=generator)
+        return cls(words.view(np.uint8)[: rows * columns].reshape(rows, columns), round(256 * (1 - dropout)))
 
     @property
     def factors(self) -> Tensor:
@@ -321,6 +322,6 @@ class Dropout:
 
     def factors_of(self, dtype: torch.dtype) -> Tensor:
         """:attr:`factors` in another type of floats."""
-        return (self.bytes <= self.keep - 1).to(dtype) * (
+        return torch.from_numpy(self.bytes <= self.keep - 1).to(dtype) * (
             256 / self.keep
         )  # not < keep: 256 does not fit into a byte
