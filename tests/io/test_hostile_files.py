@@ -178,8 +178,8 @@ def test_what_is_no_file(tmp_path, read):
     with pytest.raises(ValueError, match=r"map\.npz is not a whole"):
         read(path)
     path.unlink()
-    path.mkdir()
-    with pytest.raises(OSError, match=r"map\.npz"):
+    path.mkdir()  # a map may be a folder
+    with pytest.raises(ValueError if read is radarsdf.load else OSError, match=r"map\.npz"):
         read(path)
     path.rmdir()
     path.symlink_to(path)
