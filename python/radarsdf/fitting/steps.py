@@ -71,9 +71,8 @@ def fit_rays(
 ) -> RadarMap:
     """Fits a map. See :func:`radarsdf.fit`, also for errors; `clock` has counted the time since the beginning."""
     clock = Clock() if clock is None else clock
-    rays, inside = given.rays, given.inside
+    rays, inside, given.rays = given.rays, given.inside, None
     assert rays is not None
-    given.rays = None
     radar_map = None
     try:
         check_extent(rays, config)
@@ -98,9 +97,8 @@ def fit_rays(
                 workers.num_threads,
             )
             clock.lap("start_s")
-            noise, kept = surface.noise, surface.rays
             rough_share = surface.surfels.rough_share() if given.rough_share is None else given.rough_share
-            origin, scale = rays.origin, given.scale
+            noise, kept, origin, scale = surface.noise, surface.rays, rays.origin, given.scale
             sensor = given.sensor_of(rays, noise)
             close = _closing(learnt, inside, surface, config, workers.num_threads)
             counts = {
@@ -116,6 +114,7 @@ def fit_rays(
                 field, kept, learnt, scale if config.trains_intensity else None, config, workers
             )
             del learnt, kept
+            history = training.history
             if saved is not None:
                 saved.resume(training)
             # The map is made before the training, which changes its field: Interrupted and Diverged can hand
@@ -135,6 +134,7 @@ def fit_rays(
                 close(contents) if close is not None and not config.trains_intensity else contents
             )
             training.run(progress, saved)
+            del training  # its copies of the rays take 64 bytes a return
             if close is not None and config.trains_intensity:
                 radar_map = RadarMap(close(contents))
     except KeyboardInterrupt as interruption:
@@ -145,7 +145,7 @@ def fit_rays(
     finally:
         if radar_map is not None:
             clock.lap("training_s")
-            radar_map.report.update(clock.laps, loss_history=training.history.to_report())
+            radar_map.report.update(clock.laps, loss_history=history.to_report())
             radar_map.field.requires_grad_(False)
     return radar_map
 
