@@ -38,3 +38,13 @@ def garbage(tmp_path):
         return path
 
     return make
+
+
+@pytest.fixture
+def small_pictures(monkeypatch):
+    """Reports with small pictures and few samples of the truth, so that they take less time."""
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
+    monkeypatch.setattr("radarsdf.report.surface._WIDTH", 160)
+    monkeypatch.setattr("radarsdf.report.surface._HEIGHT", 100)
+    monkeypatch.setattr("radarsdf.report.truth._SAMPLES", 20_000)

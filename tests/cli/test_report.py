@@ -17,15 +17,6 @@ def no_work(monkeypatch):
         monkeypatch.setattr(function, lambda *_, **__: pytest.fail("the work began"))
 
 
-@pytest.fixture
-def small(monkeypatch):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    monkeypatch.setattr("radarsdf.report.surface._WIDTH", 160)
-    monkeypatch.setattr("radarsdf.report.surface._HEIGHT", 100)
-    monkeypatch.setattr("radarsdf.report.truth._SAMPLES", 20_000)
-
-
 @pytest.mark.parametrize(
     ("missing", "said"),
     [
@@ -52,7 +43,7 @@ def test_what_to_install_is_said_before_the_work(
     assert refusal(capsys, tmp_path, *words) == f"radarsdf {command}: {said}\n"
 
 
-@pytest.mark.usefixtures("small", "no_work")
+@pytest.mark.usefixtures("small_pictures", "no_work")
 def test_outputs_are_checked_before_the_work(scans_file, map_file, tmp_path, capsys):
     out = tmp_path / "map.safetensors"
     words = ["fit", scans_file, "-o", out, *FAST, "--report"]
@@ -67,7 +58,7 @@ def test_outputs_are_checked_before_the_work(scans_file, map_file, tmp_path, cap
     assert "leave out one of them" in refusal(capsys, tmp_path, *dry)
 
 
-@pytest.mark.usefixtures("small")
+@pytest.mark.usefixtures("small_pictures")
 def test_a_fit_with_its_report(scans_file, tmp_path, capsys):
     out, page = tmp_path / "map.safetensors", tmp_path / "report.html"
     assert call("fit", scans_file, "-o", out, "--report", page, "--holdout", 3, *FAST) == 0
@@ -83,7 +74,7 @@ def test_a_fit_with_its_report(scans_file, tmp_path, capsys):
     assert "<b>cost</b>" in text
 
 
-@pytest.mark.usefixtures("small")
+@pytest.mark.usefixtures("small_pictures")
 def test_the_map_is_kept_if_the_report_fails(scans_file, tmp_path, capsys, monkeypatch):
     out, page = tmp_path / "map.safetensors", tmp_path / "report.html"
 
@@ -96,7 +87,7 @@ def test_the_map_is_kept_if_the_report_fails(scans_file, tmp_path, capsys, monke
     assert files(tmp_path) == ["map.safetensors"]
 
 
-@pytest.mark.usefixtures("small")
+@pytest.mark.usefixtures("small_pictures")
 def test_a_report_of_a_map_and_scans(map_file, scans_file, tmp_path):
     page = tmp_path / "report.html"
     words = ["report", map_file, scans_file, "-o", page, "--holdout", 3, "--voxel", 0.4, "--quiet"]

@@ -91,15 +91,6 @@ def test_render(city, whole, tmp_path, capsys):
     )
 
 
-@pytest.fixture
-def small_pictures(monkeypatch):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    monkeypatch.setattr("radarsdf.report.surface._WIDTH", 160)
-    monkeypatch.setattr("radarsdf.report.surface._HEIGHT", 100)
-    monkeypatch.setattr("radarsdf.report.truth._SAMPLES", 20_000)
-
-
 @pytest.mark.usefixtures("small_pictures")
 def test_report(city, scans_file, tmp_path):
     page = tmp_path / "report.html"

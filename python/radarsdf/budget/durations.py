@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 
-from radarsdf.budget.schedule import Schedule, near_and_labelled
+from radarsdf.budget.schedule import Schedule, seen_jointly
 from radarsdf.config import FitConfig
 from radarsdf.field.widths import intensity_widths, sdf_widths, weights_of
 
@@ -34,8 +34,7 @@ def work_of(
     iterations = schedule.sdf_iterations
     joint = iterations if with_intensity and training.joint else 0
     later = max(0, schedule.intensity_iterations - joint)
-    _, labelled = near_and_labelled(config, schedule.batch_size)
-    of_both = schedule.batch_size if training.intensity_in_free_space else labelled
+    of_both = seen_jointly(config, schedule.batch_size)
     # Units: a forward pass of a sample. Forward and backward take 3. Normals take a backward pass of their
     # own, and their gradient two more: 9 in all, or 3 if the field is frozen.
     passes, frozen_passes = (9, 3) if normals and with_intensity else (3, 1)

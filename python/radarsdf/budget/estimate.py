@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf._core import FEATURE_DIM, CellSet, sample_cells, sample_rays
 from radarsdf.budget.durations import SECONDS, shared, work_of
 from radarsdf.budget.extent import check_extent
-from radarsdf.budget.schedule import Schedule, near_and_labelled
+from radarsdf.budget.schedule import Schedule, seen_jointly
 from radarsdf.config import FitConfig
 from radarsdf.field.widths import fourier_width, intensity_widths, parameters_of, sdf_widths
 from radarsdf.returns.cells import lattice_of
@@ -166,8 +166,7 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
     if schedule.intensity_iterations:
         seen = config.training.intensity_batch_size
         if config.training.joint and samples:
-            _, labelled = near_and_labelled(config, samples)
-            seen = max(seen, samples if config.training.intensity_in_free_space else labelled)
+            seen = max(seen, seen_jointly(config, samples))
     memory += _batch_bytes(config, max(samples, seen), seen)
     if with_intensity:
         memory += count * (_PER_INTENSITY + config.returns.drop_ghosts * _PER_RETURN_AGAIN)
@@ -192,7 +191,7 @@ def _copies(config: FitConfig, schedule: Schedule, *, with_intensity: bool) -> i
 
 def check_fit(rays: Rays, config: FitConfig) -> None:
     """Raises a MemoryError if a fit needs more than `max_memory_bytes`, or than the system has left."""
-    available = available_bytes() if config.max_memory_bytes is None else config.max_memory_bytes
+    available = _limit(config.max_memory_bytes)
     # Upper bounds: cells that the near band of a ray can cross, and rows of features of a cell. If a fit of
     # so many is small enough, the cells need not be counted, which takes time.
     cells = len(rays) * (3 * math.ceil(2 * config.near_band_m / config.leaf_size_m) + 3)
@@ -214,24 +213,13 @@ def check_fit(rays: Rays, config: FitConfig) -> None:
 
 def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> None:
     """Raises a MemoryError if so many voxels of `voxel_size`, m, need more memory than there is."""
-    available = available_bytes() if max_memory_bytes is None else max_memory_bytes
-    if available is not None and voxels * _PER_VOXEL > available:
-        msg = (
-            f"voxels of {voxel_size} m would take about {voxels * _PER_VOXEL / 1e9:.2f} GB, of "
-            f"{available / 1e9:.2f}: use larger ones"
-        )
-        raise MemoryError(msg)
+    _check(f"voxels of {voxel_size} m", voxels * _PER_VOXEL, max_memory_bytes, "use larger ones")
 
 
 def check_triangles(count: int, max_memory_bytes: int | None) -> None:
     """Raises a MemoryError if the mesh of a map in tiles has more triangles than memory holds."""
-    available = available_bytes() if max_memory_bytes is None else max_memory_bytes
-    if available is not None and count * _PER_TRIANGLE > available:
-        msg = (
-            f"a mesh of {count} triangles would take about {count * _PER_TRIANGLE / 1e9:.2f} GB, of "
-            f"{available / 1e9:.2f}: take a part, by a box, or write it tile by tile (radarsdf tiles mesh)"
-        )
-        raise MemoryError(msg)
+    way_out = "take a part, by a box, or write it tile by tile (radarsdf tiles mesh)"
+    _check(f"a mesh of {count} triangles", count * _PER_TRIANGLE, max_memory_bytes, way_out)
 
 
 def check_views(
@@ -242,16 +230,22 @@ def check_views(
     `cells`: leaf cells of a map whose surface has yet to be made for views; `patches` of that surface; `beams` of one
     view; `returns` of all views that are kept.
     """
-    available = available_bytes() if max_memory_bytes is None else max_memory_bytes
     needed = (
         cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM + returns * _PER_RETURN_SEEN
     )
-    if available is not None and needed > available:
-        msg = (
-            f"these views would take about {needed / 1e9:.2f} GB, of {available / 1e9:.2f}: ask for fewer poses or "
-            "returns, or make the map of a part of the scans"
-        )
+    way_out = "ask for fewer poses or returns, or make the map of a part of the scans"
+    _check("these views", needed, max_memory_bytes, way_out)
+
+
+def _check(what: str, needed_bytes: float, max_memory_bytes: int | None, way_out: str) -> None:
+    available = _limit(max_memory_bytes)
+    if available is not None and needed_bytes > available:
+        msg = f"{what} would take about {needed_bytes / 1e9:.2f} GB, of {available / 1e9:.2f}: {way_out}"
         raise MemoryError(msg)
+
+
+def _limit(max_memory_bytes: int | None) -> int | None:
+    return available_bytes() if max_memory_bytes is None else max_memory_bytes
 
 
 def available_bytes(root: Path = Path("/")) -> int | None:

@@ -100,6 +100,11 @@ def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
     return near, near if training.intensity_in_free_space else min(near, training.intensity_batch_size)
 
 
+def seen_jointly(config: FitConfig, batch_size: int) -> int:
+    """How many samples of a batch of the sdf stage the intensity network sees in a joint iteration."""
+    return batch_size if config.training.intensity_in_free_space else near_and_labelled(config, batch_size)[1]
+
+
 def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, int]:
     """Samples in a batch, and iterations, of the sdf stage."""
     batch_size = config.training.batch_size

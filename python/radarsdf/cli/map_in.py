@@ -30,12 +30,9 @@ def is_map(path: Path) -> bool:
 
 def load_map(path: Path) -> AnyMap:
     """Read a map. Tiles that are missing are said on standard error."""
-    from radarsdf.tiles.any_map import load
+    from radarsdf.tiles.any_map import lacking, load
 
     radar_map = load(path)
-    if missing := radar_map.report.get("missing_tiles"):
-        total = radar_map.report["tiles"] + len(missing)
-        complain(
-            f"radarsdf: {path} lacks {len(missing)} of {total} tiles: radarsdf tiles status {path} says why"
-        )
+    if tiles := lacking(radar_map):
+        complain(f"radarsdf: {path} lacks {tiles}: radarsdf tiles status {path} says why")
     return radar_map

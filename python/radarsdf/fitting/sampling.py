@@ -309,8 +309,8 @@ class Dropout:
     def draw(cls, rows: int, columns: int, dropout: float, generator: torch.Generator) -> Dropout:
         """Draws a dropout of a matrix (rows, columns). `dropout`: probability that a number is dropped."""
         # Each random int64 gives eight bytes. To draw bytes one by one would take a tenth of an iteration.
-        # PyTorch lets go of the interpreter's lock in each operation, NumPy does not. Two threads that draw at once waited
-        # for each other ten times: 0.35 ms in place of 0.04.
+        # PyTorch lets go of the interpreter's lock in each operation, NumPy does not. Measured on two threads that draw at
+        # once, and wait for each other: 0.35 ms with PyTorch alone, 0.26 so.
         words = np.empty(-(-rows * columns // 8), np.int64)
         torch.from_numpy(words).random_(-(2**63), None, generator=generator)
         return cls(words.view(np.uint8)[: rows * columns].reshape(rows, columns), round(256 * (1 - dropout)))

@@ -310,6 +310,7 @@ class Training:
             # used.
             cosine = 0.5 * (1 + math.cos(math.pi * i / iterations))
             share = cosine if self._config.training.cosine_schedule else 1.0
+            # A small batch of the intensity stage has fewer parts than there are threads.
             work = list(zip(self._backends, ahead or stage.draw(), strict=False))
             found = list(self._workers.map(stage.gradients_of, work))
             loss = sum(sum(part.losses.values()) for part in found)

@@ -35,7 +35,6 @@ _ROUNDS = 2  # four are no better
 _MOST_RETURNS = 50_000
 _GROUPS = np.array([[2.5, 0.25, 0.12]])  # a kind of cells, as above
 _CORRELATION = 0.1  # of the returns in a group: n of them count n / (1 + 0.1 (n - 1)) times
-_ROWS_AT_ONCE = 1 << 18
 _LEAST_MEAN = 0.005  # of the range of intensities. A third of the means are smaller: they tell nothing
 
 # With a network, the answer is the mean of two: the network's, and `_NETWORK_TIMES` that with what it leaves in closed
@@ -132,10 +131,7 @@ class Reflectance:
             unit = unit - np.float32(_NETWORK_TIMES) * answers
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         response = Response.of(unit, directions, rays.ranges_m, incidence, kinds)
-        left = unit.copy()
-        for first in range(0, len(left), _ROWS_AT_ONCE):  # of all at once, it would take 80 bytes a return
-            part = slice(first, first + _ROWS_AT_ONCE)
-            left[part] -= response.at(directions[part], rays.ranges_m[part], incidence[part], kinds[part])
+        left = unit - response.at(directions, rays.ranges_m, incidence, kinds)
         rows, groups = _grouped(points, directions, incidence, left, leaf_size_m, num_threads)
         cells = _in_metres(_KINDS, leaf_size_m)
         keys, means, explained = fit_cell_means(cells, _TILINGS, *groups, _SHRINKAGE, _ROUNDS, num_threads)

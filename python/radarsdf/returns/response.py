@@ -25,6 +25,7 @@ _MIN_COSINE = 0.02
 _MOST_REGRESSED = 8_000  # returns, evenly spread: enough for fourteen numbers
 _REWEIGHTINGS = 2  # three are no better
 _REFERENCE_RANGE_M = 10.0
+_ROWS_AT_ONCE = 1 << 18  # all at once, the columns would take 80 bytes a return
 _ANGLES_RAD = np.linspace(0, np.pi / 2, 2001)  # at which the response to the incidence is tabulated
 _BASE = 5  # coefficients that do not belong to the incidence
 NUM_COEFFICIENTS = _BASE + 4 + len(_LOBES_RAD)
@@ -82,8 +83,26 @@ class Response:
 
         `incidence_rad` (N,): angle to the normal of the surface, not used without one. `kinds` (N,): of the surface.
         """
+        of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
+        tables = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in self.coefficients]
         found = np.empty(len(kinds), np.float32)
-        of_angles = _of_incidence(_ANGLES_RAD).T
+        for first in range(0, len(kinds), _ROWS_AT_ONCE):
+            part = slice(first, first + _ROWS_AT_ONCE)
+            found[part] = self._of_block(
+                directions[part], ranges_m[part], incidence_rad[part], kinds[part], tables
+            )
+        return found
+
+    def _of_block(
+        self,
+        directions: Float32,
+        ranges_m: Float32,
+        incidence_rad: Float32,
+        kinds: NDArray[np.int8],
+        tables: list[Float32],
+    ) -> Float32:
+        """Some of :meth:`at`. `tables`: for each kind, the response to `_ANGLES_RAD`."""
+        found = np.empty(len(kinds), np.float32)
         for kind in range(NUM_KINDS):
             own = np.flatnonzero(kinds == kind)
             columns = _of_ray(directions[own], ranges_m[own])
@@ -93,8 +112,7 @@ class Response:
             else:
                 # The nearest angle of the table: to interpolate would take more time than all else.
                 nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
-                table = _weighted_sum(self.coefficients[kind, _BASE:], of_angles.astype(np.float32))
-                values += table[np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
+                values += tables[kind][np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
             found[own] = values
         return found
 

@@ -43,6 +43,13 @@ def load(path: str | PathLike[str]) -> AnyMap:
     return TiledMap(path) if Path(path).is_dir() else load_file(path)
 
 
+def lacking(radar_map: AnyMap) -> str:
+    """How many tiles a map lacks, in words; empty if none."""
+    if not isinstance(radar_map, TiledMap) or not (missing := radar_map.missing):
+        return ""
+    return f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
+
+
 def predicted(radar_map: AnyMap, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
     """The intensities (N,) that a map predicts for rays, sensor units, and these rays: those in no tile are left out."""
     found = np.asarray(radar_map.intensity(*rays.in_world()), np.float64)
