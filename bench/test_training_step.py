@@ -56,13 +56,14 @@ class Step:
 
     def samples(self):
         """Samples, and dropout factors for the inputs of the intensity network."""
-        (samples,) = self.sampler.spread(self.size) if self.frozen else self.sampler.batch()
+        batch = self.sampler.spread(self.size) if self.frozen else self.sampler.batch()
+        (samples,) = batch.split()
         if self.stage == "geometry":
             return samples, None
         dims = (cells_width(CONFIG), fourier_width(CONFIG))
         dropouts = (CONFIG.networks.feature_dropout, CONFIG.networks.fourier_dropout)
         factors = [
-            Dropout.draw(samples.num_near, dim, share, self.generator).factors
+            Dropout.draw(share, self.generator).factors(samples.num_near, dim)
             for dim, share in zip(dims, dropouts, strict=True)
         ]
         return samples, factors

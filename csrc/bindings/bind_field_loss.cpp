@@ -9,6 +9,7 @@
 #include <variant>
 #include <vector>
 
+#include "bindings/held_crew.hpp"
 #include "bindings/layer_arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "field/field_loss.hpp"
@@ -19,7 +20,8 @@ namespace {
 template <typename T>
 using Network = std::pair<Arrays<T>, Arrays<T>>;  // weights and biases
 
-using Bytes = std::pair<Array<std::uint8_t>, int>;  // of a dropout, and what it keeps
+using Drop = std::pair<std::uint64_t, int>;                        // seed of a dropout, and what it keeps
+using Parts = std::vector<std::pair<std::int64_t, std::int64_t>>;  // samples of each, and those with a label
 
 // A FieldLoss with the arrays that it reads, and those that it writes the gradients of the networks to.
 template <typename T>
@@ -36,7 +38,7 @@ class LossArrays {
     loss_.emplace(parameters, options, gradients);
   }
 
-  const FieldLoss<T>& loss() const { return *loss_; }
+  FieldLoss<T>& loss() { return *loss_; }
 
   Arrays<T> sdf_gradients, intensity_gradients;  // weights and biases of each layer in turn
 
@@ -64,17 +66,28 @@ class LossArrays {
 // What Python knows as FieldLoss: its numbers have the type of the features.
 class AnyFieldLoss {
  public:
-  template <typename... Arguments>
-  explicit AnyFieldLoss(Arguments&&... arguments) : arrays_(std::forward<Arguments>(arguments)...) {}
+  template <typename Kind, typename... Arguments>
+  explicit AnyFieldLoss(std::in_place_type_t<Kind> kind, Arguments&&... arguments)
+      : arrays_(kind, std::forward<Arguments>(arguments)...) {}
 
   AnyFieldLoss(const AnyFieldLoss&) = delete;
   AnyFieldLoss& operator=(const AnyFieldLoss&) = delete;
 
   template <typename T>
-  const LossArrays<T>& of() const {
-    const auto* arrays = std::get_if<LossArrays<T>>(&arrays_);
+  LossArrays<T>& of() {
+    auto* arrays = std::get_if<LossArrays<T>>(&arrays_);
     if (arrays == nullptr) throw py::type_error("the batch must have the dtype of the features");
     return *arrays;
+  }
+
+  std::pair<double, double> finish(HeldCrew& crew) {
+    const FieldLosses losses = std::visit(
+        [&](auto& arrays) {
+          auto& loss = arrays.loss();
+          return crew.finish([&](Crew& own) { return loss.finish(own); });
+        },
+        arrays_);
+    return {losses.sdf, losses.intensity};
   }
 
   using Gradients = std::variant<Arrays<float>, Arrays<double>>;
@@ -90,27 +103,33 @@ class AnyFieldLoss {
 };
 
 template <typename T>
-LossBatch<T> points_of(const Array<T>& points, const Array<T>& sdf_m) {
+LossBatch<T> points_of(const Array<T>& points, const Array<T>& sdf_m, const Parts& parts) {
   const std::int64_t count = check_points(points);
   if (sdf_m.ndim() != 1 || sdf_m.shape(0) != count) throw std::invalid_argument("sdf_m must have shape (N,)");
-  return {points.data(), sdf_m.data(), count};
+  LossBatch<T> batch{points.data(), sdf_m.data(), {}};
+  std::int64_t left = count;
+  for (const auto& [samples, labelled] : parts) {
+    if (labelled < 0 || labelled > samples || samples > left) {
+      throw std::invalid_argument("parts must be of the batch");
+    }
+    left -= samples;
+    batch.parts.push_back({samples, labelled});
+  }
+  if (left != 0) throw std::invalid_argument("each sample must be in a part");
+  return batch;
 }
 
 template <typename T>
-LossBatch<T> rays_of(const FieldLoss<T>& loss, const Array<T>& points, const Array<T>& sdf_m, const Rows<T>& rays,
-                     std::int64_t num_labelled, const std::vector<Bytes>& dropout) {
-  LossBatch<T> batch = points_of(points, sdf_m);
-  check_shape(rays, batch.count, kRayColumns, "rays");
+LossBatch<T> rays_of(const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, const Rows<T>& rays,
+                     const std::vector<Drop>& dropout) {
+  LossBatch<T> batch = points_of(points, sdf_m, parts);
+  check_shape(rays, points.shape(0), kRayColumns, "rays");
   batch.rays = rays.data();
   batch.ray_stride = row_stride(rays, "rays");
-  if (num_labelled < 0 || num_labelled > batch.count) throw std::invalid_argument("num_labelled must be of the batch");
-  batch.num_labelled = num_labelled;
-  const std::int64_t columns[] = {loss.parameters().cells(), loss.parameters().waves()};
   if (dropout.size() > 2) throw std::invalid_argument("only the two encodings can have a dropout");
   for (std::size_t i = 0; i < dropout.size(); ++i) {
-    check_shape(dropout[i].first, loss.num_seen(batch.count, num_labelled), columns[i], "dropout");
     if (dropout[i].second < 1) throw std::invalid_argument("a dropout must keep something");
-    batch.dropout[i] = {dropout[i].first.data(), dropout[i].second};
+    batch.dropout[i] = {dropout[i].first, dropout[i].second};
   }
   return batch;
 }
@@ -141,49 +160,50 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       "`intensity`: weights and biases of their layers, `intensity` may be None; `sees`: whether the intensity "
       "network sees SDF, viewing direction and range. The arrays are read anew by each call, where they are.");
   cls.def(
-      "sdf",
-      [](const AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, double weight,
-         Array<std::int32_t>& located, Array<T>& interpolated_grad) {
-        const FieldLoss<T>& loss = self.of<T>().loss();
-        const LossBatch<T> batch = points_of(points, sdf_m);
-        const FeatureGradients<T> gradients = by_features(loss, batch.count, located, interpolated_grad);
-        const py::gil_scoped_release release;
-        return loss.sdf(batch, weight, gradients);
+      "begin_sdf",
+      [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, double weight,
+         Array<std::int32_t>& located, Array<T>& interpolated_grad, HeldCrew& crew) {
+        FieldLoss<T>& loss = self.of<T>().loss();
+        const LossBatch<T> batch = points_of(points, sdf_m, parts);
+        const FeatureGradients<T> gradients = by_features(loss, points.shape(0), located, interpolated_grad);
+        loss.begin_sdf(batch, weight, gradients, crew.crew());
+        crew.hold(py::make_tuple(py::cast(&self), points, sdf_m, located, interpolated_grad));
       },
-      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "weight"_a, "located"_a.noconvert(),
-      "interpolated_grad"_a.noconvert(),
-      "The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of "
-      "`weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, "
-      "8 L), with the points' cells in `located` (N, L) int32.");
+      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "weight"_a, "located"_a.noconvert(),
+      "interpolated_grad"_a.noconvert(), "crew"_a,
+      "Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads "
+      "of `crew` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many "
+      "samples, and how many of these have labels of intensities. Their gradients are added in their order, so the "
+      "threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is "
+      "interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) "
+      "int32.");
   cls.def(
-      "joint",
-      [](const AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Rows<T>& rays,
-         std::int64_t num_labelled, const std::vector<Bytes>& dropout, const std::pair<double, double>& weights,
-         Array<std::int32_t>& located, Array<T>& interpolated_grad) {
-        const FieldLoss<T>& loss = self.of<T>().loss();
-        const LossBatch<T> batch = rays_of(loss, points, sdf_m, rays, num_labelled, dropout);
-        const FeatureGradients<T> gradients = by_features(loss, batch.count, located, interpolated_grad);
-        const py::gil_scoped_release release;
-        const FieldLosses losses = loss.joint(batch, {weights.first, weights.second}, gradients);
-        return std::pair(losses.sdf, losses.intensity);
+      "begin_joint",
+      [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, const Rows<T>& rays,
+         const std::vector<Drop>& dropout, const std::pair<double, double>& weights, Array<std::int32_t>& located,
+         Array<T>& interpolated_grad, HeldCrew& crew) {
+        FieldLoss<T>& loss = self.of<T>().loss();
+        const LossBatch<T> batch = rays_of(points, sdf_m, parts, rays, dropout);
+        const FeatureGradients<T> gradients = by_features(loss, points.shape(0), located, interpolated_grad);
+        loss.begin_joint(batch, {weights.first, weights.second}, gradients, crew.crew());
+        crew.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays, located, interpolated_grad));
       },
-      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_labelled"_a, "dropout"_a, "weights"_a,
-      "located"_a.noconvert(), "interpolated_grad"_a.noconvert(),
-      "Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. "
-      "`rays` (N, 8) are the samples' rays; the intensities of the first `num_labelled` are labels. `dropout` has up "
-      "to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the "
-      "encodings of cells and positions.");
+      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "rays"_a.noconvert(), "dropout"_a, "weights"_a,
+      "located"_a.noconvert(), "interpolated_grad"_a.noconvert(), "crew"_a,
+      "Like `begin_sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. "
+      "`rays` (N, 8) are the samples' rays. `dropout` has up to two pairs, of the encodings of cells and positions: "
+      "the seed of `random_bytes` (samples seen, columns), and the number below which a byte keeps its column.");
   cls.def(
-      "intensity",
-      [](const AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Rows<T>& rays,
-         std::int64_t num_labelled, const std::vector<Bytes>& dropout, double weight) {
-        const FieldLoss<T>& loss = self.of<T>().loss();
-        const LossBatch<T> batch = rays_of(loss, points, sdf_m, rays, num_labelled, dropout);
-        const py::gil_scoped_release release;
-        return loss.intensity(batch, weight);
+      "begin_intensity",
+      [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, const Rows<T>& rays,
+         const std::vector<Drop>& dropout, double weight, HeldCrew& crew) {
+        FieldLoss<T>& loss = self.of<T>().loss();
+        const LossBatch<T> batch = rays_of(points, sdf_m, parts, rays, dropout);
+        loss.begin_intensity(batch, weight, crew.crew());
+        crew.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays));
       },
-      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "rays"_a.noconvert(), "num_labelled"_a, "dropout"_a, "weight"_a,
-      "Like `joint`, of the intensities alone while the SDF network and the features are frozen: writes to "
+      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "rays"_a.noconvert(), "dropout"_a, "weight"_a, "crew"_a,
+      "Like `begin_joint`, of the intensities alone while the SDF network and the features are frozen: writes to "
       "`intensity_gradients` only.");
 }
 
@@ -196,6 +216,8 @@ void bind_field_loss(py::module_& m) {
       "them. One thread at a time may use an object.");
   bind_methods<float>(cls);
   bind_methods<double>(cls);
+  cls.def("finish", &AnyFieldLoss::finish, py::arg("crew"),
+          "Helps the crew with the batch that was begun. Gives both mean losses, 0 for one that was not asked for.");
   cls.def_property_readonly("sdf_gradients", &AnyFieldLoss::sdf_gradients,
                             "By weights and biases of each layer of the SDF network in turn, as the last call that "
                             "trained it wrote them.");

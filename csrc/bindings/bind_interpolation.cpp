@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 #include <optional>
 
+#include "bindings/held_crew.hpp"
 #include "bindings/subjects.hpp"
 #include "bindings/table_arrays.hpp"
 #include "field/encodings.hpp"
@@ -79,6 +80,24 @@ void bind_kernels(py::class_<VertexTable>& cls) {
       "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true), "out_grad"_a.noconvert(),
       "features_grad"_a.noconvert(), "num_threads"_a = 0,
       "Adds the transpose of `interpolate`, applied to `out_grad` (N, 8 L), to `features_grad` (num_rows, 8).");
+
+  cls.def(
+      "scatter",
+      [](const VertexTable& table, const Array<T>& points, const Located& located, const Rows<T>& out_grad,
+         Array<T>& features_grad, HeldCrew& crew) {
+        const PointBatch<T> batch = point_batch(table, points, located, Directions());
+        check_features(table, features_grad);
+        check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
+        const std::int64_t stride = row_stride(out_grad, "out_grad");
+        const T* grad = out_grad.data();
+        T* result = features_grad.mutable_data();
+        const py::gil_scoped_release release;
+        crew.crew().run(num_level_tasks(table), [&](std::int64_t task) {
+          scatter_task(table, batch, grad, stride, result, level_task(table, task));
+        });
+      },
+      "points"_a.noconvert(), "located"_a.noconvert(), "out_grad"_a.noconvert(), "features_grad"_a.noconvert(),
+      "crew"_a, "The same by the threads of a crew, without directions.");
 
   cls.def(
       "coordinate_gradient",

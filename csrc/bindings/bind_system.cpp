@@ -3,12 +3,14 @@
 #include <pybind11/stl.h>
 
 #include "bindings/arrays.hpp"
+#include "bindings/held_crew.hpp"
 #include "bindings/subjects.hpp"
 #include "field/field_loss.hpp"
 #include "kernels/fourier_kernels.hpp"
 #include "lattice/cell.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
+#include "util/random_bytes.hpp"
 
 namespace radarsdf {
 namespace {
@@ -38,6 +40,25 @@ void bind_numbers(py::module_& m) {
 void bind_system(py::module_& m) {
   set_interrupt_check(&check_signals);
   using namespace py::literals;
+  py::class_<HeldCrew>(m, "Crew",
+                       "Threads for short pieces of work, the calling one among them. They end with the object. One "
+                       "thread at a time may use it.")
+      .def(py::init<int>(), "num_threads"_a)
+      .def(
+          "finish", [](HeldCrew& crew) { crew.finish([](Crew& own) { own.finish(); }); },
+          "Helps with what was begun, and returns at its end.");
+  m.def(
+      "random_bytes",
+      [](std::uint64_t seed, std::int64_t rows, std::int64_t columns) {
+        if (rows < 0 || columns < 0) throw std::invalid_argument("there cannot be less than no rows and columns");
+        Array<std::uint8_t> bytes(std::vector<std::int64_t>{rows, columns});
+        RandomRows random(seed, columns);
+        for (std::int64_t i = 0; i < rows; ++i) {
+          std::copy_n(random.row(i), columns, bytes.mutable_data() + i * columns);
+        }
+        return bytes;
+      },
+      "seed"_a, "rows"_a, "columns"_a, "Random bytes (rows, columns), those of a dropout with this seed.");
   m.attr("__version__") = RADARSDF_VERSION;
   bind_numbers(m);
   m.def(

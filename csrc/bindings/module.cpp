@@ -10,7 +10,7 @@ PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   radarsdf::bind_cell_set(m);
   radarsdf::VertexTableClass table = radarsdf::bind_vertex_table(m);
   radarsdf::bind_interpolation(table);
-  radarsdf::bind_optimiser(m, table);
+  radarsdf::bind_optimiser(table);
   radarsdf::bind_ray_average(table);
   radarsdf::bind_encodings(m);
   radarsdf::bind_mlp(m);

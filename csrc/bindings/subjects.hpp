@@ -16,7 +16,7 @@ void bind_system(pybind11::module_& m);
 void bind_cell_set(pybind11::module_& m);
 VertexTableClass bind_vertex_table(pybind11::module_& m);
 void bind_interpolation(VertexTableClass& table);
-void bind_optimiser(pybind11::module_& m, VertexTableClass& table);
+void bind_optimiser(VertexTableClass& table);
 void bind_ray_average(VertexTableClass& table);
 void bind_encodings(pybind11::module_& m);
 void bind_mlp(pybind11::module_& m);

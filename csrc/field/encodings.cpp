@@ -51,16 +51,17 @@ void interpolate(const VertexTable& table, const T* features, const PointBatch<T
 template <typename T>
 void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
              T* features_grad, int num_threads) {
-  const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
-  const Interpolation<T> in = interpolation(table, batch);
-  // Threads take whole (level, group) pairs, whose rows are disjoint: no atomics, no private copies of the gradient,
-  // and each row's sum in the order of the points. Coarse levels first: they are hit most.
-  const int groups = num_vertex_groups(table.encoding());
   const int threads = batch.count < kMinPoints ? 1 : num_threads;
-  parallel_tasks(table.num_levels() * groups, threads, [&](std::int64_t task) {
-    const int level = table.num_levels() - 1 - static_cast<int>(task) / groups;
-    kernels.scatter(in, out_grad, stride, features_grad, level, static_cast<int>(task) % groups, 0, batch.count);
+  parallel_tasks(num_level_tasks(table), threads, [&](std::int64_t task) {
+    scatter_task(table, batch, out_grad, stride, features_grad, level_task(table, task));
   });
+}
+
+template <typename T>
+void scatter_task(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
+                  T* features_grad, LevelTask task) {
+  const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
+  kernels.scatter(interpolation(table, batch), out_grad, stride, features_grad, task.level, task.group, 0, batch.count);
 }
 
 template <typename T>
@@ -116,6 +117,7 @@ void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::i
   template void encode(const VertexTable&, const T*, const T*, std::int64_t, std::int32_t*, T*, std::int64_t, int); \
   template void interpolate(const VertexTable&, const T*, const PointBatch<T>&, T*, std::int64_t, int);             \
   template void scatter(const VertexTable&, const PointBatch<T>&, const T*, std::int64_t, T*, int);                 \
+  template void scatter_task(const VertexTable&, const PointBatch<T>&, const T*, std::int64_t, T*, LevelTask);      \
   template void coordinate_gradient(const VertexTable&, const T*, const PointBatch<T>&, const T*, std::int64_t, T*, \
                                     int);                                                                           \
   template void fourier(const T*, std::int64_t, double, int, int, T*, std::int64_t, int);                           \

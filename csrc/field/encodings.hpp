@@ -7,6 +7,7 @@
 
 #include <cstdint>
 
+#include "field/level_tasks.hpp"
 #include "field/point_batch.hpp"
 #include "lattice/vertex_table.hpp"
 
@@ -28,6 +29,10 @@ void interpolate(const VertexTable& table, const T* features, const PointBatch<T
 template <typename T>
 void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
              T* features_grad, int num_threads);
+// One of its tasks, see level_tasks.hpp.
+template <typename T>
+void scatter_task(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
+                  T* features_grad, LevelTask task);
 
 template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,

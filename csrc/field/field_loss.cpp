@@ -7,9 +7,11 @@
 #include <memory>
 #include <stdexcept>
 #include <string>
+#include <utility>
 
 #include "kernels/fourier_kernels.hpp"
 #include "util/large_array.hpp"
+#include "util/random_bytes.hpp"
 
 namespace radarsdf {
 namespace {
@@ -22,13 +24,27 @@ Matrix<T> matrix(std::int64_t rows, std::int64_t columns) {
   return large_array<T>(rows * columns);
 }
 
-// What a sum over a batch is to be multiplied by: a thread's share of a small one may be empty.
+// What a sum over a batch is to be multiplied by.
 double mean(std::int64_t count) { return 1 / static_cast<double>(std::max<std::int64_t>(count, 1)); }
 
-// What is asked for of a batch.
+// The samples of a part of a batch.
+template <typename T>
+struct Part {
+  const T* points;
+  const T* sdf_m;
+  std::int64_t count;
+  const T* rays;
+  std::int64_t ray_stride;
+  std::int64_t num_labelled;
+  std::int64_t num_seen;             // the intensity network sees the first so many
+  std::int64_t before, seen_before;  // samples of the batch
+  Dropout dropout[2];
+};
+
+// What is asked for of a part.
 template <typename T>
 struct Request {
-  FieldLosses weights;
+  FieldLosses shares;                               // of one sample in the weighted means over the batch
   const std::vector<LayerGradients<T>>* sdf;        // null: features and SDF network are frozen, without a loss
   const std::vector<LayerGradients<T>>* intensity;  // null: there is no loss of intensities
   FeatureGradients<T> by_features;                  // `interpolated` is null where they are frozen
@@ -37,18 +53,18 @@ struct Request {
 template <typename T>
 class Pass {
  public:
-  Pass(const FieldParameters<T>& field, const LossOptions& options, const LossBatch<T>& batch,
-       const Request<T>& request, std::int64_t num_seen)
+  Pass(const FieldParameters<T>& field, const LossOptions& options, const Part<T>& part, const Request<T>& request)
       : field_(field),
         options_(options),
-        batch_(batch),
+        batch_(part),
         request_(request),
-        num_seen_(num_seen),
+        num_seen_(part.num_seen),
         levels_(field.levels()),
         cells_(field.cells()),
         waves_(field.waves()),
         feature_(field.feature()) {}
 
+  // Sums over the samples.
   FieldLosses run() {
     encode();
     const bool trains = request_.sdf != nullptr;
@@ -103,7 +119,7 @@ class Pass {
   double sdf_loss() {
     const std::int64_t outputs = 1 + feature_;
     const T inverse_sigma = static_cast<T>(1 / options_.sigma_m);
-    const T share = static_cast<T>(request_.weights.sdf * mean(batch_.count));
+    const T share = static_cast<T>(request_.shares.sdf);
     double sum = 0;
     for (std::int64_t i = 0; i < batch_.count; ++i) {
       const T logit = out_[i * outputs], label = 1 / (1 + std::exp(-batch_.sdf_m[i] * inverse_sigma));
@@ -111,18 +127,22 @@ class Pass {
       sum += static_cast<double>(std::max(logit, T(0)) - logit * label + std::log1p(tail));
       out_grad_[i * outputs] = share * ((logit < 0 ? tail : T(1)) / (1 + tail) - label);
     }
-    return sum * mean(batch_.count);
+    return sum;
   }
 
-  // Applies the dropout to a sample's row of an encoding, or of its gradient. `to` may be `from`.
-  void drop(const Dropout& dropout, std::int64_t i, std::int64_t columns, const T* from, T* to) const {
-    if (!dropout.bytes) {
-      if (to != from) std::copy_n(from, columns, to);
-      return;
-    }
-    const std::uint8_t* bytes = dropout.bytes + i * columns;
+  // Applies a dropout to rows of an encoding, or of its gradient, one for each sample that is seen. `to` may be `from`.
+  void drop(const Dropout& dropout, std::int64_t columns, const T* from, std::int64_t from_row, T* to,
+            std::int64_t to_row) const {
+    RandomRows random(dropout.seed, columns);
     const T scale = T(256) / static_cast<T>(dropout.keep);
-    for (std::int64_t d = 0; d < columns; ++d) to[d] = from[d] * (bytes[d] < dropout.keep ? scale : T(0));
+    for (std::int64_t i = 0; i < num_seen_; ++i, from += from_row, to += to_row) {
+      if (dropout.keep >= 256) {
+        if (to != from) std::copy_n(from, columns, to);
+        continue;
+      }
+      const std::uint8_t* bytes = random.row(batch_.seen_before + i);
+      for (std::int64_t d = 0; d < columns; ++d) to[d] = from[d] * (bytes[d] < dropout.keep ? scale : T(0));
+    }
   }
 
   // Mean absolute error, and the gradients by the layers and, where `trains`, by what the SDF network hands on.
@@ -131,7 +151,9 @@ class Pass {
     const std::int64_t links = feature_ + field_.sees.sdf;  // columns that the SDF network gives
     const std::int64_t rest = dim() + links;                // the columns from here on are data and need no gradient
     const Matrix<T> x = matrix<T>(count, width);
-    for (std::int64_t i = 0; i < count; ++i) fill(i, x.get() + i * width);
+    drop(batch_.dropout[0], cells_, encoding_.get(), dim(), x.get(), width);
+    drop(batch_.dropout[1], waves_, encoding_.get() + cells_, dim(), x.get() + cells_, width);
+    for (std::int64_t i = 0; i < count; ++i) fill(i, x.get() + i * width + dim());
     if (field_.sees.view_direction) {
       const Matrix<T> directions = matrix<T>(count, 3);
       for (std::int64_t i = 0; i < count; ++i) {
@@ -161,7 +183,7 @@ class Pass {
     const Matrix<T> predicted = matrix<T>(count, 1);
     const Matrix<T> hidden = matrix<T>(count, mlp_hidden_columns(field_.intensity));
     mlp(field_.intensity, inputs, count, hidden.get(), predicted.get(), 1);
-    const T share = static_cast<T>(request_.weights.intensity * mean(count));
+    const T share = static_cast<T>(request_.shares.intensity);
     double sum = 0;
     for (std::int64_t i = 0; i < count; ++i) {
       // No return is expected from free space (3QFPI).
@@ -172,15 +194,11 @@ class Pass {
     }
     mlp_backward(field_.intensity, inputs, count, hidden.get(), {predicted.get(), 1, 1}, *request_.intensity,
                  input_grads, 1);
-    return sum * mean(count);
+    return sum;
   }
 
-  // What the intensity network sees of a sample, but for the harmonics.
+  // What the intensity network sees of a sample after the encodings, but for the harmonics.
   void fill(std::int64_t i, T* x) const {
-    const T* encoding = encoding_.get() + i * dim();
-    drop(batch_.dropout[0], i, cells_, encoding, x);
-    drop(batch_.dropout[1], i, waves_, encoding + cells_, x + cells_);
-    x += dim();
     const T* out = out_.get() + i * (1 + feature_);
     x = std::copy_n(out + 1, feature_, x);
     if (field_.sees.sdf) *x++ = out[0];
@@ -206,11 +224,9 @@ class Pass {
   // Gradients of the intensity by the cells' encoding.
   void add_cells(T* cells_grad) {
     if (!cells_grad_) return;
-    for (std::int64_t i = 0; i < num_seen_; ++i) {
-      T* own = cells_grad_.get() + i * cells_;
-      drop(batch_.dropout[0], i, cells_, own, own);
-      for (std::int64_t d = 0; d < cells_; ++d) cells_grad[i * cells_ + d] += own[d];
-    }
+    T* own = cells_grad_.get();
+    drop(batch_.dropout[0], cells_, own, cells_, own, cells_);
+    for (std::int64_t i = 0; i < num_seen_ * cells_; ++i) cells_grad[i] += own[i];
   }
 
   // The encoding is the sum of the levels, so each level's gradient is that of the sum.
@@ -224,7 +240,7 @@ class Pass {
 
   const FieldParameters<T>& field_;
   const LossOptions& options_;
-  const LossBatch<T>& batch_;
+  const Part<T>& batch_;
   const Request<T>& request_;
   std::int64_t num_seen_;
   std::int64_t levels_, cells_, waves_, feature_;  // numbers of columns
@@ -241,6 +257,15 @@ void check_layers(const std::vector<Layer<T>>& layers, std::int64_t num_gradient
   for (const Layer<T>& layer : layers) {
     if (layer.inputs != inputs || layer.outputs < 1) throw std::invalid_argument(message);
     inputs = layer.outputs;
+  }
+}
+
+template <typename T>
+void add(const std::vector<Layer<T>>& layers, const std::vector<LayerGradients<T>>& from,
+         const std::vector<LayerGradients<T>>& to) {
+  for (std::size_t i = 0; i < layers.size(); ++i) {
+    for (std::int64_t k = 0; k < layers[i].outputs * layers[i].inputs; ++k) to[i].weights[k] += from[i].weights[k];
+    for (std::int64_t k = 0; k < layers[i].outputs; ++k) to[i].biases[k] += from[i].biases[k];
   }
 }
 
@@ -268,30 +293,116 @@ FieldLoss<T>::FieldLoss(const FieldParameters<T>& parameters, const LossOptions&
 }
 
 template <typename T>
-void FieldLoss<T>::check_intensity() const {
-  if (parameters_.intensity.empty()) throw std::invalid_argument("there is no intensity network");
+struct FieldLoss<T>::Job {
+  std::vector<Part<T>> parts;
+  std::vector<NetworkGradients<T>> by_networks;  // of each part
+  std::vector<FieldLosses> sums;                 // of each part
+  FieldLosses means;                             // what the sums are multiplied by
+  bool trains, sees;
+  std::unique_ptr<std::int32_t[]> located;  // where the caller does not ask for it
+};
+
+template <typename T>
+void FieldLoss<T>::begin_sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features,
+                             Crew& crew) {
+  begin(batch, {weight, 0}, by_features, true, false, crew);
 }
 
 template <typename T>
-double FieldLoss<T>::sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features) const {
-  const Request<T> request{{weight, 0}, &gradients_.sdf, nullptr, by_features};
-  return Pass<T>(parameters_, options_, batch, request, 0).run().sdf;
+void FieldLoss<T>::begin_joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features,
+                               Crew& crew) {
+  begin(batch, weights, by_features, true, true, crew);
 }
 
 template <typename T>
-FieldLosses FieldLoss<T>::joint(const LossBatch<T>& batch, FieldLosses weights,
-                                const FeatureGradients<T>& by_features) const {
-  check_intensity();
-  const Request<T> request{weights, &gradients_.sdf, &gradients_.intensity, by_features};
-  return Pass<T>(parameters_, options_, batch, request, num_seen(batch.count, batch.num_labelled)).run();
+void FieldLoss<T>::begin_intensity(const LossBatch<T>& batch, double weight, Crew& crew) {
+  begin(batch, {0, weight}, {nullptr, nullptr}, false, true, crew);
 }
 
 template <typename T>
-double FieldLoss<T>::intensity(const LossBatch<T>& batch, double weight) const {
-  check_intensity();
-  const auto located = large_array<std::int32_t>(batch.count * parameters_.table->num_levels());
-  const Request<T> request{{0, weight}, nullptr, &gradients_.intensity, {located.get(), nullptr}};
-  return Pass<T>(parameters_, options_, batch, request, num_seen(batch.count, batch.num_labelled)).run().intensity;
+void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features,
+                         bool trains, bool sees, Crew& crew) {
+  if (sees && parameters_.intensity.empty()) throw std::invalid_argument("there is no intensity network");
+  if (job_) throw std::logic_error("the batch before this one is not finished");
+  const auto job = std::make_shared<Job>();
+  std::int64_t count = 0, num_seen = 0;
+  for (const LossPart& part : batch.parts) {
+    const std::int64_t seen = options_.intensity_in_free_space ? part.count : part.num_labelled;
+    const T* rays = batch.rays ? batch.rays + count * batch.ray_stride : nullptr;
+    job->by_networks.push_back(job->parts.empty() ? gradients_ : of_part(job->parts.size()));
+    job->parts.push_back({batch.points + 3 * count,
+                          batch.sdf_m + count,
+                          part.count,
+                          rays,
+                          batch.ray_stride,
+                          part.num_labelled,
+                          seen,
+                          count,
+                          num_seen,
+                          {batch.dropout[0], batch.dropout[1]}});
+    count += part.count;
+    num_seen += seen;
+  }
+  job->sums.resize(job->parts.size());
+  job->means = {mean(count), mean(num_seen)};
+  job->trains = trains;
+  job->sees = sees;
+  FeatureGradients<T> to = by_features;
+  if (!to.located) {
+    job->located = large_array<std::int32_t>(count * parameters_.table->num_levels());
+    to.located = job->located.get();
+  }
+  const FieldLosses shares{weights.sdf * job->means.sdf, weights.intensity * job->means.intensity};
+  crew.begin(static_cast<std::int64_t>(job->parts.size()), [this, job, to, shares](std::int64_t task) {
+    const auto i = static_cast<std::size_t>(task);
+    const Part<T>& part = job->parts[i];
+    const Request<T> request{shares,
+                             job->trains ? &job->by_networks[i].sdf : nullptr,
+                             job->sees ? &job->by_networks[i].intensity : nullptr,
+                             {to.located + part.before * parameters_.table->num_levels(),
+                              job->trains ? to.interpolated + part.before * parameters_.levels() : nullptr}};
+    job->sums[i] = Pass<T>(parameters_, options_, part, request).run();
+  });
+  job_ = job;
+}
+
+template <typename T>
+FieldLosses FieldLoss<T>::finish(Crew& crew) {
+  if (!job_) throw std::logic_error("no batch was begun");
+  const std::shared_ptr<Job> job = std::move(job_);
+  crew.finish();
+  FieldLosses losses{0, 0};
+  for (const FieldLosses& sum : job->sums) {
+    losses.sdf += sum.sdf * job->means.sdf;
+    losses.intensity += sum.intensity * job->means.intensity;
+  }
+  for (std::size_t i = 1; i < job->parts.size(); ++i) {
+    if (job->trains) add(parameters_.sdf, job->by_networks[i].sdf, gradients_.sdf);
+    if (job->sees) add(parameters_.intensity, job->by_networks[i].intensity, gradients_.intensity);
+  }
+  return losses;
+}
+
+template <typename T>
+NetworkGradients<T> FieldLoss<T>::of_part(std::size_t part) {
+  if (of_parts_.size() < part) of_parts_.resize(part);
+  std::vector<T>& numbers = of_parts_[part - 1];
+  std::int64_t size = 0;
+  for (const auto* layers : {&parameters_.sdf, &parameters_.intensity}) {
+    for (const Layer<T>& layer : *layers) size += layer.outputs * (layer.inputs + 1);
+  }
+  numbers.resize(static_cast<std::size_t>(size));
+  NetworkGradients<T> gradients;
+  T* next = numbers.data();
+  const auto share_out = [&](const std::vector<Layer<T>>& layers, std::vector<LayerGradients<T>>& of_layers) {
+    for (const Layer<T>& layer : layers) {
+      of_layers.push_back({next, next + layer.outputs * layer.inputs});
+      next += layer.outputs * (layer.inputs + 1);
+    }
+  };
+  share_out(parameters_.sdf, gradients.sdf);
+  share_out(parameters_.intensity, gradients.intensity);
+  return gradients;
 }
 
 template class FieldLoss<float>;

@@ -6,11 +6,13 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 #include "field/encodings.hpp"
 #include "field/mlp.hpp"
 #include "lattice/vertex_table.hpp"
+#include "util/crew.hpp"
 
 namespace radarsdf {
 
@@ -62,22 +64,28 @@ struct NetworkGradients {
   std::vector<LayerGradients<T>> sdf, intensity;
 };
 
-// The bytes of a dropout: a number whose byte is below `keep` stays, times 256 / keep; the others become 0.
+// Each number has a random byte (see RandomRows). If it is below `keep`, the number stays, times 256 / keep; the others
+// become 0.
 struct Dropout {
-  const std::uint8_t* bytes = nullptr;  // null: all stays
-  int keep = 256;
+  std::uint64_t seed = 0;
+  int keep = 256;  // all stays
 };
 
-// Samples on rays. The loss of the signed distances needs points and labels only.
+// A run of a batch's samples, which one thread works on.
+struct LossPart {
+  std::int64_t count;
+  std::int64_t num_labelled;  // the first have the intensity of their return as a label
+};
+
+// Samples on rays, part by part. The loss of the signed distances needs points and labels only.
 template <typename T>
 struct LossBatch {
   const T* points;  // (count, 3) local frame, m
   const T* sdf_m;   // (count) labels, positive in front of the return
-  std::int64_t count;
+  std::vector<LossPart> parts;
   const T* rays = nullptr;  // (count, kRayColumns), rows ray_stride apart
   std::int64_t ray_stride = 0;
-  std::int64_t num_labelled = 0;  // the first have the intensity of their return as a label
-  Dropout dropout[2] = {};        // of the cells' encoding and of the Fourier encoding: (num_seen, columns)
+  Dropout dropout[2] = {};  // of the cells' encoding and of the Fourier encoding: (num_seen, columns)
 };
 
 // By the features, which only few points touch: what `scatter` and `adam_step` take.
@@ -92,8 +100,9 @@ struct FieldLosses {
   double sdf, intensity;
 };
 
-// All gradients are overwritten. The calls run on the calling thread; two calls of one object must not overlap, since
-// both would write the gradients of the networks.
+// A batch is begun, and the caller may do something else until it calls `finish`; then all gradients are overwritten.
+// They are made part by part and added in the order of the parts, so they do not depend on the number of threads. One
+// batch at a time; what it points to must stay until its end.
 template <typename T>
 class FieldLoss {
  public:
@@ -101,24 +110,29 @@ class FieldLoss {
   FieldLoss(const FieldParameters<T>& parameters, const LossOptions& options, const NetworkGradients<T>& gradients);
 
   const FieldParameters<T>& parameters() const { return parameters_; }
-  // The intensity network sees the first so many samples of a batch.
-  std::int64_t num_seen(std::int64_t count, std::int64_t num_labelled) const {
-    return options_.intensity_in_free_space ? count : num_labelled;
-  }
 
   // The loss of the signed distances alone.
-  double sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features) const;
+  void begin_sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features, Crew& crew);
   // Both losses.
-  FieldLosses joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features) const;
+  void begin_joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features, Crew& crew);
   // The loss of the intensities, by the intensity network alone: features and SDF network are frozen.
-  double intensity(const LossBatch<T>& batch, double weight) const;
+  void begin_intensity(const LossBatch<T>& batch, double weight, Crew& crew);
+  // Helps the crew. A loss that was not asked for is 0.
+  FieldLosses finish(Crew& crew);
 
  private:
-  void check_intensity() const;
+  struct Job;
+
+  // `trains`: features and SDF network, by the first loss. `sees`: there is a loss of intensities.
+  void begin(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features, bool trains,
+             bool sees, Crew& crew);
+  NetworkGradients<T> of_part(std::size_t part);  // from 1 on
 
   FieldParameters<T> parameters_;
   LossOptions options_;
   NetworkGradients<T> gradients_;
+  std::vector<std::vector<T>> of_parts_;  // gradients of the networks by all parts but the first
+  std::shared_ptr<Job> job_;              // the batch that was begun
 };
 
 }  // namespace radarsdf

@@ -10,11 +10,10 @@
 namespace radarsdf {
 
 template <typename T>
-void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, TaskQueue& queue) {
+void adam_task(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
+               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, LevelTask task) {
   const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
   const AdamKernel<T> adam_kernel = RADARSDF_KERNEL(adam_kernel<T>)();
-  const int groups = num_vertex_groups(table.encoding());
   const std::int64_t corners = corners_per_group(table.encoding());
   std::int64_t points = 0;
   for (const PointBatch<T>& batch : batches) points += batch.count;
@@ -24,20 +23,17 @@ void adam_step(const VertexTable& table, const std::vector<PointBatch<T>>& batch
   const auto most = static_cast<std::size_t>(std::min(points * corners, table.num_rows())) + 1;
   if (rows.size() < most) rows.resize(most);
   if (sums.size() < most * kFeatureDim) sums.resize(most * kFeatureDim);
-  for (int task = queue.take(); task < table.num_levels() * groups; task = queue.take()) {
-    const int level = table.num_levels() - 1 - task / groups;  // coarse ones first: they take longest
-    RowSums<T> touched{adam.marks, rows.data(), sums.data(), 0};
-    for (std::size_t b = 0; b < batches.size(); ++b) {
-      kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, level, task % groups, 0,
-                           batches[b].count);
-    }
-    adam_kernel.move(adam, touched.rows, touched.sums, touched.count);
+  RowSums<T> touched{adam.marks, rows.data(), sums.data(), 0};
+  for (std::size_t b = 0; b < batches.size(); ++b) {
+    kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, task.level, task.group, 0,
+                         batches[b].count);
   }
+  adam_kernel.move(adam, touched.rows, touched.sums, touched.count);
 }
 
 #define RADARSDF_INSTANTIATE(T)                                                                                \
-  template void adam_step(const VertexTable&, const std::vector<PointBatch<T>>&, const std::vector<const T*>&, \
-                          const std::vector<std::int64_t>&, const AdamStep<T>&, TaskQueue&);
+  template void adam_task(const VertexTable&, const std::vector<PointBatch<T>>&, const std::vector<const T*>&, \
+                          const std::vector<std::int64_t>&, const AdamStep<T>&, LevelTask);
 RADARSDF_INSTANTIATE(float)
 RADARSDF_INSTANTIATE(double)
 #undef RADARSDF_INSTANTIATE

@@ -16,11 +16,12 @@
 namespace radarsdf {
 namespace {
 
-std::atomic<bool> forked{false};
+std::atomic<int> forks{0};
 std::atomic<void (*)()> interrupt_check{nullptr};
+thread_local bool ignores_interrupts = false;
 
 #ifdef RADARSDF_FORKS
-[[maybe_unused]] const int at_fork = pthread_atfork(nullptr, nullptr, [] { forked = true; });
+[[maybe_unused]] const int at_fork = pthread_atfork(nullptr, nullptr, [] { ++forks; });
 #endif
 
 }  // namespace
@@ -29,7 +30,7 @@ int resolve_num_threads(int num_threads) {
 #ifdef _OPENMP
   // Where the system refuses a thread, OpenMP ends the whole program.
   constexpr int kMaxThreads = 1024;
-  if (forked) return 1;
+  if (forks > 0) return 1;
   return num_threads > 0 ? std::min(num_threads, kMaxThreads) : omp_get_max_threads();
 #else
   (void)num_threads;
@@ -37,7 +38,11 @@ int resolve_num_threads(int num_threads) {
 #endif
 }
 
+int num_forks() { return forks; }
+
 void set_interrupt_check(void (*check)()) { interrupt_check = check; }
+
+void ignore_interrupts_here() { ignores_interrupts = true; }
 
 void check_interrupt() {
   using Clock = std::chrono::steady_clock;
@@ -46,7 +51,7 @@ void check_interrupt() {
   if (omp_get_thread_num() != 0) return;
 #endif
   void (*const check)() = interrupt_check;
-  if (check == nullptr || Clock::now() < next) return;
+  if (check == nullptr || ignores_interrupts || Clock::now() < next) return;
   next = Clock::now() + std::chrono::milliseconds(100);
   check();
 }

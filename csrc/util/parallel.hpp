@@ -20,6 +20,10 @@ int resolve_num_threads(int num_threads);
 // the threads that help it, check_interrupt does nothing: a task that takes long may ask on whichever it runs.
 void set_interrupt_check(void (*check)());
 void check_interrupt();
+void ignore_interrupts_here();  // for a thread that helps the one that made the call
+
+// How often this process, or one that it came from, was forked: threads from before stayed with the parent.
+int num_forks();
 
 // Runs task(i) for i in [0, num_tasks) on up to num_threads threads, each task whole on one thread.
 // An exception thrown by a task is rethrown here, and the tasks not yet begun are left out: it must not leave an OpenMP

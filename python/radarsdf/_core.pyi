@@ -13,6 +13,7 @@ __all__: list[str] = [
     "CellBlocks",
     "CellMeans",
     "CellSet",
+    "Crew",
     "Encoding",
     "FEATURE_DIM",
     "FieldLoss",
@@ -26,7 +27,6 @@ __all__: list[str] = [
     "RAY_RANGE",
     "SurfaceTracer",
     "SurfelMap",
-    "TaskQueue",
     "VertexTable",
     "available_instruction_sets",
     "bridge_cells",
@@ -51,6 +51,7 @@ __all__: list[str] = [
     "num_threads",
     "openmp_version",
     "principal_axes",
+    "random_bytes",
     "sample_cells",
     "sample_rays",
     "set_instruction_set",
@@ -59,6 +60,16 @@ __all__: list[str] = [
     "stable_order",
     "sum_moments",
 ]
+
+class Crew:
+    """
+    Threads for short pieces of work, the calling one among them. They end with the object. One thread at a time may use it.
+    """
+    def __init__(self, num_threads: typing.SupportsInt | typing.SupportsIndex) -> None: ...
+    def finish(self) -> None:
+        """
+        Helps with what was begun, and returns at its end.
+        """
 
 class CellSet:
     """
@@ -168,8 +179,20 @@ class VertexTable:
         encoding: Encoding = ...,
         num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
     ) -> None: ...
+    def average_rays(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        directions: numpy.typing.NDArray[numpy.float32],
+        normals: numpy.typing.NDArray[numpy.float32],
+        weights: numpy.typing.NDArray[numpy.float32],
+        truncation_m: typing.SupportsFloat | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.float32]:
+        """
+        Of an octree: for each vertex (num_rows,) float32 the mean of its signed distances, m, to planes through the `points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame.
+        """
     @typing.overload
-    def adam_step(
+    def begin_adam_step(
         self,
         batches: collections.abc.Sequence[
             tuple[
@@ -185,13 +208,13 @@ class VertexTable:
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
-        queue: TaskQueue,
+        crew: Crew,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: what no other call with the same `queue` has begun. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: the other threads of `crew` begin, and its `finish` is the end. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
         """
     @typing.overload
-    def adam_step(
+    def begin_adam_step(
         self,
         batches: collections.abc.Sequence[
             tuple[
@@ -207,22 +230,10 @@ class VertexTable:
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
-        queue: TaskQueue,
+        crew: Crew,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: what no other call with the same `queue` has begun. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
-        """
-    def average_rays(
-        self,
-        points: numpy.typing.NDArray[numpy.float32],
-        directions: numpy.typing.NDArray[numpy.float32],
-        normals: numpy.typing.NDArray[numpy.float32],
-        weights: numpy.typing.NDArray[numpy.float32],
-        truncation_m: typing.SupportsFloat | typing.SupportsIndex,
-        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-    ) -> numpy.typing.NDArray[numpy.float32]:
-        """
-        Of an octree: for each vertex (num_rows,) float32 the mean of its signed distances, m, to planes through the `points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: the other threads of `crew` begin, and its `finish` is the end. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
         """
     @typing.overload
     def coordinate_gradient(
@@ -350,6 +361,18 @@ class VertexTable:
     @typing.overload
     def scatter(
         self,
+        points: numpy.typing.NDArray[numpy.float32],
+        located: numpy.typing.NDArray[numpy.int32],
+        out_grad: numpy.typing.NDArray[numpy.float32],
+        features_grad: numpy.typing.NDArray[numpy.float32],
+        crew: Crew,
+    ) -> None:
+        """
+        The same by the threads of a crew, without directions.
+        """
+    @typing.overload
+    def scatter(
+        self,
         points: numpy.typing.NDArray[numpy.float64],
         located: numpy.typing.NDArray[numpy.int32],
         directions: numpy.typing.NDArray[numpy.float64] | None,
@@ -359,6 +382,18 @@ class VertexTable:
     ) -> None:
         """
         Adds the transpose of `interpolate`, applied to `out_grad` (N, 8 L), to `features_grad` (num_rows, 8).
+        """
+    @typing.overload
+    def scatter(
+        self,
+        points: numpy.typing.NDArray[numpy.float64],
+        located: numpy.typing.NDArray[numpy.int32],
+        out_grad: numpy.typing.NDArray[numpy.float64],
+        features_grad: numpy.typing.NDArray[numpy.float64],
+        crew: Crew,
+    ) -> None:
+        """
+        The same by the threads of a crew, without directions.
         """
     @property
     def encoding(self) -> Encoding: ...
@@ -370,12 +405,6 @@ class VertexTable:
     def num_levels(self) -> int: ...
     @property
     def num_rows(self) -> int: ...
-
-class TaskQueue:
-    """
-    Shares the work of one `adam_step` between several calls of it.
-    """
-    def __init__(self) -> None: ...
 
 class FieldLoss:
     """
@@ -422,108 +451,120 @@ class FieldLoss:
         `features` (num_rows, 8); `frequencies`: half width (m), the first exponent and how many; `sdf` and `intensity`: weights and biases of their layers, `intensity` may be None; `sees`: whether the intensity network sees SDF, viewing direction and range. The arrays are read anew by each call, where they are.
         """
     @typing.overload
-    def intensity(
+    def begin_intensity(
         self,
         points: numpy.typing.NDArray[numpy.float32],
         sdf_m: numpy.typing.NDArray[numpy.float32],
+        parts: collections.abc.Sequence[
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
+        ],
         rays: numpy.typing.NDArray[numpy.float32],
-        num_labelled: typing.SupportsInt | typing.SupportsIndex,
         dropout: collections.abc.Sequence[
-            tuple[
-                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
-                typing.SupportsInt | typing.SupportsIndex,
-            ]
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
         ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
-    ) -> float:
+        crew: Crew,
+    ) -> None:
         """
-        Like `joint`, of the intensities alone while the SDF network and the features are frozen: writes to `intensity_gradients` only.
+        Like `begin_joint`, of the intensities alone while the SDF network and the features are frozen: writes to `intensity_gradients` only.
         """
     @typing.overload
-    def intensity(
+    def begin_intensity(
         self,
         points: numpy.typing.NDArray[numpy.float64],
         sdf_m: numpy.typing.NDArray[numpy.float64],
+        parts: collections.abc.Sequence[
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
+        ],
         rays: numpy.typing.NDArray[numpy.float64],
-        num_labelled: typing.SupportsInt | typing.SupportsIndex,
         dropout: collections.abc.Sequence[
-            tuple[
-                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
-                typing.SupportsInt | typing.SupportsIndex,
-            ]
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
         ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
-    ) -> float:
+        crew: Crew,
+    ) -> None:
         """
-        Like `joint`, of the intensities alone while the SDF network and the features are frozen: writes to `intensity_gradients` only.
+        Like `begin_joint`, of the intensities alone while the SDF network and the features are frozen: writes to `intensity_gradients` only.
         """
     @typing.overload
-    def joint(
+    def begin_joint(
         self,
         points: numpy.typing.NDArray[numpy.float32],
         sdf_m: numpy.typing.NDArray[numpy.float32],
+        parts: collections.abc.Sequence[
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
+        ],
         rays: numpy.typing.NDArray[numpy.float32],
-        num_labelled: typing.SupportsInt | typing.SupportsIndex,
         dropout: collections.abc.Sequence[
-            tuple[
-                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
-                typing.SupportsInt | typing.SupportsIndex,
-            ]
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
         ],
         weights: tuple[
             typing.SupportsFloat | typing.SupportsIndex, typing.SupportsFloat | typing.SupportsIndex
         ],
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float32],
-    ) -> tuple[float, float]:
+        crew: Crew,
+    ) -> None:
         """
-        Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays; the intensities of the first `num_labelled` are labels. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
+        Like `begin_sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays. `dropout` has up to two pairs, of the encodings of cells and positions: the seed of `random_bytes` (samples seen, columns), and the number below which a byte keeps its column.
         """
     @typing.overload
-    def joint(
+    def begin_joint(
         self,
         points: numpy.typing.NDArray[numpy.float64],
         sdf_m: numpy.typing.NDArray[numpy.float64],
+        parts: collections.abc.Sequence[
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
+        ],
         rays: numpy.typing.NDArray[numpy.float64],
-        num_labelled: typing.SupportsInt | typing.SupportsIndex,
         dropout: collections.abc.Sequence[
-            tuple[
-                typing.Annotated[numpy.typing.ArrayLike, numpy.uint8],
-                typing.SupportsInt | typing.SupportsIndex,
-            ]
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
         ],
         weights: tuple[
             typing.SupportsFloat | typing.SupportsIndex, typing.SupportsFloat | typing.SupportsIndex
         ],
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float64],
-    ) -> tuple[float, float]:
+        crew: Crew,
+    ) -> None:
         """
-        Like `sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays; the intensities of the first `num_labelled` are labels. `dropout` has up to two pairs of bytes (samples seen, columns) and the number below which a byte keeps its column, of the encodings of cells and positions.
+        Like `begin_sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays. `dropout` has up to two pairs, of the encodings of cells and positions: the seed of `random_bytes` (samples seen, columns), and the number below which a byte keeps its column.
         """
     @typing.overload
-    def sdf(
+    def begin_sdf(
         self,
         points: numpy.typing.NDArray[numpy.float32],
         sdf_m: numpy.typing.NDArray[numpy.float32],
+        parts: collections.abc.Sequence[
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
+        ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float32],
-    ) -> float:
+        crew: Crew,
+    ) -> None:
         """
-        The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of `weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads of `crew` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many samples, and how many of these have labels of intensities. Their gradients are added in their order, so the threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
         """
     @typing.overload
-    def sdf(
+    def begin_sdf(
         self,
         points: numpy.typing.NDArray[numpy.float64],
         sdf_m: numpy.typing.NDArray[numpy.float64],
+        parts: collections.abc.Sequence[
+            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
+        ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float64],
-    ) -> float:
+        crew: Crew,
+    ) -> None:
         """
-        The mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m. Writes the gradients of `weight` times it: to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads of `crew` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many samples, and how many of these have labels of intensities. Their gradients are added in their order, so the threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        """
+    def finish(self, crew: Crew) -> tuple[float, float]:
+        """
+        Helps the crew with the batch that was begun. Gives both mean losses, 0 for one that was not asked for.
         """
     @property
     def intensity_gradients(
@@ -1057,6 +1098,15 @@ def principal_axes(
 ) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.float64]]:
     """
     Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3), in columns, of symmetric `matrices` (N, 3, 3) float64.
+    """
+
+def random_bytes(
+    seed: typing.SupportsInt | typing.SupportsIndex,
+    rows: typing.SupportsInt | typing.SupportsIndex,
+    columns: typing.SupportsInt | typing.SupportsIndex,
+) -> numpy.typing.NDArray[numpy.uint8]:
+    """
+    Random bytes (rows, columns), those of a dropout with this seed.
     """
 
 def sample_cells(

@@ -247,7 +247,7 @@ class FitConfig:
     effort: Annotated[float, Field(gt=0, le=1000)] = 1.0
     """Multiplies the iterations that follow from the size of the data. 0.5 takes about half the time."""
     seed: Annotated[int, Field(ge=0, le=_MAX_SEED)] = 0
-    """Seed of all random numbers of the fit. The same seed, data and number of threads give the same bits."""
+    """Seed of all random numbers of the fit. The same seed and data give the same bits, see :func:`radarsdf.fit`."""
     num_threads: Annotated[int, Field(ge=0, le=MAX_THREADS)] = 0
     """Threads of the fit. 0: as many as PyTorch uses."""
     max_memory_bytes: Annotated[int, Field(ge=1, lt=2**63)] | None = None

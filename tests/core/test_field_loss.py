@@ -15,8 +15,8 @@ from radarsdf import FitConfig, _core
 from radarsdf.field.field import Field
 from radarsdf.fitting.autograd_gradients import AutogradGradients
 from radarsdf.fitting.core_gradients import CoreGradients, _layers
-from radarsdf.fitting.gradients import Share
-from radarsdf.fitting.sampling import RaySampler
+from radarsdf.fitting.gradients import RandomDropout
+from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
 
@@ -43,20 +43,25 @@ def rays():
 
 
 @dataclasses.dataclass
-class Batch:
-    """A field, and what a thread would have of a batch."""
+class Made:
+    """A field, and a batch of samples in three parts."""
 
     field: Field
     config: FitConfig
-    samples: object
+    batch: Batch
 
-    def backend(self, kind, **training):
-        """Of one of two threads, with 0.7 of the dropout."""
-        share = Share(0.7, torch.Generator().manual_seed(5))
-        return kind(self.field, self.config.override(training=training), share)
+    def gradients(self, kind, stage, threads=2, **training):
+        """By a back end with 0.7 of the dropout, on so many threads."""
+        dropout = RandomDropout(0.7, torch.Generator().manual_seed(5))
+        with Workers(threads) as workers:
+            backend = kind(self.field, self.config.override(training=training), dropout, workers)
+            found, result = getattr(backend, stage)(self.batch, lambda: "meanwhile")
+            assert result == "meanwhile"
+            # The back end would write into the arrays again.
+            return dataclasses.replace(found, by_parameters=[p.clone() for p in found.by_parameters])
 
 
-def make_batch(rays, dtype=torch.float32, batch_size=400, **changes):
+def make_batch(rays, dtype=torch.float32, batch_size=400, parts=3, **changes):
     config = FitConfig(**grouped(**changes))
     cells = _core.CellSet(config.leaf_size_m)
     for chunk in rays.along(np.linspace(-0.3, 0.3, 7)):
@@ -69,11 +74,9 @@ def make_batch(rays, dtype=torch.float32, batch_size=400, **changes):
     sampler = RaySampler(
         rays, config, batch_size, generator, intensities=torch.from_numpy(rays.intensities.copy())
     )
-    (samples,) = sampler.batch()
-    exact = {name: getattr(samples, name).to(dtype) for name in ("points", "sdf_m", "of_ray")}
-    return Batch(
-        field.to(dtype), config, dataclasses.replace(samples, share=0.5, labelled_share=0.4, **exact)
-    )
+    batch = sampler.batch(parts)
+    exact = {name: getattr(batch, name).to(dtype) for name in ("points", "sdf_m", "of_ray")}
+    return Made(field.to(dtype), config, dataclasses.replace(batch, **exact))
 
 
 @pytest.fixture
@@ -91,9 +94,9 @@ def default_dtype(dtype):
 @pytest.mark.parametrize("changes", CONFIGS.values(), ids=CONFIGS)
 def test_same_as_autograd(rays, changes, stage, dtype):
     batch = make_batch(rays, dtype, **changes)
-    backends = [batch.backend(kind, row_updates=False) for kind in (CoreGradients, AutogradGradients)]
-    with Workers(1):
-        found, expected = (getattr(backend, stage)(batch.samples) for backend in backends)
+    found, expected = (
+        batch.gradients(kind, stage, row_updates=False) for kind in (CoreGradients, AutogradGradients)
+    )
     assert found.touched is None
     assert expected.touched is None
     weight = batch.config.training.sdf_loss_weight
@@ -114,15 +117,10 @@ def test_same_as_autograd(rays, changes, stage, dtype):
 @pytest.mark.parametrize("kind", [CoreGradients, AutogradGradients])
 def test_the_touched_features_get_the_same_gradient(rays, kind, stage, dtype):
     batch = make_batch(rays, dtype)
-    samples = batch.samples
-    with Workers(1):
-        dense, rows = (
-            getattr(batch.backend(kind, row_updates=row_updates), stage)(samples)
-            for row_updates in (False, True)
-        )
-        touched = rows.touched
-        assert touched is not None
-        by_features = torch.zeros_like(batch.field.cells.features)
+    dense, rows = (batch.gradients(kind, stage, row_updates=row_updates) for row_updates in (False, True))
+    assert rows.touched is not None
+    by_features = torch.zeros_like(batch.field.cells.features)
+    for touched in rows.touched:
         batch.field.cells.table.scatter(
             touched.points.numpy(),
             touched.located.numpy(),
@@ -132,43 +130,61 @@ def test_the_touched_features_get_the_same_gradient(rays, kind, stage, dtype):
         )
     torch.testing.assert_close(by_features, dense.by_parameters[0], rtol=0, atol=1e-15)
     assert len(rows.by_parameters) == len(dense.by_parameters) - 1
-    assert (touched.located[: samples.num_near, 0] >= 0).float().mean() > 0.9
+    located = torch.cat([touched.located for touched in rows.touched])
+    near = torch.cat([torch.arange(len(s.points)) < s.num_near for s in batch.batch.split()])
+    assert (located[near, 0] >= 0).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_threads_change_no_bit_and_parts_only_the_rounding(rays, stage):
+    one, two, seven = (make_batch(rays).gradients(CoreGradients, stage, threads=n) for n in (1, 2, 7))
+    for other in (two, seven):
+        assert one.losses == other.losses
+        for a, b in zip(one.by_parameters, other.by_parameters, strict=True):
+            assert torch.equal(a, b)
+    whole = make_batch(rays, parts=1).gradients(CoreGradients, stage)
+    if stage != "sdf":  # whose dropout is found by the samples' places, which parts change
+        return
+    assert whole.losses == pytest.approx(one.losses, rel=1e-6)
+    for a, b in zip(one.by_parameters, whole.by_parameters, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * b.abs().max().item())
+
+
+def test_what_fails_meanwhile_leaves_nothing_begun(rays):
+    made = make_batch(rays)
+    dropout = RandomDropout(0.7, torch.Generator().manual_seed(5))
+    with Workers(2) as workers:
+        backend = CoreGradients(made.field, made.config, dropout, workers)
+        with pytest.raises(ZeroDivisionError):
+            backend.joint(made.batch, lambda: 1 / 0)
+        found, _ = backend.joint(made.batch, lambda: None)
+    assert all(loss > 0 for loss in found.losses.values())
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_extreme_logits_and_no_samples(rays, stage):
-    batch = make_batch(rays)
-    samples = batch.samples
+    made = make_batch(rays)
+    batch = made.batch
     with torch.no_grad():
-        for parameter in batch.field.sdf_network.parameters():
+        for parameter in made.field.sdf_network.parameters():
             parameter.mul_(30)
-    backend = batch.backend(CoreGradients, row_updates=False)
-    with Workers(1):
-        found = getattr(backend, stage)(samples)
-        assert all(np.isfinite(loss) for loss in found.losses.values())
-        assert all(p.isfinite().all() for p in found.by_parameters)
-        none = dataclasses.replace(
-            samples,
-            points=samples.points[:0],
-            sdf_m=samples.sdf_m[:0],
-            of_ray=samples.of_ray[:0],
-            num_near=0,
-            num_labelled=0,
-        )
-        found = getattr(backend, stage)(none)
+    found = made.gradients(CoreGradients, stage, row_updates=False)
+    assert all(np.isfinite(loss) for loss in found.losses.values())
+    assert all(p.isfinite().all() for p in found.by_parameters)
+    none = {name: getattr(batch, name)[:0] for name in ("points", "sdf_m", "of_ray")}
+    made.batch = dataclasses.replace(batch, parts=[(0, 0)] * 2, near=[0, 0], **none)
+    found = made.gradients(CoreGradients, stage, row_updates=False)
     assert set(found.losses.values()) == {0.0}
     assert not any(p.any() for p in found.by_parameters)
 
 
 def test_not_a_number_is_passed_on(rays):
-    batch = make_batch(rays)
-    samples, backend = batch.samples, batch.backend(CoreGradients)
-    samples.sdf_m[3] = float("nan")
-    with Workers(1):
-        assert np.isnan(backend.sdf(samples).losses["sdf"])
-        samples.sdf_m[3] = 0
-        samples.of_ray[2, 7] = float("nan")
-        losses = backend.joint(samples).losses
+    made = make_batch(rays)
+    made.batch.sdf_m[3] = float("nan")
+    assert np.isnan(made.gradients(CoreGradients, "sdf").losses["sdf"])
+    made.batch.sdf_m[3] = 0
+    made.batch.of_ray[2, 7] = float("nan")
+    losses = made.gradients(CoreGradients, "joint").losses
     assert np.isnan(losses["intensity"])
     assert np.isfinite(losses["sdf"])
 
@@ -218,8 +234,12 @@ def test_the_core_refuses_networks_that_do_not_fit(rays, changes, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"num_labelled": 401}, "of the batch"),
-        ({"num_labelled": -1}, "of the batch"),
+        ({"parts": [(200, 100), (200, 201)]}, "of the batch"),
+        ({"parts": [(200, 100), (200, -1)]}, "of the batch"),
+        ({"parts": [(200, 100), (201, 0)]}, "of the batch"),
+        ({"parts": [(-1, -1), (400, 0)]}, "of the batch"),
+        ({"parts": [(200, 100), (199, 0)]}, "in a part"),
+        ({"parts": []}, "in a part"),
         ({"points": np.zeros((400, 2), np.float32)}, "points must have shape"),
         ({"sdf_m": np.zeros(399, np.float32)}, "sdf_m must have shape"),
         ({"sdf_m": np.zeros((400, 1), np.float32)}, "sdf_m must have shape"),
@@ -227,34 +247,33 @@ def test_the_core_refuses_networks_that_do_not_fit(rays, changes, message):
         ({"rays": np.zeros((8, 400), np.float32).T}, "contiguous rows"),
         ({"located": np.zeros((400, 2), np.int32)}, "located must have shape"),
         ({"interpolated_grad": np.zeros((400, 16), np.float32)}, "interpolated_grad must have shape"),
-        ({"dropout": [(np.zeros((200, 23), np.uint8), 3)]}, "dropout must have shape"),
-        ({"dropout": [(np.zeros((200, 24), np.uint8), 0)]}, "keep something"),
-        ({"dropout": [(np.zeros((200, 24), np.uint8), 1)] * 3}, "only the two encodings"),
+        ({"dropout": [(7, 0)]}, "keep something"),
+        ({"dropout": [(7, 1)] * 3}, "only the two encodings"),
     ],
 )
 def test_the_core_refuses_batches_that_do_not_fit(rays, changes, message):
     made = make_batch(rays)
-    samples = made.samples
-    loss = _core.FieldLoss(**core_arguments(made))
-    batch = {
-        "points": samples.points.numpy(),
-        "sdf_m": samples.sdf_m.numpy(),
-        "rays": samples.of_ray.numpy(),
-        "num_labelled": 200,
-        "dropout": [],
+    loss, crew = _core.FieldLoss(**core_arguments(made)), _core.Crew(2)
+    sdf_batch = {
+        "points": made.batch.points.numpy(),
+        "sdf_m": made.batch.sdf_m.numpy(),
+        "parts": [(200, 100), (200, 100)],
+        "crew": crew,
     }
+    batch = sdf_batch | {"rays": made.batch.of_ray.numpy(), "dropout": []}
     outputs = {
         "located": np.zeros((400, 3), np.int32),
         "interpolated_grad": np.zeros((400, 24), np.float32),
     }
     calls = {
-        loss.sdf: {"points": batch["points"], "sdf_m": batch["sdf_m"], "weight": 1.0} | outputs,
-        loss.joint: batch | outputs | {"weights": (1.0, 1.0)},
-        loss.intensity: batch | {"weight": 1.0},
+        loss.begin_sdf: sdf_batch | outputs | {"weight": 1.0},
+        loss.begin_joint: batch | outputs | {"weights": (1.0, 1.0)},
+        loss.begin_intensity: batch | {"weight": 1.0},
     }
     refused = 0
     for call, arguments in calls.items():
-        assert np.min(call(**arguments)) > 0
+        call(**arguments)
+        assert np.max(loss.finish(crew)) > 0
         if changes.keys() <= arguments.keys():
             refused += 1
             with pytest.raises(ValueError, match=message):
@@ -262,36 +281,76 @@ def test_the_core_refuses_batches_that_do_not_fit(rays, changes, message):
     assert refused > 0
 
 
+def test_the_core_does_one_batch_after_the_other(rays):
+    made = make_batch(rays)
+    loss, other = (_core.FieldLoss(**core_arguments(made)) for _ in range(2))
+    crew = _core.Crew(2)
+    arguments = [
+        made.batch.points.numpy(),
+        made.batch.sdf_m.numpy(),
+        [(400, 200)],
+        made.batch.of_ray.numpy(),
+        [],
+        1.0,
+    ]
+    with pytest.raises(RuntimeError, match="no batch was begun"):
+        loss.finish(crew)
+    loss.begin_intensity(*arguments, crew)
+    for busy in (loss, other):
+        with pytest.raises(RuntimeError, match="not finished"):
+            busy.begin_intensity(*arguments, crew)
+    expected = loss.finish(crew)
+    other.begin_intensity(*arguments, crew)
+    assert other.finish(crew) == expected
+    # What was begun and is forgotten ends with the crew, and before its arrays.
+    other.begin_intensity(*[np.array(a) if isinstance(a, np.ndarray) else a for a in arguments], crew)
+    del crew, other
+    gc.collect()
+
+
 def test_the_core_refuses_other_types_and_a_missing_network(rays):
-    batch = make_batch(rays)
-    samples, arguments = batch.samples, core_arguments(batch)
+    made = make_batch(rays)
+    arguments, crew = core_arguments(made), _core.Crew(1)
+    batch = made.batch
     outputs = [np.zeros((400, 3), np.int32), np.zeros((400, 24), np.float64)]
-    points, sdf_m = (samples.points.numpy().astype(np.float64), samples.sdf_m.numpy().astype(np.float64))
+    points, sdf_m = (column.numpy().astype(np.float64) for column in (batch.points, batch.sdf_m))
     with pytest.raises(TypeError, match="dtype of the features"):
-        _core.FieldLoss(**arguments).sdf(points, sdf_m, 1.0, *outputs)
+        _core.FieldLoss(**arguments).begin_sdf(points, sdf_m, [(400, 0)], 1.0, *outputs, crew)
     with pytest.raises(TypeError):
         _core.FieldLoss(**(arguments | {"features": np.zeros((3, 8), np.int32)}))
     loss = _core.FieldLoss(**(arguments | {"intensity": None}))
     assert loss.intensity_gradients == []
     with pytest.raises(ValueError, match="no intensity network"):
-        loss.intensity(samples.points.numpy(), samples.sdf_m.numpy(), samples.of_ray.numpy(), 200, [], 1.0)
+        loss.begin_intensity(
+            batch.points.numpy(), batch.sdf_m.numpy(), [(400, 200)], batch.of_ray.numpy(), [], 1.0, crew
+        )
 
 
 def test_the_core_keeps_what_it_reads(rays):
     made = make_batch(rays)
-    samples, arguments = made.samples, core_arguments(made)
+    samples, arguments, crew = made.batch, core_arguments(made), _core.Crew(2)
     arguments["table"] = _core.VertexTable(
         made.field.cells.table.leaf_keys(), made.config.leaf_size_m, made.config.encoding.num_levels
     )
     for name in ("features", "sdf", "intensity"):
         arguments[name] = copy.deepcopy(arguments[name])
     loss = _core.FieldLoss(**arguments)
-    batch = (samples.points.numpy(), samples.sdf_m.numpy(), samples.of_ray.numpy(), 200, [], 1.0)
-    before = loss.intensity(*batch)
+    batch = (
+        samples.points.numpy(),
+        samples.sdf_m.numpy(),
+        [(400, 200)],
+        samples.of_ray.numpy(),
+        [],
+        1.0,
+        crew,
+    )
+    loss.begin_intensity(*batch)
+    before = loss.finish(crew)
     gradients = loss.intensity_gradients
     arguments.clear()
     gc.collect()
-    assert loss.intensity(*batch) == before
+    loss.begin_intensity(*batch)
+    assert loss.finish(crew) == before
     del loss
     gc.collect()
     assert all(np.isfinite(gradient).all() for gradient in gradients)

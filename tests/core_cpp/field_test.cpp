@@ -161,7 +161,6 @@ struct Scene {
             {cells + 6 * kFrequencies.count + kFeature + sees.sdf + kHarmonics * sees.view_direction + sees.log_range,
              11, 1},
             40),
-        dropped(static_cast<std::size_t>(cells * kCount)),
         located(kLevels * kCount),
         by_interpolated(kFeatureDim * kLevels * kCount) {
     const auto numbers = test::normal_numbers<double>(kCount, 1, 24);
@@ -172,7 +171,6 @@ struct Scene {
                   directions.begin() + static_cast<std::ptrdiff_t>(3 * i + 3));
       rays.insert(rays.end(), {5 + std::abs(numbers[i]), numbers[i]});
     }
-    for (std::size_t i = 0; i < dropped.size(); ++i) dropped[i] = static_cast<std::uint8_t>(37 * i % 256);
   }
 
   FieldParameters<double> parameters() const {
@@ -182,8 +180,10 @@ struct Scene {
     return FieldLoss<double>(parameters(), {0.1, free_space}, {sdf.gradients, intensity.gradients});
   }
   LossBatch<double> batch() const {
-    LossBatch<double> all{points.data(), sdf_m.data(), kCount, rays.data(), kRayColumns, kNear, {}};
-    all.dropout[0] = {dropped.data(), 200};
+    // In two parts, which are not equal.
+    LossBatch<double> all{points.data(), sdf_m.data(), {{35, 30}, {kCount - 35, kNear - 30}},
+                          rays.data(),   kRayColumns,  {}};
+    all.dropout[0] = {5, 200};
     return all;
   }
   FeatureGradients<double> by_features() { return {located.data(), by_interpolated.data()}; }
@@ -203,7 +203,6 @@ struct Scene {
   bool free_space;
   std::int64_t cells;
   Network sdf, intensity;
-  std::vector<std::uint8_t> dropped;
   std::vector<std::int32_t> located;
   std::vector<double> by_interpolated;
 };
@@ -214,15 +213,20 @@ TEST_CASE("the gradients of the losses are those of differences") {
   for (const Encoding encoding : {Encoding::kTriQuadtree, Encoding::kOctree}) {
     for (const bool all : {true, false}) {
       Scene scene(encoding, {all, all, all}, all);
-      const FieldLoss<double> loss = scene.loss();
+      FieldLoss<double> loss = scene.loss();
+      Crew crew(2);
 
-      const auto geometry = [&] { return 0.7 * loss.sdf(scene.batch(), 0.7, scene.by_features()); };
+      const auto geometry = [&] {
+        loss.begin_sdf(scene.batch(), 0.7, scene.by_features(), crew);
+        return 0.7 * loss.finish(crew).sdf;
+      };
       geometry();
       check_gradient(scene.features, scene.features_gradient(), geometry);
       check_network(scene.sdf, geometry);
 
       const auto joint = [&] {
-        const FieldLosses found = loss.joint(scene.batch(), {0.7, 1.3}, scene.by_features());
+        loss.begin_joint(scene.batch(), {0.7, 1.3}, scene.by_features(), crew);
+        const FieldLosses found = loss.finish(crew);
         return 0.7 * found.sdf + 1.3 * found.intensity;
       };
       joint();
@@ -232,7 +236,10 @@ TEST_CASE("the gradients of the losses are those of differences") {
       check_network(scene.intensity, joint);
 
       const auto by_sdf = scene.sdf.by_weights;
-      const auto reflectance = [&] { return 1.3 * loss.intensity(scene.batch(), 1.3); };
+      const auto reflectance = [&] {
+        loss.begin_intensity(scene.batch(), 1.3, crew);
+        return 1.3 * loss.finish(crew).intensity;
+      };
       reflectance();
       check_network(scene.intensity, reflectance);
       CHECK(scene.sdf.by_weights == by_sdf);  // the geometry is frozen
@@ -247,10 +254,15 @@ TEST_CASE("the losses are what their names say") {
     std::fill(network->weights.back().begin(), network->weights.back().end(), 0.0);
     std::fill(network->biases.back().begin(), network->biases.back().end(), 0.0);
   }
-  const FieldLosses found = scene.loss().joint(scene.batch(), {1, 1}, scene.by_features());
+  FieldLoss<double> loss = scene.loss();
+  Crew crew(1);
+  loss.begin_joint(scene.batch(), {1, 1}, scene.by_features(), crew);
+  const FieldLosses found = loss.finish(crew);
   CHECK(found.sdf == doctest::Approx(std::log(2.0)));  // the cross-entropy of a half and any label
   double sum = 0;
-  for (std::size_t i = 0; i < Scene::kNear; ++i) sum += std::abs(scene.rays[kRayColumns * i + kRayIntensity]);
+  for (std::size_t i = 0; i < Scene::kCount; ++i) {  // those with a label come first in each part
+    if (i < 30 || (i >= 35 && i < 35 + Scene::kNear - 30)) sum += std::abs(scene.rays[kRayColumns * i + kRayIntensity]);
+  }
   CHECK(found.intensity == doctest::Approx(sum / Scene::kNear));
 }
 
@@ -273,10 +285,13 @@ TEST_CASE("a loss of parts that do not fit is refused") {
   refused([](auto&, auto& o) { o.sigma_m = 0; });
   FieldParameters<double> alone = scene.parameters();
   alone.intensity.clear();
-  const FieldLoss<double> geometry(alone, {0.1, false}, {scene.sdf.gradients, {}});
-  CHECK(geometry.sdf(scene.batch(), 1, scene.by_features()) > 0);
-  CHECK_THROWS_AS(geometry.intensity(scene.batch(), 1), std::invalid_argument);
-  CHECK_THROWS_AS(geometry.joint(scene.batch(), {1, 1}, scene.by_features()), std::invalid_argument);
+  FieldLoss<double> geometry(alone, {0.1, false}, {scene.sdf.gradients, {}});
+  Crew crew(1);
+  geometry.begin_sdf(scene.batch(), 1, scene.by_features(), crew);
+  CHECK(geometry.finish(crew).sdf > 0);
+  CHECK_THROWS_AS(geometry.begin_intensity(scene.batch(), 1, crew), std::invalid_argument);
+  CHECK_THROWS_AS(geometry.begin_joint(scene.batch(), {1, 1}, scene.by_features(), crew), std::invalid_argument);
+  CHECK_THROWS_AS(geometry.finish(crew), std::logic_error);
 }
 
 }  // namespace radarsdf

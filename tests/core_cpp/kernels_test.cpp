@@ -12,6 +12,7 @@
 #include "field/optimiser.hpp"
 #include "helpers.hpp"
 #include "kernels/product_kernels.hpp"
+#include "util/crew.hpp"
 
 namespace radarsdf {
 namespace {
@@ -273,9 +274,10 @@ TEST_CASE("Adam on the touched rows is Adam, but that rows without a gradient st
                                     rate / (1 - std::pow(betas[0], step)),
                                     1 / (1 - std::pow(betas[1], step)),
                                     epsilon};
-        TaskQueue queue;
-        adam_step(scene.table, {part(first), part(first + half)}, {grads[0], grads[1]}, {kStride, kStride}, adam,
-                  queue);
+        Crew(2).run(num_level_tasks(scene.table), [&](std::int64_t task) {
+          adam_task(scene.table, {part(first), part(first + half)}, {grads[0], grads[1]}, {kStride, kStride}, adam,
+                    level_task(scene.table, task));
+        });
 
         std::vector<double> by_features(features.size()), touches(features.size());
         const std::vector<double> ones(scene.grad.size(), 1);

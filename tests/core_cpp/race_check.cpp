@@ -32,6 +32,7 @@
 #include "surface/marching_cubes.hpp"
 #include "surface/ray_tracing.hpp"
 #include "surface/sparse_lattice.hpp"
+#include "util/crew.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
 #include "util/parallel_sort.hpp"
@@ -108,7 +109,7 @@ void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
   results.add(harmonics.data(), kPoints * 16);
 }
 
-// Two steps of Adam, each by threads of the caller's own that take a part of the rows, as a fit's do.
+// Two steps of Adam, as a fit makes them.
 template <typename T>
 void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   const auto points = random_numbers<T>(3 * kPoints, 4.0, 1);
@@ -126,15 +127,11 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   for (std::int32_t step = 1; step <= 2; ++step) {
     const radarsdf::AdamStep<T> adam{features.data(), moments.data(), marks.data(), decays.data(), step,
                                      T(0.01),         T(1),           T(1e-8)};
-    std::vector<std::thread> workers;
-    radarsdf::TaskQueue queue;
-    for (int i = 0; i < threads; ++i) {
-      workers.emplace_back([&] {
-        radarsdf::adam_step(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
-                            queue);
-      });
-    }
-    for (std::thread& worker : workers) worker.join();
+    radarsdf::Crew crew(threads);
+    crew.run(radarsdf::num_level_tasks(table), [&](std::int64_t task) {
+      radarsdf::adam_task(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
+                          radarsdf::level_task(table, task));
+    });
   }
   results.add(features.data(), 8 * table.num_rows());
   results.add(moments.data(), 16 * table.num_rows());

@@ -72,6 +72,19 @@ def test_same_seed_same_bits_other_seed_other_bits(scene):
     assert not torch.equal(maps[0].field.cells.features, other.field.cells.features)
 
 
+@pytest.mark.parametrize("config", [QUICK, FitConfig.quick()], ids=["trained", "averaged"])
+def test_the_number_of_threads_changes_no_bit(scene, config):
+    # Batches of more parts than threads, of as many, and of fewer.
+    config = config.override(training={"batch_size": 2200, "intensity_batch_size": 1100})
+    maps = [
+        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config.override(num_threads=n))
+        for n in (1, 2, 3, 7)
+    ]
+    for other in maps[1:]:
+        for name, value in maps[0].field.state_dict().items():
+            assert torch.equal(value, other.field.state_dict()[name]), name
+
+
 def test_scans_may_come_one_after_another(scene):
     config = FitConfig(num_threads=1, training={"sdf_iterations": 3, "intensity_iterations": 3})
     given = scene.points, scene.poses, scene.intensities
@@ -161,9 +174,9 @@ def test_the_more_often_samples_are_seen_the_more_is_hidden(monkeypatch):
     scene = ground_and_wall(scans=2, returns_per_scan=128)
     shares = []
 
-    def record(rows, columns, dropout, generator):
+    def record(dropout, generator):
         shares.append(dropout)
-        return draw(rows, columns, dropout, generator)
+        return draw(dropout, generator)
 
     draw = Dropout.draw
     monkeypatch.setattr(Dropout, "draw", record)

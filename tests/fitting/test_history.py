@@ -10,7 +10,6 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.budget.schedule import Schedule
 from radarsdf.fitting import history
-from radarsdf.fitting.gradients import Gradients
 from radarsdf.fitting.history import LossHistory
 from radarsdf.fitting.skipped import skipped_parts
 
@@ -23,10 +22,8 @@ def test_spans_have_the_means_of_all_iterations(monkeypatch):
     monkeypatch.setattr(history, "_MOST_SPANS", 4)
     losses = LossHistory({"sdf": 10, "intensity": 0})
     losses.start()
-    for done in range(1, 11):  # the losses are 1 to 10, in two parts
-        losses.add(
-            [Gradients({"sdf": done - 0.5}, [], None), Gradients({"sdf": 0.5}, [], None)], {"sdf": done}
-        )
+    for done in range(1, 11):
+        losses.add({"sdf": float(done)}, {"sdf": done})
     found = losses.to_report()
     assert list(found) == ["sdf"]
     assert found["sdf"]["iterations"] == [3, 5, 8, 10]
@@ -49,12 +46,12 @@ def test_it_goes_on_where_a_stop_was():
     for losses, first, last in ((whole, 0, 400), (stopped, 0, 150)):
         losses.start()
         for i in range(first, last):
-            losses.add([Gradients({"sdf": float(i)}, [], None)], {"sdf": i + 1})
+            losses.add({"sdf": float(i)}, {"sdf": i + 1})
     resumed = LossHistory({"sdf": 400})
     resumed.restore({name: tensor.clone() for name, tensor in stopped.state().items()})
     resumed.start()
     for i in range(150, 400):
-        resumed.add([Gradients({"sdf": float(i)}, [], None)], {"sdf": i + 1})
+        resumed.add({"sdf": float(i)}, {"sdf": i + 1})
     ours, expected = resumed.to_report()["sdf"], whole.to_report()["sdf"]
     assert (ours["iterations"], ours["losses"]) == (expected["iterations"], expected["losses"])
     assert len(ours["losses"]) == 200

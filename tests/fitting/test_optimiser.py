@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from radarsdf._core import CellSet
+from radarsdf._core import CellSet, Crew
 from radarsdf.field import kernels
 from radarsdf.field.encodings import Octree, TriQuadtree
 from radarsdf.fitting.optimiser import Adam, RowAdam, Touched
@@ -134,13 +134,14 @@ def test_a_step_refuses_what_does_not_fit():
         torch.zeros(rows, 2, dtype=torch.int32),
     )
     _, located = kernels.encode(cells.features, points, cells.table)
-    decays = torch.ones(5, 2)
+    decays, crew = torch.ones(5, 2), Crew(2)
 
     def step(gradient, features=cells.features, number=1):
-        kernels.adam_step(
+        with kernels.adam_step(
             cells.table, [(points, located, gradient)], features, memory, decays,
-            step=number, learning_rate=1e-2, epsilon=1e-15,
-        )()  # fmt: skip
+            step=number, learning_rate=1e-2, epsilon=1e-15, crew=crew,
+        ):  # fmt: skip
+            pass
 
     good = torch.zeros(len(points), 24)
     step(good)

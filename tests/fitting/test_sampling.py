@@ -44,7 +44,7 @@ def sensors_of(rays, samples):
     return points, points - rays.directions[index].astype(np.float64) * rays.ranges_m[index, None]
 
 
-DRAWS = {"batch": lambda draw: draw.batch()[0], "spread": lambda draw: draw.spread(256)[0]}
+DRAWS = {"batch": lambda draw: draw.batch().split()[0], "spread": lambda draw: draw.spread(256).split()[0]}
 
 
 def test_neighbours_come_together_and_all_have_their_turn(rays):
@@ -58,7 +58,7 @@ def test_neighbours_come_together_and_all_have_their_turn(rays):
     in_order = rays.points[np.argsort(cell_keys(rays.points, FitConfig().leaf_size_m), kind="stable")]
     seen = []
     while len(seen) * 32 < len(rays):
-        taken = np.sort(rows_of(in_order, draw.batch()[0])[:32].numpy())
+        taken = np.sort(rows_of(in_order, draw.batch().split()[0])[:32].numpy())
         assert (np.diff(taken) == 1).sum() >= 20  # of 31, where runs of five are cut at most twice
         seen.append(taken)
     assert len(np.unique(np.concatenate(seen))) == len(rays)
@@ -82,7 +82,7 @@ def test_ranges_of_the_samples(rays):
     draw = RaySampler(rays, config, 512, torch.Generator().manual_seed(0))
     near, free, lowest_share = [], [], []
     for _ in range(40):
-        samples = draw.batch()[0]
+        samples = draw.batch().split()[0]
         range_m = torch.from_numpy(rays.ranges_m)[rows_of(rays.points, samples)][samples.num_near :]
         near.append(samples.sdf_m[: samples.num_near])
         from_sensor = range_m - samples.sdf_m[samples.num_near :]
@@ -107,7 +107,7 @@ def test_each_ray_is_seen_equally_often(rays, batch_size):
     seen = np.zeros((2, NUM_RAYS), int)
     batches = 4 * NUM_RAYS * 2 // batch_size
     for _ in range(batches):
-        samples = draw.batch()[0]
+        samples = draw.batch().split()[0]
         rows = rows_of(rays.points, samples)
         for kind, part in enumerate((rows[: samples.num_near], rows[samples.num_near :])):
             np.add.at(seen[kind], part.numpy(), 1)
@@ -121,7 +121,7 @@ def test_spread_sees_each_ray_equally_often(rays):
     draw = sampler(rays, 300)
     seen = np.zeros(NUM_RAYS, int)
     for _ in range(10):
-        samples = draw.spread(300)[0]
+        samples = draw.spread(300).split()[0]
         assert samples.num_near == len(samples.points) == 300
         assert samples.sdf_m.abs().max() <= FitConfig().near_band_m
         np.add.at(seen, rows_of(rays.points, samples).numpy(), 1)
@@ -129,7 +129,7 @@ def test_spread_sees_each_ray_equally_often(rays):
 
 
 def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
-    samples = sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS)[0]
+    samples = sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS).split()[0]
     index = rows_of(rays.points, samples).numpy()
     offset = samples.points.numpy() - rays.points[index]
     along = (offset * rays.directions[index]).sum(axis=1)
@@ -140,7 +140,7 @@ def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
 
 def test_passes_take_the_rays_in_different_orders(rays):
     draw = sampler(rays, NUM_RAYS, near_samples=1, free_samples=1)
-    first, second, third = (rows_of(rays.points, draw.batch()[0])[: NUM_RAYS // 2] for _ in range(3))
+    first, second, third = (rows_of(rays.points, draw.batch().split()[0])[: NUM_RAYS // 2] for _ in range(3))
     assert set(first.tolist()).isdisjoint(second.tolist())
     assert set(third.tolist()) not in (set(first.tolist()), set(second.tolist()))
 
@@ -150,7 +150,7 @@ def test_passes_take_the_rays_in_different_orders(rays):
     [(6, 6, 120), (6, 2, 180), (1, 5, 40), (3, 0, 240), (1, 500, 1)],
 )
 def test_shares_of_near_and_free_samples(rays, near_samples, free_samples, num_near):
-    samples = sampler(rays, 240, near_samples=near_samples, free_samples=free_samples).batch()[0]
+    samples = sampler(rays, 240, near_samples=near_samples, free_samples=free_samples).batch().split()[0]
     assert samples.num_near == num_near
     assert samples.points.shape == (240, 3)
     assert samples.points.dtype == samples.sdf_m.dtype == torch.float32
@@ -170,7 +170,7 @@ def test_only_so_many_intensities_are_labels(rays, parts):
     config = FitConfig(training={"intensity_batch_size": 24})
     generator, unit = torch.Generator().manual_seed(0), torch.linspace(0, 1, NUM_RAYS)
     draw = RaySampler(rays, config, 288, generator, 6, unit)
-    batches = [draw.batch(parts) for _ in range(NUM_RAYS // 24 * 12)]
+    batches = [draw.batch(parts).split() for _ in range(NUM_RAYS // 24 * 12)]
     assert {sum(part.num_labelled for part in batch) for batch in batches} == {24}
     assert {sum(part.num_near for part in batch) for batch in batches} == {144}
     for batch in batches[:5]:
@@ -181,22 +181,22 @@ def test_only_so_many_intensities_are_labels(rays, parts):
     labelled = torch.cat([part.intensities[: part.num_labelled] for batch in batches for part in batch])
     assert len(torch.unique(labelled)) > 0.9 * NUM_RAYS
     # All near samples are labelled where there are no intensities, and where free space has a label of its own.
-    assert RaySampler(rays, config, 288, generator).batch()[0].num_labelled == 144
+    assert RaySampler(rays, config, 288, generator).batch().split()[0].num_labelled == 144
     free = config.override(training={"intensity_in_free_space": True})
-    assert RaySampler(rays, free, 288, generator, 1, unit).batch()[0].num_labelled == 144
+    assert RaySampler(rays, free, 288, generator, 1, unit).batch().split()[0].num_labelled == 144
 
 
 def test_the_rarer_kind_reaches_every_ray_in_the_long_run(rays):
     draw = sampler(rays, 240, near_samples=5, free_samples=1)
-    free = torch.cat([rows_of(rays.points, s := draw.batch()[0])[s.num_near :] for _ in range(400)])
+    free = torch.cat([rows_of(rays.points, s := draw.batch().split()[0])[s.num_near :] for _ in range(400)])
     assert len(torch.unique(free)) > 0.99 * NUM_RAYS
 
 
 def test_a_batch_larger_than_the_scene(rays):
     few = rays.select(slice(None, None, 250))
-    samples = sampler(few, 100, near_samples=1, free_samples=1).batch()[0]
+    samples = sampler(few, 100, near_samples=1, free_samples=1).batch().split()[0]
     assert sorted(torch.bincount(rows_of(few.points, samples)[:50], minlength=4).tolist()) == [12, 12, 13, 13]
-    assert len(sampler(few, 1).batch()[0].points) == 1
+    assert len(sampler(few, 1).batch().split()[0].points) == 1
 
 
 def test_the_generator_decides_alone(rays):
@@ -213,7 +213,7 @@ def test_the_generator_decides_alone(rays):
 
 def test_memory_does_not_grow_with_the_samples(rays):
     def bytes_held(draw):
-        draw.batch()[0]
+        draw.batch().split()[0]
         arrays = [v for v in vars(draw).values() if isinstance(v, (torch.Tensor, np.ndarray))]
         return sum(a.nbytes for a in arrays)
 
@@ -224,7 +224,7 @@ def test_memory_does_not_grow_with_the_samples(rays):
 
 def test_neighbours_in_a_batch_are_neighbours_in_space(rays):
     dense = dataclasses.replace(rays, points=rays.points * np.float32(0.1))
-    samples = sampler(dense, 512, near_samples=1, free_samples=1).spread(512)[0]
+    samples = sampler(dense, 512, near_samples=1, free_samples=1).spread(512).split()[0]
     steps = np.linalg.norm(np.diff(dense.points[rows_of(dense.points, samples).numpy()], axis=0), axis=1)
     shuffled = np.linalg.norm(
         np.diff(dense.points[np.random.default_rng(0).permutation(NUM_RAYS)], axis=0), axis=1
@@ -236,8 +236,8 @@ def test_neighbours_in_a_batch_are_neighbours_in_space(rays):
 @pytest.mark.parametrize(("near_samples", "free_samples"), [(6, 6), (6, 2), (1, 5), (3, 0)])
 def test_parts_are_the_batch_each_with_its_share(rays, near_samples, free_samples, parts):
     settings = {"near_samples": near_samples, "free_samples": free_samples}
-    (whole,) = sampler(rays, 250, **settings).batch()
-    found = sampler(rays, 250, **settings).batch(parts)
+    (whole,) = sampler(rays, 250, **settings).batch().split()
+    found = sampler(rays, 250, **settings).batch(parts).split()
     sizes = [len(part.points) for part in found]
     assert sum(sizes) == 250
     assert max(sizes) - min(sizes) <= 2
@@ -260,8 +260,8 @@ def test_parts_are_the_batch_each_with_its_share(rays, near_samples, free_sample
 
 
 def test_parts_of_spread_samples(rays):
-    (whole,) = sampler(rays).spread(101)
-    found = sampler(rays).spread(101, 2)
+    (whole,) = sampler(rays).spread(101).split()
+    found = sampler(rays).spread(101, 2).split()
     assert [part.num_near for part in found] == [50, 51]
     assert torch.equal(torch.cat([part.points for part in found]), whole.points)
     assert torch.equal(torch.cat([part.of_ray for part in found]), whole.of_ray)
@@ -270,7 +270,7 @@ def test_parts_of_spread_samples(rays):
 def test_what_is_known_of_a_ray_comes_with_its_samples(rays):
     unit = torch.linspace(0, 1, len(rays))
     draw = RaySampler(rays, FitConfig(), 256, torch.Generator().manual_seed(0), intensities=unit)
-    for (samples,) in (draw.batch(), draw.spread(100)):
+    for (samples,) in (draw.batch().split(), draw.spread(100).split()):
         rows = rows_of(rays.points, samples)
         assert torch.equal(samples.intensities, unit[rows])
         assert torch.equal(samples.directions, torch.from_numpy(rays.directions)[rows])
@@ -279,22 +279,30 @@ def test_what_is_known_of_a_ray_comes_with_its_samples(rays):
 @pytest.mark.parametrize("dropout", [0.0, 0.3, 0.85])
 def test_dropout_zeroes_its_share_and_keeps_the_mean(dropout):
     state = torch.get_rng_state()
-    factors = Dropout.draw(999, 21, dropout, torch.Generator().manual_seed(0)).factors
+    factors = Dropout.draw(dropout, torch.Generator().manual_seed(0)).factors(999, 21)
     assert factors.shape == (999, 21)
     assert factors.dtype == torch.float32
     assert abs(float((factors == 0).float().mean()) - dropout) < 0.015
     assert abs(float(factors.mean()) - 1) < 0.05
     assert len(factors.unique()) == (1 if dropout == 0 else 2)
-    assert torch.equal(factors, Dropout.draw(999, 21, dropout, torch.Generator().manual_seed(0)).factors)
-    assert (
-        not torch.equal(factors, Dropout.draw(999, 21, dropout, torch.Generator().manual_seed(1)).factors)
-        or dropout == 0
+    again, other = (
+        Dropout.draw(dropout, torch.Generator().manual_seed(seed)).factors(999, 21) for seed in (0, 1)
     )
+    assert torch.equal(factors, again)
+    assert not torch.equal(factors, other) or dropout == 0
     assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_dropout_hides_no_column_or_row_more_than_another():
-    # The factors are cut from 64-bit words: each byte of a word has to do.
-    hidden = (Dropout.draw(8000, 8, 0.5, torch.Generator().manual_seed(0)).factors == 0).double()
+    # The factors are cut from 64-bit words: each byte of a word has to do, and words that follow each other.
+    hidden = (Dropout.draw(0.5, torch.Generator().manual_seed(0)).factors(8000, 24) == 0).double()
     assert (hidden.mean(0) - 0.5).abs().max() < 0.03
     assert torch.corrcoef(hidden.T).fill_diagonal_(0).abs().max() < 0.06
+    assert torch.corrcoef(torch.stack([hidden[1:, 0], hidden[:-1, 0]]))[0, 1].abs() < 0.04
+    assert (hidden.mean(1) - 0.5).std() == pytest.approx(0.5 / 24**0.5, rel=0.05)
+
+
+def test_successive_dropouts_have_nothing_in_common():
+    generator = torch.Generator().manual_seed(0)
+    hidden = [(Dropout.draw(0.5, generator).factors(500, 24) == 0).double().ravel() for _ in range(20)]
+    assert torch.corrcoef(torch.stack(hidden)).fill_diagonal_(0).abs().max() < 0.05

@@ -15,7 +15,6 @@ from radarsdf.returns.rays import prepare
 
 SETTINGS = {
     "returns": {"drop_ghosts": False, "onto_planes": False},
-    "networks": {"feature_dropout": 0.0, "fourier_dropout": 0.0},  # which each thread draws for itself
 }
 
 
@@ -59,7 +58,7 @@ def test_normals_of_no_samples(scene):
 def test_parts_count_by_their_samples(scene, batch_size, parts):
     rays = prepare(scene.points, scene.poses)
     draw = RaySampler(rays, FitConfig(), batch_size, torch.Generator().manual_seed(0))
-    for batch in (draw.batch(parts), draw.spread(batch_size, parts)):
+    for batch in (draw.batch(parts).split(), draw.spread(batch_size, parts).split()):
         sizes, labelled = [len(part.points) for part in batch], [part.num_labelled for part in batch]
         assert [part.share for part in batch] == [size / sum(sizes) for size in sizes]
         assert [part.labelled_share for part in batch] == [count / sum(labelled) for count in labelled]

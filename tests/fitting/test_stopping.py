@@ -304,13 +304,13 @@ def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypat
     eighth = 8 if stage == "sdf" else 10 + 8
 
     def failing(of_stage):
-        def gradients(backend, samples):
+        def gradients(backend, batch, meanwhile):
             nonlocal calls
             calls += 1
-            found = of_stage(backend, samples)
+            found, result = of_stage(backend, batch, meanwhile)
             if calls == eighth:
                 found.losses[name] *= math.inf
-            return found
+            return found, result
 
         return gradients
 

@@ -12,9 +12,9 @@ threads.
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, TaskQueue, VertexTable
+from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Crew, VertexTable
 from radarsdf._core import fourier as _fourier
 from radarsdf._core import spherical_harmonics as _spherical_harmonics
 
@@ -256,6 +256,7 @@ def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor
     return out, located
 
 
+@contextmanager
 def adam_step(
     table: VertexTable,
     batches: Sequence[tuple[Tensor, Tensor, Tensor]],
@@ -266,8 +267,11 @@ def adam_step(
     step: int,
     learning_rate: float,
     epsilon: float,
-) -> Callable[[], None]:
+    crew: Crew,
+) -> Iterator[None]:
     """A step of Adam, in place, on the rows of features that batches touch. Other rows do not change.
+
+    The other threads of `crew` do it during the ``with`` block. At its end, the calling thread helps them.
 
     Parameters
     ----------
@@ -286,15 +290,10 @@ def adam_step(
         Number of this step, from 1 on.
     learning_rate, epsilon : float
         Adam's.
-
-    Returns
-    -------
-    callable
-        Does the step. Several threads may call it at once; each does a part, and together they do the whole
-        step.
+    crew : Crew
+        Threads.
     """
-    return functools.partial(
-        table.adam_step,
+    table.begin_adam_step(
         [(view(points), located.numpy(), rows_view(grad)) for points, located, grad in batches],
         view(features),
         memory.moments.numpy(),
@@ -303,8 +302,12 @@ def adam_step(
         step,
         learning_rate,
         epsilon,
-        TaskQueue(),
+        crew,
     )
+    try:
+        yield
+    finally:
+        crew.finish()
 
 
 def locate(points: Tensor, table: VertexTable) -> Tensor:

@@ -29,7 +29,7 @@ FORMAT = "radarsdf.checkpoint"
 _EVERY_S = 30.0  # seconds between two files, at least
 _NONE = object()  # where one of two configurations lacks a setting
 _SHARE = 0.02  # largest share of the time that is spent on writing
-_SETTINGS_NOT_COMPARED = ("num_threads", "max_memory_bytes")  # another number of threads shows in the tensors
+_SETTINGS_NOT_COMPARED = ("num_threads", "max_memory_bytes")  # none of them changes the result
 
 
 class Checkpoint:
@@ -92,7 +92,7 @@ class Checkpoint:
         Raises
         ------
         ValueError
-            If the file is damaged, or from a fit with another number of threads.
+            If the file is damaged.
         """
         if not self._path.exists():
             return
@@ -100,8 +100,7 @@ class Checkpoint:
         try:
             with safe_open(self._path, framework="pt") as file:
                 if (names := set(file.keys())) != set(expected):
-                    parts = sum(name.startswith("backend.") and name.endswith(".generator") for name in names)
-                    msg = f"other tensors: perhaps of {parts} threads"
+                    msg = f"{sorted(names ^ set(expected))!s:.100} are too few or too many"
                     raise ValueError(msg)
                 for name, tensor in expected.items():
                     shape = tuple(file.get_slice(name).get_shape())

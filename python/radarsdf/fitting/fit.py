@@ -66,9 +66,9 @@ def fit(
     Returns
     -------
     RadarMap
-        Its ``report`` has the times and counts of the fit. The same input, seed and number of threads give
-        the same bits. With another number of threads the samples are the same, but the rounding differs, and
-        with intensities also the dropout.
+        Its ``report`` has the times and counts of the fit. The same input and seed give the same bits, with any
+        number of threads. Only where the gradients are PyTorch's (``training.gradients``, ``networks.normals``) does
+        the rounding depend on it.
 
     Raises
     ------

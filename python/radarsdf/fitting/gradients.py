@@ -11,7 +11,9 @@ rounding.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -19,7 +21,10 @@ from torch import Tensor
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.widths import cells_width, fourier_width
-from radarsdf.fitting.sampling import Dropout, Samples
+from radarsdf.fitting.sampling import Batch, Dropout
+from radarsdf.threads import Workers
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -39,74 +44,77 @@ class Touched:
 
 @dataclass(frozen=True)
 class Gradients:
-    """Losses and gradients of one thread's share of a batch. The next batch overwrites the arrays."""
+    """Losses and gradients of a batch. The next batch overwrites the arrays."""
 
     losses: dict[str, float]
-    """The part of each loss, "sdf" and "intensity", that this share adds to the loss of the whole batch."""
+    """Each loss, "sdf" and "intensity"."""
     by_parameters: list[Tensor]
     """Gradients of those parameters that are trained: all features (unless `touched` is given), SDF network,
     intensity network."""
-    touched: Touched | None
-    """If only the touched features move: the gradient for these."""
+    touched: list[Touched] | None
+    """If only the touched features move: the gradient for these, perhaps in parts."""
 
 
 @dataclass(frozen=True)
-class Share:
-    """How the back end of one thread takes part in a batch."""
+class RandomDropout:
+    """What the dropout of a training is drawn from."""
 
-    dropout_scale: float
+    scale: float
     """Factor on the dropout of the configuration."""
     generator: torch.Generator
-    """Random numbers of this thread's dropout."""
+    """Random numbers."""
 
 
 class GradientBackend(ABC):
-    """Losses and gradients of one thread's share of each batch.
+    """Losses and gradients of batches.
 
-    The parameters of `field` must keep their memory: a back end may hold views of them.
+    The parameters of `field` must keep their memory: a back end may hold views of them. Gradients of a batch's parts are
+    added in their order, so the threads of `workers` change no bit.
     """
 
-    def __init__(self, field: Field, config: FitConfig, share: Share) -> None:
+    def __init__(self, field: Field, config: FitConfig, dropout: RandomDropout, workers: Workers) -> None:
         self._field = field
         self._config = config
-        self._share = share
+        self._dropout = dropout
+        self._workers = workers
         self._moves_rows = config.moves_rows(field.intensity_network is not None)
 
     @abstractmethod
-    def sdf(self, samples: Samples) -> Gradients:
-        """Gradients of the sdf loss with respect to features and SDF network."""
+    def num_parts(self, batch_size: int) -> int:
+        """The best number of parts of a batch with so many samples."""
 
     @abstractmethod
-    def joint(self, samples: Samples) -> Gradients:
-        """Gradients of the sum of both losses with respect to all parameters."""
+    def sdf(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+        """Gradients of the sdf loss with respect to features and SDF network, and the result of `meanwhile`.
+
+        The calling thread runs `meanwhile` while others already work on the batch.
+        """
 
     @abstractmethod
-    def intensity(self, samples: Samples) -> Gradients:
-        """Gradients of the intensity loss with respect to the intensity network. The others are frozen."""
+    def joint(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+        """The same of the sum of both losses with respect to all parameters."""
+
+    @abstractmethod
+    def intensity(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+        """The same of the intensity loss with respect to the intensity network. The other parameters are frozen."""
 
     def state(self) -> dict[str, Tensor]:
         """The state of the random numbers of dropout."""
-        return {"generator": self._share.generator.get_state()}
+        return {"generator": self._dropout.generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restores what :meth:`state` gave."""
-        self._share.generator.set_state(state["generator"])
+        self._dropout.generator.set_state(state["generator"])
 
-    def _num_seen(self, samples: Samples) -> int:
-        """Number of samples, the first ones, that the intensity network sees."""
-        in_free_space = self._config.training.intensity_in_free_space
-        return len(samples.points) if in_free_space else samples.num_labelled
-
-    def _seen_share(self, samples: Samples) -> float:
-        """What the mean over them counts in that of the whole batch."""
-        return samples.share if self._config.training.intensity_in_free_space else samples.labelled_share
-
-    def _draw_dropouts(self, count: int) -> list[Dropout]:
-        """Dropout of each part of the encoding of `count` samples, for the intensity network alone."""
-        networks, scale = self._config.networks, self._share.dropout_scale
+    def _draw_dropouts(self) -> list[tuple[int, Dropout]]:
+        """Columns and dropout of each part of the encoding, for the intensity network alone."""
+        networks, scale = self._config.networks, self._dropout.scale
         shares = [scale * networks.feature_dropout, scale * networks.fourier_dropout]
         if not any(shares):
             return []
         widths = (cells_width(self._config), fourier_width(self._config))
-        parts = [part for part in zip(widths, shares, strict=True) if part[0]]
-        return [Dropout.draw(count, *part, self._share.generator) for part in parts]
+        return [
+            (width, Dropout.draw(share, self._dropout.generator))
+            for width, share in zip(widths, shares, strict=True)
+            if width
+        ]

@@ -5,15 +5,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-
-from radarsdf.fitting.gradients import Gradients
 
 _MOST_SPANS = 200  # of each loss: enough for a plot, little in the file of a map
 
@@ -40,16 +38,14 @@ class LossHistory:
         before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
         self._started_s = time.perf_counter() - before_s
 
-    def add(self, parts: Iterable[Gradients], done: Mapping[str, int]) -> None:
+    def add(self, losses: Mapping[str, float], done: Mapping[str, int]) -> None:
         """Add the losses of an iteration, after which so many are `done` for each loss."""
         now_s = time.perf_counter() - self._started_s
-        for name in self._spans:
-            losses = [part.losses[name] for part in parts if name in part.losses]
-            if losses:
-                spans = self._spans[name]
-                span = spans[(done[name] - 1) * len(spans) // self._iterations[name]]
-                span += (1, sum(losses), 0)
-                span[2] = now_s
+        for name, loss in losses.items():
+            spans = self._spans[name]
+            span = spans[(done[name] - 1) * len(spans) // self._iterations[name]]
+            span += (1, loss, 0)
+            span[2] = now_s
 
     def to_report(self) -> dict[str, dict[str, list[Any]]]:
         """Of each loss, for each span: the iterations that were done at its end, the mean loss, the seconds of training."""

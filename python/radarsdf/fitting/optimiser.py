@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -18,7 +17,6 @@ from radarsdf.threads import Workers
 
 _BETAS = (0.9, 0.999)
 _EPSILON = 1e-15  # 3QFP
-_Result = TypeVar("_Result")
 
 
 class Adam:
@@ -135,9 +133,9 @@ class RowAdam:
         self,
         touched: Sequence[Touched],
         workers: Workers,
-        meanwhile: Callable[[], _Result],
-    ) -> _Result:
-        """Changes the rows that batches touched. Returns the result of `meanwhile`.
+        meanwhile: Callable[[], None],
+    ) -> None:
+        """Changes the rows that batches touched.
 
         The calling thread runs `meanwhile` first, and then helps the other threads with the rows.
         """
@@ -147,7 +145,7 @@ class RowAdam:
             decays = torch.tensor([_BETAS], dtype=torch.float64, device="cpu") ** powers
             # Denormal numbers would be slow, and make no difference beside a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
-        move = kernels.adam_step(
+        with kernels.adam_step(
             self._cells.table,
             [(t.points, t.located, t.gradient) for t in touched],
             self._cells.features,
@@ -156,12 +154,6 @@ class RowAdam:
             step=self.step_count,
             learning_rate=self.learning_rate,
             epsilon=_EPSILON,
-        )
-
-        def work(first: Callable[[], _Result] | None) -> _Result | None:
-            result = None if first is None else first()
-            move()
-            return result
-
-        result, *_ = workers.map(work, [meanwhile] + [None] * (workers.num_threads - 1))
-        return result  # type: ignore[return-value]
+            crew=workers.crew,
+        ):
+            meanwhile()

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from radarsdf._core import RAY_DIRECTION, RAY_INTENSITY, RAY_POINT, RAY_RANGE, cell_keys, stable_order
+from radarsdf._core import (
+    RAY_DIRECTION,
+    RAY_INTENSITY,
+    RAY_POINT,
+    RAY_RANGE,
+    cell_keys,
+    random_bytes,
+    stable_order,
+)
 from radarsdf.budget.schedule import near_and_labelled
 from radarsdf.config import FitConfig
 from radarsdf.returns.rays import Rays
@@ -23,7 +30,7 @@ _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly over an interv
 
 @dataclass(frozen=True)
 class Samples:
-    """A batch of points on rays. Those near the surface come first."""
+    """Points on rays. Those near the surface come first."""
 
     points: Tensor
     """(B, 3) float32, local frame, m."""
@@ -55,6 +62,35 @@ class Samples:
     def intensities(self) -> Tensor:
         """(B,) scaled intensities of the returns."""
         return self.of_ray[:, RAY_INTENSITY]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples in parts, one part after the other. Each part is the work of one thread."""
+
+    points: Tensor
+    """(B, 3), see :class:`Samples`."""
+    sdf_m: Tensor
+    """(B,)."""
+    of_ray: Tensor
+    """(B, 7 or 8)."""
+    parts: list[tuple[int, int]]
+    """Of each part: the number of its samples, and how many of these, the first ones, have labels of intensities."""
+    near: list[int]
+    """Of each part: how many of its samples, the first ones, are near the surface."""
+
+    def split(self) -> list[Samples]:
+        """The samples of each part."""
+        sizes, labelled = map(list, zip(*self.parts, strict=True))
+        columns = [torch.split_with_sizes(column, sizes) for column in (self.points, self.sdf_m, self.of_ray)]
+        # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
+        shares = ([count / max(sum(counts), 1) for count in counts] for counts in (sizes, labelled))
+        return [
+            Samples(x, sdf, num_near, num_labelled, of_ray, *shares_of_part)
+            for x, sdf, of_ray, num_near, num_labelled, *shares_of_part in zip(
+                *columns, self.near, labelled, *shares, strict=True
+            )
+        ]
 
 
 class RaySampler:
@@ -148,8 +184,8 @@ class RaySampler:
     def _uniform(self, count: int) -> Tensor:
         return torch.rand(count, generator=self._generator, dtype=torch.float32, device="cpu")
 
-    def spread(self, count: int, parts: int = 1) -> list[Samples]:
-        """`count` samples near the surface, in `parts` for the threads.
+    def spread(self, count: int, parts: int = 1) -> Batch:
+        """`count` samples near the surface, in `parts`.
 
         They are uniform within `near_band_m` along the beam, and have the sensor's angular noise across it.
         """
@@ -163,10 +199,10 @@ class RaySampler:
             noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
             points += noise * (config.sampling.cross_range_noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
-        return self._split(points, sdf_m, ray, near, near, near)
+        return Batch(points, sdf_m, ray, list(zip(near, near, strict=True)), near)
 
-    def batch(self, parts: int = 1) -> list[Samples]:
-        """`batch_size` samples, in `parts` for the threads, each with its share of near and free samples."""
+    def batch(self, parts: int = 1) -> Batch:
+        """`batch_size` samples, in `parts`, each with its share of near and free samples."""
         if parts not in self._layouts:
             self._layouts[parts] = _Layout.of(self._counts, parts, self._config)
         layout = self._layouts[parts]
@@ -179,28 +215,7 @@ class RaySampler:
         # Random numbers are drawn for the whole batch and then divided, so samples do not depend on `parts`.
         sdf_m = torch.addcmul(start_m, length_m, self._uniform(len(places)).index_select(0, layout.order))
         points = torch.addcmul(_returns(ray), sdf_m[:, None], _directions(ray), value=-1)
-        return self._split(points, sdf_m, ray, layout.sizes, layout.near, layout.labelled)
-
-    def _split(
-        self,
-        points: Tensor,
-        sdf_m: Tensor,
-        ray: Tensor,
-        sizes: Sequence[int],
-        near: Sequence[int],
-        labelled: Sequence[int],
-    ) -> list[Samples]:
-        if len(sizes) == 1:
-            return [Samples(points, sdf_m, near[0], labelled[0], ray)]
-        columns = [torch.split_with_sizes(column, sizes) for column in (points, sdf_m, ray)]
-        # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
-        shares = ([count / sum(counts) for count in counts] for counts in (sizes, labelled))
-        return [
-            Samples(x, sdf, num_near, num_labelled, of_ray, *shares_of_part)
-            for x, sdf, of_ray, num_near, num_labelled, *shares_of_part in zip(
-                *columns, near, labelled, *shares, strict=True
-            )
-        ]
+        return Batch(points, sdf_m, ray, layout.parts, layout.near)
 
 
 def _in_morton_order(rays: Rays, intensities: Tensor | None, leaf_size_m: float) -> NDArray[np.float32]:
@@ -248,12 +263,10 @@ class _Layout:
     negative."""
     length: tuple[Tensor, Tensor]
     """(B,) each: c and d. The segment has the length c + d · range, m, towards the sensor."""
-    sizes: list[int]
-    """Number of samples in each part."""
+    parts: list[tuple[int, int]]
+    """See :attr:`Batch.parts`."""
     near: list[int]
-    """Number of near samples in each part."""
-    labelled: list[int]
-    """The first of these, whose intensities are labels."""
+    """See :attr:`Batch.near`."""
 
     @classmethod
     def of(cls, counts: tuple[int, int, int], parts: int, config: FitConfig) -> _Layout:
@@ -282,7 +295,8 @@ class _Layout:
         sums = [sum(part) for part in zip(*shares, strict=True)]
         labelled, others, _ = shares
         near = [sum(pair) for pair in zip(labelled, others, strict=True)]
-        return cls(index, order, (start, of_range), (length, length_of_range), sums, near, labelled)
+        parts_of_batch = list(zip(sums, labelled, strict=True))
+        return cls(index, order, (start, of_range), (length, length_of_range), parts_of_batch, near)
 
 
 def _spread(count: int, of: int) -> NDArray[np.int64]:
@@ -297,31 +311,23 @@ def _spread(count: int, of: int) -> NDArray[np.int64]:
 class Dropout:
     """Which numbers of a matrix are kept.
 
-    PyTorch's dropout draws from the global generator, so the same seed would not give the same bits.
+    PyTorch's dropout draws from the global generator, so the same seed would not give the same bits. And the threads of
+    the core each make the bytes of their own rows.
     """
 
-    bytes: NDArray[np.uint8]
-    """(rows, columns) uint8, a random byte for each number of the matrix."""
+    seed: int
+    """Of the random bytes, one for each number of the matrix."""
     keep: int
-    """Numbers whose byte is below this are kept. From 0 to 256."""
+    """Numbers whose byte is below this are kept. From 1 to 256."""
 
     @classmethod
-    def draw(cls, rows: int, columns: int, dropout: float, generator: torch.Generator) -> Dropout:
-        """Draws a dropout of a matrix (rows, columns). `dropout`: probability that a number is dropped."""
-        # Each random int64 gives eight bytes. To draw bytes one by one would take a tenth of an iteration.
-        # PyTorch lets go of the interpreter's lock in each operation, NumPy does not. Measured on two threads that draw at
-        # once, and wait for each other: 0.35 ms with PyTorch alone, 0.26 so.
-        words = np.empty(-(-rows * columns // 8), np.int64)
-        torch.from_numpy(words).random_(-(2**63), None, generator=generator)
-        return cls(words.view(np.uint8)[: rows * columns].reshape(rows, columns), round(256 * (1 - dropout)))
+    def draw(cls, dropout: float, generator: torch.Generator) -> Dropout:
+        """Draws a dropout. `dropout`: probability that a number is dropped."""
+        seed = torch.empty((), dtype=torch.int64, device="cpu").random_(generator=generator)
+        return cls(int(seed), round(256 * (1 - dropout)))
 
-    @property
-    def factors(self) -> Tensor:
-        """(rows, columns) float32: 0 for dropped numbers, 256 / keep for the others, so that the mean is 1."""
-        return self.factors_of(torch.float32)
-
-    def factors_of(self, dtype: torch.dtype) -> Tensor:
-        """:attr:`factors` in another type of floats."""
-        return torch.from_numpy(self.bytes <= self.keep - 1).to(dtype) * (
-            256 / self.keep
-        )  # not < keep: 256 does not fit into a byte
+    def factors(self, rows: int, columns: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(rows, columns): 0 for dropped numbers, 256 / keep for the others, so that the mean is 1."""
+        bytes_ = random_bytes(self.seed, rows, columns)
+        # not < keep: 256 does not fit into a byte
+        return torch.from_numpy(bytes_ <= self.keep - 1).to(dtype) * (256 / self.keep)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The training loop: the stages sdf and intensity, with batches split over threads."""
+"""The training loop: the stages sdf and intensity."""
 
 from __future__ import annotations
 
@@ -16,32 +16,28 @@ from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf.budget.schedule import Schedule
-from radarsdf.config import MAX_THREADS, FitConfig
+from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.autograd_gradients import AutogradGradients
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.core_gradients import CoreGradients
-from radarsdf.fitting.gradients import GradientBackend, Gradients, Share
+from radarsdf.fitting.gradients import GradientBackend, Gradients, RandomDropout
 from radarsdf.fitting.history import LossHistory
 from radarsdf.fitting.optimiser import Adam, RowAdam
-from radarsdf.fitting.sampling import RaySampler, Samples
+from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.fitting.stopping import Diverged
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.progress import hides_bar
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
-# Random generators of a fit: one for samples, one for the dropout of each thread.
-_GENERATORS = MAX_THREADS + 1
-# Samples in a part of a batch of the intensity stage. With less work, threads wait for the interpreter's lock longer than
-# they save: an iteration of 1024 samples took 2.0 ms on two threads, and 1.6 on one.
-_LEAST_PART = 1024
+_GENERATORS = 2  # random generators of a fit: for samples, for dropout
 _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
 
 
 class _Draws:
-    """Draws the samples of all threads in one: in several, small operations would wait for each other."""
+    """Draws the batches of both stages."""
 
     def __init__(
         self,
@@ -50,10 +46,11 @@ class _Draws:
         scale: IntensityScale | None,
         config: FitConfig,
         schedule: Schedule,
-        parts: int,
+        num_parts: Callable[[int], int],
     ) -> None:
         self._config = config
-        self._parts = parts
+        self._schedule = schedule
+        self._num_parts = num_parts
         self._generator = torch.Generator("cpu").manual_seed(config.seed * _GENERATORS)
 
         def sampler(rays: Rays) -> RaySampler:
@@ -82,16 +79,16 @@ class _Draws:
         samplers = {"surface": self._surface}
         return samplers if self._returns is self._surface else samplers | {"returns": self._returns}
 
-    def of_surface(self) -> list[Samples]:
-        """A batch of the sdf stage, in a part for each thread."""
-        return self._surface.batch(self._parts)
+    def of_surface(self) -> Batch:
+        """A batch of the sdf stage."""
+        return self._surface.batch(self._num_parts(self._schedule.batch_size))
 
-    def of_returns(self) -> list[Samples]:
-        """A batch of the intensity stage, in a part for each thread, or for fewer."""
+    def of_returns(self) -> Batch:
+        """A batch of the intensity stage."""
         if self._config.training.intensity_in_free_space:
-            return self._returns.batch(self._parts)
+            return self._returns.batch(self._num_parts(self._schedule.batch_size))
         count = self._config.training.intensity_batch_size
-        return self._returns.spread(count, max(1, min(self._parts, count // _LEAST_PART)))
+        return self._returns.spread(count, self._num_parts(count))
 
 
 @dataclass(frozen=True)
@@ -121,18 +118,16 @@ class _Stage:
     """Optimisers of the parameters that are trained, in the order of their gradients."""
     rows: RowAdam | None
     """Optimiser of the features if only the touched ones move."""
-    draw: Callable[[], list[Samples]]
-    """Draws a batch, in a part for each thread."""
-    gradients_of: Callable[[tuple[GradientBackend, Samples]], Gradients]
-    """Computes losses and gradients of a part."""
+    draw: Callable[[], Batch]
+    """Draws a batch."""
+    gradients_of: Callable[[Batch, Callable[[], Batch | None]], tuple[Gradients, Batch | None]]
+    """Computes losses and gradients of a batch, and the result of what it runs meanwhile."""
 
 
 class Training:
     """Trains `field` in place: the sdf stage on `surface`, then the intensity stage on all `returns`.
 
-    Without a `scale` there are no intensities. Each batch is split over the threads. Their gradients are
-    added in the order of the threads, so the same number of threads gives the same bits. With another number,
-    the rounding and the dropout differ.
+    Without a `scale` there are no intensities.
     """
 
     def __init__(
@@ -156,12 +151,10 @@ class Training:
         )
         self.schedule = schedule
         self.iterations = schedule.iterations
-        parts = min(workers.num_threads, schedule.batch_size, config.training.intensity_batch_size)
         self._draws: _Draws | None = None  # not made without iterations, because it sorts the returns
-        self._backends: list[GradientBackend] = []
+        self._backend = _backend(field, config, schedule, workers)
         if any(self.iterations.values()):
-            self._draws = _Draws(surface, returns, scale, config, schedule, parts)
-            self._backends = _backends(field, config, schedule, parts)
+            self._draws = _Draws(surface, returns, scale, config, schedule, self._backend.num_parts)
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         self.history = LossHistory(self.iterations)
@@ -192,9 +185,7 @@ class Training:
             state |= {f"rows.{k}": v for k, v in self._rows.state().items()}
         if self._draws is not None:
             state |= {f"draws.{k}": v for k, v in self._draws.state().items()}
-        for i, backend in enumerate(self._backends):
-            state |= {f"backend.{i}.{k}": v for k, v in backend.state().items()}
-        return state
+        return state | {f"backend.{k}": v for k, v in self._backend.state().items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restores what :meth:`state` of the same fit gave. Raises a ValueError if it is impossible."""
@@ -214,8 +205,7 @@ class Training:
             self._rows.restore(_part(state, "rows"))
         if self._draws is not None:
             self._draws.restore(_part(state, "draws"))
-        for i, backend in enumerate(self._backends):
-            backend.restore(_part(state, f"backend.{i}"))
+        self._backend.restore(_part(state, "backend"))
 
     def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
         """Runs all iterations that are left.
@@ -270,7 +260,7 @@ class Training:
                     adams=[sdf_adam, intensity_adam] if joint and intensity_adam is not None else [sdf_adam],
                     rows=self._rows,
                     draw=self._draws.of_surface,
-                    gradients_of=_joint_gradients if joint else _sdf_gradients,
+                    gradients_of=self._backend.joint if joint else self._backend.sdf,
                 )
             )
         if intensity_adam is not None and intensity_iterations > joint:
@@ -283,7 +273,7 @@ class Training:
                     adams=[intensity_adam],
                     rows=None,
                     draw=self._draws.of_returns,
-                    gradients_of=_intensity_gradients,
+                    gradients_of=self._backend.intensity,
                 )
             )
         return stages
@@ -304,39 +294,33 @@ class Training:
             msg = f"{fault} at iteration {i} of {iterations} of the {stage.name} stage: a lower learning rate may help"
             raise Diverged(msg)
 
-        ahead: list[Samples] | None = None
+        ahead: Batch | None = None
         for i in range(self._done(stage), iterations):
             # Each stage starts at the full learning rate, also for an optimiser that an earlier stage has
             # used.
             cosine = 0.5 * (1 + math.cos(math.pi * i / iterations))
             share = cosine if self._config.training.cosine_schedule else 1.0
-            # A small batch of the intensity stage has fewer parts than there are threads.
-            work = list(zip(self._backends, ahead or stage.draw(), strict=False))
-            found = list(self._workers.map(stage.gradients_of, work))
-            loss = sum(sum(part.losses.values()) for part in found)
-            if not math.isfinite(loss):
-                give_up(f"the {_bad_losses(found)} loss is {loss}")
             stop = pauses.interrupted()
             write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
             look = stop or write or i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
             # No samples are drawn ahead before the state is written: it would contain the draw after the
             # next.
-            rest = functools.partial(_move_networks, found, stage.adams, share, None if look else stage.draw)
+            found, ahead = stage.gradients_of(ahead or stage.draw(), _nothing if look else stage.draw)
+            loss = sum(found.losses.values())
+            if not math.isfinite(loss):
+                give_up(f"the {_bad_losses(found)} loss is {loss}")
+            move_networks = functools.partial(_move_networks, found, stage.adams, share)
             if rows is None:
-                ahead = rest()
+                move_networks()
             else:
                 rows.learning_rate = share * rows.full_rate
-                ahead = rows.step(
-                    [part.touched for part in found if part.touched is not None],
-                    self._workers,
-                    meanwhile=rest,
-                )
+                rows.step(found.touched or [], self._workers, meanwhile=move_networks)
             self.losses[stage.name] = loss
             for name in stage.counts:
                 before = stage.iterations_before if name == stage.name else 0
                 self.iterations_done[name] = min(before + i + 1, self.iterations[name])
-            self.history.add(found, self.iterations_done)
-            del found, rest  # gradients of all features are as large as these: not two for each thread
+            self.history.add(found.losses, self.iterations_done)
+            del found, move_networks  # gradients of all features are as large as these: not two at once
             pauses.bar.set_postfix_str(f"{stage.name} loss {loss:.3g}", refresh=False)
             pauses.bar.update()
             if look:
@@ -351,51 +335,29 @@ class Training:
                 raise KeyboardInterrupt
 
 
-def _backends(field: Field, config: FitConfig, schedule: Schedule, parts: int) -> list[GradientBackend]:
-    """A back end for each thread."""
+def _backend(field: Field, config: FitConfig, schedule: Schedule, workers: Workers) -> GradientBackend:
     # Normals are gradients, and the core's loss does not differentiate twice.
     normals = field.intensity_network is not None and config.networks.normals
     kind = AutogradGradients if normals or config.training.gradients == "autograd" else CoreGradients
-    seeds = range(config.seed * _GENERATORS + 1, config.seed * _GENERATORS + 1 + parts)
-    generators = [torch.Generator("cpu").manual_seed(seed) for seed in seeds]
-    return [kind(field, config, Share(schedule.dropout_scale, generator)) for generator in generators]
+    generator = torch.Generator("cpu").manual_seed(config.seed * _GENERATORS + 1)
+    return kind(field, config, RandomDropout(schedule.dropout_scale, generator), workers)
 
 
-_Work = tuple[GradientBackend, Samples]
-
-
-def _sdf_gradients(work: _Work) -> Gradients:
-    backend, samples = work
-    return backend.sdf(samples)
-
-
-def _joint_gradients(work: _Work) -> Gradients:
-    backend, samples = work
-    return backend.joint(samples)
-
-
-def _intensity_gradients(work: _Work) -> Gradients:
-    backend, samples = work
-    return backend.intensity(samples)
-
-
-def _bad_losses(found: Sequence[Gradients]) -> str:
+def _bad_losses(found: Gradients) -> str:
     """Names of the losses that are not finite."""
-    bad = {name for part in found for name, value in part.losses.items() if not math.isfinite(value)}
-    return " and ".join(sorted(bad))
+    return " and ".join(sorted(name for name, value in found.losses.items() if not math.isfinite(value)))
 
 
-def _move_networks(
-    found: Sequence[Gradients], adams: Sequence[Adam], share: float, draw: Callable[[], list[Samples]] | None
-) -> list[Samples] | None:
-    """Adds the gradients of all threads, changes the networks and draws the next samples by `draw`."""
-    for part in found[1:]:
-        torch._foreach_add_(found[0].by_parameters, part.by_parameters)
-    total = iter(found[0].by_parameters)
+def _move_networks(found: Gradients, adams: Sequence[Adam], share: float) -> None:
+    """Changes the networks by the gradients."""
+    total = iter(found.by_parameters)
     for adam in adams:
         adam.learning_rate = share * adam.full_rate
         adam.step(list(itertools.islice(total, len(adam.parameters))))
-    return None if draw is None else draw()
+
+
+def _nothing() -> None:
+    """Is done meanwhile where no samples are drawn ahead."""
 
 
 def _part(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:

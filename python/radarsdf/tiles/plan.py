@@ -55,7 +55,7 @@ class Plan:
     """What the tasks have in common, and a list of tiles. Tiles are pure functions of their plan and their rays."""
 
     config: FitConfig
-    """Settings of all fits, with the noise of the sensor and the number of threads, on which bits depend."""
+    """Settings of all fits, with the noise of the sensor and the number of threads, on which bits may depend."""
     tile_m: float
     """Edge of a tile, m."""
     halo_m: float
