@@ -1,8 +1,11 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
+#include <pybind11/stl.h>
+
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "lattice/cell_set.hpp"
+#include "util/gather_rows.hpp"
 #include "util/stable_order.hpp"
 
 namespace radarsdf {
@@ -93,6 +96,32 @@ void bind_cell_set(py::module_& m) {
         return to_array(std::move(order));
       },
       "keys"_a.noconvert(), "Positions (N,) int32 of `keys` (N,) uint64 in ascending order; equal ones in their own.");
+  m.def(
+      "gather_rows",
+      [](const std::vector<Array<float>>& blocks, const Array<std::int32_t>& order, Array<float>& out,
+         int num_threads) {
+        const std::int64_t count = check_column(order, "order");
+        std::vector<Block<float>> matrices;
+        std::int64_t columns = 0, rows = -1;
+        for (const Array<float>& block : blocks) {
+          if (block.ndim() != 2) throw std::invalid_argument("blocks must be matrices");
+          if (rows >= 0 && block.shape(0) != rows) throw std::invalid_argument("blocks must have the same rows");
+          rows = block.shape(0);
+          columns += block.shape(1);
+          matrices.push_back({block.data(), block.shape(1)});
+        }
+        check_shape(out, count, columns, "out");
+        const std::int32_t* from = order.data();
+        if (std::any_of(from, from + count, [&](std::int32_t row) { return row < 0 || row >= rows; })) {
+          throw std::invalid_argument("order must lie in [0, rows)");
+        }
+        float* to = out.mutable_data();
+        const py::gil_scoped_release release;
+        gather_rows(matrices, from, count, to, num_threads);
+      },
+      "blocks"_a.noconvert(), "order"_a.noconvert(), "out"_a.noconvert(), "num_threads"_a = 0,
+      "Writes rows of `blocks` (N, W) float32 side by side, in `order` (M,) int32, to `out` (M, sum of the W) "
+      "float32.");
   bind_cells<float>(m, cell_set);
   bind_cells<double>(m, cell_set);
 }

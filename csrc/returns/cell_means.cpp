@@ -4,10 +4,12 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <stdexcept>
 #include <utility>
 
 #include "util/parallel.hpp"
+#include "util/prefetch.hpp"
 
 namespace radarsdf {
 namespace {
@@ -75,13 +77,24 @@ std::int64_t number_cells(const Tiles& tiles, const Views& views, std::int32_t* 
                           std::vector<std::uint64_t>* keys) {
   FlatMap numbers(static_cast<std::size_t>(views.count / kViewsPerCell));
   std::int32_t next = 0;
-  for (std::int64_t i = 0; i < views.count; ++i) {
-    const std::uint64_t key = tiles.key(views, i);
-    if (numbers.insert(key, next)) {
-      rows[i] = next++;
-      if (keys != nullptr) keys->push_back(key);
-    } else {
-      rows[i] = numbers.find(key);
+  // Of millions of views, almost every look-up waits for memory: a run of them waits together.
+  std::uint64_t run[64];
+  constexpr std::int64_t size = std::size(run);
+  for (std::int64_t first = 0; first < views.count; first += size) {
+    const std::int64_t last = std::min(first + size, views.count);
+    const FlatMapView table = numbers.view();
+    for (std::int64_t i = first; i < last; ++i) {
+      run[i - first] = tiles.key(views, i);
+      prefetch(table.slots + table.home(run[i - first]));
+    }
+    for (std::int64_t i = first; i < last; ++i) {
+      const std::uint64_t key = run[i - first];
+      if (numbers.insert(key, next)) {
+        rows[i] = next++;
+        if (keys != nullptr) keys->push_back(key);
+      } else {
+        rows[i] = numbers.find(key);
+      }
     }
   }
   return next;
@@ -94,6 +107,13 @@ double median_absolute(const std::vector<double>& values) {
   std::nth_element(sizes.begin(), middle, sizes.end());
   return *middle;
 }
+
+// All that is known of a cell in one place: of millions, each is a wait for memory.
+struct Cell {
+  double sum = 0, mass = 0;
+  double mean = 0;
+  double less = 0;  // what the last mean takes less than the one before
+};
 
 CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_tilings, const Views& views,
                      const float* values, const float* weights, double shrinkage, int rounds, float* explained) {
@@ -108,27 +128,23 @@ CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_til
   }
   firsts.push_back(result.keys.size());
 
-  std::vector<double> left(values, values + count), means(result.keys.size(), 0.0);
-  std::vector<double> weight(weights, weights + count), sums, masses;
+  std::vector<double> left(values, values + count), weight(weights, weights + count);
+  std::vector<Cell> cells(result.keys.size());
   for (int round = 0; round < rounds; ++round) {
     for (std::size_t k = 0; k < kinds.size(); ++k) {
       check_interrupt();
       const std::int32_t* row = &rows[k * count];
-      double* mean = &means[firsts[k]];
-      const std::size_t size = firsts[k + 1] - firsts[k];
-      sums.assign(size, 0.0);
-      masses.assign(size, 0.0);
+      Cell* own = cells.data() + firsts[k];
       for (std::size_t i = 0; i < count; ++i) {
-        const auto r = static_cast<std::size_t>(row[i]);
-        sums[r] += weight[i] * (left[i] + mean[r]);
-        masses[r] += weight[i];
+        Cell& cell = own[row[i]];
+        cell.sum += weight[i] * (left[i] + cell.mean);
+        cell.mass += weight[i];
       }
-      for (std::size_t r = 0; r < size; ++r) {
-        sums[r] /= masses[r] + shrinkage;  // the new mean
-        std::swap(sums[r], mean[r]);
-        sums[r] -= mean[r];  // what it takes less than the old one
+      for (Cell* cell = own; cell != cells.data() + firsts[k + 1]; ++cell) {
+        const double mean = cell->sum / (cell->mass + shrinkage);
+        *cell = {0, 0, mean, cell->mean - mean};
       }
-      for (std::size_t i = 0; i < count; ++i) left[i] += sums[static_cast<std::size_t>(row[i])];
+      for (std::size_t i = 0; i < count; ++i) left[i] += own[row[i]].less;
     }
     if (round == 0 && rounds > 1) {
       const double scale = kCauchyMedians * median_absolute(left);
@@ -139,7 +155,8 @@ CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_til
     }
   }
   for (std::size_t i = 0; i < count; ++i) explained[i] = static_cast<float>(values[i] - left[i]);
-  result.means.assign(means.begin(), means.end());
+  std::transform(cells.begin(), cells.end(), std::back_inserter(result.means),
+                 [](const Cell& cell) { return static_cast<float>(cell.mean); });
   return result;
 }
 

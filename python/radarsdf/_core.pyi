@@ -37,6 +37,7 @@ __all__: list[str] = [
     "count_scans",
     "fit_cell_means",
     "fourier",
+    "gather_rows",
     "instruction_set",
     "marching_cubes_dense",
     "marching_cubes_dense_backward",
@@ -820,6 +821,16 @@ def fourier(
 ) -> None:
     """
     Writes sin and cos of 2^k pi x / half_width_m to `out` (N, 6 num_frequencies).
+    """
+
+def gather_rows(
+    blocks: list[numpy.typing.NDArray[numpy.float32]],
+    order: numpy.typing.NDArray[numpy.int32],
+    out: numpy.typing.NDArray[numpy.float32],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> None:
+    """
+    Writes rows of `blocks` (N, W) float32 side by side, in `order` (M,) int32, to `out` (M, sum of the W) float32.
     """
 
 def instruction_set() -> str:

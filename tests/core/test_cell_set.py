@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf._core import CellSet, cell_keys, sample_cells, sample_rays, stable_order
+from radarsdf._core import CellSet, cell_keys, gather_rows, sample_cells, sample_rays, stable_order
 
 LEAF_M = 0.2
 OFFSETS_M = np.linspace(-0.3, 0.3, 7).astype(np.float32)
@@ -80,3 +80,24 @@ def test_arguments_of_samples_are_checked():
 def test_the_order_of_keys_is_stable(highest, count):
     keys = np.random.default_rng(count).integers(0, highest, count, np.uint64)
     np.testing.assert_array_equal(stable_order(keys), np.argsort(keys, kind="stable"))
+
+
+@pytest.mark.parametrize("count", [0, 1, 40_000])
+def test_rows_of_blocks_are_gathered_side_by_side(count):
+    generator = np.random.default_rng(0)
+    blocks = [generator.normal(size=(50_000, width)).astype(np.float32) for width in (3, 1, 4)]
+    order = generator.integers(0, 50_000, count, np.int32)
+    for threads in (1, 3):
+        out = np.zeros((count, 8), np.float32)
+        gather_rows(blocks, order, out, threads)
+        np.testing.assert_array_equal(out, np.concatenate(blocks, 1)[order])
+
+
+def test_arguments_of_gathered_rows_are_checked():
+    block, out = np.zeros((4, 2), np.float32), np.zeros((3, 2), np.float32)
+    gather_rows([block], np.array([3, 0, 0], np.int32), out)
+    for order in ([4, 0, 0], [-1, 0, 0], [0, 0]):
+        with pytest.raises(ValueError, match=r"order|out"):
+            gather_rows([block], np.array(order, np.int32), out)
+    with pytest.raises(ValueError, match="same rows"):
+        gather_rows([block, block[:3]], np.zeros(3, np.int32), np.zeros((3, 4), np.float32))

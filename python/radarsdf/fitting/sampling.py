@@ -17,6 +17,7 @@ from radarsdf._core import (
     RAY_POINT,
     RAY_RANGE,
     cell_keys,
+    gather_rows,
     random_bytes,
     stable_order,
 )
@@ -24,7 +25,6 @@ from radarsdf.budget.schedule import near_and_labelled
 from radarsdf.config import FitConfig
 from radarsdf.returns.rays import Rays
 
-_ROWS_AT_ONCE = 1 << 16
 _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly over an interval of length 1
 
 
@@ -115,6 +115,8 @@ class RaySampler:
         large map, the rays of a batch would otherwise be far apart, and share no cache lines.
     intensities : Tensor, optional
         (N,) scaled intensities of the rays.
+    num_threads : int
+        Threads that sort the rays. 0: as many as OpenMP uses.
     """
 
     def __init__(
@@ -125,11 +127,13 @@ class RaySampler:
         generator: torch.Generator,
         neighbours: int = 1,
         intensities: Tensor | None = None,
+        num_threads: int = 1,
     ) -> None:
         self._config = config
         self._neighbours = neighbours
         self._generator = generator
-        self._rays = torch.from_numpy(_in_morton_order(rays, intensities, config.leaf_size_m))
+        rows = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
+        self._rays = torch.from_numpy(rows)
         self._order = np.zeros(0, np.int64)
         self._order_from = torch.zeros_like(generator.get_state())
         """State of the generator before `_order` was drawn."""
@@ -218,19 +222,19 @@ class RaySampler:
         return Batch(points, sdf_m, ray, layout.parts, layout.near)
 
 
-def _in_morton_order(rays: Rays, intensities: Tensor | None, leaf_size_m: float) -> NDArray[np.float32]:
+def _in_morton_order(
+    rays: Rays, intensities: Tensor | None, leaf_size_m: float, num_threads: int
+) -> NDArray[np.float32]:
     """(N, 7 or 8) numbers of the rays in Morton order of their returns; see :attr:`Samples.of_ray`.
 
     All numbers of a ray are in one row of 32 bytes, half a cache line: a batch reads them by one index_select.
     """
-    order = stable_order(cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, 1))
+    order = stable_order(cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
     columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
     if intensities is not None:
         columns.append(intensities.numpy()[:, None])
     rows = np.empty((len(rays), sum(column.shape[1] for column in columns)), np.float32)
-    for first in range(0, len(rows), _ROWS_AT_ONCE):  # so that nothing else is as large
-        part = slice(first, first + _ROWS_AT_ONCE)
-        np.concatenate([column[order[part]] for column in columns], axis=1, out=rows[part])
+    gather_rows([np.ascontiguousarray(column) for column in columns], order, rows, num_threads)
     return rows
 
 

@@ -47,6 +47,7 @@ class _Draws:
         config: FitConfig,
         schedule: Schedule,
         num_parts: Callable[[int], int],
+        num_threads: int,
     ) -> None:
         self._config = config
         self._schedule = schedule
@@ -57,7 +58,15 @@ class _Draws:
             unit = None
             if scale is not None and rays.intensities is not None:
                 unit = torch.from_numpy(scale.to_unit(rays.intensities))
-            return RaySampler(rays, config, schedule.batch_size, self._generator, schedule.neighbours, unit)
+            return RaySampler(
+                rays,
+                config,
+                schedule.batch_size,
+                self._generator,
+                schedule.neighbours,
+                unit,
+                num_threads,
+            )
 
         self._surface = sampler(surface)
         # Ghosts are not part of the surface, but the sensor will see them again, so their intensities are
@@ -154,7 +163,8 @@ class Training:
         self._draws: _Draws | None = None  # not made without iterations, because it sorts the returns
         self._backend = _backend(field, config, schedule, workers)
         if any(self.iterations.values()):
-            self._draws = _Draws(surface, returns, scale, config, schedule, self._backend.num_parts)
+            num_parts, num_threads = self._backend.num_parts, workers.num_threads
+            self._draws = _Draws(surface, returns, scale, config, schedule, num_parts, num_threads)
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         self.history = LossHistory(self.iterations)
