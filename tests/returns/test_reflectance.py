@@ -81,12 +81,33 @@ def test_with_a_network_the_answer_is_the_mean_of_two(rays):
     """That of the network, and of half of it with what that leaves in closed form."""
     answers = np.linspace(0.2, 0.6, len(rays), dtype=np.float32)
     surfels = Surfels.of(rays, LEAF_M, 1)
-    found = Reflectance.of(rays, unit(rays), surfels, LEAF_M, 1, answers)
+    found = Reflectance.of(rays, unit(rays), surfels, LEAF_M, 1, lambda *_: answers)
     closed = Reflectance.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1)
     whole, leaves = (r.at(rays.points, rays.directions, rays.ranges_m, 1) for r in (found, closed))
     assert closed.network_share == 0
     expected = (answers + (answers / 2 + leaves)) / 2
     np.testing.assert_allclose(found.network_share * answers + whole, expected, rtol=0, atol=1e-4)
+
+
+def test_a_network_is_asked_once_for_a_group(rays, monkeypatch):
+    monkeypatch.setattr(reflectance, "_MOST_RETURNS", 1000)
+    asked = []
+
+    def ask(points, directions, ranges_m):
+        np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6)
+        asked.append(len(points))
+        values = 0.3 + 0.02 * points[:, 0] + 0.1 * directions[:, 1] + 0.01 * ranges_m
+        return values.astype(np.float32)
+
+    answers = ask(rays.points, rays.directions, rays.ranges_m)
+    surfels = Surfels.of(rays, LEAF_M, 1)
+    found = Reflectance.of(rays, unit(rays), surfels, LEAF_M, 1, ask)
+    assert asked[1] < 0.8 * len(rays)
+    each = Reflectance.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1)
+    closed, leaves = (r.at(rays.points, rays.directions, rays.ranges_m, 1) for r in (found, each))
+    assert answers.std() > 0.04
+    # Within a group the answer differs by some hundredths.
+    assert np.abs(2 * closed - leaves).mean() < 0.003
 
 
 def test_means_that_tell_nothing_are_left_out(rays, monkeypatch):

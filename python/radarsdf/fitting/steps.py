@@ -34,7 +34,7 @@ from radarsdf.returns.evidence import Evidence, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.reflectance import Reflectance
+from radarsdf.returns.reflectance import Float32, Reflectance
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.surfels import Surfels
 from radarsdf.threads import Workers
@@ -199,12 +199,13 @@ def _with_closed_form(
 ) -> MapContents:
     scale, config = contents.intensity_scale, contents.config
     assert scale is not None
-    answers = None
-    if config.trains_intensity:
-        sensors = torch.from_numpy(rays.points - rays.directions * rays.ranges_m[:, None])
-        answers = scale.to_unit(queries.intensity(contents, torch.from_numpy(rays.points), sensors).numpy())
-    unit = scale.to_unit(intensities)
-    found = Reflectance.of(rays, unit, surfels, config.leaf_size_m, num_threads, answers, cell_of_ray)
+
+    def ask(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
+        sensors = torch.from_numpy(points - directions * ranges_m[:, None])
+        return scale.to_unit(queries.intensity(contents, torch.from_numpy(points), sensors).numpy())
+
+    unit, network = scale.to_unit(intensities), ask if config.trains_intensity else None
+    found = Reflectance.of(rays, unit, surfels, config.leaf_size_m, num_threads, network, cell_of_ray)
     return dataclasses.replace(contents, reflectance=found)
 
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -42,6 +43,8 @@ _LEAST_MEAN = 0.005  # of the range of intensities. A third of the means are sma
 # since it is no better than the closed form on real drives.
 _NETWORK_TIMES = 0.5
 _CLOSED_TIMES = 0.5
+
+Ask = Callable[[Float32, Float32, Float32], Float32]
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ class Reflectance:
         surfels: Surfels,
         leaf_size_m: float,
         num_threads: int = 0,
-        answers: Float32 | None = None,
+        ask: Ask | None = None,
         cell_of_ray: NDArray[np.int32] | None = None,
     ) -> Reflectance:
         """The reflectance of `rays`.
@@ -115,8 +118,9 @@ class Reflectance:
             Edge of a leaf cell, m.
         num_threads : int
             0: as many as OpenMP uses. The result has the same bits with any number.
-        answers : (N,) float32, optional
-            The intensities that a network answers for them, scaled alike. Default: there is no network.
+        ask : callable, optional
+            What a network answers: intensities (M,) float32, scaled alike, at points (M, 3), local frame, m, seen along
+            directions (M, 3), unit vectors, from ranges (M,), m. Default: there is no network.
         cell_of_ray : (N,) int32, optional
             Row of each return's cell in those of `surfels`. Default: `surfels` are of the same returns.
         """
@@ -126,17 +130,28 @@ class Reflectance:
         points = np.ascontiguousarray(rays.points)
         directions = np.ascontiguousarray(rays.directions)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
+        groups = _Groups.of(points, directions, incidence, leaf_size_m, num_threads)
         times, share = 1.0, 0.0
-        if answers is not None:
-            unit = unit - np.float32(_NETWORK_TIMES) * answers
+        if ask is not None:
+            answers = ask(groups.points, _unit_vectors(groups.directions), groups.means(rays.ranges_m))
+            unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         response = Response.of(unit, directions, rays.ranges_m, incidence, kinds)
         left = unit - response.at(directions, rays.ranges_m, incidence, kinds)
-        rows, groups = _grouped(points, directions, incidence, left, leaf_size_m, num_threads)
-        cells = _in_metres(_KINDS, leaf_size_m)
-        keys, means, explained = fit_cell_means(cells, _TILINGS, *groups, _SHRINKAGE, _ROUNDS, num_threads)
+        keys, means, explained = fit_cell_means(
+            _in_metres(_KINDS, leaf_size_m),
+            _TILINGS,
+            groups.points,
+            groups.directions,
+            groups.means(incidence),
+            groups.means(left),
+            groups.weights,
+            _SHRINKAGE,
+            _ROUNDS,
+            num_threads,
+        )
         # The cells have means, and the error that counts is the absolute one, whose centre is the median.
-        response.coefficients[:, 0] += np.median(left - explained[rows])
+        response.coefficients[:, 0] += np.median(left - groups.of_returns(explained))
         kept = np.abs(means) >= _LEAST_MEAN
         return cls(
             leaf_size_m,
@@ -176,35 +191,55 @@ def _incidence(normals: Float32, plane: NDArray[np.int32], directions: Float32) 
     return angle
 
 
-_Groups = tuple[Float32, Float32, Float32, Float32, Float32]
+def _unit_vectors(directions: Float32) -> Float32:
+    unit: Float32 = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return unit
 
 
-def _grouped(
-    points: Float32,
-    directions: Float32,
-    incidence_rad: Float32,
-    values: Float32,
-    leaf_size_m: float,
-    num_threads: int,
-) -> tuple[NDArray[np.int32], _Groups]:
-    """Row of each return's group, and points, directions, incidences, values and weights of the groups.
+@dataclass(frozen=True)
+class _Groups:
+    """Returns that are close and seen alike. A group is one return, unless there are many."""
 
-    A group is one return, unless there are many.
-    """
-    if len(points) <= _MOST_RETURNS:
-        alone = np.arange(len(points), dtype=np.int32)
-        return alone, (points, directions, incidence_rad, values, np.ones(len(points), np.float32))
-    rows, count = cell_rows(_in_metres(_GROUPS, leaf_size_m), points, directions, incidence_rad)
-    moments = sum_moments(points, directions, rows, count, num_threads)
-    returns = moments[:, 0]
+    rows: NDArray[np.int32] | None
+    """(N,) row of each return's group. None: each is alone."""
+    points: Float32
+    """(G, 3) mean point, local frame, m."""
+    directions: Float32
+    """(G, 3) mean direction."""
+    counts: NDArray[np.float64]
+    """(G,) number of returns."""
 
-    def mean(sums: NDArray[Any]) -> Float32:
-        return np.ascontiguousarray((sums.T / returns).T, np.float32)
+    @classmethod
+    def of(
+        cls,
+        points: Float32,
+        directions: Float32,
+        incidence_rad: Float32,
+        leaf_size_m: float,
+        num_threads: int,
+    ) -> _Groups:
+        if len(points) <= _MOST_RETURNS:
+            return cls(None, points, directions, np.ones(len(points)))
+        rows, count = cell_rows(_in_metres(_GROUPS, leaf_size_m), points, directions, incidence_rad)
+        moments = sum_moments(points, directions, rows, count, num_threads)
+        counts = moments[:, 0].copy()
+        return cls(rows, _divided(moments[:, 1:4], counts), _divided(moments[:, 10:], counts), counts)
 
-    return rows, (
-        mean(moments[:, 1:4]),
-        mean(moments[:, 10:]),
-        mean(np.bincount(rows, incidence_rad, count)),
-        mean(np.bincount(rows, values, count)),
-        (returns / (1 + _CORRELATION * (returns - 1))).astype(np.float32),
-    )
+    @property
+    def weights(self) -> Float32:
+        """(G,)."""
+        return (self.counts / (1 + _CORRELATION * (self.counts - 1))).astype(np.float32)
+
+    def means(self, values: Float32) -> Float32:
+        """(G,) of values (N,) of the returns."""
+        if self.rows is None:
+            return np.ascontiguousarray(values)
+        return _divided(np.bincount(self.rows, values, len(self.counts)), self.counts)
+
+    def of_returns(self, values: Float32) -> Float32:
+        """(N,) of values (G,) of the groups."""
+        return values if self.rows is None else values[self.rows]
+
+
+def _divided(sums: NDArray[Any], counts: NDArray[np.float64]) -> Float32:
+    return np.ascontiguousarray((sums.T / counts).T, np.float32)
