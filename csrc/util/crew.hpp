@@ -9,15 +9,16 @@
 #include <cstdint>
 #include <exception>
 #include <functional>
+#include <memory>
 #include <mutex>
 #include <thread>
 #include <vector>
 
 namespace radarsdf {
 
-// To wake a sleeping thread took 50 us, and again 50 to tell the one that waits (a virtual machine of two processors),
-// where half an iteration takes 500. So a thread that has nothing to do looks for work for a moment before it sleeps.
-// It does not look for long, as OpenMP's threads do: beside another busy program these made fits fifty times slower.
+// To wake a sleeping thread takes 50 us (a virtual machine of two processors), and again 50 to tell the one that waits.
+// So a thread that has nothing to do looks for work for a moment before it sleeps. It does not look for long, as
+// OpenMP's threads do: beside another busy program these made fits thirty times slower.
 //
 // One thread at a time may call it.
 class Crew {
@@ -45,17 +46,23 @@ class Crew {
   std::function<void(std::int64_t)> task_;
   std::int64_t num_tasks_ = 0;
   std::atomic<std::int64_t> next_{0};
-  std::exception_ptr error_;  // under mutex_
+  std::exception_ptr error_;  // under the mutex
   bool begun_ = false;
 
-  std::mutex mutex_;
-  std::condition_variable wake_, done_;
-  std::atomic<std::int64_t> job_{0};  // number of the last one; changed under mutex_
-  std::atomic<int> working_{0};       // threads in the last job; changed under mutex_
-  std::atomic<bool> stop_{false};     // changed under mutex_
-  bool open_ = false;                 // a thread may still join the last job; under mutex_
+  // In a process that was forked they cannot be destroyed: that would wait for threads that stayed with the parent.
+  struct Others {
+    std::mutex mutex;
+    std::condition_variable wake, done;
+    std::vector<std::thread> threads;
+  };
+  bool has_others() const;
+
+  std::unique_ptr<Others> others_;
+  std::atomic<std::int64_t> job_{0};  // number of the last one; changed under the mutex
+  std::atomic<int> working_{0};       // threads in the last job; changed under the mutex
+  std::atomic<bool> stop_{false};     // changed under the mutex
+  bool open_ = false;                 // a thread may still join the last job; under the mutex
   int forks_;                         // of this process, when the threads were made
-  std::vector<std::thread> threads_;
 };
 
 }  // namespace radarsdf

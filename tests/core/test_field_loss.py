@@ -7,6 +7,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import gc
+import os
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -306,6 +309,29 @@ def test_the_core_does_one_batch_after_the_other(rays):
     other.begin_intensity(*[np.array(a) if isinstance(a, np.ndarray) else a for a in arguments], crew)
     del crew, other
     gc.collect()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("pause_s", [0.0, 0.05], ids=["looking", "asleep"])
+def test_a_forked_child_goes_on_with_a_crew_alone(rays, pause_s):
+    made = make_batch(rays)
+    loss, crew = _core.FieldLoss(**core_arguments(made)), _core.Crew(3)
+    points, sdf_m, of_ray = (getattr(made.batch, name).numpy() for name in ("points", "sdf_m", "of_ray"))
+    arguments = points, sdf_m, [(200, 100), (200, 100)], of_ray, [], 1.0, crew
+    loss.begin_intensity(*arguments)
+    expected = loss.finish(crew)
+    time.sleep(pause_s)
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)
+        loss.begin_intensity(*arguments)
+        same = loss.finish(crew) == expected
+        del arguments, crew  # its threads stayed with the parent
+        os._exit(17 if same else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
+    loss.begin_intensity(*arguments)
+    assert loss.finish(crew) == expected
 
 
 def test_the_core_refuses_other_types_and_a_missing_network(rays):
