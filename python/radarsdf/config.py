@@ -343,6 +343,12 @@ class FitConfig:
         through_normals = with_intensity and self.training.joint and self.networks.normals
         return self.training.row_updates and not through_normals
 
+    def differentiates_in_core(self, with_intensity: bool) -> bool:
+        """Whether the gradients come from the compiled core: see `training.gradients`."""
+        # Normals are gradients, and the core does not differentiate twice.
+        normals = with_intensity and self.networks.normals
+        return self.training.gradients == "core" and not normals
+
     def _metres(self, cells: float) -> float:
         return float(f"{cells * self.leaf_size_m:.12g}")  # 1.5 · 0.2 gives 0.3, not 0.30000000000000004
 

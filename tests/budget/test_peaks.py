@@ -24,6 +24,10 @@ CASES = {
     "all rows, 1 thread": ALL_ROWS | {"num_threads": 1},
     "all rows, 2 threads": ALL_ROWS | {"num_threads": 2},
     "all rows, 8 threads": ALL_ROWS | {"num_threads": 8},
+    "all rows by autograd, 4 threads": {
+        "training": {"row_updates": False, "gradients": "autograd"},
+        "num_threads": 4,
+    },
     "octree": OCTREE | {"num_threads": 2},
     "octree, normals": OCTREE | NORMALS | {"num_threads": 4},
 }

@@ -184,6 +184,8 @@ def _copies(config: FitConfig, schedule: Schedule, *, with_intensity: bool) -> i
         return _COPIES if schedule.sdf_iterations else 1
     if not schedule.sdf_iterations:
         return 3  # itself and two moments
+    if config.differentiates_in_core(with_intensity):
+        return _COPIES + 1
     # Each thread has a gradient of all rows. Through normals the loss sees them twice: two gradients, and their sum.
     gradients = 3 if with_intensity and config.networks.normals else 1
     return _COPIES + gradients * resolve_num_threads(config.num_threads)

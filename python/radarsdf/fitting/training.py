@@ -346,9 +346,8 @@ class Training:
 
 
 def _backend(field: Field, config: FitConfig, schedule: Schedule, workers: Workers) -> GradientBackend:
-    # Normals are gradients, and the core's loss does not differentiate twice.
-    normals = field.intensity_network is not None and config.networks.normals
-    kind = AutogradGradients if normals or config.training.gradients == "autograd" else CoreGradients
+    in_core = config.differentiates_in_core(field.intensity_network is not None)
+    kind = CoreGradients if in_core else AutogradGradients
     generator = torch.Generator("cpu").manual_seed(config.seed * _GENERATORS + 1)
     return kind(field, config, RandomDropout(schedule.dropout_scale, generator), workers)
 
