@@ -10,6 +10,22 @@
 namespace radarsdf {
 namespace {
 
+// Calls `by` with the checked batch, the gradient and its stride, and what they are added to; without the interpreter's
+// lock.
+template <typename T, typename By>
+void scatter_by(const VertexTable& table, const Array<T>& points, const Array<std::int32_t>& located,
+                const std::optional<Array<T>>& directions, const Rows<T>& out_grad, Array<T>& features_grad,
+                const By& by) {
+  const PointBatch<T> batch = point_batch(table, points, located, directions);
+  check_features(table, features_grad);
+  check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
+  const std::int64_t stride = row_stride(out_grad, "out_grad");
+  const T* grad = out_grad.data();
+  T* result = features_grad.mutable_data();
+  const py::gil_scoped_release release;
+  by(batch, grad, stride, result);
+}
+
 template <typename T>
 void bind_kernels(py::class_<VertexTable>& cls) {
   using Located = Array<std::int32_t>;
@@ -68,14 +84,8 @@ void bind_kernels(py::class_<VertexTable>& cls) {
       "scatter",
       [](const VertexTable& table, const Array<T>& points, const Located& located, const Directions& directions,
          const Rows<T>& out_grad, Array<T>& features_grad, int num_threads) {
-        const PointBatch<T> batch = point_batch(table, points, located, directions);
-        check_features(table, features_grad);
-        check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
-        const std::int64_t stride = row_stride(out_grad, "out_grad");
-        const T* grad = out_grad.data();
-        T* result = features_grad.mutable_data();
-        const py::gil_scoped_release release;
-        scatter(table, batch, grad, stride, result, num_threads);
+        scatter_by(table, points, located, directions, out_grad, features_grad,
+                   [&](const auto&... arguments) { scatter(table, arguments..., num_threads); });
       },
       "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true), "out_grad"_a.noconvert(),
       "features_grad"_a.noconvert(), "num_threads"_a = 0,
@@ -85,15 +95,9 @@ void bind_kernels(py::class_<VertexTable>& cls) {
       "scatter",
       [](const VertexTable& table, const Array<T>& points, const Located& located, const Rows<T>& out_grad,
          Array<T>& features_grad, HeldCrew& crew) {
-        const PointBatch<T> batch = point_batch(table, points, located, Directions());
-        check_features(table, features_grad);
-        check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
-        const std::int64_t stride = row_stride(out_grad, "out_grad");
-        const T* grad = out_grad.data();
-        T* result = features_grad.mutable_data();
-        const py::gil_scoped_release release;
-        crew.crew().run(num_level_tasks(table), [&](std::int64_t task) {
-          scatter_task(table, batch, grad, stride, result, level_task(table, task));
+        scatter_by(table, points, located, Directions(), out_grad, features_grad, [&](const auto&... arguments) {
+          crew.crew().run(num_level_tasks(table),
+                          [&](std::int64_t task) { scatter_task(table, arguments..., level_task(table, task)); });
         });
       },
       "points"_a.noconvert(), "located"_a.noconvert(), "out_grad"_a.noconvert(), "features_grad"_a.noconvert(),

@@ -56,9 +56,8 @@ class Pass {
   Pass(const FieldParameters<T>& field, const LossOptions& options, const Part<T>& part, const Request<T>& request)
       : field_(field),
         options_(options),
-        batch_(part),
+        part_(part),
         request_(request),
-        num_seen_(part.num_seen),
         levels_(field.levels()),
         cells_(field.cells()),
         waves_(field.waves()),
@@ -69,24 +68,24 @@ class Pass {
     encode();
     const bool trains = request_.sdf != nullptr;
     const std::int64_t outputs = 1 + feature_;
-    out_ = matrix<T>(batch_.count, outputs);
-    const Matrix<T> hidden = trains ? matrix<T>(batch_.count, mlp_hidden_columns(field_.sdf)) : nullptr;
+    out_ = matrix<T>(part_.count, outputs);
+    const Matrix<T> hidden = trains ? matrix<T>(part_.count, mlp_hidden_columns(field_.sdf)) : nullptr;
     std::vector<Columns<const T>> inputs = {{encoding_.get(), dim(), cells_}};
     if (waves_ > 0) inputs.push_back({encoding_.get() + cells_, dim(), waves_});
-    mlp(field_.sdf, inputs, batch_.count, hidden.get(), out_.get(), 1);
+    mlp(field_.sdf, inputs, part_.count, hidden.get(), out_.get(), 1);
 
     FieldLosses losses{0, 0};
     if (request_.intensity != nullptr) losses.intensity = intensity_loss(trains);
     if (!trains) return losses;
-    out_grad_ = matrix<T>(batch_.count, outputs);
-    std::fill_n(out_grad_.get(), batch_.count * outputs, T(0));
+    out_grad_ = matrix<T>(part_.count, outputs);
+    std::fill_n(out_grad_.get(), part_.count * outputs, T(0));
     losses.sdf = sdf_loss();
     add_links();
-    const Matrix<T> own = sums_levels() ? matrix<T>(batch_.count, cells_) : nullptr;
+    const Matrix<T> own = sums_levels() ? matrix<T>(part_.count, cells_) : nullptr;
     T* cells_grad = own ? own.get() : request_.by_features.interpolated;
     std::vector<Columns<T>> input_grads = {{cells_grad, cells_, cells_}};
     if (waves_ > 0) input_grads.push_back({nullptr, 0, waves_});
-    mlp_backward(field_.sdf, inputs, batch_.count, hidden.get(), {out_grad_.get(), outputs, outputs}, *request_.sdf,
+    mlp_backward(field_.sdf, inputs, part_.count, hidden.get(), {out_grad_.get(), outputs, outputs}, *request_.sdf,
                  input_grads, 1);
     add_cells(cells_grad);
     if (own) spread(own.get());
@@ -98,11 +97,11 @@ class Pass {
   std::int64_t dim() const { return cells_ + waves_; }
 
   void encode() {
-    encoding_ = matrix<T>(batch_.count, dim());
-    const Matrix<T> own = sums_levels() ? matrix<T>(batch_.count, levels_) : nullptr;
-    radarsdf::encode(*field_.table, field_.features, batch_.points, batch_.count, request_.by_features.located,
+    encoding_ = matrix<T>(part_.count, dim());
+    const Matrix<T> own = sums_levels() ? matrix<T>(part_.count, levels_) : nullptr;
+    radarsdf::encode(*field_.table, field_.features, part_.points, part_.count, request_.by_features.located,
                      own ? own.get() : encoding_.get(), own ? levels_ : dim(), 1);
-    for (std::int64_t i = 0; own && i < batch_.count; ++i) {
+    for (std::int64_t i = 0; own && i < part_.count; ++i) {
       for (std::int64_t d = 0; d < cells_; ++d) {
         T sum = 0;
         for (std::int64_t at = d; at < levels_; at += cells_) sum += own[i * levels_ + at];
@@ -110,7 +109,7 @@ class Pass {
       }
     }
     if (waves_ > 0) {
-      fourier(batch_.points, batch_.count, field_.frequencies.half_width_m, field_.frequencies.first,
+      fourier(part_.points, part_.count, field_.frequencies.half_width_m, field_.frequencies.first,
               field_.frequencies.count, encoding_.get() + cells_, dim(), 1);
     }
   }
@@ -121,8 +120,8 @@ class Pass {
     const T inverse_sigma = static_cast<T>(1 / options_.sigma_m);
     const T share = static_cast<T>(request_.shares.sdf);
     double sum = 0;
-    for (std::int64_t i = 0; i < batch_.count; ++i) {
-      const T logit = out_[i * outputs], label = 1 / (1 + std::exp(-batch_.sdf_m[i] * inverse_sigma));
+    for (std::int64_t i = 0; i < part_.count; ++i) {
+      const T logit = out_[i * outputs], label = 1 / (1 + std::exp(-part_.sdf_m[i] * inverse_sigma));
       const T tail = std::exp(-std::abs(logit));
       sum += static_cast<double>(std::max(logit, T(0)) - logit * label + std::log1p(tail));
       out_grad_[i * outputs] = share * ((logit < 0 ? tail : T(1)) / (1 + tail) - label);
@@ -133,31 +132,32 @@ class Pass {
   // Applies a dropout to rows of an encoding, or of its gradient, one for each sample that is seen. `to` may be `from`.
   void drop(const Dropout& dropout, std::int64_t columns, const T* from, std::int64_t from_row, T* to,
             std::int64_t to_row) const {
+    if (dropout.keep >= 256 && to == from) return;
     RandomRows random(dropout.seed, columns);
     const T scale = T(256) / static_cast<T>(dropout.keep);
-    for (std::int64_t i = 0; i < num_seen_; ++i, from += from_row, to += to_row) {
+    for (std::int64_t i = 0; i < part_.num_seen; ++i, from += from_row, to += to_row) {
       if (dropout.keep >= 256) {
-        if (to != from) std::copy_n(from, columns, to);
+        std::copy_n(from, columns, to);
         continue;
       }
-      const std::uint8_t* bytes = random.row(batch_.seen_before + i);
+      const std::uint8_t* bytes = random.row(part_.seen_before + i);
       for (std::int64_t d = 0; d < columns; ++d) to[d] = from[d] * (bytes[d] < dropout.keep ? scale : T(0));
     }
   }
 
   // Mean absolute error, and the gradients by the layers and, where `trains`, by what the SDF network hands on.
   double intensity_loss(bool trains) {
-    const std::int64_t count = num_seen_, width = field_.intensity[0].inputs;
+    const std::int64_t count = part_.num_seen, width = field_.intensity[0].inputs;
     const std::int64_t links = feature_ + field_.sees.sdf;  // columns that the SDF network gives
     const std::int64_t rest = dim() + links;                // the columns from here on are data and need no gradient
     const Matrix<T> x = matrix<T>(count, width);
-    drop(batch_.dropout[0], cells_, encoding_.get(), dim(), x.get(), width);
-    drop(batch_.dropout[1], waves_, encoding_.get() + cells_, dim(), x.get() + cells_, width);
+    drop(part_.dropout[0], cells_, encoding_.get(), dim(), x.get(), width);
+    drop(part_.dropout[1], waves_, encoding_.get() + cells_, dim(), x.get() + cells_, width);
     for (std::int64_t i = 0; i < count; ++i) fill(i, x.get() + i * width + dim());
     if (field_.sees.view_direction) {
       const Matrix<T> directions = matrix<T>(count, 3);
       for (std::int64_t i = 0; i < count; ++i) {
-        std::copy_n(batch_.rays + i * batch_.ray_stride + kRayDirection, 3, directions.get() + 3 * i);
+        std::copy_n(part_.rays + i * part_.ray_stride + kRayDirection, 3, directions.get() + 3 * i);
       }
       spherical_harmonics(directions.get(), count, x.get() + rest, width, 1);
     }
@@ -187,7 +187,7 @@ class Pass {
     double sum = 0;
     for (std::int64_t i = 0; i < count; ++i) {
       // No return is expected from free space (3QFPI).
-      const T label = i < batch_.num_labelled ? batch_.rays[i * batch_.ray_stride + kRayIntensity] : T(0);
+      const T label = i < part_.num_labelled ? part_.rays[i * part_.ray_stride + kRayIntensity] : T(0);
       const T error = predicted[i] - label;
       sum += static_cast<double>(std::abs(error));
       predicted[i] = error > 0 ? share : error < 0 ? -share : T(0);
@@ -204,7 +204,7 @@ class Pass {
     if (field_.sees.sdf) *x++ = out[0];
     if (field_.sees.view_direction) x += kHarmonics;
     if (field_.sees.log_range) {
-      const T range_m = batch_.rays[i * batch_.ray_stride + kRayRange] - batch_.sdf_m[i];
+      const T range_m = part_.rays[i * part_.ray_stride + kRayRange] - part_.sdf_m[i];
       *x = std::log10(std::max(range_m, T(1e-3)) / 10);
     }
   }
@@ -213,7 +213,7 @@ class Pass {
   void add_links() {
     if (!links_grad_) return;
     const std::int64_t links = feature_ + field_.sees.sdf;
-    for (std::int64_t i = 0; i < num_seen_; ++i) {
+    for (std::int64_t i = 0; i < part_.num_seen; ++i) {
       const T* from = links_grad_.get() + i * links;
       T* to = out_grad_.get() + i * (1 + feature_);
       for (std::int64_t g = 0; g < feature_; ++g) to[1 + g] += from[g];
@@ -225,13 +225,13 @@ class Pass {
   void add_cells(T* cells_grad) {
     if (!cells_grad_) return;
     T* own = cells_grad_.get();
-    drop(batch_.dropout[0], cells_, own, cells_, own, cells_);
-    for (std::int64_t i = 0; i < num_seen_ * cells_; ++i) cells_grad[i] += own[i];
+    drop(part_.dropout[0], cells_, own, cells_, own, cells_);
+    for (std::int64_t i = 0; i < part_.num_seen * cells_; ++i) cells_grad[i] += own[i];
   }
 
   // The encoding is the sum of the levels, so each level's gradient is that of the sum.
   void spread(const T* cells_grad) const {
-    for (std::int64_t i = 0; i < batch_.count; ++i) {
+    for (std::int64_t i = 0; i < part_.count; ++i) {
       for (std::int64_t first = 0; first < levels_; first += cells_) {
         std::copy_n(cells_grad + i * cells_, cells_, request_.by_features.interpolated + i * levels_ + first);
       }
@@ -240,9 +240,8 @@ class Pass {
 
   const FieldParameters<T>& field_;
   const LossOptions& options_;
-  const Part<T>& batch_;
+  const Part<T>& part_;
   const Request<T>& request_;
-  std::int64_t num_seen_;
   std::int64_t levels_, cells_, waves_, feature_;  // numbers of columns
   Matrix<T> encoding_, out_, out_grad_;
   Matrix<T> cells_grad_, links_grad_;  // of the intensity's loss alone

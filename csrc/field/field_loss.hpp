@@ -88,7 +88,7 @@ struct LossBatch {
   Dropout dropout[2] = {};  // of the cells' encoding and of the Fourier encoding: (num_seen, columns)
 };
 
-// By the features, which only few points touch: what `scatter` and `adam_step` take.
+// By the features, which only few points touch: what `scatter` and `adam_task` take.
 template <typename T>
 struct FeatureGradients {
   std::int32_t* located;  // (count, num_levels), see VertexTable::locate
