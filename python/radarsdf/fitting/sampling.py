@@ -135,7 +135,7 @@ class RaySampler:
         rows = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
         self._rays = torch.from_numpy(rows)
         self._order = np.zeros(0, np.int64)
-        self._order_from = torch.zeros_like(generator.get_state())
+        self._order_from = generator.get_state()
         """State of the generator before `_order` was drawn."""
         self._next = 0
         near, labelled = near_and_labelled(config, batch_size)
@@ -145,11 +145,21 @@ class RaySampler:
 
     def state(self) -> dict[str, Tensor]:
         """The order of the rays, as a state of the generator, and the position in it."""
-        drawn = len(self._order) > 0
-        return {
-            "order_from": self._order_from,
-            "next": torch.tensor(self._next if drawn else -1, dtype=torch.int64, device="cpu"),
-        }
+        if len(self._order) == 0:
+            return self.state_at_start(self._generator)
+        following = torch.tensor(self._next, dtype=torch.int64, device="cpu")
+        return {"order_from": self._order_from, "next": following}
+
+    @staticmethod
+    def state_at_start(generator: torch.Generator) -> dict[str, Tensor]:
+        """:meth:`state` of a sampler that has drawn nothing."""
+        following = torch.tensor(-1, dtype=torch.int64, device="cpu")
+        return {"order_from": torch.zeros_like(generator.get_state()), "next": following}
+
+    @staticmethod
+    def has_begun(state: dict[str, Tensor]) -> bool:
+        """Whether a sampler with this :meth:`state` has drawn."""
+        return int(state["next"]) >= 0
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restores what :meth:`state` of a sampler of the same rays gave. Changes the generator's state."""
@@ -157,7 +167,7 @@ class RaySampler:
         if not -1 <= following <= len(self._rays):
             msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"
             raise ValueError(msg)
-        if following >= 0:
+        if self.has_begun(state):
             self._generator.set_state(state["order_from"])
             self._draw_order()
             self._next = following

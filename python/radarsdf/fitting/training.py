@@ -68,36 +68,54 @@ class _Draws:
                 num_threads,
             )
 
-        self._surface = sampler(surface)
+        self._sampler = sampler(surface)
+        self._left: dict[str, Tensor] | None = None
+        """State of the surface's sampler, once that of the returns has taken its place."""
         # Ghosts are not part of the surface, but the sensor will see them again, so their intensities are
-        # learnt.
-        self._returns = self._surface if returns is surface or scale is None else sampler(returns)
+        # learnt. Each sampler has its own copy of the rays: there is one at a time.
+        self._sampler_of_returns: Callable[[], RaySampler] | None = None
+        if returns is not surface and scale is not None:
+            self._sampler_of_returns = functools.partial(sampler, returns)
 
     def state(self) -> dict[str, Tensor]:
         """All that the next batches depend on."""
-        samplers = self._samplers()
-        state = {f"{name}.{k}": v for name, sampler in samplers.items() for k, v in sampler.state().items()}
+        states = {"surface": self._sampler.state()}
+        if self._left is not None:
+            states = {"surface": self._left, "returns": states["surface"]}
+        elif self._sampler_of_returns is not None:
+            states["returns"] = RaySampler.state_at_start(self._generator)
+        state = {f"{name}.{k}": v for name, own in states.items() for k, v in own.items()}
         return state | {"generator": self._generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        for name, sampler in self._samplers().items():
-            sampler.restore(_part(state, name))
-        self._generator.set_state(state["generator"])  # last, because the samplers change it
+        returns = _part(state, "returns")
+        if returns and RaySampler.has_begun(returns):
+            self._turn_to_returns()
+            self._left = _part(state, "surface")
+            self._sampler.restore(returns)
+        else:
+            self._sampler.restore(_part(state, "surface"))
+        self._generator.set_state(state["generator"])  # last, because the sampler changes it
 
-    def _samplers(self) -> dict[str, RaySampler]:
-        samplers = {"surface": self._surface}
-        return samplers if self._returns is self._surface else samplers | {"returns": self._returns}
+    def _turn_to_returns(self) -> None:
+        """Draws from the returns from now on, ghosts included."""
+        if self._sampler_of_returns is None:
+            return
+        self._left = self._sampler.state()
+        del self._sampler
+        self._sampler, self._sampler_of_returns = self._sampler_of_returns(), None
 
     def of_surface(self) -> Batch:
         """A batch of the sdf stage."""
-        return self._surface.batch(self._num_parts(self._schedule.batch_size))
+        return self._sampler.batch(self._num_parts(self._schedule.batch_size))
 
     def of_returns(self) -> Batch:
-        """A batch of the intensity stage."""
+        """A batch of the intensity stage, after the last one of the sdf stage."""
+        self._turn_to_returns()
         if self._config.training.intensity_in_free_space:
-            return self._returns.batch(self._num_parts(self._schedule.batch_size))
+            return self._sampler.batch(self._num_parts(self._schedule.batch_size))
         count = self._config.training.intensity_batch_size
-        return self._returns.spread(count, self._num_parts(count))
+        return self._sampler.spread(count, self._num_parts(count))
 
 
 @dataclass(frozen=True)
