@@ -81,6 +81,7 @@ WORDS = {
     "encoding.kind": ["tri-quadtree", "octree"],
     "training.start": ["noise"],  # an average needs more: see below
     "training.gradients": ["core", "autograd"],
+    "training.optimiser": ["soap", "adam"],
     "networks.reflectance": ["network", "closed-form", "both"],
 }
 WIDTHS = ["networks.sdf_hidden", "networks.intensity_hidden"]
@@ -409,6 +410,7 @@ PUBLISHED = {
         "intensity_batch_size": 8192,
         "sdf_iterations": 1000,
         "intensity_iterations": 4000,
+        "optimiser": "adam",
         "learning_rate": 1e-3,
         "intensity_learning_rate": 1e-3,
         "cosine_schedule": False,

@@ -15,6 +15,7 @@ PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   radarsdf::bind_encodings(m);
   radarsdf::bind_mlp(m);
   radarsdf::bind_field_loss(m);
+  radarsdf::bind_soap(m);
   radarsdf::bind_surfaces(m);
   radarsdf::bind_cell_means(m);
   radarsdf::bind_cell_sums(m);

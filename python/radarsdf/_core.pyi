@@ -56,6 +56,8 @@ __all__: list[str] = [
     "sample_cells",
     "sample_rays",
     "set_instruction_set",
+    "soap_memory_size",
+    "soap_step",
     "sparse_lattice",
     "spherical_harmonics",
     "stable_order",
@@ -1147,6 +1149,37 @@ def sample_rays(
 def set_instruction_set(name: str) -> None:
     """
     Chooses the kernels: for tests and benches; not while another call runs.
+    """
+
+def soap_memory_size(
+    rows: typing.SupportsInt | typing.SupportsIndex, columns: typing.SupportsInt | typing.SupportsIndex
+) -> int:
+    """
+    Numbers that SOAP remembers of a matrix of weights.
+    """
+
+@typing.overload
+def soap_step(
+    weights: list[numpy.typing.NDArray[numpy.float32]],
+    gradients: list[numpy.typing.NDArray[numpy.float32]],
+    memories: list[numpy.typing.NDArray[numpy.float32]],
+    step: typing.SupportsInt | typing.SupportsIndex,
+    learning_rate: typing.SupportsFloat | typing.SupportsIndex,
+) -> None:
+    """
+    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step.
+    """
+
+@typing.overload
+def soap_step(
+    weights: list[numpy.typing.NDArray[numpy.float64]],
+    gradients: list[numpy.typing.NDArray[numpy.float64]],
+    memories: list[numpy.typing.NDArray[numpy.float64]],
+    step: typing.SupportsInt | typing.SupportsIndex,
+    learning_rate: typing.SupportsFloat | typing.SupportsIndex,
+) -> None:
+    """
+    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step.
     """
 
 def sparse_lattice(

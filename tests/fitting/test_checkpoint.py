@@ -228,7 +228,9 @@ class TestOtherFiles:
             ("rows.step_count", torch.tensor(-1)),
             ("backend.generator", torch.full((5056,), 255, dtype=torch.uint8)),
             ("backend.generator", torch.zeros(5, dtype=torch.uint8)),
-            ("adam.sdf.step", torch.tensor(float("nan"))),
+            ("optimiser.sdf.adam.step", torch.tensor(float("nan"))),
+            ("optimiser.sdf.memory.0", None),
+            ("optimiser.intensity.step_count", torch.tensor(-1)),
             ("something", torch.zeros(1)),
         ],
     )
@@ -276,11 +278,12 @@ def test_the_state_is_all_there_is(scene):
     finally:
         Training._run_stage = loop
     first, second = taken
-    frozen = [k for k in first if k.startswith(("field.cells", "field.sdf", "adam.sdf", "rows"))]
+    frozen = [k for k in first if k.startswith(("field.cells", "field.sdf", "optimiser.sdf", "rows"))]
     assert all(torch.equal(first[k], second[k]) for k in frozen)
     for part in (
         "field.intensity_network",
-        "adam.intensity.mean",
+        "optimiser.intensity.memory",
+        "optimiser.intensity.adam.mean",
         "backend.generator",
         "draws.returns.next",
     ):

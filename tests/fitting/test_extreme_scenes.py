@@ -155,7 +155,11 @@ def test_centimetres_for_metres_change_nothing_but_roundings():
     """Tolerance: 1 mm, and 0.1 dB, in the median. The range in log10(range / 10 m) is left out: it knows of metres."""
     scene = ground_and_wall()
     # Cells that look for ghosts are of 0.4 m, whatever the units.
-    config = QUICK.override(networks={"log_range": False}, returns={"drop_ghosts": False})
+    config = QUICK.override(
+        networks={"log_range": False},
+        returns={"drop_ghosts": False},
+        training={"optimiser": "adam"},  # SOAP's first steps make much of roundings
+    )
     poses = scene.poses.copy()
     poses[:, :3, 3] *= 100
     origin = poses[:, :3, 3].mean(

@@ -125,8 +125,9 @@ def test_why_samples_were_left_out(scene, monkeypatch, effort, why):
 
 def test_utm_coordinates_change_nothing():
     offset = np.array([5e5, 5.4e6, 320.0])  # multiples of the block: the lattice is the world's
+    config = QUICK.override(training={"optimiser": "adam"})  # SOAP's first steps make much of roundings
     near, far = (
-        radarsdf.fit((s := ground_and_wall(offset=o)).points, s.poses, s.intensities, config=QUICK)
+        radarsdf.fit((s := ground_and_wall(offset=o)).points, s.poses, s.intensities, config=config)
         for o in (np.zeros(3), offset)
     )
     x = np.random.default_rng(0).uniform([8, -5, -0.2], [20, 5, 0.2], (500, 3))
@@ -221,12 +222,12 @@ def test_each_stage_of_the_schedule_begins_at_the_full_rate(scene):
 @pytest.mark.parametrize(
     ("returns", "changes", "expected"),
     [
-        (100_000, {}, 300),  # one pass is nearly enough
-        (200_000, {}, 586),  # one pass is more than enough
-        (30_000, {}, 176),  # two passes are not enough, and still all that the data gives
+        (100_000, {}, 180),  # half a pass is nearly enough
+        (200_000, {}, 352),  # and here more than enough
+        (50_000, {}, 176),  # a pass is not enough, and still all that the data gives
         (2_000, {}, 150),  # without so many iterations there is no surface
-        (100_000, {"effort": 2.0}, 600),
-        (200_000, {"effort": 0.5}, 293),
+        (100_000, {"effort": 2.0}, 360),
+        (200_000, {"effort": 0.5}, 176),
         (2_000, {"effort": 0.25}, 38),
         (2_000, {"effort": 1e-9}, 1),
         (20_000, {"training": {"sdf_iterations": 7}}, 7),

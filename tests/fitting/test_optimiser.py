@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Adam is PyTorch's, without what PyTorch's brings along; by rows it is the same where all rows are touched."""
+"""Adam is PyTorch's, without what PyTorch's brings along; by rows it is the same where all rows are touched; SOAP."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from radarsdf._core import CellSet, Crew
 from radarsdf.field import kernels
 from radarsdf.field.encodings import Octree, TriQuadtree
-from radarsdf.fitting.optimiser import Adam, RowAdam, Touched
+from radarsdf.fitting.optimiser import Adam, RowAdam, Soap, Touched
 from radarsdf.threads import Workers
 
 
@@ -47,6 +47,40 @@ def test_a_fit_does_not_import_pytorch_s_compiler(tmp_path):
         "sys.exit(any(name.partition('.')[0] == 'sympy' or name == 'torch._dynamo' for name in sys.modules))\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
+
+
+def network_and_gradients(seed):
+    """Parameters of a network, and gradients for fifty steps."""
+    generator = torch.Generator().manual_seed(seed)
+    shapes = ((6, 9), (6,), (5, 6), (5,), (1, 5), (1,))
+    network = [torch.randn(shape, generator=generator).requires_grad_() for shape in shapes]
+    return network, [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(50)]
+
+
+def test_soap_moves_the_weights_of_hidden_layers_and_adam_the_rest():
+    ours, gradients = network_and_gradients(0)
+    theirs = [p.detach().clone().requires_grad_() for p in ours]
+    soap, adam = Soap(ours, 1e-2), Adam(theirs, 1e-2)
+    for step in gradients:
+        soap.learning_rate = adam.learning_rate = 5e-3
+        soap.step(step)
+        adam.step(step)
+    for a, b, hidden in zip(ours, theirs, (True, False, True, False, False, False), strict=True):
+        assert torch.equal(a, b) != hidden
+    assert soap.full_rate == 1e-2
+
+
+def test_soap_goes_on_from_its_state():
+    whole, gradients = network_and_gradients(1)
+    resumed = [p.detach().clone().requires_grad_() for p in whole]
+    soap, first, second = Soap(whole, 1e-2), Soap(resumed, 1e-2), Soap(resumed, 1e-2)
+    for i, step in enumerate(gradients):
+        soap.step(step)
+        (first if i < 20 else second).step(step)
+        if i == 19:
+            second.restore({name: value.clone() for name, value in first.state().items()})
+    for a, b in zip(whole, resumed, strict=True):
+        assert torch.equal(a, b)
 
 
 def cells_and_points(encoding, half_m=1.0, count=500):

@@ -9,31 +9,26 @@ from dataclasses import dataclass
 
 from radarsdf.config import FitConfig
 
-# The sdf stage makes one pass over the samples, within these limits. If they contradict each other, the least
-# number of iterations wins over the most passes and the most samples.
+# The sdf stage makes so many passes over the samples, within these limits. If they contradict each other, the least
+# number of iterations wins over the most passes and the most samples. Measured: docs/levers.md, "SOAP".
+_SDF_PASSES = 0.6
 _LEAST_SDF_ITERATIONS = 150  # with fewer, the surface of a small scene is unfinished
-# With fewer, the networks have not converged. Measured: 0.8 points of F-score on hugin(seed=1, frames=30),
-# 0.3 on a real scene.
-_ENOUGH_SDF_ITERATIONS = 300
-# With more passes over few returns, the field memorises their noise. Measured: 3 passes cost 0.6 points of
-# F-score on oculii(seed=1, frames=40), 13 passes 1.4 on a tenth of oculii.
-_MOST_SDF_PASSES = 2.0
-_MOST_SAMPLES_PER_VERTEX = 32.0  # measured: wall has 100 in one pass, and is as good after 20
+_ENOUGH_SDF_ITERATIONS = 180  # with fewer, the networks have not converged
+_MOST_SDF_PASSES = 1.2  # with more over few returns, the field memorises their noise
+_MOST_SAMPLES_PER_VERTEX = 20.0
 # Where that takes more iterations than these, half of it. Measured on `hugin` and `oculii` of 600 scans and on eight
 # `hugin` side by side: 0.0 to 0.1 points of F-score less in half the training.
-_MANY_SDF_ITERATIONS = 500
+_MANY_SDF_ITERATIONS = 300
 # Beyond this, batches grow: one of the usual size touches little of so large a map.
 _MOST_SDF_ITERATIONS = 5000
 
 # The training of the intensity network makes this many passes over the samples near the surface, within these limits.
 # Joint iterations count. Measured with the closed form, which mends part of what is missing: docs/levers.md.
-_INTENSITY_PASSES = 1.25
-_LEAST_INTENSITY_ITERATIONS = 1000  # with fewer, it has not converged on a small scene
-_MOST_INTENSITY_ITERATIONS = (
-    3500  # measured on `hugin` of 600 scans: 2500, 3000, 3500 end at 2.911, 2.906, 2.898 dB
-)
+_INTENSITY_PASSES = 0.65
+_LEAST_INTENSITY_ITERATIONS = 500  # with fewer, it has not converged on a small scene
+_MOST_INTENSITY_ITERATIONS = 1750
 # After the joint iterations, since the field moves under the network until then.
-_LEAST_INTENSITY_STAGE = 500
+_LEAST_INTENSITY_STAGE = 300
 
 _HALF_DROPOUT_PASSES = 2.5  # a fit that uses each sample so often has half of the configured dropout
 
@@ -109,7 +104,7 @@ def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, 
     """Samples in a batch, and iterations, of the sdf stage."""
     batch_size = config.training.batch_size
     one_pass = samples / batch_size
-    wanted = max(one_pass, min(_ENOUGH_SDF_ITERATIONS, _MOST_SDF_PASSES * one_pass))
+    wanted = max(_SDF_PASSES * one_pass, min(_ENOUGH_SDF_ITERATIONS, _MOST_SDF_PASSES * one_pass))
     most = _MOST_SAMPLES_PER_VERTEX * vertices / batch_size
     wanted = min(wanted, max(min(most, _MANY_SDF_ITERATIONS), most / 2))
     iterations = max(_LEAST_SDF_ITERATIONS, math.ceil(wanted))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Adam (Kingma and Ba, ICLR 2015): for networks by PyTorch, for features on the rows that a batch touches."""
+"""Adam (Kingma and Ba, ICLR 2015) by PyTorch, and for features on the rows that a batch touches; SOAP for networks."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
+from radarsdf import _core
 from radarsdf._core import FEATURE_DIM
 from radarsdf.field import kernels
 from radarsdf.field.encodings import VertexFeatures
@@ -71,6 +72,77 @@ class Adam:
             amsgrad=False,
             maximize=False,
         )
+
+
+class Soap:
+    """SOAP (Vyas et al., ICLR 2025) for the weights of hidden layers, and :class:`Adam` for all else of a network.
+
+    Adam scales each number of a gradient by itself, although the inputs of a layer depend on each other. SOAP does so
+    in a basis in which they hardly do. Measured: a network learns as much in a quarter to a half of Adam's steps
+    (``docs/levers.md``).
+
+    Attributes
+    ----------
+    parameters : list of Tensor
+        The tensors that are optimised.
+    learning_rate : float
+        Learning rate of the next step.
+    full_rate : float
+        Learning rate at the start.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
+        self.parameters = list(parameters)
+        self.full_rate = self.learning_rate = learning_rate
+        self.step_count = 0
+        # A layer with one output has one vector of weights: nothing to turn.
+        is_matrix = [p.ndim == 2 and min(p.shape) > 1 for p in self.parameters]
+        self._matrices = [i for i, yes in enumerate(is_matrix) if yes]
+        self._others = [i for i, yes in enumerate(is_matrix) if not yes]
+        self._adam = Adam(_at(self._others, self.parameters), learning_rate)
+        self._memories = [
+            p.new_zeros(_core.soap_memory_size(*p.shape)) for p in _at(self._matrices, self.parameters)
+        ]
+
+    def state(self) -> dict[str, Tensor]:
+        """All that the next steps depend on, except the parameters. The tensors are not copied."""
+        state = {f"memory.{i}": memory for i, memory in enumerate(self._memories)}
+        count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
+        return state | {f"adam.{k}": v for k, v in self._adam.state().items()} | {"step_count": count}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restores what :meth:`state` of an optimiser of the same parameters gave.
+
+        Raises
+        ------
+        ValueError
+            If the number of steps is negative.
+        """
+        count = int(state["step_count"])
+        if count < 0:
+            msg = f"an optimiser cannot have made {count} steps"
+            raise ValueError(msg)
+        for i, memory in enumerate(self._memories):
+            memory.copy_(state[f"memory.{i}"])
+        self._adam.restore({k: state[f"adam.{k}"] for k in self._adam.state()})
+        self.step_count = count
+
+    def step(self, gradients: Sequence[Tensor]) -> None:
+        """Changes the parameters by `gradients`, which are in the same order."""
+        self.step_count += 1
+        self._adam.learning_rate = self.learning_rate
+        self._adam.step(_at(self._others, gradients))
+        _core.soap_step(
+            weights=[kernels.view(p) for p in _at(self._matrices, self.parameters)],
+            gradients=[g.numpy() for g in _at(self._matrices, gradients)],
+            memories=[memory.numpy() for memory in self._memories],
+            step=self.step_count,
+            learning_rate=self.learning_rate,
+        )
+
+
+def _at(places: Sequence[int], tensors: Sequence[Tensor]) -> list[Tensor]:
+    return [tensors[i] for i in places]
 
 
 class RowAdam:

@@ -24,7 +24,7 @@ from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.core_gradients import CoreGradients
 from radarsdf.fitting.gradients import GradientBackend, Gradients, RandomDropout
 from radarsdf.fitting.history import LossHistory
-from radarsdf.fitting.optimiser import Adam, RowAdam
+from radarsdf.fitting.optimiser import Adam, RowAdam, Soap
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.fitting.stopping import Diverged
 from radarsdf.interrupts import deferred_interrupts
@@ -32,6 +32,8 @@ from radarsdf.progress import hides_bar
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
+_NetworkOptimiser = Adam | Soap
+_OPTIMISERS: dict[str, type[_NetworkOptimiser]] = {"adam": Adam, "soap": Soap}
 _GENERATORS = 2  # random generators of a fit: for samples, for dropout
 _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
 
@@ -141,8 +143,8 @@ class _Stage:
     """Joint iterations of the sdf stage that count as iterations of this stage too."""
     counts: tuple[str, ...]
     """The stages that an iteration counts for. Joint iterations count for both."""
-    adams: list[Adam]
-    """Optimisers of the parameters that are trained, in the order of their gradients."""
+    optimisers: list[_NetworkOptimiser]
+    """Of the parameters that are trained, in the order of their gradients."""
     rows: RowAdam | None
     """Optimiser of the features if only the touched ones move."""
     draw: Callable[[], Batch]
@@ -186,15 +188,16 @@ class Training:
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         self.history = LossHistory(self.iterations)
-        sdf_parameters = list(field.sdf_network.parameters())
         self._rows = None
+        self._optimisers: dict[str, _NetworkOptimiser] = {}
+        rate, of_network = config.training.learning_rate, _OPTIMISERS[config.training.optimiser]
         if config.moves_rows(scale is not None):
-            self._rows = RowAdam(field.cells, config.training.learning_rate)
+            self._rows = RowAdam(field.cells, rate)
         else:
-            sdf_parameters = [*field.cells.parameters(), *sdf_parameters]
-        self._adams = {"sdf": Adam(sdf_parameters, config.training.learning_rate)}
+            self._optimisers["features"] = Adam(field.cells.parameters(), rate)
+        self._optimisers["sdf"] = of_network(field.sdf_network.parameters(), rate)
         if field.intensity_network is not None:
-            self._adams["intensity"] = Adam(
+            self._optimisers["intensity"] = of_network(
                 field.intensity_network.parameters(), config.training.intensity_learning_rate
             )
 
@@ -207,8 +210,8 @@ class Training:
         }
         state |= {f"history.{name}": spans for name, spans in self.history.state().items()}
         state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
-        for name, adam in self._adams.items():
-            state |= {f"adam.{name}.{k}": v for k, v in adam.state().items()}
+        for name, optimiser in self._optimisers.items():
+            state |= {f"optimiser.{name}.{k}": v for k, v in optimiser.state().items()}
         if self._rows is not None:
             state |= {f"rows.{k}": v for k, v in self._rows.state().items()}
         if self._draws is not None:
@@ -227,8 +230,8 @@ class Training:
         self.history.restore(_part(state, "history"))
         for name, parameter in self._field.named_parameters():
             parameter.data.copy_(state[f"field.{name}"])
-        for name, adam in self._adams.items():
-            adam.restore(_part(state, f"adam.{name}"))
+        for name, optimiser in self._optimisers.items():
+            optimiser.restore(_part(state, f"optimiser.{name}"))
         if self._rows is not None:
             self._rows.restore(_part(state, "rows"))
         if self._draws is not None:
@@ -276,8 +279,9 @@ class Training:
         if self._draws is None:
             return stages
         sdf_iterations, intensity_iterations = self.iterations["sdf"], self.iterations["intensity"]
-        sdf_adam, intensity_adam = self._adams["sdf"], self._adams.get("intensity")
-        joint = sdf_iterations if intensity_adam is not None and self._config.training.joint else 0
+        of_surface = [o for name, o in self._optimisers.items() if name != "intensity"]
+        of_intensity = [o for name, o in self._optimisers.items() if name == "intensity"]
+        joint = sdf_iterations if of_intensity and self._config.training.joint else 0
         if sdf_iterations:
             stages.append(
                 _Stage(
@@ -285,20 +289,20 @@ class Training:
                     iterations=sdf_iterations,
                     iterations_before=0,
                     counts=("sdf", "intensity") if joint else ("sdf",),
-                    adams=[sdf_adam, intensity_adam] if joint and intensity_adam is not None else [sdf_adam],
+                    optimisers=of_surface + of_intensity if joint else of_surface,
                     rows=self._rows,
                     draw=self._draws.of_surface,
                     gradients_of=self._backend.joint if joint else self._backend.sdf,
                 )
             )
-        if intensity_adam is not None and intensity_iterations > joint:
+        if of_intensity and intensity_iterations > joint:
             stages.append(
                 _Stage(
                     name="intensity",
                     iterations=intensity_iterations - joint,
                     iterations_before=joint,
                     counts=("intensity",),
-                    adams=[intensity_adam],
+                    optimisers=of_intensity,
                     rows=None,
                     draw=self._draws.of_returns,
                     gradients_of=self._backend.intensity,
@@ -312,7 +316,7 @@ class Training:
 
     def _run_stage(self, stage: _Stage, pauses: _Pauses) -> None:
         rows, iterations = stage.rows, stage.iterations
-        parameters = [p for adam in stage.adams for p in adam.parameters]
+        parameters = [p for optimiser in stage.optimisers for p in optimiser.parameters]
         changing = [*parameters, *([] if rows is None else [rows.features])]
         good = [p.detach().clone() for p in changing]
 
@@ -337,7 +341,7 @@ class Training:
             loss = sum(found.losses.values())
             if not math.isfinite(loss):
                 give_up(f"the {_bad_losses(found)} loss is {loss}")
-            move_networks = functools.partial(_move_networks, found, stage.adams, share)
+            move_networks = functools.partial(_move_networks, found, stage.optimisers, share)
             if rows is None:
                 move_networks()
             else:
@@ -375,12 +379,12 @@ def _bad_losses(found: Gradients) -> str:
     return " and ".join(sorted(name for name, value in found.losses.items() if not math.isfinite(value)))
 
 
-def _move_networks(found: Gradients, adams: Sequence[Adam], share: float) -> None:
+def _move_networks(found: Gradients, optimisers: Sequence[_NetworkOptimiser], share: float) -> None:
     """Changes the networks by the gradients."""
     total = iter(found.by_parameters)
-    for adam in adams:
-        adam.learning_rate = share * adam.full_rate
-        adam.step(list(itertools.islice(total, len(adam.parameters))))
+    for optimiser in optimisers:
+        optimiser.learning_rate = share * optimiser.full_rate
+        optimiser.step(list(itertools.islice(total, len(optimiser.parameters))))
 
 
 def _nothing() -> None:

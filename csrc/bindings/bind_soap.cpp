@@ -1,0 +1,53 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include <pybind11/stl.h>
+
+#include <vector>
+
+#include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
+#include "field/soap.hpp"
+
+namespace radarsdf {
+namespace {
+
+template <typename T>
+void bind_step(py::module_& m) {
+  using namespace py::literals;
+  m.def(
+      "soap_step",
+      [](std::vector<Array<T>>& weights, const std::vector<Array<T>>& gradients, std::vector<Array<T>>& memories,
+         std::int64_t step, double learning_rate) {
+        if (step < 1) throw std::invalid_argument("step must be at least 1");
+        if (gradients.size() != weights.size() || memories.size() != weights.size()) {
+          throw std::invalid_argument("there must be a gradient and a memory for each matrix of weights");
+        }
+        std::vector<SoapMatrix<T>> matrices;
+        for (std::size_t i = 0; i < weights.size(); ++i) {
+          if (weights[i].ndim() != 2) throw std::invalid_argument("weights must be matrices");
+          const std::int64_t rows = weights[i].shape(0), columns = weights[i].shape(1);
+          check_shape(gradients[i], rows, columns, "gradients");
+          if (check_column(memories[i], "memories") != soap_memory_size(rows, columns)) {
+            throw std::invalid_argument("memories must have soap_memory_size numbers");
+          }
+          matrices.push_back(
+              {weights[i].mutable_data(), gradients[i].data(), memories[i].mutable_data(), rows, columns});
+        }
+        const py::gil_scoped_release release;
+        for (const SoapMatrix<T>& matrix : matrices) soap_step(matrix, step, learning_rate);
+      },
+      "weights"_a.noconvert(), "gradients"_a.noconvert(), "memories"_a.noconvert(), "step"_a, "learning_rate"_a,
+      "Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers "
+      "each, are zero before the first step.");
+}
+
+}  // namespace
+
+void bind_soap(py::module_& m) {
+  m.def("soap_memory_size", &soap_memory_size, py::arg("rows"), py::arg("columns"),
+        "Numbers that SOAP remembers of a matrix of weights.");
+  bind_step<float>(m);
+  bind_step<double>(m);
+}
+
+}  // namespace radarsdf

@@ -1,0 +1,227 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "field/soap.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "kernels/product_kernels.hpp"
+#include "kernels/soap_kernels.hpp"
+#include "util/instruction_set.hpp"
+
+namespace radarsdf {
+namespace {
+
+constexpr double kBeta = 0.95;  // of means, squares and sums, as published
+// Steps after which the bases are turned; in the beginning after 1, 2, 4 and so on. Measured: each 10, as published,
+// and each 30 train as well.
+constexpr std::int64_t kTurnEvery = 32;
+// Of the mean eigenvalue, added to all: of axes along which gradients are zero, rounding would leave nothing
+// orthogonal.
+constexpr double kRidge = 1e-3;
+// Of the root mean square of the gradient: along axes where it is less, a gradient may be nothing but rounding, and
+// Adam would make a whole step of it.
+constexpr double kFloor = 1e-2;
+constexpr double kLeast = 1e-15;            // for gradients of zero, as for Adam
+constexpr std::int64_t kLongestSide = 512;  // turning takes time with the cube of it
+
+constexpr std::int64_t padded(std::int64_t columns) {
+  return (columns + kColumnBlock - 1) / kColumnBlock * kColumnBlock;
+}
+
+bool has_basis(std::int64_t side) { return side <= kLongestSide; }
+
+// Numbers of a square matrix for one side; none if it has no basis.
+std::int64_t square_size(std::int64_t side) { return has_basis(side) ? side * padded(side) : 0; }
+
+// Rows of numbers, padded with zeros.
+template <typename T>
+struct Matrix {
+  T* data;
+  std::int64_t rows, columns;
+
+  std::int64_t stride() const { return padded(columns); }
+  std::int64_t size() const { return rows * stride(); }
+  T* row(std::int64_t r) const { return data + r * stride(); }
+};
+
+template <typename T>
+Matrix<T> of(std::vector<T>& numbers, std::int64_t rows, std::int64_t columns) {
+  numbers.assign(static_cast<std::size_t>(rows * padded(columns)), T(0));
+  return {numbers.data(), rows, columns};
+}
+
+template <typename T>
+void transpose(Matrix<T> from, Matrix<T> to) {
+  for (std::int64_t r = 0; r < from.rows; ++r) {
+    for (std::int64_t c = 0; c < from.columns; ++c) to.row(c)[r] = from.row(r)[c];
+  }
+}
+
+template <typename T>
+double trace(Matrix<T> square) {
+  double sum = 0;
+  for (std::int64_t i = 0; i < square.rows; ++i) sum += static_cast<double>(square.row(i)[i]);
+  return sum;
+}
+
+template <typename T>
+class Soap {
+ public:
+  explicit Soap(const SoapMatrix<T>& matrix) : matrix_(matrix) {
+    const std::int64_t rows = matrix.rows, columns = matrix.columns;
+    T* next = matrix.memory;
+    const auto take = [&next](std::int64_t side, std::int64_t width) {
+      const Matrix<T> taken{next, side, width};
+      next += taken.size();
+      return taken;
+    };
+    means_ = take(rows, columns);
+    squares_ = take(rows, columns);
+    if (has_basis(rows)) {
+      left_sum_ = take(rows, rows);
+      left_ = take(rows, rows);
+    }
+    if (has_basis(columns)) {
+      right_sum_ = take(columns, columns);
+      right_ = take(columns, columns);
+      right_transposed_ = take(columns, columns);
+    }
+    gradient_ = of(gradient_numbers_, rows, columns);
+    half_ = of(half_numbers_, rows, columns);
+    turned_ = of(turned_numbers_, rows, columns);
+  }
+
+  void step(std::int64_t number, double learning_rate) {
+    for (std::int64_t r = 0; r < matrix_.rows; ++r) {
+      std::copy_n(matrix_.gradient + r * matrix_.columns, matrix_.columns, gradient_.row(r));
+    }
+    if (number == 1) {
+      begin(left_);
+      begin(right_);
+      begin(right_transposed_);
+    }
+    add_to_sums();
+    const bool is_power_of_two = (number & (number - 1)) == 0;
+    if (number % kTurnEvery == 0 || (number < kTurnEvery && is_power_of_two)) turn();
+    into_bases(gradient_, turned_);
+    kernels_.add(turned_.data, T(kBeta), epsilon(), means_.data, squares_.data, turned_.data, turned_.size());
+    out_of_bases(turned_, gradient_);
+    // Means over few steps are too small by 1 - beta^number, roots of squares by the root of that.
+    const double grown = 1 - std::pow(kBeta, static_cast<double>(number));
+    const T rate = static_cast<T>(learning_rate / std::sqrt(grown));
+    for (std::int64_t r = 0; r < matrix_.rows; ++r) {
+      T* weights = matrix_.weights + r * matrix_.columns;
+      for (std::int64_t c = 0; c < matrix_.columns; ++c) weights[c] -= rate * gradient_.row(r)[c];
+    }
+  }
+
+ private:
+  static void begin(Matrix<T> basis) {
+    if (!basis.data) return;
+    for (std::int64_t i = 0; i < basis.rows; ++i) basis.row(i)[i] = 1;
+  }
+
+  // c = a b, or a' b, and what is in c if `add`.
+  void multiply(Matrix<T> a, bool transposed, Matrix<T> b, Matrix<T> c, bool add = false) const {
+    Product<T> product{};
+    product.a = a.data;
+    product.a_row = transposed ? 1 : a.stride();
+    product.a_depth = transposed ? a.stride() : 1;
+    product.b = b.data;
+    product.b_row = b.stride();
+    product.c = c.data;
+    product.c_row = product.columns = c.stride();
+    product.rows = c.rows;
+    product.depth = b.rows;
+    product.add = add;
+    product_kernel_.multiply(product);
+  }
+
+  void add_to_sums() {
+    if (left_.data) {
+      const Matrix<T> transposed = of(scratch_, matrix_.columns, matrix_.rows);
+      transpose(gradient_, transposed);
+      kernels_.scale(left_sum_.data, T(kBeta), left_sum_.size());
+      multiply(gradient_, false, transposed, left_sum_, true);
+    }
+    if (right_.data) {
+      kernels_.scale(right_sum_.data, T(kBeta), right_sum_.size());
+      multiply(gradient_, true, gradient_, right_sum_, true);
+    }
+  }
+
+  // A turn changes no sum of squares, so that of the gradient is the trace of either sum.
+  T epsilon() const {
+    const Matrix<T> sum = left_.data ? left_sum_ : right_sum_;
+    const double mean_square =
+        sum.data ? (1 - kBeta) * trace(sum) / static_cast<double>(matrix_.rows * matrix_.columns) : 0;
+    return static_cast<T>(kFloor * std::sqrt(mean_square) + kLeast);
+  }
+
+  // The rows of a basis are its vectors: turned = left G right'.
+  void into_bases(Matrix<T> from, Matrix<T> to) {
+    if (left_.data) multiply(left_, false, from, half_);
+    const Matrix<T> half = left_.data ? half_ : from;
+    if (right_.data) {
+      multiply(half, false, right_transposed_, to);
+    } else {
+      std::copy_n(half.data, half.size(), to.data);
+    }
+  }
+
+  void out_of_bases(Matrix<T> from, Matrix<T> to) {
+    if (right_.data) multiply(from, false, right_, half_);
+    const Matrix<T> half = right_.data ? half_ : from;
+    if (left_.data) {
+      multiply(left_, true, half, to);
+    } else {
+      std::copy_n(half.data, half.size(), to.data);
+    }
+  }
+
+  // One step of subspace iteration towards the eigenvectors, which change slowly. The means turn along; the squares, as
+  // published, do not.
+  void turn() {
+    out_of_bases(means_, turned_);
+    turn_basis(left_sum_, left_);
+    turn_basis(right_sum_, right_);
+    if (right_.data) transpose(right_, right_transposed_);
+    into_bases(turned_, means_);
+  }
+
+  void turn_basis(Matrix<T> sum, Matrix<T> basis) {
+    if (!basis.data) return;
+    const auto scale = static_cast<T>(static_cast<double>(sum.rows) / trace(sum));
+    if (!(std::isfinite(scale) && scale > 0)) return;
+    const Matrix<T> next = of(scratch_, basis.rows, basis.columns);
+    multiply(basis, false, sum, next);
+    for (std::int64_t i = 0; i < next.size(); ++i) next.data[i] = scale * next.data[i] + T(kRidge) * basis.data[i];
+    if (kernels_.orthonormalise(next.data, next.rows, next.stride())) std::copy_n(next.data, next.size(), basis.data);
+  }
+
+  const SoapMatrix<T>& matrix_;
+  Matrix<T> means_{}, squares_{};                                               // of gradients in the bases
+  Matrix<T> left_sum_{}, left_{}, right_sum_{}, right_{}, right_transposed_{};  // without data: its own axes
+  std::vector<T> gradient_numbers_, half_numbers_, turned_numbers_, scratch_;
+  Matrix<T> gradient_{}, half_{}, turned_{};
+  ProductKernel<T> product_kernel_ = RADARSDF_KERNEL(product_kernel<T>)();
+  SoapKernels<T> kernels_ = RADARSDF_KERNEL(soap_kernels<T>)();
+};
+
+}  // namespace
+
+std::int64_t soap_memory_size(std::int64_t rows, std::int64_t columns) {
+  return 2 * rows * padded(columns) + 2 * square_size(rows) + 3 * square_size(columns);
+}
+
+template <typename T>
+void soap_step(const SoapMatrix<T>& matrix, std::int64_t step, double learning_rate) {
+  Soap<T>(matrix).step(step, learning_rate);
+}
+
+template void soap_step(const SoapMatrix<float>&, std::int64_t, double);
+template void soap_step(const SoapMatrix<double>&, std::int64_t, double);
+
+}  // namespace radarsdf
