@@ -65,7 +65,7 @@ void bind_cell_means(py::module_& m) {
       "fit_cell_means",
       [](const Array<double>& kinds, int num_tilings, const Array<float>& points, const Array<float>& directions,
          const Array<float>& incidence_rad, const Array<float>& values, const Array<float>& weights, double shrinkage,
-         int rounds, int num_threads) {
+         int rounds, float least_mean, int num_threads) {
         const std::vector<CellKind> k = kinds_of(kinds);
         const int tilings = check_tilings(num_tilings);
         const Views views = views_of(points, directions, incidence_rad);
@@ -77,18 +77,18 @@ void bind_cell_means(py::module_& m) {
         CellMeans found;
         {
           const py::gil_scoped_release release;
-          found = fit_cell_means(k, tilings, views, v, w, shrinkage, rounds, num_threads);
+          found = fit_cell_means(k, tilings, views, v, w, {shrinkage, rounds, least_mean}, num_threads);
         }
         return std::make_tuple(to_array(std::move(found.keys)), to_array(std::move(found.means)),
                                to_array(std::move(found.explained)));
       },
       "kinds"_a.noconvert(), "num_tilings"_a, "points"_a.noconvert(), "directions"_a.noconvert(),
       "incidence_rad"_a.noconvert(), "values"_a.noconvert(), "weights"_a.noconvert(), "shrinkage"_a, "rounds"_a,
-      "num_threads"_a = 0,
+      "least_mean"_a = 0, "num_threads"_a = 0,
       "Splits `values` (N,) into means in cells of several `kinds` (K, 3): edge in m, step of the direction's "
       "components, step of the incidence in rad; a step of 0: not by it. `points`, `directions` (N, 3) float32, "
-      "`incidence_rad` (N,), NaN: not known. Gives keys (M,) uint64 and means (M,) float32 of the cells, and "
-      "what they explain of each value (N,).");
+      "`incidence_rad` (N,), NaN: not known. Gives keys (M,) uint64 and means (M,) float32 of the cells, "
+      "without means smaller than `least_mean`, and what all explain of each value (N,).");
   py::class_<CellMeansAt>(m, "CellMeans", "Answers from means in cells.")
       .def(py::init([](const Array<double>& kinds, int num_tilings, const Array<std::uint64_t>& keys,
                        const Array<float>& means) {

@@ -110,14 +110,14 @@ double median_absolute(const std::vector<double>& values) {
 
 // All that is known of a cell in one place: of millions, each is a wait for memory.
 struct Cell {
-  double sum = 0, mass = 0;
-  double mean = 0;
-  double less = 0;  // what the last mean takes less than the one before
+  double sum = 0;  // of weighted values; then what the last mean takes less than the one before
+  float mass = 0, mean = 0;
 };
 
 CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_tilings, const Views& views,
-                     const float* values, const float* weights, double shrinkage, int rounds, float* explained) {
+                     const float* values, const float* weights, const CellMeanOptions& options) {
   const auto count = static_cast<std::size_t>(views.count);
+  const int rounds = options.rounds;
   CellMeans result;
   std::vector<std::int32_t> rows(kinds.size() * count);
   std::vector<std::size_t> firsts;  // of each kind's cells, and the end
@@ -128,35 +128,51 @@ CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_til
   }
   firsts.push_back(result.keys.size());
 
-  std::vector<double> left(values, values + count), weight(weights, weights + count);
+  std::vector<double> left(values, values + count);
+  std::vector<float> reweighted;
   std::vector<Cell> cells(result.keys.size());
   for (int round = 0; round < rounds; ++round) {
     for (std::size_t k = 0; k < kinds.size(); ++k) {
       check_interrupt();
       const std::int32_t* row = &rows[k * count];
       Cell* own = cells.data() + firsts[k];
+      Cell* end = cells.data() + firsts[k + 1];
+      for (Cell* cell = own; cell != end; ++cell) cell->sum = cell->mass = 0;
       for (std::size_t i = 0; i < count; ++i) {
         Cell& cell = own[row[i]];
-        cell.sum += weight[i] * (left[i] + cell.mean);
-        cell.mass += weight[i];
+        cell.sum += double{weights[i]} * (left[i] + double{cell.mean});
+        cell.mass += weights[i];
       }
-      for (Cell* cell = own; cell != cells.data() + firsts[k + 1]; ++cell) {
-        const double mean = cell->sum / (cell->mass + shrinkage);
-        *cell = {0, 0, mean, cell->mean - mean};
+      for (Cell* cell = own; cell != end; ++cell) {
+        const auto mean = static_cast<float>(cell->sum / (double{cell->mass} + options.shrinkage));
+        cell->sum = double{cell->mean} - double{mean};
+        cell->mean = mean;
       }
-      for (std::size_t i = 0; i < count; ++i) left[i] += own[row[i]].less;
+      for (std::size_t i = 0; i < count; ++i) left[i] += own[row[i]].sum;
     }
     if (round == 0 && rounds > 1) {
       const double scale = kCauchyMedians * median_absolute(left);
-      for (std::size_t i = 0; scale > 0 && i < count; ++i) {
+      if (!(scale > 0)) continue;
+      reweighted.resize(count);
+      for (std::size_t i = 0; i < count; ++i) {
         const double relative = left[i] / scale;
-        weight[i] = weights[i] / std::sqrt(1 + relative * relative);
+        reweighted[i] = static_cast<float>(double{weights[i]} / std::sqrt(1 + relative * relative));
       }
+      weights = reweighted.data();
     }
   }
-  for (std::size_t i = 0; i < count; ++i) explained[i] = static_cast<float>(values[i] - left[i]);
-  std::transform(cells.begin(), cells.end(), std::back_inserter(result.means),
-                 [](const Cell& cell) { return static_cast<float>(cell.mean); });
+  result.explained.reserve(count);
+  for (std::size_t i = 0; i < count; ++i) {
+    result.explained.push_back(static_cast<float>(double{values[i]} - left[i]));
+  }
+  std::size_t kept = 0;
+  for (std::size_t i = 0; i < cells.size(); ++i) {
+    if (std::abs(cells[i].mean) < options.least_mean) continue;
+    result.keys[kept++] = result.keys[i];
+    result.means.push_back(cells[i].mean);
+  }
+  result.keys.resize(kept);
+  result.keys.shrink_to_fit();
   return result;
 }
 
@@ -167,25 +183,28 @@ std::int64_t cell_rows(const CellKind& kind, const Views& views, std::int32_t* r
 }
 
 CellMeans fit_cell_means(const std::vector<CellKind>& kinds, int num_tilings, const Views& views, const float* values,
-                         const float* weights, double shrinkage, int rounds, int num_threads) {
+                         const float* weights, const CellMeanOptions& options, int num_threads) {
   CellMeans all;
   if (views.count == 0 || kinds.empty()) return all;
   std::vector<CellMeans> parts(static_cast<std::size_t>(num_tilings));
-  std::vector<std::vector<float>> explained(static_cast<std::size_t>(num_tilings));
   parallel_tasks(num_tilings, num_threads, [&](std::int64_t t) {
-    const auto i = static_cast<std::size_t>(t);
-    explained[i].resize(static_cast<std::size_t>(views.count));
-    parts[i] = fit_tiling(kinds, static_cast<int>(t), num_tilings, views, values, weights, shrinkage, rounds,
-                          explained[i].data());
+    parts[static_cast<std::size_t>(t)] =
+        fit_tiling(kinds, static_cast<int>(t), num_tilings, views, values, weights, options);
   });
+  std::size_t num_means = 0;
+  for (const CellMeans& part : parts) num_means += part.means.size();
+  all.keys.reserve(num_means);
+  all.means.reserve(num_means);
+  all.explained.reserve(static_cast<std::size_t>(views.count));
   for (std::int64_t i = 0; i < views.count; ++i) {
     double sum = 0;
-    for (const std::vector<float>& own : explained) sum += own[static_cast<std::size_t>(i)];
+    for (const CellMeans& part : parts) sum += double{part.explained[static_cast<std::size_t>(i)]};
     all.explained.push_back(static_cast<float>(sum / num_tilings));
   }
-  for (const CellMeans& part : parts) {
+  for (CellMeans& part : parts) {
     all.keys.insert(all.keys.end(), part.keys.begin(), part.keys.end());
     all.means.insert(all.means.end(), part.means.begin(), part.means.end());
+    part = {};
   }
   return all;
 }

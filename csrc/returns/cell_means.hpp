@@ -38,11 +38,17 @@ struct CellMeans {
 // how many there are.
 std::int64_t cell_rows(const CellKind& kind, const Views& views, std::int32_t* rows);
 
+struct CellMeanOptions {
+  double shrinkage;  // a mean of weight n counts n / (n + shrinkage)
+  int rounds;
+  float least_mean;  // smaller ones are left out of what is found
+};
+
 // Splits `values` (count,) into means in the cells, tiling by tiling. Each kind takes the means of what the others
-// leave, in turn, `rounds` times; a mean of weight n counts n / (n + shrinkage). After the first round a value that is
-// far off has less weight (Cauchy). The same bits with any number of threads.
+// leave, in turn, some rounds long. After the first a value that is far off has less weight (Cauchy). The same bits
+// with any number of threads.
 CellMeans fit_cell_means(const std::vector<CellKind>& kinds, int num_tilings, const Views& views, const float* values,
-                         const float* weights, double shrinkage, int rounds, int num_threads);
+                         const float* weights, const CellMeanOptions& options, int num_threads);
 
 // Answers from means of cells.
 class CellMeansAt {

@@ -789,6 +789,7 @@ def fit_cell_means(
     weights: numpy.typing.NDArray[numpy.float32],
     shrinkage: typing.SupportsFloat | typing.SupportsIndex,
     rounds: typing.SupportsInt | typing.SupportsIndex,
+    least_mean: typing.SupportsFloat | typing.SupportsIndex = 0,
     num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
 ) -> tuple[
     numpy.typing.NDArray[numpy.uint64],
@@ -796,7 +797,7 @@ def fit_cell_means(
     numpy.typing.NDArray[numpy.float32],
 ]:
     """
-    Splits `values` (N,) into means in cells of several `kinds` (K, 3): edge in m, step of the direction's components, step of the incidence in rad; a step of 0: not by it. `points`, `directions` (N, 3) float32, `incidence_rad` (N,), NaN: not known. Gives keys (M,) uint64 and means (M,) float32 of the cells, and what they explain of each value (N,).
+    Splits `values` (N,) into means in cells of several `kinds` (K, 3): edge in m, step of the direction's components, step of the incidence in rad; a step of 0: not by it. `points`, `directions` (N, 3) float32, `incidence_rad` (N,), NaN: not known. Gives keys (M,) uint64 and means (M,) float32 of the cells, without means smaller than `least_mean`, and what all explain of each value (N,).
     """
 
 @typing.overload

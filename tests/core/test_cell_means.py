@@ -65,11 +65,23 @@ def test_means_are_those_of_the_definition(rounds):
 
 def test_any_number_of_threads_has_the_same_bits():
     asked, values = views(20_000), np.random.default_rng(2).normal(size=20_000).astype(np.float32)
-    fits = [fit_cell_means(KINDS, 4, *asked, values, np.ones_like(values), 3.0, 2, n) for n in (1, 2, 5)]
+    fits = [fit_cell_means(KINDS, 4, *asked, values, np.ones_like(values), 3.0, 2, 0.0, n) for n in (1, 2, 5)]
     for other in fits[1:]:
         assert all((a == b).all() for a, b in zip(fits[0], other, strict=True))
     cells = CellMeans(KINDS, 4, *fits[0][:2])
     assert (cells.sums(*asked, 1) == cells.sums(*asked, 4)).all()
+
+
+def test_small_means_are_left_out_of_what_is_found():
+    asked, values = views(), np.random.default_rng(3).normal(size=3000).astype(np.float32)
+    arguments = KINDS, 2, *asked, values, np.ones_like(values), 5.0, 2
+    keys, means, explained = fit_cell_means(*arguments)
+    large_keys, large_means, still_explained = fit_cell_means(*arguments, 0.1)
+    kept = np.abs(means) >= np.float32(0.1)
+    assert 0.1 < kept.mean() < 0.9
+    np.testing.assert_array_equal(large_keys, keys[kept])
+    np.testing.assert_array_equal(large_means, means[kept])
+    np.testing.assert_array_equal(still_explained, explained)
 
 
 def test_rows_number_the_cells_as_they_occur():

@@ -92,8 +92,8 @@ std::vector<double> explained_by(int tiling, int num_tilings, const Returns& all
 
 radarsdf::CellMeans fit(const Returns& all, int num_tilings, const std::vector<float>& values,
                         const std::vector<float>& weights, double shrinkage, int rounds, int threads = 1) {
-  return radarsdf::fit_cell_means(kKinds, num_tilings, all.views(), values.data(), weights.data(), shrinkage, rounds,
-                                  threads);
+  return radarsdf::fit_cell_means(kKinds, num_tilings, all.views(), values.data(), weights.data(),
+                                  {shrinkage, rounds, 0}, threads);
 }
 
 radarsdf::CellMeansAt answers(const radarsdf::CellMeans& means, int num_tilings) {

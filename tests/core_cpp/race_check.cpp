@@ -231,7 +231,7 @@ void means_and_tracing(int threads, Results& results) {
   const radarsdf::Views views{points.data(), directions.data(), values.data(), kPoints};
   const std::vector<radarsdf::CellKind> kinds{{1.0, 0.2, 0.0}, {2.0, 0.0, 0.5}};
   const std::vector<float> weights(kPoints, 1.0F);
-  const auto means = radarsdf::fit_cell_means(kinds, 3, views, values.data(), weights.data(), 2.0, 2, threads);
+  const auto means = radarsdf::fit_cell_means(kinds, 3, views, values.data(), weights.data(), {2.0, 2, 0}, threads);
   const auto num_means = static_cast<std::int64_t>(means.keys.size());
   results.add(means.explained.data(), kPoints);
   std::vector<float> numbers(kPoints);

@@ -13,7 +13,7 @@ from radarsdf import FitConfig
 from radarsdf.evaluation import KNNIntensity, holdout
 from radarsdf.returns import reflectance
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.reflectance import Reflectance
+from radarsdf.returns.reflectance import Reflectance, Residuals
 from radarsdf.returns.surfels import Surfels
 
 LEAF_M = 0.2
@@ -37,7 +37,9 @@ def unit(rays):
 
 
 def learnt(rays, values, num_threads=1):
-    return Reflectance.of(rays, values, Surfels.of(rays, LEAF_M, num_threads), LEAF_M, num_threads)
+    return Reflectance.of(
+        Residuals.of(rays, values, Surfels.of(rays, LEAF_M, num_threads), LEAF_M, num_threads), num_threads
+    )
 
 
 def at(found, rays):
@@ -81,8 +83,8 @@ def test_with_a_network_the_answer_is_the_mean_of_two(rays):
     """That of the network, and of half of it with what that leaves in closed form."""
     answers = np.linspace(0.2, 0.6, len(rays), dtype=np.float32)
     surfels = Surfels.of(rays, LEAF_M, 1)
-    found = Reflectance.of(rays, unit(rays), surfels, LEAF_M, 1, lambda *_: answers)
-    closed = Reflectance.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1)
+    found = Reflectance.of(Residuals.of(rays, unit(rays), surfels, LEAF_M, 1, lambda *_: answers))
+    closed = Reflectance.of(Residuals.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1))
     whole, leaves = (r.at(rays.points, rays.directions, rays.ranges_m, 1) for r in (found, closed))
     assert closed.network_share == 0
     expected = (answers + (answers / 2 + leaves)) / 2
@@ -101,9 +103,9 @@ def test_a_network_is_asked_once_for_a_group(rays, monkeypatch):
 
     answers = ask(rays.points, rays.directions, rays.ranges_m)
     surfels = Surfels.of(rays, LEAF_M, 1)
-    found = Reflectance.of(rays, unit(rays), surfels, LEAF_M, 1, ask)
+    found = Reflectance.of(Residuals.of(rays, unit(rays), surfels, LEAF_M, 1, ask))
     assert asked[1] < 0.8 * len(rays)
-    each = Reflectance.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1)
+    each = Reflectance.of(Residuals.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1))
     closed, leaves = (r.at(rays.points, rays.directions, rays.ranges_m, 1) for r in (found, each))
     assert answers.std() > 0.04
     # Within a group the answer differs by some hundredths.

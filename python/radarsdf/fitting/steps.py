@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,21 +21,19 @@ from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.closed_form import ClosedForm
 from radarsdf.fitting.skipped import Skipped, skipped_parts
 from radarsdf.fitting.start import STARTS, Start
 from radarsdf.fitting.stopping import Diverged, Interrupted
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
-from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.reflectance import Float32, Reflectance
 from radarsdf.returns.sensor import Sensor
-from radarsdf.returns.surfels import Surfels
 from radarsdf.threads import Workers
 
 
@@ -100,7 +97,7 @@ def fit_rays(
             rough_share = surface.surfels.rough_share() if given.rough_share is None else given.rough_share
             noise, kept, origin, scale = surface.noise, surface.rays, rays.origin, given.scale
             sensor = given.sensor_of(rays, noise)
-            close = _closing(learnt, inside, surface, config, workers.num_threads)
+            closed_form = ClosedForm(learnt, inside, surface, config, workers.num_threads)
             counts = {
                 "returns": rays.num_given + given.movers,
                 "returns_used": len(kept),
@@ -130,13 +127,11 @@ def fit_rays(
                 sensor=sensor,
                 report=counts | _report(config, field, training, counts, given, workers.num_threads),
             )
-            radar_map = RadarMap(
-                close(contents) if close is not None and not config.trains_intensity else contents
-            )
+            contents = closed_form.added(contents, trained=False)
+            radar_map = RadarMap(contents)
             training.run(progress, saved)
-            del training  # its copies of the rays take 64 bytes a return
-            if close is not None and config.trains_intensity:
-                radar_map = RadarMap(close(contents))
+            del training  # its copy of the rays takes 32 bytes a return
+            radar_map = RadarMap(closed_form.added(contents, trained=True))
     except KeyboardInterrupt as interruption:
         raise Interrupted(radar_map) from interruption
     except Diverged as error:
@@ -165,48 +160,6 @@ def _initialise(field: Field, start: Start, config: FitConfig) -> None:
     if not all(parameter.isfinite().all() for parameter in field.parameters()):
         msg = "what the training starts from is not finite: training.sigma_cells may be too small"
         raise Diverged(msg)
-
-
-def _closing(
-    rays: Rays,
-    inside: NDArray[np.bool_] | None,
-    surface: SurfaceReturns,
-    config: FitConfig,
-    num_threads: int,
-) -> Callable[[MapContents], MapContents] | None:
-    """Adds intensities, or what their network leaves of them, in closed form to a map. None if they are not wanted."""
-    if rays.intensities is None or not config.closes_intensity:
-        return None
-    cells = surface.surfels.cells.cell_of_ray
-    return functools.partial(
-        _with_closed_form,
-        rays=rays,
-        intensities=rays.intensities,
-        surfels=surface.surfels,
-        cell_of_ray=cells if inside is None else cells[inside],
-        num_threads=num_threads,
-    )
-
-
-def _with_closed_form(
-    contents: MapContents,
-    *,
-    rays: Rays,
-    intensities: NDArray[np.float32],
-    surfels: Surfels,
-    cell_of_ray: NDArray[np.int32],
-    num_threads: int,
-) -> MapContents:
-    scale, config = contents.intensity_scale, contents.config
-    assert scale is not None
-
-    def ask(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
-        sensors = torch.from_numpy(points - directions * ranges_m[:, None])
-        return scale.to_unit(queries.intensity(contents, torch.from_numpy(points), sensors).numpy())
-
-    unit, network = scale.to_unit(intensities), ask if config.trains_intensity else None
-    found = Reflectance.of(rays, unit, surfels, config.leaf_size_m, num_threads, network, cell_of_ray)
-    return dataclasses.replace(contents, reflectance=found)
 
 
 def _report(

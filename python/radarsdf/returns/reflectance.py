@@ -94,6 +94,74 @@ class Reflectance:
         _ = self._planes, self._cells  # which check the keys
 
     @classmethod
+    def of(cls, residuals: Residuals, num_threads: int = 0) -> Reflectance:
+        """The reflectance that explains `residuals`. The same bits with any number of threads; 0: as many as OpenMP uses."""
+        groups, response = residuals.groups, residuals.response
+        keys, means, explained = fit_cell_means(
+            _in_metres(_KINDS, residuals.leaf_size_m),
+            _TILINGS,
+            groups.points,
+            groups.directions,
+            residuals.incidence_rad,
+            groups.means(residuals.left),
+            groups.weights,
+            _SHRINKAGE,
+            _ROUNDS,
+            _LEAST_MEAN,
+            num_threads,
+        )
+        # The cells have means, and the error that counts is the absolute one, whose centre is the median.
+        coefficients = response.coefficients.copy()
+        coefficients[:, 0] += np.median(residuals.left - groups.of_returns(explained))
+        times = residuals.times
+        return cls(
+            residuals.leaf_size_m,
+            times * coefficients,
+            np.float32(times) * response.table,
+            residuals.plane_keys,
+            residuals.normals,
+            keys,
+            (np.float32(times) * means).astype(np.float16),
+            residuals.network_share,
+        )
+
+    def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
+        """The quantity (N,) at points (N, 3), local frame, m, seen along directions (N, 3), unit vectors."""
+        size_m = LEAVES_PER_SURFEL * self.leaf_size_m
+        limit_m = MAX_CELLS_FROM_ORIGIN * self.leaf_size_m  # farther points have no key, and no cell
+        near = np.ascontiguousarray(np.clip(np.nan_to_num(points), -limit_m, limit_m))
+        directions = np.ascontiguousarray(directions)
+        rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
+        incidence = _incidence(self.normals, rows, directions)
+        found = self._response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
+        found += self._cells.sums(near, directions, incidence, num_threads)
+        return found
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What regressions leave of a quantity of returns. It holds no rays: of ten million, these are half a gigabyte."""
+
+    leaf_size_m: float
+    """Edge of a leaf cell, m."""
+    response: Response
+    """The regressions."""
+    plane_keys: NDArray[np.uint64]
+    """See :class:`Reflectance`."""
+    normals: Float32
+    """Likewise."""
+    groups: _Groups
+    """Of the returns."""
+    incidence_rad: Float32
+    """(G,) mean of each group, NaN without a plane."""
+    left: Float32
+    """(N,) of each return."""
+    times: float = 1.0
+    """What the closed form counts beside a network."""
+    network_share: float = 0.0
+    """See :class:`Reflectance`."""
+
+    @classmethod
     def of(
         cls,
         rays: Rays,
@@ -103,8 +171,8 @@ class Reflectance:
         num_threads: int = 0,
         ask: Ask | None = None,
         cell_of_ray: NDArray[np.int32] | None = None,
-    ) -> Reflectance:
-        """The reflectance of `rays`.
+    ) -> Residuals:
+        """The residuals of `rays`.
 
         Parameters
         ----------
@@ -137,44 +205,17 @@ class Reflectance:
             unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         response = Response.of(unit, directions, rays.ranges_m, incidence, kinds)
-        left = unit - response.at(directions, rays.ranges_m, incidence, kinds)
-        keys, means, explained = fit_cell_means(
-            _in_metres(_KINDS, leaf_size_m),
-            _TILINGS,
-            groups.points,
-            groups.directions,
-            groups.means(incidence),
-            groups.means(left),
-            groups.weights,
-            _SHRINKAGE,
-            _ROUNDS,
-            num_threads,
-        )
-        # The cells have means, and the error that counts is the absolute one, whose centre is the median.
-        response.coefficients[:, 0] += np.median(left - groups.of_returns(explained))
-        kept = np.abs(means) >= _LEAST_MEAN
         return cls(
             leaf_size_m,
-            times * response.coefficients,
-            np.float32(times) * response.table,
+            response,
             surfels.cells.keys[surfels.cell_of_plane[flat]],
             normals[flat],
-            keys[kept],
-            (np.float32(times) * means[kept]).astype(np.float16),
+            groups,
+            groups.means(incidence),
+            unit - response.at(directions, rays.ranges_m, incidence, kinds),
+            times,
             share,
         )
-
-    def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
-        """The quantity (N,) at points (N, 3), local frame, m, seen along directions (N, 3), unit vectors."""
-        size_m = LEAVES_PER_SURFEL * self.leaf_size_m
-        limit_m = MAX_CELLS_FROM_ORIGIN * self.leaf_size_m  # farther points have no key, and no cell
-        near = np.ascontiguousarray(np.clip(np.nan_to_num(points), -limit_m, limit_m))
-        directions = np.ascontiguousarray(directions)
-        rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
-        incidence = _incidence(self.normals, rows, directions)
-        found = self._response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
-        found += self._cells.sums(near, directions, incidence, num_threads)
-        return found
 
 
 def _in_metres(kinds: NDArray[np.float64], leaf_size_m: float) -> NDArray[np.float64]:
