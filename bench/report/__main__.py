@@ -106,7 +106,7 @@ def _say(line: str) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m bench.report", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    measure = commands.add_parser("run", help="run the experiments, about 25 minutes on two cores")
+    measure = commands.add_parser("run", help="run the experiments, about 40 minutes on two cores")
     measure.add_argument("--out", type=Path, default=_RESULTS, help="the JSON; default: bench/results.json")
     measure.add_argument("--only", nargs="+", choices=NAMES, default=[], help="these, merged into the JSON")
     size = measure.add_mutually_exclusive_group()

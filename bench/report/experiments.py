@@ -136,8 +136,8 @@ def _experiments() -> dict[str, Experiment]:
         ),
         "curve": Experiment(
             "error over time",
-            8,
-            _paper("curve", "hugin", *_SAMPLES, *once),
+            20,
+            _paper("curve", "hugin", *_SAMPLES, "--repetitions", "3"),
             _paper("curve", *quick, *once, peers=two),
             _paper("curve", *_SCENES, *_SAMPLES, *once),
             "curve.json",

@@ -11,14 +11,14 @@ from radarsdf.config import FitConfig
 from radarsdf.field.widths import intensity_widths, sdf_widths, weights_of
 
 # Seconds on one thread, measured on the machine that BENCHMARK.md names: `python -m bench.stress durations`
-# measures fits and prints them. The estimates of twenty fits were 0.68 to 1.20 times their processor time.
+# measures fits and prints them. The estimates of twenty fits were 0.65 to 1.24 times their processor time.
 SECONDS = {
-    "return": 1.6e-06,
-    "cell": 9.7e-07,
-    "moved row": 4.4e-09,
-    "iteration": 7.0e-4,
+    "return": 1.7e-06,
+    "cell": 9.4e-07,
+    "moved row": 7.5e-09,
+    "iteration": 9.3e-4,
     "encoded number": 2.2e-9,
-    "multiplication": 2.5e-11,
+    "multiplication": 2.6e-11,
 }
 _SHARED = ("encoded number", "multiplication")  # done by all threads; one thread does the other kinds
 
