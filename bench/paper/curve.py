@@ -32,6 +32,7 @@ _LEVERS: tuple[Changes, ...] = (
     {"mesh": {"min_detection_rate": 0.0}},
     {"encoding": {"bridge_cells": 0}},
     {"training": {"row_updates": False}},
+    {"training": {"optimiser": "adam", "intensity_learning_rate": 6e-3}},
     {"training": {"joint": False}},
     {"encoding": {"fourier_count": 16}},
     {"networks": {"normals": True}},

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cstddef>
 
+#include "field/padding.hpp"
 #include "kernels/product_kernels.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
@@ -19,10 +20,6 @@ constexpr std::int64_t kMaxPieces = 16;
 
 template <typename T>
 constexpr T kOne = 1;
-
-constexpr std::int64_t padded(std::int64_t columns) {
-  return (columns + kColumnBlock - 1) / kColumnBlock * kColumnBlock;
-}
 
 template <typename T>
 std::vector<T> zeros(std::int64_t size) {

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <vector>
 
+#include "field/padding.hpp"
 #include "kernels/product_kernels.hpp"
 #include "kernels/soap_kernels.hpp"
 #include "util/instruction_set.hpp"
@@ -25,10 +26,6 @@ constexpr double kRidge = 1e-3;
 constexpr double kFloor = 1e-2;
 constexpr double kLeast = 1e-15;            // for gradients of zero, as for Adam
 constexpr std::int64_t kLongestSide = 512;  // turning takes time with the cube of it
-
-constexpr std::int64_t padded(std::int64_t columns) {
-  return (columns + kColumnBlock - 1) / kColumnBlock * kColumnBlock;
-}
 
 bool has_basis(std::int64_t side) { return side <= kLongestSide; }
 

@@ -79,7 +79,7 @@ class Soap:
 
     Adam scales each number of a gradient by itself, although the inputs of a layer depend on each other. SOAP does so
     in a basis in which they hardly do. Measured: a network learns as much in a quarter to a half of Adam's steps
-    (``docs/levers.md``).
+    (``docs/levers_time.md``).
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class RowAdam:
 
     The mean and mean square of an untouched row decay as with a gradient of zero, but the row does not
     change. Adam would go on to move it along its last gradient, by up to thirty times the learning rate.
-    Measured: the surface is as good without that (``docs/levers.md``).
+    Measured: the surface is as good without that (``docs/levers_time.md``).
 
     Attributes
     ----------

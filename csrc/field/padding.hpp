@@ -1,0 +1,17 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// How long rows of matrices are that product kernels multiply.
+#pragma once
+
+#include <cstdint>
+
+#include "kernels/product_kernels.hpp"
+
+namespace radarsdf {
+
+constexpr std::int64_t padded(std::int64_t columns) {
+  return (columns + kColumnBlock - 1) / kColumnBlock * kColumnBlock;
+}
+
+}  // namespace radarsdf
