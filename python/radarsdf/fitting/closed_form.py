@@ -25,8 +25,8 @@ class ClosedForm:
     Parameters
     ----------
     rays : Rays
-        N returns that the map is learnt from, with ghosts. They are let go as soon as they are not needed: of ten
-        million, they and what is made of them would not fit beside the means of their cells.
+        N returns that the map is learnt from, with ghosts. They are let go before the means of cells are found: of ten
+        million, they and what is made of them take half a gigabyte.
     inside : (N',) bool, optional
         Those of the returns of `surface` that `rays` are. None: all.
     surface : SurfaceReturns
