@@ -44,7 +44,7 @@ struct Matrix {
 };
 
 template <typename T>
-Matrix<T> of(std::vector<T>& numbers, std::int64_t rows, std::int64_t columns) {
+Matrix<T> zeros_in(std::vector<T>& numbers, std::int64_t rows, std::int64_t columns) {
   numbers.assign(static_cast<std::size_t>(rows * padded(columns)), T(0));
   return {numbers.data(), rows, columns};
 }
@@ -85,9 +85,9 @@ class Soap {
       right_ = take(columns, columns);
       right_transposed_ = take(columns, columns);
     }
-    gradient_ = of(gradient_numbers_, rows, columns);
-    half_ = of(half_numbers_, rows, columns);
-    turned_ = of(turned_numbers_, rows, columns);
+    gradient_ = zeros_in(gradient_numbers_, rows, columns);
+    half_ = zeros_in(half_numbers_, rows, columns);
+    turned_ = zeros_in(turned_numbers_, rows, columns);
   }
 
   void step(std::int64_t number, double learning_rate) {
@@ -138,7 +138,7 @@ class Soap {
 
   void add_to_sums() {
     if (left_.data) {
-      const Matrix<T> transposed = of(scratch_, matrix_.columns, matrix_.rows);
+      const Matrix<T> transposed = zeros_in(scratch_, matrix_.columns, matrix_.rows);
       transpose(gradient_, transposed);
       kernels_.scale(left_sum_.data, T(kBeta), left_sum_.size());
       multiply(gradient_, false, transposed, left_sum_, true);
@@ -192,7 +192,7 @@ class Soap {
     if (!basis.data) return;
     const auto scale = static_cast<T>(static_cast<double>(sum.rows) / trace(sum));
     if (!(std::isfinite(scale) && scale > 0)) return;
-    const Matrix<T> next = of(scratch_, basis.rows, basis.columns);
+    const Matrix<T> next = zeros_in(scratch_, basis.rows, basis.columns);
     multiply(basis, false, sum, next);
     for (std::int64_t i = 0; i < next.size(); ++i) next.data[i] = scale * next.data[i] + T(kRidge) * basis.data[i];
     if (kernels_.orthonormalise(next.data, next.rows, next.stride())) std::copy_n(next.data, next.size(), basis.data);

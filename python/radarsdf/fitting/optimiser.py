@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
@@ -20,10 +21,8 @@ _BETAS = (0.9, 0.999)
 _EPSILON = 1e-15  # 3QFP
 
 
-class Adam:
-    """Adam with the same bits as ``torch.optim.Adam(fused=True)``.
-
-    That class imports PyTorch's compiler and SymPy. These 800 modules take a second, as long as a small fit.
+class Optimiser(ABC):
+    """Changes tensors by their gradients.
 
     Attributes
     ----------
@@ -38,24 +37,49 @@ class Adam:
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         self.parameters = list(parameters)
         self.full_rate = self.learning_rate = learning_rate
+
+    @abstractmethod
+    def state(self) -> dict[str, Tensor]:
+        """All that the next steps depend on, except the parameters. The tensors are not copied."""
+
+    @abstractmethod
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restores what :meth:`state` of an optimiser of the same parameters gave.
+
+        Raises
+        ------
+        ValueError
+            If no optimiser can have that state.
+        """
+
+    @abstractmethod
+    def step(self, gradients: Sequence[Tensor]) -> None:
+        """Changes the parameters by `gradients`, which are in the same order."""
+
+
+class Adam(Optimiser):
+    """Adam with the same bits as ``torch.optim.Adam(fused=True)``.
+
+    That class imports PyTorch's compiler and SymPy. These 800 modules take a second, as long as a small fit.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
+        super().__init__(parameters, learning_rate)
         self._means = [torch.zeros_like(p) for p in self.parameters]
         self._squares = [torch.zeros_like(p) for p in self.parameters]
         self._step = torch.zeros((), dtype=torch.float32, device="cpu")
 
     def state(self) -> dict[str, Tensor]:
-        """All that the next steps depend on, except the parameters. The tensors are not copied."""
         lists = {"mean": self._means, "square": self._squares}
         state = {f"{name}.{i}": value for name, values in lists.items() for i, value in enumerate(values)}
         return state | {"step": self._step}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of an optimiser of the same parameters gave."""
         for name, value in self.state().items():
             value.copy_(state[name])
 
     @torch.no_grad()
     def step(self, gradients: Sequence[Tensor]) -> None:
-        """Changes the parameters by `gradients`, which are in the same order."""
         self._step.add_(1)
         torch._fused_adam_(  # the kernel has no public name
             self.parameters,
@@ -74,50 +98,32 @@ class Adam:
         )
 
 
-class Soap:
+class Soap(Optimiser):
     """SOAP (Vyas et al., ICLR 2025) for the weights of hidden layers, and :class:`Adam` for all else of a network.
 
     Adam scales each number of a gradient by itself, although the inputs of a layer depend on each other. SOAP does so
     in a basis in which they hardly do. Measured: a network learns as much in a quarter to a half of Adam's steps
     (``docs/levers_time.md``).
-
-    Attributes
-    ----------
-    parameters : list of Tensor
-        The tensors that are optimised.
-    learning_rate : float
-        Learning rate of the next step.
-    full_rate : float
-        Learning rate at the start.
     """
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
-        self.parameters = list(parameters)
-        self.full_rate = self.learning_rate = learning_rate
+        super().__init__(parameters, learning_rate)
         self.step_count = 0
         # A layer with one output has one vector of weights: nothing to turn.
         is_matrix = [p.ndim == 2 and min(p.shape) > 1 for p in self.parameters]
         self._matrices = [i for i, yes in enumerate(is_matrix) if yes]
         self._others = [i for i, yes in enumerate(is_matrix) if not yes]
         self._adam = Adam(_at(self._others, self.parameters), learning_rate)
-        self._memories = [
-            p.new_zeros(_core.soap_memory_size(*p.shape)) for p in _at(self._matrices, self.parameters)
-        ]
+        matrices = _at(self._matrices, self.parameters)
+        self._weights = [kernels.view(p) for p in matrices]
+        self._memories = [p.new_zeros(_core.soap_memory_size(*p.shape)) for p in matrices]
 
     def state(self) -> dict[str, Tensor]:
-        """All that the next steps depend on, except the parameters. The tensors are not copied."""
         state = {f"memory.{i}": memory for i, memory in enumerate(self._memories)}
         count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
         return state | {f"adam.{k}": v for k, v in self._adam.state().items()} | {"step_count": count}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of an optimiser of the same parameters gave.
-
-        Raises
-        ------
-        ValueError
-            If the number of steps is negative.
-        """
         count = int(state["step_count"])
         if count < 0:
             msg = f"an optimiser cannot have made {count} steps"
@@ -128,12 +134,11 @@ class Soap:
         self.step_count = count
 
     def step(self, gradients: Sequence[Tensor]) -> None:
-        """Changes the parameters by `gradients`, which are in the same order."""
         self.step_count += 1
         self._adam.learning_rate = self.learning_rate
         self._adam.step(_at(self._others, gradients))
         _core.soap_step(
-            weights=[kernels.view(p) for p in _at(self._matrices, self.parameters)],
+            weights=self._weights,
             gradients=[g.numpy() for g in _at(self._matrices, gradients)],
             memories=[memory.numpy() for memory in self._memories],
             step=self.step_count,

@@ -24,7 +24,7 @@ from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.core_gradients import CoreGradients
 from radarsdf.fitting.gradients import GradientBackend, Gradients, RandomDropout
 from radarsdf.fitting.history import LossHistory
-from radarsdf.fitting.optimiser import Adam, RowAdam, Soap
+from radarsdf.fitting.optimiser import Adam, Optimiser, RowAdam, Soap
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.fitting.stopping import Diverged
 from radarsdf.interrupts import deferred_interrupts
@@ -32,8 +32,7 @@ from radarsdf.progress import hides_bar
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
-_NetworkOptimiser = Adam | Soap
-_OPTIMISERS: dict[str, type[_NetworkOptimiser]] = {"adam": Adam, "soap": Soap}
+_OPTIMISERS: dict[str, type[Optimiser]] = {"adam": Adam, "soap": Soap}
 _GENERATORS = 2  # random generators of a fit: for samples, for dropout
 _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
 
@@ -143,7 +142,7 @@ class _Stage:
     """Joint iterations of the sdf stage that count as iterations of this stage too."""
     counts: tuple[str, ...]
     """The stages that an iteration counts for. Joint iterations count for both."""
-    optimisers: list[_NetworkOptimiser]
+    optimisers: list[Optimiser]
     """Of the parameters that are trained, in the order of their gradients."""
     rows: RowAdam | None
     """Optimiser of the features if only the touched ones move."""
@@ -189,7 +188,7 @@ class Training:
         self.losses: dict[str, float] = {}
         self.history = LossHistory(self.iterations)
         self._rows = None
-        self._optimisers: dict[str, _NetworkOptimiser] = {}
+        self._optimisers: dict[str, Optimiser] = {}
         rate, of_network = config.training.learning_rate, _OPTIMISERS[config.training.optimiser]
         if config.moves_rows(scale is not None):
             self._rows = RowAdam(field.cells, rate)
@@ -379,7 +378,7 @@ def _bad_losses(found: Gradients) -> str:
     return " and ".join(sorted(name for name, value in found.losses.items() if not math.isfinite(value)))
 
 
-def _move_networks(found: Gradients, optimisers: Sequence[_NetworkOptimiser], share: float) -> None:
+def _move_networks(found: Gradients, optimisers: Sequence[Optimiser], share: float) -> None:
     """Changes the networks by the gradients."""
     total = iter(found.by_parameters)
     for optimiser in optimisers:

@@ -113,7 +113,9 @@ class Reflectance:
         # The cells have means, and the error that counts is the absolute one, whose centre is the median.
         coefficients = response.coefficients.copy()
         coefficients[:, 0] += np.median(residuals.left - groups.of_returns(explained))
-        times = residuals.times
+        times, share = 1.0, 0.0
+        if residuals.has_network:
+            times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         return cls(
             residuals.leaf_size_m,
             times * coefficients,
@@ -122,7 +124,7 @@ class Reflectance:
             residuals.normals,
             keys,
             (np.float32(times) * means).astype(np.float16),
-            residuals.network_share,
+            share,
         )
 
     def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
@@ -156,10 +158,8 @@ class Residuals:
     """(G,) mean of each group, NaN without a plane."""
     left: Float32
     """(N,) of each return."""
-    times: float = 1.0
-    """What the closed form counts beside a network."""
-    network_share: float = 0.0
-    """See :class:`Reflectance`."""
+    has_network: bool
+    """Whether they are what a network leaves."""
 
     @classmethod
     def of(
@@ -199,11 +199,9 @@ class Residuals:
         directions = np.ascontiguousarray(rays.directions)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
         groups = _Groups.of(points, directions, incidence, leaf_size_m, num_threads)
-        times, share = 1.0, 0.0
         if ask is not None:
             answers = ask(groups.points, _unit_vectors(groups.directions), groups.means(rays.ranges_m))
             unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
-            times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         response = Response.of(unit, directions, rays.ranges_m, incidence, kinds)
         return cls(
             leaf_size_m,
@@ -213,8 +211,7 @@ class Residuals:
             groups,
             groups.means(incidence),
             unit - response.at(directions, rays.ranges_m, incidence, kinds),
-            times,
-            share,
+            ask is not None,
         )
 
 
