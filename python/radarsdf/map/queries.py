@@ -130,7 +130,7 @@ def confidence(contents: MapContents, evidence: EvidenceAt) -> Tensor:
     """(N,) probability that a surface is within a leaf cell's edge. 0 where there are no returns."""
     start_vector_library()
     terms = confidence_terms(contents, evidence)
-    probability = (terms @ torch.tensor(_LOGIT, dtype=torch.float64, device="cpu")).sigmoid()
+    probability = (terms * torch.tensor(_LOGIT, dtype=torch.float64, device="cpu")).sum(1).sigmoid()
     # A surface is no nearer than its position is known: the share of a normal distribution within a cell's edge.
     error_cells = terms[:, 1].exp()
     return probability.minimum(torch.erf(math.sqrt(0.5) / error_cells)).float()

@@ -19,6 +19,7 @@ from radarsdf.io.sequence import Scan, Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.traced_surface import TracedSurface
+from radarsdf.products import turned
 from radarsdf.returns.sensor import Sensor
 
 _Floats = NDArray[np.float64]
@@ -152,7 +153,7 @@ def view_from(
     check_views(viewed.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation))
     position = pose[:3, 3] - viewed.origin
     chosen = _answers(surface, pose[:3, :3], position, sensor, round(wanted), viewed.roughness)
-    points = (surface.centres[chosen] - position) @ pose[:3, :3]
+    points = turned(surface.centres[chosen] - position, pose[:3, :3].T)
     intensities = None
     if viewed.intensity is not None:
         intensities = viewed.intensity(surface.centres[chosen], position)
@@ -206,7 +207,7 @@ def _in_view(centres: _Floats, R: _Floats, position: _Floats, sensor: Sensor) ->
     """Rows of the patches (N, 3) that lie in the sensor's field of view and ranges."""
     seen = np.ones(len(centres), bool)
     limits = (sensor.range_m, sensor.azimuth_rad, sensor.elevation_rad)
-    for values, (low, high) in zip(_polar((centres - position) @ R), limits, strict=True):
+    for values, (low, high) in zip(_polar(turned(centres - position, R.T)), limits, strict=True):
         seen &= (values >= low) & (values <= high)
     return np.flatnonzero(seen)
 
@@ -272,7 +273,7 @@ def _first_surface(
     """Range and intensity (E, A) of what each beam first meets, NaN where that is nothing."""
     shape = (len(elevation), len(azimuth))
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
-    directions = sensor.directions(grid[1].ravel(), grid[0].ravel()) @ R.T
+    directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)
     hits = viewed.surface.first_hits(position, directions, float(sensor.range_m[1]))
     met = np.isfinite(hits.ranges_m) & (hits.ranges_m >= sensor.range_m[0])
     ranges_m = np.where(met, hits.ranges_m, np.float32(np.nan))

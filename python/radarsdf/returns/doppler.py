@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.products import normal_matrix, product
+
 FloatArray = NDArray[np.float64]
 
 MIN_RETURNS = 10
@@ -76,11 +78,12 @@ def sensor_velocity(
     if len(rows) < MIN_RETURNS:
         return unknown
     away = -x[rows] / ranges[rows, None]
+    away_columns = np.ascontiguousarray(away.T)
     measured = speeds[rows]
 
     def residuals(velocities: FloatArray) -> FloatArray:
         """(K, M) differences of the measured speeds from those of velocities (K, 3)."""
-        off: FloatArray = measured - velocities @ away.T
+        off: FloatArray = measured - product(velocities, away_columns)
         return off if interval_mps is None else off - interval_mps * np.round(off / interval_mps)
 
     velocity = _most_agreed(away, measured, residuals, interval_mps)
@@ -92,17 +95,18 @@ def sensor_velocity(
         agrees = np.abs(off) < max(_SIGMA_MPS, 3 * sigma)
         if agrees.sum() < max(MIN_RETURNS / 2, _MIN_AGREEING * len(rows)):
             return unknown
-        normal = away[agrees].T @ away[agrees]
+        normal = normal_matrix(away[agrees], away[agrees])
         if np.linalg.cond(normal) > _MAX_CONDITION:
             return unknown
-        velocity = velocity + np.linalg.solve(normal, away[agrees].T @ off[agrees])
+        velocity = velocity + np.linalg.solve(normal, normal_matrix(away[agrees], off[agrees, None])[:, 0])
         # The median is not drawn by what moves.
         sigma = min(1.4826 * float(np.median(np.abs(residuals(velocity[None])[0][agrees]))), _SIGMA_MPS)
     static = np.zeros(len(x), bool)
     off = residuals(velocity[None])[0]
     static[rows] = np.abs(off) < max(_SIGMA_MPS, 3 * sigma)
     spread = float(np.sum(off[agrees] ** 2)) / max(int(agrees.sum()) - 3, 1)
-    return SensorVelocity(velocity, spread * np.linalg.inv(normal), static)
+    covariance: FloatArray = np.multiply(spread, np.linalg.inv(normal))
+    return SensorVelocity(velocity, covariance, static)
 
 
 def _most_agreed(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.config import ReturnsConfig
+from radarsdf.products import normal_matrix, product
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
@@ -88,12 +89,13 @@ def sensor_noise(
         shares = _shares(rays, rows, normals)
         least = np.array([0.025 * surfels.cell_size_m, 1e-3, 1e-3]) ** 2
         for _ in range(_ROUNDS):  # the weights are the variances of the round before
-            variance = shares @ sigma2
+            variance = product(shares, sigma2[:, None])[:, 0]
             used = residual2 < _SIGMAS2 * variance
             weighted = shares[used] / variance[used, None] ** 2
-            rest = residual2[used] - shares[used][:, ~free] @ sigma2[~free]
+            rest = residual2[used] - product(shares[used][:, ~free], sigma2[~free, None])[:, 0]
             weighted = weighted[:, free]
-            solution = np.linalg.lstsq(weighted.T @ shares[used][:, free], weighted.T @ rest, rcond=None)[0]
+            normal = normal_matrix(weighted, shares[used][:, free])
+            solution = np.linalg.lstsq(normal, normal_matrix(weighted, rest[:, None])[:, 0], rcond=None)[0]
             sigma2[free] = _TRUNCATION * np.maximum(solution, least[free])
     return SensorNoise(*np.sqrt(sigma2).tolist())
 

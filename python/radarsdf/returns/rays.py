@@ -26,6 +26,7 @@ from radarsdf.checks import (
 )
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
+from radarsdf.products import turned
 
 _MISSING: Any = object()  # where there are fewer scans of one kind
 _MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
@@ -251,7 +252,7 @@ def prepare(
         seen_from = positions[middle_scan(i, num_scans, accumulate_scans)]
         keep = _kept(scan, min_range_m, max_range_m)
         values = None if of_scan is None else of_scan[keep]
-        local = (scan if keep.all() else scan[keep]) @ T_world_sensor[i, :3, :3].T + (
+        local = turned(scan if keep.all() else scan[keep], T_world_sensor[i, :3, :3]) + (
             positions[i] - local_origin
         )
         polar = _directions_and_ranges(local - (seen_from - local_origin))

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.products import normal_matrix, product
+
 Float32 = NDArray[np.float32]
 
 # A return lies on no surface that is known, on a level one or on a steep one. The ground is another material than walls,
@@ -66,7 +68,7 @@ class Response:
         rays = _of_ray(directions[some], ranges_m[some]).astype(np.float64)
         coefficients = np.zeros((NUM_KINDS, NUM_COEFFICIENTS))
         coefficients[:, :_BASE] = _regression(rays, y)
-        left = y - rays @ coefficients[NO_SURFACE, :_BASE]
+        left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
         table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
         for kind in (LEVEL, STEEP):
             own = chosen == kind
@@ -167,8 +169,10 @@ def _regression(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDA
     ridge = np.eye(design.shape[1]) * (1e-3 * np.sqrt(len(values)) + 1e-6 * float((design**2).sum()))
     for _ in range(_REWEIGHTINGS):
         weighted = design * weights[:, None]
-        coefficients: NDArray[np.float64] = np.linalg.solve(design.T @ weighted + ridge, weighted.T @ values)
-        error = np.abs(values - design @ coefficients)
+        coefficients: NDArray[np.float64] = np.linalg.solve(
+            normal_matrix(design, weighted) + ridge, normal_matrix(weighted, values[:, None])[:, 0]
+        )
+        error = np.abs(values - product(design, coefficients[:, None])[:, 0])
         weights = 1 / np.maximum(1, error / max(float(np.median(error)), 1e-9))
     return coefficients
 
@@ -189,8 +193,10 @@ def _smooth_means(bins: NDArray[np.int32], values: NDArray[np.float64]) -> NDArr
                 _kernel(size, width / step)
                 for size, width, step in zip(TABLE_SHAPE, widths, steps, strict=True)
             )
-            means = by_range @ sums @ by_elevation + _TABLE_SHRINKAGE * means
-            means /= by_range @ masses @ by_elevation + _TABLE_SHRINKAGE
+            smooth_sums, smooth_masses = (
+                product(product(by_range, table), by_elevation) for table in (sums, masses)
+            )
+            means = (smooth_sums + _TABLE_SHRINKAGE * means) / (smooth_masses + _TABLE_SHRINKAGE)
     return means
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_outputs, write_whole
+from radarsdf.products import turned
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.welding import WeldedMesh
@@ -82,7 +83,7 @@ def _glb(local: NDArray[np.float64], faces: NDArray[np.int32]) -> bytes:
         baseColorFactor=[200, 200, 200, 255], metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )
     visual = of_trimesh.TextureVisuals(material=material)
-    mesh = trimesh.Trimesh(local @ _GLTF_TILE.T, faces, visual=visual, process=False)
+    mesh = trimesh.Trimesh(turned(local, _GLTF_TILE), faces, visual=visual, process=False)
     data: Any = mesh.export(file_type="glb", include_normals=True)
     return bytes(data)
 
