@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import Scans
+from radarsdf.view.serving import start_server
 from radarsdf.view.viewer import Viewer
 
 from ..conftest import ground_and_wall
@@ -160,6 +162,85 @@ def test_a_click_tells_what_the_map_knows(client, viewer, sharp_map):
 
 def test_the_page_cannot_be_made_public(viewer):
     assert viewer._server.request_share_url() is None
+
+
+def answer_to(viewer, *headers):
+    """The status that a request of the page gets."""
+    with socket.create_connection((viewer.host, viewer.port), timeout=10) as connection:
+        lines = "\r\n".join(["GET / HTTP/1.1", *headers, "Connection: close", "", ""])
+        connection.sendall(lines.encode())
+        return int(connection.makefile("rb").readline().split()[1])
+
+
+def test_other_pages_are_refused(viewer):
+    port = viewer.port
+    assert answer_to(viewer, f"Host: localhost:{port}") == 200
+    assert answer_to(viewer, f"Host: 127.0.0.1:{port}", f"Origin: http://127.0.0.1:{port}") == 200
+    assert answer_to(viewer, f"Host: evil.example:{port}") == 403  # whose name suddenly means this machine
+    assert answer_to(viewer, f"Host: localhost:{port}", "Origin: http://evil.example") == 403
+    assert answer_to(viewer, f"Host: localhost:{port}", f"Host: evil.example:{port}") != 200
+    upgrade = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
+               "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==")  # fmt: skip
+    host = f"Host: localhost:{port}"
+    assert answer_to(viewer, host, *upgrade, f"Origin: http://localhost:{port}") == 101
+    assert answer_to(viewer, host, *upgrade, "Origin: http://evil.example") == 403
+    assert answer_to(viewer, host, *upgrade, "Origin: null") == 403
+    assert answer_to(viewer, f"Host: evil.example:{port}", *upgrade) == 403
+
+
+def test_wild_messages_leave_the_viewer_to_others(viewer, client, caplog):
+    controls = {m.message["props"]["label"]: m.message["uuid"] for m in client.received()
+                if "label" in m.message.get("props", {})}  # fmt: skip
+    handle = viewer._controls._scan
+    before = len(client.received())
+    with PlainClient(viewer.host, viewer.port) as wild:
+        for uuid in controls.values():
+            for value in (
+                1e30,
+                -1e300,
+                float("nan"),
+                float("inf"),
+                "x",
+                None,
+                [],
+                {},
+                True,
+                10**18,
+                "x" * 50_000,
+            ):
+                wild.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
+            wild.send("GuiUpdateMessage", uuid=uuid, updates={"update_cb": 1, "removed": True})
+        for place in ([1e30] * 3, [float("nan")] * 3, "abc", [1.0], None, [[1.0]]):
+            wild.send("TransformControlsUpdateMessage", name="/sensor", wxyz=[1, 0, 0, 0], position=place)
+            wild.send("TransformControlsUpdateMessage", name="/sensor", wxyz=place, position=[0, 0, 0])
+            wild.send("ScenePointerMessage", event_type="click", ray_origin=place, ray_direction=place,
+                      screen_pos=[[0.5, 0.5]], modifier=None)  # fmt: skip
+        wild.send("NoMessage")
+        for data in (b"", b"\xc1", b"\x91" * 60_000, "text"):
+            wild._socket.send(data)
+        slide(wild, "scan", 2)  # which is taken after them
+        client.wait_for(lambda m: "scan 2: " in str(m.message.get("updates", {}).get("_markdown")), before)
+        slide(client, "scan", 3)
+        client.wait_for(lambda m: "scan 3: " in str(m.message.get("updates", {}).get("_markdown")), before)
+    assert viewer._painter._thread.is_alive()
+    assert handle.value == 3
+    assert not handle._impl.removed
+    assert np.abs(viewer._painter.newest.sensor).max() < 1e3
+    assert not caplog.records  # viser would log what its handlers cannot do with a message
+    # One that is too long ends the connection of who sent it, and no other.
+    with PlainClient(viewer.host, viewer.port) as wild:
+        wild._socket.send(bytes(100_000))
+        wild._thread.join(10)
+        assert not wild._thread.is_alive()
+    before = len(client.received())
+    slide(client, "scan", 4)
+    client.wait_for(lambda m: "scan 4: " in str(m.message.get("updates", {}).get("_markdown")), before)
+
+
+def test_a_server_that_cannot_be_guarded_is_not_started(monkeypatch):
+    monkeypatch.setattr("viser.ViserServer", lambda *_, **__: None)  # as if it listened in another way
+    with pytest.raises(RuntimeError, match="cannot be guarded"):
+        start_server("127.0.0.1", 0)
 
 
 def test_a_map_far_away_without_intensities():

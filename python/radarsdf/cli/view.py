@@ -28,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to listen on; default: 127.0.0.1, which only this machine reaches",
+        help="address to listen on; default: 127.0.0.1, which only this machine reaches; with 0.0.0.0 everyone who can reach "
+        "the machine sees the map, by its address or its name",
     )
     parser.add_argument(
         "--port", type=int, metavar="N", help="port to listen on; default: 8080, or the next that is free"

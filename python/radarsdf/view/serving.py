@@ -10,17 +10,21 @@ import io
 import os
 import socket
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from http import HTTPStatus
 from typing import Any
 
 from radarsdf.checks import whole_number
+from radarsdf.view.guarding import MAX_MESSAGE_BYTES, bounded, why_refused
 
 _PORTS_TRIED = 100
 _TITLE = "radarsdf"
 _WINDOW_S = 0.05  # viser collects messages for a sixtieth of a second
 _ROUND_TRIPS = 3
 _PATIENCE_S = 20.0
+_STARTING = threading.Lock()
 
 
 def require_viser() -> None:
@@ -66,6 +70,8 @@ def _family(host: str) -> socket.AddressFamily:
 def start_server(host: str, port: int) -> Any:
     """A `viser.ViserServer` that listens on host and port, without the button that would make the page public.
 
+    It refuses requests of other pages, and takes of messages only what :func:`bounded` leaves.
+
     Raises
     ------
     ImportError
@@ -76,8 +82,10 @@ def start_server(host: str, port: int) -> Any:
     require_viser()
     import viser  # noqa: PLC0415
 
-    with _silence():
+    controls: dict[str, Mapping[str, Any]] = {}
+    with _silence(), _guarded(host, port, controls):
         server: Any = viser.ViserServer(host, port, _TITLE, verbose=False)
+    controls["all"] = server.gui._gui_input_handle_from_uuid
     # A page asks for it by a message, which others can send too: a tunnel through a third party.
     server.request_share_url = lambda *_, **__: None
     server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -86,6 +94,67 @@ def start_server(host: str, port: int) -> Any:
         msg = f"port {port} of {host} was taken meanwhile"
         raise OSError(msg)
     return server
+
+
+@contextlib.contextmanager
+def _guarded(host: str, port: int, controls: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
+    """Let the server that viser starts meanwhile on this host ask `why_refused` and `bounded`.
+
+    viser has no door for that, but the function of websockets that it calls has two: a function that is asked before
+    each request is answered, and the class of a connection.
+
+    Raises
+    ------
+    RuntimeError
+        If viser did not start its server by that function: it would be open to all pages.
+    """
+    import msgspec  # noqa: PLC0415 - viser needs it and websockets
+    import websockets.asyncio.server  # noqa: PLC0415
+    from websockets.asyncio.server import ServerConnection  # noqa: PLC0415
+
+    library: Any = websockets.asyncio.server
+
+    class Connection(ServerConnection):
+        async def recv(self, decode: bool | None = None) -> Any:
+            while True:
+                data: Any = await super().recv(decode)
+                try:
+                    message = bounded(msgspec.msgpack.decode(data), controls.get("all", {}))
+                except (msgspec.MsgspecError, RecursionError, TypeError, ValueError):  # also of text
+                    continue
+                if message is not None:
+                    return msgspec.msgpack.encode(message)
+
+    guarded = []
+    serve = library.serve
+
+    def guarded_serve(
+        handler: Any, own_host: Any, own_port: Any, *, process_request: Any, **given: Any
+    ) -> Any:
+        # If the port is taken meanwhile, viser tries the next ones.
+        if own_host != host or own_port < port or not handler.__module__.startswith("viser."):
+            return serve(handler, own_host, own_port, process_request=process_request, **given)
+
+        def process(connection: Any, request: Any) -> Any:
+            headers = request.headers
+            why = why_refused(headers.get_all("Host"), headers.get_all("Origin"), host)
+            if why is not None:
+                return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
+            return process_request(connection, request)
+
+        guarded.append(own_port)
+        given |= {"create_connection": Connection, "max_size": MAX_MESSAGE_BYTES}
+        return serve(handler, own_host, own_port, process_request=process, **given)
+
+    with _STARTING:
+        library.serve = guarded_serve
+        try:
+            yield
+        finally:
+            library.serve = serve
+    if not guarded:
+        msg = "this version of viser cannot be guarded against other pages of the browser: install another"
+        raise RuntimeError(msg)
 
 
 def stop_server(server: Any) -> None:

@@ -52,7 +52,8 @@ class Viewer:
     max_vertices : int
         A mesh of more vertices is thinned.
     host : str
-        Address to listen on. Others than those of this machine alone let everyone in who can reach it.
+        Address to listen on. Others than those of this machine alone let everyone in who can reach it, by this address;
+        with ``0.0.0.0`` by any address and the name of the machine. Other names, and pages of others, are refused.
     port : int, optional
         Port to listen on. None: 8080, or the next that is free.
     progress : bool, optional
