@@ -12,7 +12,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
@@ -20,6 +20,7 @@ from radarsdf import _core
 from radarsdf.config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.tensors import open_tensors
 from radarsdf.returns.rays import Rays
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ class Checkpoint:
             return
         expected = training.state()
         try:
-            with safe_open(self._path, framework="pt") as file:
+            with open_tensors(self._path) as file:
                 if (names := set(file.keys())) != set(expected):
                     msg = f"{sorted(names ^ set(expected))!s:.100} are too few or too many"
                     raise ValueError(msg)
@@ -124,7 +125,7 @@ class Checkpoint:
     def _check_identity(self) -> None:
         identity: Any = None
         try:
-            with safe_open(self._path, framework="pt") as file:
+            with open_tensors(self._path) as file:
                 metadata = file.metadata() or {}
             if metadata.get("format") == FORMAT:
                 identity = json.loads(metadata["identity"])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from radarsdf.io.files import check_regular_file
+from radarsdf.io.files import check_regular_file, in_utf8
 from radarsdf.io.unpacking import bound_ros1, bounded, check_zstd_files, unpack_zstd
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -131,22 +131,23 @@ def _opened(path: Path) -> Iterator[Any]:
         msg = f'{path}: bags are read by rosbags: pip install "radarsdf[ros]"'
         raise ImportError(msg) from error
     ros1 = path.suffix.lower() == _ROS1_SUFFIX
-    try:
-        reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
-        if path.is_dir():
-            check_zstd_files(path)
-        with bounded():
-            reader.open()
-        if ros1:
-            bound_ros1(reader)
-    except PermissionError:
-        raise
-    except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
-        raise _damaged(path, error) from error
-    try:
-        yield reader
-    finally:
-        reader.close()
+    with in_utf8(path) as readable:  # which SQLite needs
+        try:
+            reader: Any = rosbag1.Reader(readable) if ros1 else rosbag2.Reader(readable)
+            if path.is_dir():
+                check_zstd_files(path)
+            with bounded():
+                reader.open()
+            if ros1:
+                bound_ros1(reader)
+        except PermissionError:
+            raise
+        except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
+            raise _damaged(path, error) from error
+        try:
+            yield reader
+        finally:
+            reader.close()
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:

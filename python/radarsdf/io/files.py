@@ -8,6 +8,7 @@ import errno
 import os
 import secrets
 import stat
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from os import PathLike
@@ -37,6 +38,26 @@ def check_regular_file(path: str | PathLike[str]) -> None:
         raise ValueError(msg)
     with open(path, "rb"):  # noqa: PTH123 - raises the error that names the path, for a folder too
         pass
+
+
+@contextmanager
+def in_utf8(path: str | PathLike[str]) -> Iterator[Path]:
+    """A path in UTF-8 to a file or folder, for libraries that take no others: the names of Linux are any bytes.
+
+    Yields
+    ------
+    Path
+        `path` itself if it can be, or else a link to it with the same suffix, which is removed.
+    """
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory(prefix="radarsdf_") as folder:
+            link = Path(folder) / f"link{Path(path).suffix.encode(errors='ignore').decode()}"
+            link.symlink_to(os.path.abspath(path))  # noqa: PTH100 - a link in the path stays as it is
+            yield link
+    else:
+        yield Path(path)
 
 
 def are_numbers(words: list[str]) -> bool:

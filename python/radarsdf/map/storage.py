@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 from torch import Tensor
@@ -21,6 +21,7 @@ from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.tensors import open_tensors
 from radarsdf.map.contents import MapContents
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.reflectance import Reflectance
@@ -159,7 +160,7 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
     """
     check_regular_file(path)
     try:
-        with safe_open(path, framework="pt") as file:
+        with open_tensors(path) as file:
             metadata = file.metadata() or {}
             _check_format(metadata, path)
             # Copied, because the tensors are views of the file, which may be changed or removed.
@@ -177,7 +178,7 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
 
 def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
     """(C,) Morton keys of the leaf cells of a map, ascending. Nothing else of its file is read or checked."""
-    with safe_open(path, framework="np") as file:
+    with open_tensors(path, "np") as file:
         keys: NDArray[np.uint64] = file.get_tensor("leaf_keys").astype(np.uint64)
     return keys
 

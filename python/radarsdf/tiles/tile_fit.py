@@ -8,10 +8,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import write_whole
+from radarsdf.io.tensors import open_tensors
 from radarsdf.tiles.plan import Plan, TilePlan, failure_path, map_path
 from radarsdf.tiles.ray_files import read_rays
 
@@ -77,6 +78,6 @@ def is_done(root: Path, plan: Plan, tile: TilePlan) -> bool:
 
 def report_of(root: Path, tile: TilePlan) -> dict[str, Any]:
     """The report of the fit of a tile that is done; see :attr:`RadarMap.report`. Nothing else is read."""
-    with safe_open(map_path(root, tile), framework="np") as file:
+    with open_tensors(map_path(root, tile), "np") as file:
         report: dict[str, Any] = json.loads((file.metadata() or {})["description"])["report"]
     return report
