@@ -12,6 +12,7 @@ from radarsdf import FitConfig
 from radarsdf.budget import durations
 from radarsdf.budget.schedule import Schedule
 from radarsdf.field.widths import intensity_widths, parameters_of, sdf_widths, weights_of
+from radarsdf.fitting.core_gradients import CoreGradients
 from torch import nn
 
 from ..settings import grouped
@@ -93,6 +94,47 @@ def test_threads_share_what_can_be_shared_as_far_as_there_are_processors(monkeyp
         shared = durations.shared(base, threads)
         assert shared["multiplication"] == base["multiplication"] / share
         assert shared["iteration"] == base["iteration"]
+
+
+@pytest.mark.parametrize(
+    ("returns", "with_intensity", "changes"),
+    [
+        (1, False, {}),
+        (7, True, {}),
+        (60, True, {"joint": False}),
+        (60, True, {"batch_size": 700, "intensity_in_free_space": True}),
+        (400, True, {"sdf_iterations": 3, "intensity_iterations": 5}),
+    ],
+)
+def test_samples_are_those_that_the_training_sees(scene, monkeypatch, returns, with_intensity, changes):
+    seen = {"sdf": 0, "joint": 0, "intensity": 0}
+    for name in seen:
+        counted(monkeypatch, name, seen)
+    points, intensities = scene.points[0][:returns], scene.intensities[0][:returns]
+    config = FitConfig(num_threads=1, returns={"drop_ghosts": False}, training=changes)
+    given = ([points], scene.poses[:1], [intensities] if with_intensity else None)
+    report = radarsdf.fit(*given, config=config, progress=False).report
+    rows, cells = report["vertices"], report["leaf_cells"]
+    schedule = Schedule.of(
+        config, surface_returns=returns, returns=returns, vertices=rows, with_intensity=with_intensity
+    )
+    expected = durations.work_of(
+        config, schedule, returns=returns, cells=cells, rows=rows, with_intensity=with_intensity
+    )
+    evaluations = 3 * (seen["sdf"] + seen["joint"]) + seen["intensity"]
+    assert expected["encoded number"] == sdf_widths(config)[0] * evaluations
+    assert evaluations <= 3 * 500 * 12 * returns or "sdf_iterations" in changes
+
+
+def counted(monkeypatch, name, seen):
+    """Adds the samples of each batch to `seen`."""
+    gradients = getattr(CoreGradients, name)
+
+    def counting(backend, batch, meanwhile):
+        seen[name] += len(batch.points)
+        return gradients(backend, batch, meanwhile)
+
+    monkeypatch.setattr(CoreGradients, name, counting)
 
 
 def test_the_estimate_is_the_sum(scene):

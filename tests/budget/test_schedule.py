@@ -97,3 +97,14 @@ def test_what_is_set_is_done():
     paper = schedule(10**7, vertices=10, sdf_iterations=1000, intensity_iterations=4000)
     assert paper.iterations == {"sdf": 1000, "intensity": 4000}
     assert schedule(10**7, sdf_iterations=0).sdf_iterations == 0
+
+
+def test_a_batch_of_few_returns_has_the_samples_of_one_pass():
+    few = schedule(5)
+    assert (few.batch_size, few.intensity_batch_size) == (5 * 12, 5 * 6)
+    assert few.neighbours == 1
+    assert few.iterations == {"sdf": 150, "intensity": 500}
+    usual = schedule(400)
+    assert (usual.batch_size, usual.intensity_batch_size) == (4096, 1024)
+    published = schedule(5, sdf_iterations=1000, intensity_iterations=4000)
+    assert (published.batch_size, published.intensity_batch_size) == (4096, 1024)

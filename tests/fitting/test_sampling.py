@@ -117,6 +117,21 @@ def test_each_ray_is_seen_equally_often(rays, batch_size):
     assert set(np.unique(seen)) <= {whole, whole + 1}
 
 
+@pytest.mark.parametrize("kind", DRAWS)
+def test_a_batch_of_few_rays_draws_one_order_at_most(rays, kind, monkeypatch):
+    draws, draw_order = [], RaySampler._draw_order
+    monkeypatch.setattr(RaySampler, "_draw_order", lambda self: (draws.append(1), draw_order(self)))
+    few = rays.select(np.arange(3))
+    draw = sampler(few)
+    seen = np.zeros(3, int)
+    for batch in range(7):
+        samples = DRAWS[kind](draw)
+        rows = rows_of(few.points, samples)
+        np.add.at(seen, rows[: samples.num_near].numpy(), 1)
+        assert len(draws) <= batch + 1
+        assert seen.max() - seen.min() <= 1
+
+
 def test_spread_sees_each_ray_equally_often(rays):
     draw = sampler(rays, 300)
     seen = np.zeros(NUM_RAYS, int)

@@ -39,9 +39,9 @@ def work_of(
     # own, and their gradient two more: 9 in all, or 3 if the field is frozen.
     passes, frozen_passes = (9, 3) if normals and with_intensity else (3, 1)
     evaluations = passes * iterations * schedule.batch_size
-    evaluations += frozen_passes * later * training.intensity_batch_size
+    evaluations += frozen_passes * later * schedule.intensity_batch_size
     sdf, intensity = weights_of(sdf_widths(config)), weights_of(intensity_widths(config))
-    multiplied = sdf * evaluations + intensity * 3 * (joint * of_both + later * training.intensity_batch_size)
+    multiplied = sdf * evaluations + intensity * 3 * (joint * of_both + later * schedule.intensity_batch_size)
     return {
         "return": float(returns),
         "cell": float(cells),

@@ -164,7 +164,7 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
     samples = learns_features * schedule.batch_size
     seen = 0
     if schedule.intensity_iterations:
-        seen = config.training.intensity_batch_size
+        seen = schedule.intensity_batch_size
         if config.training.joint and samples:
             seen = max(seen, seen_jointly(config, samples))
     memory += _batch_bytes(config, max(samples, seen), seen)

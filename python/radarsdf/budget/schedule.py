@@ -45,6 +45,8 @@ class Schedule:
     """Iterations of the sdf stage."""
     intensity_iterations: int
     """Iterations that train the intensity network."""
+    intensity_batch_size: int
+    """Samples in an iteration of the intensity stage."""
     dropout_scale: float
     """Factor on the configured dropout."""
     passes: float
@@ -61,19 +63,33 @@ class Schedule:
         if sdf_iterations is None:
             batch_size, sdf_iterations = _sdf_schedule(config, samples, vertices)
         # A larger batch takes more rays at as many places: rays at the same place share cache lines.
-        neighbours = batch_size // training.batch_size
+        neighbours = max(1, batch_size // training.batch_size)
         passes = sdf_iterations * batch_size / samples
         if not with_intensity:
-            return cls(batch_size, neighbours, sdf_iterations, 0, 0.0, passes)
+            return cls(batch_size, neighbours, sdf_iterations, 0, 0, 0.0, passes)
         samples = returns * sampling.near_samples
-        intensity_iterations = training.intensity_iterations
+        intensity_batch_size, intensity_iterations = (
+            training.intensity_batch_size,
+            training.intensity_iterations,
+        )
         if intensity_iterations is None:
+            intensity_batch_size = min(intensity_batch_size, samples)
             intensity_iterations = _intensity_schedule(config, samples, sdf_iterations)
+        if training.intensity_in_free_space:  # the samples are those of the sdf stage
+            intensity_batch_size = batch_size
         # A sample that is used often is easily memorised. Measured: the same dropout for all scenes (0.7 and
         # 0.2) is as good on sparse ones, but costs 2 % on a dense one, which uses its samples twice.
-        times_used = intensity_iterations * training.intensity_batch_size / samples
+        times_used = intensity_iterations * intensity_batch_size / samples
         dropout_scale = times_used / (times_used + _HALF_DROPOUT_PASSES)
-        return cls(batch_size, neighbours, sdf_iterations, intensity_iterations, dropout_scale, passes)
+        return cls(
+            batch_size,
+            neighbours,
+            sdf_iterations,
+            intensity_iterations,
+            intensity_batch_size,
+            dropout_scale,
+            passes,
+        )
 
     @property
     def iterations(self) -> dict[str, int]:
@@ -102,7 +118,9 @@ def seen_jointly(config: FitConfig, batch_size: int) -> int:
 
 def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, int]:
     """Samples in a batch, and iterations, of the sdf stage."""
-    batch_size = config.training.batch_size
+    # Few returns: what is learnt from more samples than those of a pass is the same again. Measured on 20 to 300 returns
+    # of four simulated scenes: errors are as small, and 20 take a quarter of the time.
+    batch_size = min(config.training.batch_size, samples)
     one_pass = samples / batch_size
     wanted = max(_SDF_PASSES * one_pass, min(_ENOUGH_SDF_ITERATIONS, _MOST_SDF_PASSES * one_pass))
     most = _MOST_SAMPLES_PER_VERTEX * vertices / batch_size

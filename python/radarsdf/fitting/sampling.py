@@ -185,7 +185,9 @@ class RaySampler:
 
         After the last ray, a new order is drawn.
         """
-        parts = []
+        # A whole pass takes every ray once, in any order: of few rays, a batch would draw hundreds of orders.
+        passes, count = divmod(count, len(self._rays))
+        parts = [np.repeat(np.arange(len(self._rays)), passes)]
         while count > 0:
             if self._next >= len(self._order):
                 self._draw_order()

@@ -115,7 +115,7 @@ class _Draws:
         self._turn_to_returns()
         if self._config.training.intensity_in_free_space:
             return self._sampler.batch(self._num_parts(self._schedule.batch_size))
-        count = self._config.training.intensity_batch_size
+        count = self._schedule.intensity_batch_size
         return self._sampler.spread(count, self._num_parts(count))
 
 
