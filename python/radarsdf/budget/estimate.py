@@ -116,23 +116,24 @@ def estimate(
     return estimate_rays(rays, config)
 
 
-def estimate_rays(rays: Rays, config: FitConfig) -> Estimate:
-    """:func:`estimate` for scans that are already rays."""
-    count, threads = len(rays), resolve_num_threads(config.num_threads)
-    cells, rows = _count_cells(rays, config)
-    schedule = _schedule(rays, rows, config)
+def estimate_rays(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> Estimate:
+    """:func:`estimate` for scans that are already rays, of which a map is learnt from those `inside`, (N,). None: all."""
+    threads = resolve_num_threads(config.num_threads)
+    learnt = rays if inside is None else rays.select(inside)
+    cells, rows = _count_cells(learnt, config)
+    schedule = _schedule(learnt, rows, config)
     work = work_of(
         config,
         schedule,
-        returns=count,
+        returns=len(rays),
         cells=cells,
         rows=rows,
         with_intensity=_trains_intensity(rays, config),
     )
     return Estimate(
-        peak_memory_bytes=_fit_bytes(rays, cells, rows, config),
+        peak_memory_bytes=_fit_bytes(learnt, len(rays), cells, rows, config),
         seconds=sum(SECONDS[kind] * amount for kind, amount in shared(work, threads).items()),
-        returns=count,
+        returns=len(learnt),
         leaf_cells=cells,
         vertices=rows,
         iterations=schedule.iterations,
@@ -150,7 +151,8 @@ def _trains_intensity(rays: Rays, config: FitConfig) -> bool:
     return rays.intensities is not None and config.trains_intensity
 
 
-def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
+def _fit_bytes(rays: Rays, num_checked: int, cells: int, rows: int, config: FitConfig) -> int:
+    """Of a map that is learnt from `rays`, the only ones of `num_checked` whose returns are inside."""
     count, with_intensity = len(rays), _trains_intensity(rays, config)
     schedule, moves_rows = _schedule(rays, rows, config), config.moves_rows(with_intensity)
     memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL
@@ -172,7 +174,7 @@ def _fit_bytes(rays: Rays, cells: int, rows: int, config: FitConfig) -> int:
         memory += count * (_PER_INTENSITY + config.returns.drop_ghosts * _PER_RETURN_AGAIN)
     if rays.intensities is not None and config.closes_intensity:
         memory += count * _PER_RETURN_OF_CLOSED_FORM
-    passing = count * _PER_RETURN_CHECKED
+    passing = num_checked * _PER_RETURN_CHECKED
     if config.encoding.kind == "octree":
         passing = max(passing, _ALWAYS + cells * _PER_CELL + rows * _PER_OCTREE_ROW)
     return int(max(memory, passing))
@@ -191,8 +193,11 @@ def _copies(config: FitConfig, schedule: Schedule, *, with_intensity: bool) -> i
     return _COPIES + gradients * resolve_num_threads(config.num_threads)
 
 
-def check_fit(rays: Rays, config: FitConfig) -> None:
-    """Raises a MemoryError if a fit needs more than `max_memory_bytes`, or than the system has left."""
+def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> None:
+    """Raises a MemoryError if a fit needs more than `max_memory_bytes`, or than the system has left.
+
+    `inside`: as of :func:`estimate_rays`.
+    """
     available = _limit(config.max_memory_bytes)
     # Upper bounds: cells that the near band of a ray can cross, and rows of features of a cell. If a fit of
     # so many is small enough, the cells need not be counted, which takes time.
@@ -200,10 +205,11 @@ def check_fit(rays: Rays, config: FitConfig) -> None:
     corners = 12 if config.encoding.kind == "tri-quadtree" else 8
     if (
         available is None
-        or _fit_bytes(rays, cells, cells * corners * config.encoding.num_levels, config) <= available
+        or _fit_bytes(rays, len(rays), cells, cells * corners * config.encoding.num_levels, config)
+        <= available
     ):
         return
-    expected = estimate_rays(rays, config)
+    expected = estimate_rays(rays, config, inside)
     if expected.peak_memory_bytes > available:
         msg = (
             f"the fit would take about {expected.peak_memory_bytes / 1e9:.2f} GB for {expected.leaf_cells} leaf cells "

@@ -73,7 +73,7 @@ def fit_rays(
     radar_map = None
     try:
         check_extent(rays, config)
-        check_fit(rays, config)
+        check_fit(rays, config, inside)
         saved = None if checkpoint is None else Checkpoint(checkpoint, rays, given.scale, config)
         clock.lap("prepare_s")
         # A map that is made in inference mode could not give gradients later.

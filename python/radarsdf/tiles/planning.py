@@ -193,9 +193,8 @@ class Planner:
         return self._looked_at(draft)
 
     def _looked_at(self, plan: Plan) -> Plan:
-        """The plan with what the largest tiles tell of noise, roughness, memory and time."""
+        """The plan with what the largest tiles tell of noise and roughness, and with the cost of each."""
         noises, rough, returns = [], 0.0, 0
-        bytes_per_ray = seconds_per_ray = 0.0
         for tile in sorted(plan.tiles, key=lambda planned: -planned.returns)[:_LOOKED_AT]:
             rays, _ = read_rays(self._folder, plan, tile)
             with Workers(plan.config.num_threads) as workers:
@@ -203,26 +202,23 @@ class Planner:
             noises.append(dataclasses.astuple(surface.noise))
             rough += surface.surfels.rough_share() * len(rays)
             returns += len(rays)
-            expected = estimate_rays(rays, plan.config)
-            bytes_per_ray = max(bytes_per_ray, expected.peak_memory_bytes / len(rays))
-            seconds_per_ray = max(seconds_per_ray, expected.seconds / len(rays))
         noise = SensorNoise(*np.median(noises, axis=0).tolist())
         names = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
         known = dict(zip(names, dataclasses.astuple(noise), strict=True))
-        tiles = [
-            dataclasses.replace(
-                tile,
-                memory_bytes=int(tile.rays * bytes_per_ray) + _LEAST_BYTES,
-                seconds=round(tile.rays * seconds_per_ray, 3),
-            )
-            for tile in plan.tiles
-        ]
         return dataclasses.replace(
             plan,
             config=plan.config.override(returns=known),
             rough_share=rough / returns,
             sensor=self._sensor(noise),
-            tiles=tuple(tiles),
+            tiles=tuple(self._estimated(plan, tile) for tile in plan.tiles),
+        )
+
+    def _estimated(self, plan: Plan, tile: TilePlan) -> TilePlan:
+        """The tile with the memory and time that its own fit takes."""
+        rays, inside = read_rays(self._folder, plan, tile)
+        expected = estimate_rays(rays, plan.config, inside)
+        return dataclasses.replace(
+            tile, memory_bytes=expected.peak_memory_bytes, seconds=round(expected.seconds, 3)
         )
 
     def _sensor(self, noise: SensorNoise) -> Sensor:
@@ -234,9 +230,6 @@ class Planner:
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m,
         )
-
-
-_LEAST_BYTES = 100_000_000  # that any fit takes, however few its rays
 
 
 def make_plan(scans: Iterable[Scan], folder: Path, config: FitConfig, grid: TileGrid) -> Plan:

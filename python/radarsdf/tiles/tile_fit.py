@@ -63,6 +63,7 @@ def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
         inside=inside,
         rough_share=plan.rough_share,
     )
+    del rays  # the fit lets go of them when it has no more use for them
     radar_map = fit_rays(given, plan.config, progress=False)
     radar_map.report["plan"] = plan.digest
     radar_map.save(map_path(root, tile))
