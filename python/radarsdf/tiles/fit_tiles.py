@@ -22,6 +22,7 @@ from radarsdf.io.files import write_whole
 from radarsdf.io.read import read
 from radarsdf.io.sequence import Scan, Scans
 from radarsdf.tiles.grid import TileGrid
+from radarsdf.tiles.locking import LOCK, only_planner
 from radarsdf.tiles.plan import PLAN, Plan, failure_path
 from radarsdf.tiles.planning import InputDigest, make_plan
 from radarsdf.tiles.running import run_tasks
@@ -30,7 +31,7 @@ from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
-_OURS = {PLAN, "tiles", "scans.npy"}
+_OURS = {PLAN, LOCK, "tiles", "scans.npy"}
 _NOT_COMPARED = ("num_threads", "max_memory_bytes")
 
 
@@ -78,7 +79,7 @@ def fit_tiles(
     ValueError
         If a scan is invalid, `out` holds something else or another plan, or all tiles failed.
     OSError
-        If `out` cannot be written.
+        If `out` cannot be written, or another process makes its plan.
     """
     plan_tiles(
         scans, out, tile_size=tile_size, halo=halo, config=config, threads=None if executor is None else 1
@@ -102,18 +103,20 @@ def plan_tiles(
     folder, config = Path(out), FitConfig() if config is None else config
     grid = _grid(config, tile_size, halo)
     given = read(scans) if isinstance(scans, (str, PathLike)) else scans
-    if (folder / PLAN).is_file():
-        plan = Plan.load(folder)
-        _check_same(folder, plan, config, grid, InputDigest.of(_checked(given)))
-        return plan
-    if folder.is_dir() and not {path.name for path in folder.iterdir()} <= _OURS:
-        msg = f"{folder} holds other files: give a new folder"
-        raise ValueError(msg)
-    folder.mkdir(exist_ok=True)
-    shutil.rmtree(folder / "tiles", ignore_errors=True)  # of a plan that was not finished
-    threads = config.num_threads or threads or torch.get_num_threads()
-    plan = make_plan(_checked(given), folder, config.override(num_threads=threads), grid)
-    plan.save(folder)
+    if not (folder / PLAN).is_file():
+        if folder.is_dir() and not {path.name for path in folder.iterdir()} <= _OURS:
+            msg = f"{folder} holds other files: give a new folder"
+            raise ValueError(msg)
+        folder.mkdir(exist_ok=True)
+        with only_planner(folder):
+            if not (folder / PLAN).is_file():  # another process may just have made it
+                shutil.rmtree(folder / "tiles", ignore_errors=True)  # of a plan that was not finished
+                threads = config.num_threads or threads or torch.get_num_threads()
+                plan = make_plan(_checked(given), folder, config.override(num_threads=threads), grid)
+                plan.save(folder)
+                return plan
+    plan = Plan.load(folder)
+    _check_same(folder, plan, config, grid, InputDigest.of(_checked(given)))
     return plan
 
 
