@@ -16,7 +16,18 @@ import radarsdf
 ROOT = Path(radarsdf.__file__).parent
 # From the lowest to the highest. A room may import itself and those below it.
 ROOMS = (
-    ("_core", "checks", "interrupts", "lattice", "products", "progress", "settings", "threads", "versions"),
+    (
+        "_core",
+        "checks",
+        "extras",
+        "interrupts",
+        "lattice",
+        "products",
+        "progress",
+        "settings",
+        "threads",
+        "versions",
+    ),
     ("config",),
     ("config_toml",),
     ("io",),

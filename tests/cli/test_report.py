@@ -20,9 +20,12 @@ def no_work(monkeypatch):
 @pytest.mark.parametrize(
     ("missing", "said"),
     [
-        (["viser"], 'a report needs viser: pip install "radarsdf[view]"'),
-        (["matplotlib"], 'a report needs matplotlib: pip install "radarsdf[plot]"'),
-        (["matplotlib", "viser"], 'a report needs matplotlib and viser: pip install "radarsdf[plot,view]"'),
+        (["viser"], 'a report needs viser: pip install "viser>=1.1"'),
+        (["matplotlib"], 'a report needs matplotlib: pip install "matplotlib>=3.7"'),
+        (
+            ["matplotlib", "viser"],
+            'a report needs matplotlib and viser: pip install "matplotlib>=3.7" "viser>=1.1"',
+        ),
     ],
 )
 @pytest.mark.parametrize("command", ["fit", "report"])

@@ -20,7 +20,7 @@ from .calls import refusal
 def test_what_to_install(map_file, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     said = refusal(capsys, tmp_path, "view", map_file)
-    assert said == 'radarsdf view: the viewer needs viser: pip install "radarsdf[view]"\n'
+    assert said == 'radarsdf view: the viewer needs viser: pip install "viser>=1.1"\n'
 
 
 @pytest.mark.parametrize(

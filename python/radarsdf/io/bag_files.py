@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from radarsdf.extras import require
 from radarsdf.io.files import check_regular_file, in_utf8
 from radarsdf.io.unpacking import bound_ros1, bounded, check_zstd_files, unpack_zstd
 
@@ -125,11 +126,9 @@ def _messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, Any, A
 def _opened(path: Path) -> Iterator[Any]:
     """A reader of rosbags."""
     check_regular_file(path if path.is_file() or not (path / _METADATA).is_file() else path / _METADATA)
-    try:
-        from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        msg = f'{path}: bags are read by rosbags: pip install "radarsdf[ros]"'
-        raise ImportError(msg) from error
+    require("rosbags", what=f"{path}: bags are read by")
+    from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
+
     ros1 = path.suffix.lower() == _ROS1_SUFFIX
     with in_utf8(path) as readable:  # which SQLite needs
         try:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.extras import require
 from radarsdf.interrupts import whole_import
 from radarsdf.io.fields import COLUMNS, Fields
 from radarsdf.io.files import are_numbers, check_regular_file
@@ -208,11 +209,7 @@ def _ply(path: Path) -> Columns:
 
 
 def _las(path: Path) -> Columns:
-    try:
-        import laspy  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        msg = f'{path}: LAS and LAZ files are read by laspy: pip install "radarsdf[las]"'
-        raise ImportError(msg) from error
+    laspy = require("laspy", what=f"{path}: LAS and LAZ files are read by")
     check_las_records(path)
     # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:

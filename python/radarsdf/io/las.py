@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.extras import require
+
 INTENSITY = "radar_intensity"
 """The extra dimension of intensities: LAS's own are whole numbers from 0 to 65535."""
 
@@ -21,7 +23,7 @@ def las_writer(compressed: bool) -> Callable[[Any, Iterator[NDArray[Any]]], int]
     """A function that writes records, an array a scan, to an open file, and gives their number."""
 
     def write(file: Any, rows: Iterator[NDArray[Any]]) -> int:
-        laspy = _laspy()
+        laspy = require("laspy", what="LAS and LAZ files are written by")
         count, writer = 0, None
         try:
             for part in rows:
@@ -36,15 +38,6 @@ def las_writer(compressed: bool) -> Callable[[Any, Iterator[NDArray[Any]]], int]
         return count
 
     return write
-
-
-def _laspy() -> Any:
-    try:
-        import laspy  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        msg = 'LAS and LAZ files are written by laspy: pip install "radarsdf[las]"'
-        raise ImportError(msg) from error
-    return laspy
 
 
 def _extra(part: NDArray[Any]) -> dict[str, str]:

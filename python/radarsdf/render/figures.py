@@ -7,6 +7,8 @@ from __future__ import annotations
 import io
 from typing import Any
 
+from radarsdf.extras import require
+
 
 def new_figure(**options: Any) -> Any:
     """A figure of matplotlib, which `options` are for.
@@ -14,14 +16,12 @@ def new_figure(**options: Any) -> Any:
     Raises
     ------
     ImportError
-        If matplotlib is not installed. It comes with the extra `plot`.
+        If matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
-        from matplotlib.figure import Figure  # noqa: PLC0415
-    except ImportError as error:
-        msg = 'pictures need matplotlib: pip install "radarsdf[plot]"'
-        raise ImportError(msg) from error
+    require("matplotlib", what="pictures need")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - an extra
+    from matplotlib.figure import Figure  # noqa: PLC0415 - likewise
+
     figure = Figure(**options)
     FigureCanvasAgg(figure)
     return figure

@@ -4,20 +4,9 @@
 
 from __future__ import annotations
 
-import importlib
-
-_EXTRA_OF = {"matplotlib": "plot", "viser": "view"}
+from radarsdf.extras import require
 
 
 def require_extras() -> None:
     """Raise an ImportError that says what to install, if a library is missing. To be called before the work."""
-    missing = []
-    for name in _EXTRA_OF:
-        try:
-            importlib.import_module(name)
-        except ImportError:
-            missing.append(name)
-    if missing:
-        extras = ",".join(_EXTRA_OF[name] for name in missing)
-        msg = f'a report needs {" and ".join(missing)}: pip install "radarsdf[{extras}]"'
-        raise ImportError(msg)
+    require("matplotlib", "viser", what="a report needs")

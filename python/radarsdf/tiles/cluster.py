@@ -8,7 +8,8 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from typing import Any
+
+from radarsdf.extras import require
 
 _CONNECT_S = 10.0
 _RESOURCE = "MB"  # what workers may say that they have: dask worker --resources "MB=8000"
@@ -30,13 +31,8 @@ def cluster_executor(address: str, memory_bytes: int) -> Iterator[Executor]:
     MemoryError
         If no worker has so much memory.
     """
-    try:
-        from distributed import Client  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        msg = 'a cluster needs dask.distributed: pip install "radarsdf[cluster]"'
-        raise ImportError(msg) from error
-    client_of: Any = Client  # without types, and may not be installed
-    with client_of(address, timeout=_CONNECT_S) as client:
+    distributed = require("distributed", what="a cluster needs")
+    with distributed.Client(address, timeout=_CONNECT_S) as client:
         workers = list(client.scheduler_info(n_workers=-1)["workers"].values())
         said = [worker["resources"].get(_RESOURCE, 0) for worker in workers]
         largest = max((worker["memory_limit"] or math.inf for worker in workers), default=math.inf)

@@ -17,6 +17,7 @@ from http import HTTPStatus
 from typing import Any
 
 from radarsdf.checks import whole_number
+from radarsdf.extras import require
 from radarsdf.view.guarding import MAX_MESSAGE_BYTES, bounded, why_refused
 
 _PORTS_TRIED = 100
@@ -29,11 +30,7 @@ _STARTING = threading.Lock()
 
 def require_viser() -> None:
     """Raise an ImportError that says what to install, if viser is missing."""
-    try:
-        import viser  # noqa: F401, PLC0415 - an extra
-    except ImportError as error:
-        msg = 'the viewer needs viser: pip install "radarsdf[view]"'
-        raise ImportError(msg) from error
+    require("viser", what="the viewer needs")
 
 
 def free_port(host: str, port: int, *, exactly: bool) -> int:
