@@ -15,6 +15,7 @@ import numpy as np
 import viser
 import zstandard
 from numpy.typing import NDArray
+from radarsdf.view import light
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -159,12 +160,20 @@ class Glb(NamedTuple):
     """(V, 3)."""
     faces: NDArray[np.uint32]
     """(F, 3)."""
-    colors: NDArray[np.uint8]
-    """(V, 3) linear in light, as glTF has them."""
+    light: NDArray[np.float32]
+    """(V, 3) linear, as glTF has colours."""
+
+    @property
+    def colors(self) -> NDArray[np.float64]:
+        """(V, 3) sRGB that the page shows, 0 to 255: after three.js's ACESFilmicToneMapping."""
+        a, b, c, d, e = light._FIT
+        x = self.light.astype(np.float64) @ light._IN.T / light._EXPOSURE
+        linear = np.clip((x * (x + a) - b) / (x * (c * x + d) + e) @ light._OUT.T, 0, 1)
+        return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
     @classmethod
     def of(cls, data: bytes) -> Glb:
-        """Read it. trimesh would drop the colours of a mesh that has a material too."""
+        """Read it."""
         described = int.from_bytes(data[12:16], "little")
         tree = json.loads(data[20 : 20 + described])
         binary = data[28 + described :]
@@ -180,5 +189,5 @@ class Glb(NamedTuple):
         return cls(
             array(attributes["POSITION"], "<f4", 3),
             array(primitive["indices"], "<u4", 3),
-            array(attributes["COLOR_0"], "u1", 4)[:, :3],
+            array(attributes["COLOR_0"], "<f4", 3),
         )

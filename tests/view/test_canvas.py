@@ -10,11 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radarsdf.view import canvas as module
-from radarsdf.view.canvas import Colors, SurfaceCanvas
+from radarsdf.view.canvas import SurfaceCanvas
 from radarsdf.view.painter import Wish
+from radarsdf.view.quantities import quantities_of
 from radarsdf.view.surface import Surface
 
-SEES_ALL = Wish((0.0, 0.0, 1.5), max_uncertainty_m=9.0, min_confidence=0.0)
+SEES_ALL = Wish((0.0, 0.0, 1.5), max_uncertainty_m=9.0, min_confidence=0.0, quantity="intensity")
 MOVING = replace(SEES_ALL, coarse=True, sensor=(3.0, 0.0, 1.5))
 
 
@@ -50,8 +51,9 @@ def page(sharp_map, monkeypatch):
     scene, waits = Scene(), []
     monkeypatch.setattr(module, "wait_until_drawn", lambda *_: waits.append(scene.seen()))
     surface = Surface.of(sharp_map, 0.4, max_vertices=100_000, progress=False)
+    quantities = quantities_of(sharp_map, surface, None, SEES_ALL.sensor)
     shown = []
-    return scene, SurfaceCanvas(scene, sharp_map, surface, Colors(40, 70), None, shown.append), waits, shown
+    return scene, SurfaceCanvas(scene, sharp_map, surface, quantities, None, shown.append), waits, shown
 
 
 def never():
@@ -62,7 +64,8 @@ def test_something_is_seen_while_a_mesh_is_on_its_way(page):
     nodes, canvas, waits, shown = page
     canvas.show_mesh(SEES_ALL, never)
     assert nodes.seen() == ["mesh 1"]
-    canvas.show_mesh(SEES_ALL, never)  # by a slider: the old one stays until the new one is drawn
+    less = replace(SEES_ALL, max_uncertainty_m=8.0)
+    canvas.show_mesh(less, never)  # by a slider: the old one stays until the new one is drawn
     assert waits.pop() == ["mesh 1", "mesh 2"]
     assert nodes.seen() == ["mesh 2"]
     canvas.show_cloud(MOVING)
@@ -71,7 +74,7 @@ def test_something_is_seen_while_a_mesh_is_on_its_way(page):
     assert waits.pop() == ["cloud", "mesh 3"]
     assert nodes.seen() == ["mesh 3"]
     assert "/surface/mesh 2" not in nodes.nodes
-    assert shown == [SEES_ALL, SEES_ALL, MOVING]
+    assert shown == [SEES_ALL, less, MOVING]
 
 
 def test_what_is_superseded_is_not_taken_for_drawn(page):
@@ -107,3 +110,17 @@ def test_the_cloud_hides_what_the_mesh_hides(page, sharp_map):
     assert 0 < len(seen) < len(canvas._spread)
     assert (sharp_map.uncertainty(seen) <= limit * 1.01).all()
     assert len(canvas._cloud.colors) == len(seen)
+
+
+def test_what_does_not_change_is_not_sent_again(page):
+    nodes, canvas, _, shown = page
+    by_height = replace(SEES_ALL, quantity="height")
+    canvas.show_mesh(by_height, never)
+    moved = replace(by_height, sensor=MOVING.sensor, coarse=True)
+    canvas.show_cloud(moved)  # the sensor moves, and the height is the same from everywhere
+    canvas.show_mesh(moved, never)
+    assert (nodes.seen(), canvas.sent, shown) == (["mesh 1"], 1, [by_height, moved])
+    canvas.show_mesh(replace(moved, quantity="intensity"), never)
+    canvas.show_cloud(MOVING)
+    canvas.show_mesh(moved, never)  # of another quantity, while the cloud is seen
+    assert (nodes.seen(), canvas.sent) == (["mesh 3"], 3)

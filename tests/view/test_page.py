@@ -7,7 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from radarsdf.io import Scans
+from radarsdf.map.colors import intensity_colors
+from radarsdf.view.light import shaded
 from radarsdf.view.viewer import Viewer
+from scipy.spatial import cKDTree
 
 pytest.importorskip("viser", reason="the extra view is not installed")
 
@@ -20,7 +23,7 @@ def test_a_drag_and_a_click(sharp_map, scene):
     scans = Scans(scene.points, scene.poses, scene.intensities)
     with (
         Viewer(sharp_map, scans, voxel_size=0.4, port=0, progress=False) as viewer,
-        open_page(f"http://127.0.0.1:{viewer.port}", 800, 450) as page,
+        open_page(f"http://127.0.0.1:{viewer.port}", 900, 450) as page,
     ):
         page.wait_until(lambda: drawn(page.screenshot()) > 8_000)
         camera = camera_of(viewer._server)
@@ -50,6 +53,38 @@ def test_a_drag_and_a_click(sharp_map, scene):
 
         # The surface has other colours now.
         both = (before.min(axis=2) < 235) & (after.min(axis=2) < 235)
-        both[:, 470:] = False  # the panel
+        both[:, 570:] = False  # the panels
         change = np.abs(after.astype(int) - before)[both].mean()
         assert change > 3
+
+
+def _of_scale(pixels):
+    """Whether each colour (N, 3) is one of the scale, as it is or as dark as a shade makes it."""
+    scale = intensity_colors(np.linspace(0, 1, 256), 0, 1)[:, :3]
+    shades = np.concatenate([shaded(scale, np.full(256, factor)) for factor in np.linspace(0.87, 1, 8)])
+    return cKDTree(shades.astype(float)).query(pixels.astype(float))[0] < 6
+
+
+def test_a_narrow_screen_shows_the_map_in_the_colours_of_the_scale(sharp_map):
+    with (
+        Viewer(sharp_map, voxel_size=0.4, port=0, progress=False) as viewer,
+        open_page(f"http://127.0.0.1:{viewer.port}", 390, 844) as page,
+    ):
+        viewer._gizmo.visible = False
+        page.wait_until(lambda: page.tab.get_by_text("Reset view").count() > 0)
+        seen = page.settle()[170:540]  # without the panel, and what the page says of the graphics card
+        pixels = seen[seen.min(axis=2) < 200]
+        assert len(pixels) > 2_000
+        assert _of_scale(pixels).mean() > 0.9  # edges of triangles are mixed with the white behind them
+
+        # All of the surface is in the frame, and the controls are folded.
+        camera = camera_of(viewer._server)
+        corners = np.array([pixel_of(camera, point) for point in viewer._extent[::10]])
+        assert (corners > 0).all()
+        assert (corners < [390, 844]).all()
+        panel = page.tab.get_by_text("radarsdf", exact=True).last.locator(
+            "xpath=ancestor::div[contains(@style,'position: fixed')]"
+        )
+        assert panel.bounding_box()["height"] < 0.3 * 844
+        page.tab.get_by_role("button", name="Expand panel controls").click()
+        page.wait_until(lambda: page.tab.get_by_text("confidence ≥").is_visible())

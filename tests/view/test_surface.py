@@ -7,7 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from radarsdf.map.colors import intensity_colors
+from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import glb
+from radarsdf.view.light import shaded
 from radarsdf.view.picking import first_hit
 from radarsdf.view.surface import Surface
 from radarsdf.view.thinning import spread_evenly, thinned
@@ -91,9 +94,40 @@ def test_a_glb_has_the_colors_that_were_given():
     mesh = Glb.of(glb(SQUARE, TWO, colors))
     np.testing.assert_array_equal(mesh.faces, TWO)
     np.testing.assert_array_equal(mesh.vertices, SQUARE)
-    linear = mesh.colors / 255  # glTF is linear in light
-    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    np.testing.assert_allclose(255 * shown, colors, atol=7)
+    np.testing.assert_allclose(mesh.colors, colors, atol=0.5)
+
+
+def test_a_shade_keeps_the_hue():
+    colors = intensity_colors(np.linspace(0, 1, 64), 0, 1)[:, :3]
+    whole, half = (_oklab(shaded(colors, np.full(64, factor))) for factor in (1.0, 0.87))
+    np.testing.assert_array_equal(shaded(colors, np.ones(64)), colors)
+    np.testing.assert_allclose(half, 0.87 * whole, atol=0.004)  # lightness and chroma; colours are rounded
+
+
+def _oklab(colors):
+    srgb = colors / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    to_lms = [[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]]
+    to_lab = [[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]]
+    return np.cbrt(linear @ np.transpose(to_lms)) @ np.transpose(to_lab)
+
+
+def test_all_is_seen_and_the_frame_is_filled():
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(500, 3)) * [40, 6, 2] + [500, -300, 20]
+    for aspect in (0.4, 1.0, 2.4):
+        position, look_at = look_at_all(points, np.array([-0.3, -0.6, 0.5]), aspect, fov_rad=0.9)
+        forward = (look_at - position) / np.linalg.norm(look_at - position)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        depth = (points - position) @ forward
+        x = (points - position) @ right / depth / aspect
+        y = (points - position) @ np.cross(right, forward) / depth
+        share = np.abs([x, y]).max(axis=1) / np.tan(0.45)
+        assert 0.85 < share.max() < 0.95  # of half the frame
+        assert (depth > 0).all()
+        tight = x if share[0] > share[1] else y
+        assert tight.min() == pytest.approx(-tight.max())  # in the middle
 
 
 def test_a_ray_meets_the_nearest_triangle():

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import threading
 from types import SimpleNamespace
@@ -12,8 +13,11 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import Scans
+from radarsdf.map.colors import intensity_colors
+from radarsdf.view.light import shaded
 from radarsdf.view.serving import start_server
 from radarsdf.view.viewer import Viewer
+from scipy.spatial import cKDTree
 
 from ..conftest import ground_and_wall
 
@@ -40,6 +44,7 @@ def client(viewer):
     with PlainClient(viewer.host, viewer.port) as client:
         client.wait_for(lambda message: message.kind == "ReplayDoneMessage")
         client.wait_for(lambda message: message.kind == "GlbMessage")
+        client.wait_for(lambda m: m.kind == "SetCameraLookAtMessage" and not m.message["initial"])
         yield client
 
 
@@ -74,7 +79,9 @@ def test_a_drag_recolours_few_points_and_then_the_mesh(client, viewer, sharp_map
     updates = [m for m in client.received(before) if m.changes(CLOUD, "colors") and m.at_s < ended_s]
     assert len(updates) >= 5  # of at most 20; twice as many on an idle machine
     moving = [m for m in client.received(before) if m.at_s < ended_s]
-    assert {m.kind for m in moving} <= {"SceneNodeUpdateMessage", "SetSceneNodeVisibilityMessage"}
+    assert {m.kind for m in moving} <= {
+        "SceneNodeUpdateMessage", "SetSceneNodeVisibilityMessage", "LocalStorageGetItemRequestMessage",
+    }  # fmt: skip
     assert not any(m.changes(CLOUD, "points") for m in moving)  # only what changed is sent
     points = len(viewer.surface.vertices)
     assert min(m.frame_bytes for m in updates) < 3 * points + 1000
@@ -82,18 +89,11 @@ def test_a_drag_recolours_few_points_and_then_the_mesh(client, viewer, sharp_map
     # The mesh is coloured for the last position of the drag, in the frame of the page.
     def difference(position):
         sensor = sharp_map.origin + position
-        colors = viewer.colors(sharp_map.intensity(viewer.surface.vertices, sensor)).astype(float)
-        shaded = colors * viewer.surface.brightness[:, None]
-        return np.abs(shaded - _srgb(mesh_of(new_mesh).colors)).mean()
+        colors = viewer.quantities["intensity"].colors(np.arange(len(viewer.surface.vertices)), sensor)
+        return np.abs(shaded(colors, viewer.surface.lightness) - mesh_of(new_mesh).colors).mean()
 
     assert difference([2.0, 0.0, 1.0]) < 2
     assert difference([1.0, 0.0, 1.0]) > 4
-
-
-def _srgb(linear):
-    """Colours as a screen shows them."""
-    linear = linear / 255
-    return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def test_limits_hide_triangles(client, viewer):
@@ -116,7 +116,7 @@ def test_the_walk_shows_a_scan_and_moves_the_sensor(client, viewer, scans, sharp
     before = len(client.received())
     slide(client, "scan", 4)
     client.wait_for(lambda m: m.changes("/scans/measured", "colors"), before)
-    client.wait_for(lambda m: m.changes("/scans/predicted", "colors"), before)
+    client.wait_for(lambda m: m.changes("/scans/predicted", "points"), before)
     moved = client.wait_for(lambda m: m.kind == "SetPositionMessage" and m.name == "/sensor", before)
     np.testing.assert_allclose(moved.message["position"], scans.poses[4, :3, 3] - sharp_map.origin, atol=1e-6)
     client.wait_for(is_mesh, before)  # coloured for that position
@@ -138,10 +138,8 @@ def test_a_click_tells_what_the_map_knows(client, viewer, sharp_map):
     eye = np.array([3.0, 0.5, 2.0])
     target = np.array([12.0, 1.0, 0.0]) - sharp_map.origin  # on the plane
     viewer._on_click(SimpleNamespace(ray_origin=eye, ray_direction=target - eye))
-    said = client.wait_for(
-        lambda m: "signed distance" in str(m.message.get("updates", {}).get("_markdown")), before
-    )
-    rows = dict(row.strip("| ").split(" | ") for row in said.message["updates"]["_markdown"].splitlines()[2:])
+    said = client.wait_for(lambda m: "signed distance" in _content(m), before)
+    rows = dict(re.findall("<tr><td>(.*?)</td><td>(.*?)</td></tr>", _content(said)))
     position = np.array([float(number) for number in rows["position"].removesuffix(" m").split(",")])
     assert position == pytest.approx([12, 1, 0], abs=0.3)
     assert float(rows["signed distance"].removesuffix(" m")) == pytest.approx(
@@ -157,7 +155,79 @@ def test_a_click_tells_what_the_map_knows(client, viewer, sharp_map):
     # A click into the sky says nothing, and leaves what was said.
     before = len(client.received())
     viewer._on_click(SimpleNamespace(ray_origin=eye, ray_direction=[0.0, 0.0, 1.0]))
-    assert not any("_markdown" in m.message.get("updates", {}) for m in client.received(before))
+    assert not any(map(_content, client.received(before)))
+
+
+def _content(message):
+    """The HTML that a message gives to a text of the panel."""
+    return str(message.message.get("updates", {}).get("content", ""))
+
+
+def test_the_mark_of_a_click_is_as_large_on_the_screen_from_near_and_far(client, viewer, sharp_map):
+    target = np.array([12.0, 1.0, 0.0]) - sharp_map.origin
+    for away_m in (10.0, 100.0):
+        before = len(client.received())
+        eye = target + away_m * np.array([-0.6, 0.0, 0.8])
+        viewer._on_click(SimpleNamespace(ray_origin=eye, ray_direction=target - eye))
+        mark = client.wait_for(lambda m: m.name == "/clicked" and m.kind == "IcosphereMessage", before)
+        assert mark.message["props"]["radius"] == pytest.approx(0.012 * away_m, rel=0.05)
+
+
+def test_the_surface_is_coloured_by_what_is_chosen(client, viewer, scans, sharp_map):
+    surface = viewer.surface
+    for name, values, words in (
+        ("uncertainty", surface.uncertainty_m, "uncertainty (standard error), m"),
+        ("confidence", surface.confidence, "confidence (probability)"),
+        ("height", surface.vertices[:, 2], "height, m"),
+    ):
+        before = len(client.received())
+        slide(client, "colour by", name)
+        low, high = (0, 1) if name == "confidence" else np.percentile(values, [2, 98])
+        said = client.wait_for(lambda m, words=words: words in _content(m), before)
+        assert f">{low:.3g}<" in _content(said)
+        assert f">{high:.3g}<" in _content(said)
+        shown = mesh_of(client.wait_for(is_mesh, before)).colors
+        expected = shaded(intensity_colors(values, low, high)[:, :3], surface.lightness)
+        np.testing.assert_allclose(shown, expected, atol=1)
+    before = len(client.received())
+    slide(client, "colour by", "observed")
+    shown = mesh_of(client.wait_for(is_mesh, before)).colors
+    returns = np.concatenate([scan.world_points for scan in scans])
+    edge_m = sharp_map.config.leaf_size_m
+    seen = cKDTree(returns).query(surface.vertices)[0] <= edge_m
+    assert 0.5 < seen.mean() < 1
+    np.testing.assert_array_equal(shown[:, 0] > 1.05 * shown[:, 2], ~seen)  # orange, not grey
+    assert f"bridged: no return within {edge_m:g} m" in _content(
+        client.wait_for(lambda m: "bridged" in _content(m), before)
+    )
+    slide(client, "colour by", "intensity")
+    client.wait_for(lambda m: "intensity" in _content(m), before)
+
+
+def test_predicted_returns_do_not_look_like_measured_ones(client):
+    clouds = {m.name: m.message["props"] for m in client.received() if m.kind == "PointCloudMessage"}
+    measured, predicted = clouds["/scans/measured"], clouds["/scans/predicted"]
+    assert measured["point_shape"] != predicted["point_shape"]
+    assert measured["point_size"] > 1.2 * predicted["point_size"]
+    legend = [m.message["props"]["content"] for m in client.received() if m.kind == "GuiHtmlMessage"]
+    assert any("measured" in text and "predicted" in text and "path of the sensor" in text for text in legend)
+
+
+def test_the_view_is_reset_for_who_asks(client, viewer):
+    before = len(client.received())
+    client.send(
+        "ViewerCameraMessage", wxyz=(1.0, 0.0, 0.0, 0.0), position=(5.0, 6.0, 7.0), fov=1.0, near=0.1, far=1e3,
+        image_height=800, image_width=400, look_at=(0.0, 0.0, 1.0), up_direction=(0.0, 0.0, 1.0),
+    )  # fmt: skip
+    slide(client, "Reset view", value=True)
+    look = viewer._look(0.5)
+    moved = client.wait_for(lambda m: m.kind == "SetCameraPositionMessage", before)
+    np.testing.assert_allclose(moved.message["position"], look.position)
+    turned = client.wait_for(
+        lambda m: m.kind == "SetCameraLookAtMessage" and np.allclose(m.message["look_at"], look.look_at),
+        before,
+    )
+    assert turned
 
 
 def test_the_page_cannot_be_made_public(viewer):
@@ -258,7 +328,7 @@ def test_a_map_far_away_without_intensities():
         sensor = scene.poses[:, :3, 3].mean(axis=0) - radar_map.origin + [0, 0, 2]
         viewer._on_click(SimpleNamespace(ray_origin=sensor.tolist(), ray_direction=[8.0, 0.0, -3.0]))
         said = client.wait_for(lambda m: "signed distance" in str(m.message))
-        assert "position | 5000" in str(said.message)
+        assert "<td>position</td><td>5000" in str(said.message)
         assert "intensity" not in str(said.message)
         nodes = {message.name for message in client.received()}
         assert {"/scans/measured", "/scans/predicted"} <= nodes

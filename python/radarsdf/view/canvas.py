@@ -9,16 +9,18 @@ ended, beside what is there, which is hidden once the page has drawn the new one
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.map.colors import NEUTRAL, intensity_colors
+from radarsdf.map.colors import NEUTRAL
 from radarsdf.tiles.any_map import AnyMap
 from radarsdf.view.glb import glb
+from radarsdf.view.light import shaded
 from radarsdf.view.painter import Wish
+from radarsdf.view.quantities import Quantity
 from radarsdf.view.serving import wait_until_drawn
 from radarsdf.view.surface import Surface
 from radarsdf.view.thinning import spread_evenly
@@ -30,25 +32,8 @@ DRAG_POINTS = 30_000
 _POINT_EDGES = 1.4  # size of a point in distances of neighbours, so that there are no holes between them
 
 
-class Colors:
-    """Colours of intensities on a scale that does not change.
-
-    Parameters
-    ----------
-    low, high
-        Limits of the scale, sensor units.
-    """
-
-    def __init__(self, low: float, high: float) -> None:
-        self.low, self.high = low, high
-
-    def __call__(self, intensities: NDArray[Any]) -> NDArray[np.uint8]:
-        """(N, 3) sRGB of intensities (N,)."""
-        return intensity_colors(intensities, self.low, self.high)[:, :3]
-
-
 class SurfaceCanvas:
-    """Draws the surface, coloured by the intensity predicted for the sensor, and the scan of the walk.
+    """Draws the surface, coloured by a quantity, and the scan of the walk.
 
     Parameters
     ----------
@@ -58,8 +43,8 @@ class SurfaceCanvas:
         The map.
     surface
         Its mesh.
-    colors
-        None: the map has no intensities, and the surface is grey.
+    quantities
+        What it can be coloured by, by name.
     walk
         The scans, if there are any.
     shown
@@ -71,16 +56,17 @@ class SurfaceCanvas:
         server: Any,
         radar_map: AnyMap,
         surface: Surface,
-        colors: Colors | None,
+        quantities: Mapping[str, Quantity],
         walk: Walk | None,
         shown: Callable[[Wish], None],
     ) -> None:
-        self._server, self._map, self._surface, self._colors = server, radar_map, surface, colors
+        self._server, self._surface, self._quantities = server, surface, quantities
         self._walk, self._shown = walk, shown
         self._local = (surface.vertices - radar_map.origin).astype(np.float32)
         self._spread, _, edge_m = spread_evenly(surface.vertices, DRAG_POINTS, surface.spacing_m)
         self._rows = self._spread
         self._limits: tuple[float, float] | None = None  # of what is in the cloud
+        self._drawn: Hashable = None  # what the mesh depends on
         self._meshes: list[Any] = []  # the newest is last; others are removed when the page has drawn that
         self.sent = 0
         """Meshes that were sent so far."""
@@ -91,7 +77,7 @@ class SurfaceCanvas:
         self.node: Any = server.scene.add_frame("/surface", show_axes=False)
         """The parent of mesh and cloud."""
         self._cloud: Any = None
-        if colors is not None:
+        if any(quantity.of_sensor for quantity in quantities.values()):
             self._cloud = server.scene.add_point_cloud(
                 "/surface/cloud",
                 self._local[self._spread],
@@ -110,14 +96,14 @@ class SurfaceCanvas:
 
     def show_cloud(self, wish: Wish) -> None:
         """See `Canvas`."""
-        if self._cloud is None:
-            return
+        if not self._quantities[wish.quantity].of_sensor:
+            return  # the mesh stays as it is
         limits = (wish.max_uncertainty_m, wish.min_confidence)
         others = limits != self._limits
         if others:
             self._rows = self._spread[self._surface.kept(*limits)[self._spread]]
             self._limits = limits
-        colors = self._predicted(self._rows, wish)
+        colors = self._colors(self._rows, wish)
         with self._server.atomic():
             if others:
                 self._cloud.points = self._local[self._rows]
@@ -129,8 +115,13 @@ class SurfaceCanvas:
 
     def show_mesh(self, wish: Wish, superseded: Callable[[], bool]) -> None:
         """See `Canvas`."""
-        rows, faces = self._surface.part(self._surface.kept(wish.max_uncertainty_m, wish.min_confidence))
-        colors = self._predicted(rows, wish)
+        limits = (wish.max_uncertainty_m, wish.min_confidence)
+        drawn = (limits, wish.quantity, wish.sensor if self._quantities[wish.quantity].of_sensor else None)
+        if drawn == self._drawn and not self.coarse:
+            self._shown(wish)
+            return
+        rows, faces = self._surface.part(self._surface.kept(*limits))
+        colors = self._colors(rows, wish)
         if superseded():
             return
         old, self._meshes = self._meshes, []
@@ -147,18 +138,15 @@ class SurfaceCanvas:
         with self._server.atomic():
             for mesh in old:
                 mesh.remove()
-            self.coarse = False
+            self.coarse, self._drawn = False, drawn
             if self._cloud is not None:
                 _set_visible(self._cloud, visible=False)
         self._shown(wish)
 
-    def _predicted(self, rows: NDArray[np.int64], wish: Wish) -> NDArray[np.uint8]:
+    def _colors(self, rows: NDArray[np.int64], wish: Wish) -> NDArray[np.uint8]:
         """(N, 3) colours of vertices (N,)."""
-        colors = np.full((len(rows), 3), NEUTRAL, np.uint8)
-        if self._colors is not None and len(rows):
-            colors = self._colors(self._map.intensity(self._surface.vertices[rows], np.array(wish.sensor)))
-        shaded: NDArray[np.uint8] = (colors * self._surface.brightness[rows, None]).astype(np.uint8)
-        return shaded
+        colors = self._quantities[wish.quantity].colors(rows, wish.sensor)
+        return shaded(colors, self._surface.lightness[rows])
 
 
 def _set_visible(handle: Any, *, visible: bool) -> None:

@@ -28,6 +28,8 @@ class Wish:
     """Vertices of more uncertainty are hidden."""
     min_confidence: float
     """Vertices of less confidence are hidden."""
+    quantity: str = ""
+    """Name of what the surface is coloured by."""
     scan: int | None = None
     """The scan whose returns are shown."""
     coarse: bool = False

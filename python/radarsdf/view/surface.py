@@ -22,7 +22,7 @@ _Rows = NDArray[np.int64]
 
 _FEWEST = 1000  # vertices: less is not worth a look
 _TO_LIGHT = (-0.35, -0.5, 0.79)
-_SHADE = 0.6  # brightness where the light does not come: colours must still tell the intensity
+_SHADE = 0.87  # lightness where the light does not come: colours must still be those of the scale
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Surface:
     """(V,) see `RadarMap.uncertainty`."""
     confidence: NDArray[np.float32]
     """(V,) see `RadarMap.confidence`."""
-    brightness: NDArray[np.float32]
-    """(V,) how bright the surface is to be drawn, 0 to 1, so that its shape is seen."""
+    lightness: NDArray[np.float32]
+    """(V,) factor of the lightness of colours, at most 1, so that the shape is seen."""
     spacing_m: float
     """How far apart vertices are: the edge of the voxels, or more if the mesh was thinned."""
 
@@ -71,7 +71,7 @@ class Surface:
             np.asarray(mesh.faces, np.int32),
             np.asarray(attributes["uncertainty_m"], np.float32),
             np.asarray(attributes["confidence"], np.float32),
-            _brightness(np.asarray(mesh.vertex_normals, np.float64)),
+            _lightness(np.asarray(mesh.vertex_normals, np.float64)),
             edge_m,
         )
 
@@ -85,6 +85,6 @@ class Surface:
         return np.flatnonzero(used), faces
 
 
-def _brightness(normals: _Floats) -> NDArray[np.float32]:
+def _lightness(normals: _Floats) -> NDArray[np.float32]:
     light: NDArray[np.float64] = np.clip(normals @ np.array(_TO_LIGHT), 0.0, 1.0)
     return (_SHADE + (1 - _SHADE) * light).astype(np.float32)

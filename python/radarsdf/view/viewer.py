@@ -12,10 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.io.sequence import Scans
 from radarsdf.tiles.any_map import AnyMap
-from radarsdf.view.canvas import DRAG_POINTS, Colors, SurfaceCanvas
+from radarsdf.view.canvas import SurfaceCanvas
 from radarsdf.view.controls import Controls
+from radarsdf.view.framing import FOV_RAD, Look, look_at_all
 from radarsdf.view.painter import HELD_S, SLID_S, Painter, Wish
 from radarsdf.view.picking import first_hit
+from radarsdf.view.quantities import Colors, quantities_of
 from radarsdf.view.serving import free_port, require_viser, start_server, stop_server
 from radarsdf.view.surface import Surface
 from radarsdf.view.walk import Walk
@@ -23,10 +25,11 @@ from radarsdf.view.walk import Walk
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-_SCALE_PERCENTILES = (2.0, 98.0)
-_TO_CAMERA = np.array([-0.33, -0.57, 0.5])  # of the first view, in diagonals of what is to be seen
-_BESIDE_PANEL = np.array([0.1, -0.06, 0.0])  # what is looked at is not behind the panel on the right
+_TO_EYE = np.array([-0.33, -0.57, 0.5])  # of the first view
+_ASPECT = 1.3  # of the frame until a page tells its own
 _GIZMO_SHARE = 0.06  # size of the handles of the sensor in diagonals of the surface
+_MARK_SHARE = 0.012  # radius of the mark of a click in distances to it: so large on the screen, near and far
+_MARK_COLOR = (0, 190, 255)  # not one of a scale
 _CLICKED = "/clicked"
 
 
@@ -35,9 +38,9 @@ class Viewer:
 
     While the sensor is dragged, at most 30,000 vertices are recoloured, spread evenly over the surface: intensities of
     all take too long for ten updates a second on two cores. All are recoloured when the drag ends. The scale of the
-    colours does not change: it is the range from the 2nd to the 98th percentile of what is predicted for the first
-    position. The page shows the map's local frame, so that float32 is fine enough for any coordinates; numbers are
-    world coordinates.
+    colours does not change: it is the range from the 2nd to the 98th percentile of the values on the surface, of
+    intensities that of what is predicted for the first position. The page shows the map's local frame, so that float32
+    is fine enough for any coordinates; numbers are world coordinates.
 
     Parameters
     ----------
@@ -119,42 +122,71 @@ class Viewer:
 
     def _fill(self, scans: Scans | None) -> None:
         origin, vertices = self._map.origin, self.surface.vertices
-        path = np.zeros((1, 3)) if scans is None else scans.poses[:, :3, 3] - origin
-        low, high = np.percentile(vertices - origin, [1, 99], axis=0)
-        low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
-        size_m = float(np.linalg.norm(high - low))
+        path = np.zeros((0, 3)) if scans is None else scans.poses[:, :3, 3] - origin
+        self._extent = np.concatenate([vertices - origin, path])
+        size_m = float(np.linalg.norm(np.ptp(self._extent, axis=0)))
         server = self._server
-        look_at = (low + high) / 2 + size_m * _BESIDE_PANEL
-        server.initial_camera.look_at = tuple(look_at)
-        server.initial_camera.position = tuple(look_at + size_m * _TO_CAMERA)
+        look = self._look(_ASPECT)
+        server.initial_camera.fov = FOV_RAD
+        server.initial_camera.position, server.initial_camera.look_at = map(tuple, look)
         start = origin if scans is None else scans.poses[0, :3, 3]
         first = (float(start[0]), float(start[1]), float(start[2]))
-        colors = None
-        if self._map.has_intensity:
-            step = max(1, len(vertices) // DRAG_POINTS)
-            predicted = self._map.intensity(vertices[::step], np.array(first))
-            colors = Colors(*(float(limit) for limit in np.percentile(predicted, _SCALE_PERCENTILES)))
+        self.quantities = quantities_of(self._map, self.surface, scans, first)
+        """What the surface can be coloured by."""
+        measured = None
+        if "intensity" in self.quantities:
+            scale = self.quantities["intensity"].scale
+            measured = scale if isinstance(scale, Colors) else None
         self._walk = None
         count = 0 if scans is None else len(scans)
-        self.colors = colors
-        """The scale of the colours. None: the map has no intensities."""
-        self._controls = controls = Controls(server, self.surface, colors, count)
+        self._controls = controls = Controls(server, self.surface, self.quantities, measured, count)
         if scans is not None:
-            self._walk = Walk(server, self._map, scans, colors, controls.say_of_scan)
+            self._walk = Walk(server, self._map, scans, measured, controls.say_of_scan)
         self._clicked: NDArray[np.float64] | None = None
-        self._canvas = SurfaceCanvas(server, self._map, self.surface, colors, self._walk, self._describe)
+        self._canvas = SurfaceCanvas(
+            server, self._map, self.surface, self.quantities, self._walk, self._describe
+        )
         wish = Wish(
             first,
             max_uncertainty_m=controls.max_uncertainty_m,
             min_confidence=controls.min_confidence,
+            quantity=controls.quantity,
             scan=None if self._walk is None else 0,
         )
         self._gizmo: Any = None
-        if colors is not None:
+        if self._map.has_intensity:
             self._add_sensor(np.array(first) - origin, size_m)
         self._painter = Painter(self._canvas, wish)
-        controls.connect(self._painter, self._canvas, self._walk, self._go_to_scan)
+        controls.connect(self._painter, self._canvas, self._walk, self._go_to_scan, self._look_at_all)
+        server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
+
+    def _look(self, aspect: float) -> Look:
+        return look_at_all(self._extent, _TO_EYE, aspect)
+
+    def _look_at_all(self, client: Any) -> Look:
+        """Let a page show all that there is."""
+        camera = client.camera
+        look = self._look(_aspect(camera))
+        with client.atomic():
+            camera.up_direction = (0.0, 0.0, 1.0)
+            camera.fov = FOV_RAD
+            camera.position, camera.look_at = look
+        return look
+
+    # Coroutines, because viser would run functions in several threads, in any order.
+    async def _on_connect(self, client: Any) -> None:
+        """Let a new page show all, also after its frame has changed, until somebody looks elsewhere."""
+        first = self._look(_ASPECT)  # which a page may take after it was told a better one
+        aspect, look = _aspect(client.camera), self._look_at_all(client)
+
+        async def on_update(camera: Any) -> None:
+            nonlocal aspect, look
+            untouched = _is_at(camera, look) and _aspect(camera) != aspect
+            if untouched or (_is_at(camera, first) and not _is_at(camera, look)):
+                aspect, look = _aspect(camera), self._look_at_all(client)
+
+        client.camera.on_update(on_update)
 
     def _add_sensor(self, position: NDArray[np.float64], size_m: float) -> None:
         scale = _GIZMO_SHARE * size_m
@@ -193,8 +225,14 @@ class Viewer:
         if point is None:
             return
         self._clicked = point + self._map.origin
+        away_m = float(np.linalg.norm(point - np.asarray(event.ray_origin)))
         self._server.scene.add_icosphere(
-            _CLICKED, 1.5 * self.surface.spacing_m, (214, 39, 40), position=tuple(point)
+            _CLICKED,
+            max(_MARK_SHARE * away_m, 0.5 * self.surface.spacing_m),
+            _MARK_COLOR,
+            position=tuple(point),
+            cast_shadow=False,
+            receive_shadow=False,
         )
         self._describe(self._painter.newest)
 
@@ -224,3 +262,13 @@ class Viewer:
         if self._walk is not None and self._walk.every > 1:
             notes.append(f"of all returns together, one in {self._walk.every} is shown")
         return notes
+
+
+def _aspect(camera: Any) -> float:
+    """Width of a page's frame over its height, within what a screen can have."""
+    return float(np.clip(camera.image_width / max(camera.image_height, 1), 0.1, 10.0))
+
+
+def _is_at(camera: Any, look: Look) -> bool:
+    """Whether a page looks from there."""
+    return bool(np.allclose(camera.position, look.position, atol=0.01))

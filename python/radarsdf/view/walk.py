@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.sequence import Scan, Scans
-from radarsdf.map.colors import NEUTRAL
 from radarsdf.tiles.any_map import AnyMap
 
 ALL_RETURNS = 200_000
 """Returns of all scans that are shown together at most."""
-_POINT_M = 0.2
-_PATH_COLOR = (40, 44, 52)
-_PREDICTED_COLOR = (31, 119, 180)  # without intensities
+PATH_COLOR = (40, 44, 52)
+MEASURED_COLOR = (0, 72, 140)
+"""Without intensities."""
+PREDICTED_COLOR = (0, 158, 115)
+"""Not a colour of the scale: what is predicted and lies on the surface is seen. Its intensity is that of the surface."""
 _SHAPES = {"measured": "circle", "predicted": "diamond", "all": "circle"}
+_SIZES_M = {"measured": 0.25, "predicted": 0.2, "all": 0.2}
 
 
 class Walk:
@@ -58,7 +60,7 @@ class Walk:
         self.path: Any = server.scene.add_line_segments(
             "/scans/path",
             np.stack([path[:-1], path[1:]], axis=1),
-            _PATH_COLOR,
+            PATH_COLOR,
             thickness=3.0,
             thickness_units="screen",
         )
@@ -81,8 +83,8 @@ class Walk:
         view = self._map.render(self._poses[index])
         measured = None if self._intensities is None else self._intensities[index]
         with self._server.atomic():
-            self._draw("measured", world, self._colors_of(measured, len(world), NEUTRAL))
-            predicted = self._colors_of(view.intensities, len(view), _PREDICTED_COLOR)
+            self._draw("measured", world, self._colors_of(measured, len(world)))
+            predicted = np.full((len(view), 3), PREDICTED_COLOR, np.uint8)
             self._draw("predicted", view.world_points, predicted)
         error = ""
         if measured is not None and self._map.has_intensity:
@@ -110,14 +112,12 @@ class Walk:
         step = self.every
         world = np.concatenate([self._in_world(i) for i in range(len(self))])[::step]
         measured = None if self._intensities is None else np.concatenate(self._intensities)[::step]
-        self._draw("all", world, self._colors_of(measured, len(world), NEUTRAL))
+        self._draw("all", world, self._colors_of(measured, len(world)))
 
-    def _colors_of(
-        self, intensities: NDArray[Any] | None, count: int, without: tuple[int, int, int]
-    ) -> NDArray[np.uint8]:
-        """(N, 3) sRGB of `count` returns; `without`: the colour of all where there are no intensities."""
+    def _colors_of(self, intensities: NDArray[Any] | None, count: int) -> NDArray[np.uint8]:
+        """(N, 3) sRGB of `count` returns that were measured."""
         if intensities is None or self._colors is None:
-            return np.full((count, 3), without, np.uint8)
+            return np.full((count, 3), MEASURED_COLOR, np.uint8)
         return self._colors(np.asarray(intensities, np.float64))
 
     def _in_world(self, index: int) -> NDArray[np.float64]:
@@ -134,7 +134,7 @@ class Walk:
             f"/scans/{what}",
             local,
             colors,
-            point_size=_POINT_M,
+            point_size=_SIZES_M[what],
             point_shape=_SHAPES[what],
             point_shading="flat",
             precision="float32",
