@@ -35,6 +35,13 @@ def test_good_scans_have_notes_and_a_next_command(folder, capsys):
     assert following == f"next: radarsdf fit {folder / 'good.npz'} -o good.safetensors"
 
 
+def test_the_next_command_has_the_settings_that_were_checked(folder, capsys):
+    settings = ["--quick", "--set", "returns.max_range_m=30"]
+    assert call("check", folder / "good.npz", *settings) == 0
+    following = capsys.readouterr().out.splitlines()[-1]
+    assert following.endswith("good.npz --quick --set returns.max_range_m=30 -o good.safetensors")
+
+
 def test_an_error_is_the_first_line_and_the_status(folder, capsys):
     assert call("check", folder / "inverted.npz") == 1
     lines = capsys.readouterr().out.splitlines()

@@ -25,7 +25,7 @@ def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     assert used.startswith("9000 of 9000 returns in 6 scans make the surface")
     assert fitted.startswith("fit ")
     assert written == f"written to {path}"
-    assert following == f"next: radarsdf mesh {path} -o {path.with_suffix('.ply')}"
+    assert following == f"next: radarsdf mesh {path} -o {path.with_suffix('.ply')} --voxel 0.2"
     sigma = radarsdf.load(path).report["noise"]
     assert noise == (
         f"noise {sigma['range_m']:.3f} m, azimuth {sigma['azimuth_rad']:.4f} rad, "
@@ -35,6 +35,12 @@ def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     assert not radar_map.has_intensity
     assert radar_map.config == radarsdf.FitConfig.quick()
     assert radar_map.report["returns"] == 6 * 1500
+
+
+def test_what_was_held_out_is_to_be_evaluated(scans_file, tmp_path, capsys):
+    path = tmp_path / "map.safetensors"
+    assert call("fit", scans_file, "-o", path, "--quick", "--holdout", 3) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"and: radarsdf eval {path} {scans_file} --holdout 3"
 
 
 def test_the_checkpoint_is_used_and_removed(scans_file, tmp_path, capsys):

@@ -11,6 +11,7 @@ import sys
 import pytest
 import radarsdf.cli.info
 from radarsdf.cli import COMMANDS, main
+from radarsdf.cli.tiles import STEPS
 
 ANSWERED = """
 import sys
@@ -51,11 +52,45 @@ def test_help_lists_every_command_and_imports_none():
     assert done.stdout.splitlines()[-1] == "imported:"
 
 
+def test_no_words_are_a_wish_for_help():
+    done, asked = answer(), answer("--help")
+    assert (done.returncode, done.stdout, done.stderr) == (0, asked.stdout, "")
+
+
+def test_the_version(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert (end.value.code, capsys.readouterr().out) == (0, f"radarsdf {radarsdf.__version__}\n")
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_help_of_a_step(step):
+    done = answer("tiles", step, "--help")
+    assert done.returncode == 0
+    assert f"usage: radarsdf tiles {step} " in done.stdout
+    assert STEPS[step] in done.stdout
+    assert ("--tile-size" in done.stdout) == (step == "plan")
+
+
+def test_the_value_of_an_option_is_no_step():
+    assert "usage: radarsdf tiles [-h] [--extrinsic" in answer("tiles", "-o", "plan", "--help").stdout
+
+
+@pytest.mark.parametrize(
+    "words", [["mesh"], ["view"], ["report"], ["eval"], ["demo"], ["tiles"], ["tiles", "mesh"]], ids=" ".join
+)
+def test_all_commands_that_make_a_mesh_have_the_options_of_one(words):
+    said = answer(*words, "--help").stdout
+    for option in ("--voxel M", "--min-confidence C", "--max-uncertainty M", "--min-component N", "--quiet"):
+        assert f" {option}" in said
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_of_a_command_imports_this_one_only(command):
     done = answer(command, "--help")
     assert done.returncode == 0
     assert f"usage: radarsdf {command} " in done.stdout
+    assert ("--out " in done.stdout) == ("-o OUT, --out OUT" in done.stdout)
     assert COMMANDS[command] in done.stdout
     assert done.stdout.splitlines()[-1] == f"imported: {command}"
 
@@ -63,7 +98,6 @@ def test_help_of_a_command_imports_this_one_only(command):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ([], "arguments are required: COMMAND"),
         (["paint"], "invalid choice: 'paint'"),
         (["--paint"], "arguments are required: COMMAND"),
         (["fit"], "one of the arguments -o/--out --dry-run is required"),
@@ -77,6 +111,11 @@ def test_help_of_a_command_imports_this_one_only(command):
         (["view", "map", "--port", "x"], "invalid int value: 'x'"),
         (["eval", "mesh"], "arguments are required: truth"),
         (["demo", "--scene", "moon"], "invalid choice: 'moon'"),
+        (["tiles", "scans"], "arguments are required: -o/--out"),
+        (["tiles", "plan"], "arguments are required: "),
+        (["tiles", "fit"], "arguments are required: folder"),
+        (["tiles", "clean", "city", "--quick"], "unrecognized arguments: --quick"),
+        (["tiles", "a.npz", "b.txt", "c", "-o", "city"], "unrecognized arguments: c"),
         (["info", "map", "more"], "unrecognized arguments: more"),
     ],
 )

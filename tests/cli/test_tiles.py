@@ -77,13 +77,9 @@ def test_a_tile_that_failed_is_named(city, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["plan"], "give SCANS"),
-        (["fit"], "takes one folder"),
         (["status", "nowhere"], "no such file or folder"),
         (["mesh", "nowhere"], "there is no folder"),
         (["clean", "nowhere"], "no such file or folder"),
-        (["clean"], "takes one folder"),
-        (["a.npz", "b.txt", "c", "-o", "city"], "give SCANS"),
         (["nowhere.npz", "-o", "city"], "does not exist"),
     ],
 )

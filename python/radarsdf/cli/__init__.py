@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises
     ------
     SystemExit
-        After ``--help``, with status 0, and after a usage error, with status 2.
+        After ``--help``, without words and after ``--version``, with status 0, and after a usage error, with status 2.
     """
     words = sys.argv[1:] if arguments is None else arguments
     if hasattr(
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ):  # a character that a terminal lacks must not cost the work before it
         sys.stdout.reconfigure(errors="replace")
     try:
-        options = _parser(words).parse_args(words)
+        options = _parser(words).parse_args(words or ["--help"])
     except SystemExit:
         try:
             say(end="")  # what help printed may still be on its way
@@ -106,6 +106,19 @@ class _Parser(argparse.ArgumentParser):
             self._within = False
 
 
+class _Version(argparse.Action):
+    """Looks the version up only where it is asked for: that takes as long as all of a help text."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **options: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, **options)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        import radarsdf
+
+        say(f"radarsdf {radarsdf.__version__}")
+        parser.exit()
+
+
 def whole_parser() -> argparse.ArgumentParser:
     """The parser with the arguments of all commands."""
     return _parser((), every=True)
@@ -116,14 +129,29 @@ def _parser(words: Sequence[str], every: bool = False) -> argparse.ArgumentParse
     parser = _Parser(
         prog="radarsdf",
         description="From 3D radar scans with known poses to a surface and a reflectance map, on a CPU.",
+        epilog="radarsdf COMMAND --help says more. To begin: radarsdf demo, or radarsdf check SCANS.",
     )
+    parser.add_argument("--version", action=_Version, help="print the version and end")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     chosen = next((word for word in words if not word.startswith("-")), None)
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text)
         if every or name == chosen:
-            _module(name).add_arguments(command)
+            _add_arguments(command, name, words)
     return parser
+
+
+def _add_arguments(parser: argparse.ArgumentParser, name: str, words: Sequence[str]) -> None:
+    """The arguments of a command; of one that has steps, those of the step that follows it on the command line."""
+    module = _module(name)
+    steps: dict[str, str] = getattr(module, "STEPS", {})
+    following = words[words.index(name) + 1 :][:1] if name in words else []
+    if not following or following[0] not in steps:
+        module.add_arguments(parser)
+        return
+    parsers = parser.add_subparsers(dest="step", required=True, metavar="STEP")
+    for step, text in steps.items():
+        module.add_step_arguments(parsers.add_parser(step, help=text, description=text), step)
 
 
 def _module(command: str) -> Any:

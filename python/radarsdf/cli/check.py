@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from radarsdf.cli.map_in import MAP_SUFFIX
-from radarsdf.cli.options import add_config_options, add_json, config_of
+from radarsdf.cli.options import add_config_options, add_json, config_of, config_words
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
 from radarsdf.cli.scans_in import add_scans, scans_of, words_of
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
     failed = any(finding.severity == "error" for finding in findings)
     # Here, and not beside the data: those may be on a disk that nobody should write to.
     target = shlex.quote(Path(os.path.abspath(options.scans)).stem + MAP_SUFFIX)  # noqa: PTH100 - links keep their names
-    words = words_of(options)
+    words = shlex.join([*words_of(options), *config_words(options)])
     following = f"radarsdf check {words}" if failed else f"radarsdf fit {words} -o {target}"
     results = Results(options)
     results.add(findings=[dataclasses.asdict(finding) for finding in findings], next=following)

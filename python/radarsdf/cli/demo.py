@@ -5,12 +5,20 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
+from radarsdf.cli.options import add_fit_options, add_json, add_surface, config_of, limits_of, progress_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from radarsdf import RadarMap
+    from radarsdf.io.scans import Scans
 
 SCENES = ("hugin", "oculii", "wall", "astyx")
 """The names in `radarsdf.simulate.SCENES`, which is not imported for a help text."""
@@ -21,8 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", choices=SCENES, default="hugin", help="default: hugin")
     parser.add_argument("--frames", type=int, help="number of scans; default: depends on the scene")
     parser.add_argument(
-        "--out", type=Path, default=Path("radarsdf_demo"), help="output folder; default: radarsdf_demo"
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("radarsdf_demo"),
+        help="the folder to write; default: radarsdf_demo",
     )
+    add_surface(parser)
     add_fit_options(parser)
     add_json(parser)
 
@@ -38,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf import fit
     from radarsdf.cli.held_out import add_intensity_errors
     from radarsdf.cli.saving import save_map
-    from radarsdf.evaluation import format_metrics, holdout, surface_metrics
+    from radarsdf.evaluation import holdout
     from radarsdf.io.files import check_outputs
     from radarsdf.io.meshes import write_mesh
     from radarsdf.io.scans import Scans, write_scans
@@ -52,7 +65,7 @@ def run(options: argparse.Namespace) -> None:
     results = Results(options)
     returns = sum(map(len, scans.points))
     results.add(
-        f"simulated {options.scene}: {returns} returns in {len(scans)} scans",
+        f"simulated a drive, {options.scene}: {returns} returns in {len(scans)} scans",
         returns=returns,
         scans=len(scans),
     )
@@ -64,13 +77,17 @@ def run(options: argparse.Namespace) -> None:
     save_map(radar_map, options.out / "map.safetensors")  # first: what comes after it can be had from the map
     started_s = time.perf_counter()
     viewpoint = scans.poses[len(scans.poses) // 2, :3, 3]
-    mesh = radar_map.mesh(viewpoint=viewpoint, progress=progress_of(options))
+    mesh = radar_map.mesh(
+        options.voxel, viewpoint=viewpoint, **limits_of(options), progress=progress_of(options)
+    )
     mesh_s = time.perf_counter() - started_s
-    results.add(f"fit {fit_s:.1f} s, mesh {mesh_s:.1f} s: {radar_map}", fit_s=fit_s, mesh_s=mesh_s)
+    results.add(
+        f"fitted a map to {len(train)} of them in {fit_s:.1f} s, and made a mesh of it in {mesh_s:.1f} s: {radar_map}",
+        fit_s=fit_s,
+        mesh_s=mesh_s,
+    )
 
-    if scans.ground_truth is not None:
-        metrics = surface_metrics(mesh, scans.ground_truth, samples=1_000_000)
-        results.add(format_metrics(metrics), surface=metrics)
+    _say_errors(results, radar_map, mesh, scans)
     add_intensity_errors(results, radar_map, scans.select(test), kept)
 
     write_scans(options.out / "scans.npz", scans)
@@ -85,4 +102,23 @@ def run(options: argparse.Namespace) -> None:
         "wrote " + ", ".join(str(options.out / name) for name in files),
         files=[options.out / n for n in files],
     )
+    looked_at = [str(options.out / name) for name in ("map.safetensors", "scans.npz")]
+    results.add(f"next: {shlex.join(['radarsdf', 'view', *looked_at])}")
     results.end()
+
+
+def _say_errors(results: Results, radar_map: RadarMap, mesh: trimesh.Trimesh, scans: Scans) -> None:
+    """Say how far the mesh is from the truth, if that is known, and what the lines on intensities are."""
+    from radarsdf.evaluation import format_metrics, surface_metrics
+
+    if scans.ground_truth is not None:
+        metrics = surface_metrics(mesh, scans.ground_truth, samples=1_000_000)
+        results.add(
+            f"{metrics['precision']:.1%} of the mesh lies within {metrics['threshold_m']:g} m of the true surface, and "
+            f"{metrics['completion_ratio']:.1%} of that surface within {metrics['threshold_m']:g} m of the mesh:"
+        )
+        results.add(format_metrics(metrics), surface=metrics)
+    if radar_map.has_intensity:
+        results.add(
+            "intensities of the scans that the fit did not see, and how far the nearest returns (kNN) are off:"
+        )

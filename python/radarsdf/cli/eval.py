@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from radarsdf.cli.map_in import MAP, is_map, load_map
-from radarsdf.cli.options import add_box, add_json, add_voxel, box_of
+from radarsdf.cli.options import add_box, add_json, add_quiet, add_surface, box_of, limits_of, progress_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.scans_in import SCANS, add_poses, scans_of
 
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="also print the intensity errors on the scans that radarsdf fit --holdout N left out",
     )
-    add_voxel(parser)
+    add_surface(parser)
     add_box(parser)
     parser.add_argument(
         "--samples",
@@ -42,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=10_000_000,
         help="number of points sampled on the mesh; default: 10000000",
     )
+    add_quiet(parser)
     add_json(parser)
 
 
@@ -69,7 +70,10 @@ def run(options: argparse.Namespace) -> None:
         raise ValueError(msg)
     results = Results(options)
     if ground_truth is not None:
-        mesh = read_mesh(options.what) if radar_map is None else radar_map.mesh(options.voxel)
+        if radar_map is None:
+            mesh = read_mesh(options.what)
+        else:
+            mesh = radar_map.mesh(options.voxel, **limits_of(options), progress=progress_of(options))
         metrics = surface_metrics(mesh, ground_truth, box=box_of(options), samples=options.samples)
         results.add(format_metrics(metrics), surface=metrics)
     if options.holdout is not None and radar_map is not None and scans is not None:

@@ -15,7 +15,7 @@ from radarsdf.cli.map_in import MAP_SUFFIX
 from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
 from radarsdf.cli.results import Results, counted
 from radarsdf.cli.saying import complain
-from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
+from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of, words_of
 
 if TYPE_CHECKING:
     from radarsdf import RadarMap
@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> None:
     save_map(radar_map, options.out)
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
-    _say(results, radar_map, len(scans), time.perf_counter() - started_s, options.out)
+    _say(results, radar_map, options, len(scans), time.perf_counter() - started_s)
     if options.report is not None:
         from radarsdf.cli.check import findings_of
         from radarsdf.cli.report import add_report
@@ -136,9 +136,11 @@ def _check_report(options: argparse.Namespace) -> None:
         raise ValueError(msg)
 
 
-def _say(results: Results, radar_map: RadarMap, scans: int, seconds: float, out: Path) -> None:
+def _say(
+    results: Results, radar_map: RadarMap, options: argparse.Namespace, scans: int, seconds: float
+) -> None:
     """Say what the fit used, what it left out, what it found, and what to do next."""
-    report = radar_map.report
+    report, out = radar_map.report, options.out
     returns, used, movers, ghosts = (report[name] for name in ("returns", "returns_used", "movers", "ghosts"))
     left_out = {"move by their Doppler": movers, "are ghosts": ghosts}
     left_out["are out of range"] = returns - used - movers - ghosts
@@ -162,5 +164,10 @@ def _say(results: Results, radar_map: RadarMap, scans: int, seconds: float, out:
         noise=noise,
     )
     results.add(f"written to {out}", out=out, leaf_cells=report["leaf_cells"], map_bytes=radar_map.nbytes)
-    following = f"radarsdf mesh {shlex.quote(str(out))} -o {shlex.quote(str(out.with_suffix('.ply')))}"
-    results.add(f"next: {following}", next=following)
+    following = ["radarsdf", "mesh", str(out), "-o", str(out.with_suffix(".ply"))]
+    if options.quick:
+        following += ["--voxel", "0.2"]
+    results.add(f"next: {shlex.join(following)}", next=shlex.join(following))
+    if options.holdout is not None:
+        words = ["radarsdf", "eval", str(out), *words_of(options), "--holdout", str(options.holdout)]
+        results.add(f"and: {shlex.join(words)}", evaluate=shlex.join(words))

@@ -40,6 +40,14 @@ def _add_map(results: Results, radar_map: AnyMap) -> None:
     limits = None if scale is None else (scale.low, scale.high)
     cells, edge_m, size = radar_map.num_cells, radar_map.config.leaf_size_m, radar_map.nbytes
     results.add(_line("map", repr(radar_map)), map=repr(radar_map))
+    report = radar_map.report
+    counted_in = {name: report[name] for name in ("scans", "returns") if name in report}
+    words = ", ".join(f"{count} {name}" for name, count in counted_in.items())
+    results.add(_line("made of", words), **counted_in)
+    lower, upper = radar_map.extent
+    edges = " x ".join(f"{edge:.1f}" for edge in upper - lower)
+    corners = " to ".join("({:.1f}, {:.1f}, {:.1f})".format(*corner) for corner in (lower, upper))
+    results.add(_line("extent", f"{edges} m, from {corners} m"), extent=[lower, upper])
     results.add(_line("size", f"{size / 1e6:.1f} MB"), bytes=size)
     results.add(_line("leaf cells", f"{cells} of {edge_m:g} m"), leaf_cells=cells, leaf_size_m=edge_m)
     results.add(
@@ -50,7 +58,7 @@ def _add_map(results: Results, radar_map: AnyMap) -> None:
         _line("intensities", "none" if limits is None else "{:g} to {:g}".format(*limits)), intensities=limits
     )
     results.add(_line("rough returns", f"{radar_map.rough_share:.0%}"), rough_share=radar_map.rough_share)
-    if missing := radar_map.report.get("missing_tiles"):
+    if missing := report.get("missing_tiles"):
         results.add(_line("missing tiles", ", ".join(missing)), missing_tiles=missing)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from radarsdf.cli.map_in import add_map, load_map
-from radarsdf.cli.options import add_box, add_json, add_quiet, add_voxel, box_of, progress_of
+from radarsdf.cli.options import add_box, add_json, add_quiet, add_surface, box_of, limits_of, progress_of
 from radarsdf.cli.results import Results
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--out", type=Path, required=True, help="the mesh to write: .ply, .obj, .stl, .glb"
     )
-    add_voxel(parser)
+    add_surface(parser)
     add_box(parser)
     parser.add_argument(
         "--viewpoint",
@@ -32,33 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs=3,
         metavar=("X", "Y", "Z"),
         help="colour the mesh by the intensity seen from here: world frame, m",
-    )
-    parser.add_argument(
-        "--min-confidence",
-        type=float,
-        default=0.0,
-        metavar="C",
-        help="leave out the surface whose confidence is below C, 0 to 1; default: 0",
-    )
-    parser.add_argument(
-        "--min-detection-rate",
-        type=float,
-        default=0.028,
-        metavar="RATE",
-        help="leave out the surface with returns in a smaller share of the scans that looked there; default: 0.028",
-    )
-    parser.add_argument(
-        "--max-uncertainty",
-        type=float,
-        metavar="M",
-        help="leave out the surface whose standard error is above M, m; default: it follows from the returns",
-    )
-    parser.add_argument(
-        "--min-component",
-        type=int,
-        default=30,
-        metavar="N",
-        help="leave out connected pieces of fewer triangles; default: 30",
     )
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also draw the mesh as a picture")
     add_quiet(parser)
@@ -78,10 +51,7 @@ def run(options: argparse.Namespace) -> None:
         options.voxel,
         box=box_of(options),
         viewpoint=options.viewpoint,
-        min_confidence=options.min_confidence,
-        max_uncertainty=options.max_uncertainty,
-        min_detection_rate=options.min_detection_rate,
-        min_component_triangles=options.min_component,
+        **limits_of(options),
         progress=progress_of(options),
     )
     if len(mesh.faces) == 0:

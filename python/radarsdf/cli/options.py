@@ -61,6 +61,15 @@ def config_of(options: argparse.Namespace) -> FitConfig:
     return config
 
 
+def config_words(options: argparse.Namespace) -> list[str]:
+    """The options that :func:`config_of` reads, as one would type them again."""
+    words = [f"--{name}" for name in ("paper", "quick") if getattr(options, name)]
+    words += [] if options.config is None else ["--config", str(options.config)]
+    for text in options.set:
+        words += ["--set", text]
+    return words
+
+
 def _setting(text: str) -> dict[str, Any]:
     """One ``NAME=VALUE`` or ``GROUP.NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
     path, equals, value = text.partition("=")
@@ -94,11 +103,48 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_voxel(parser: argparse.ArgumentParser) -> None:
-    """Add the option ``--voxel``."""
+def add_surface(parser: argparse.ArgumentParser) -> None:
+    """Add ``--voxel``, and the options that :func:`limits_of` reads: those of every command that makes a mesh."""
     parser.add_argument(
         "--voxel", type=float, default=0.1, metavar="M", help="edge length of a voxel, m; default: 0.1"
     )
+    parser.add_argument(
+        "--min-confidence",
+        type=float,
+        default=0.0,
+        metavar="C",
+        help="leave out the surface whose confidence is below C, 0 to 1; default: 0",
+    )
+    parser.add_argument(
+        "--max-uncertainty",
+        type=float,
+        metavar="M",
+        help="leave out the surface whose standard error is above M, m; default: it follows from the returns",
+    )
+    parser.add_argument(
+        "--min-detection-rate",
+        type=float,
+        default=0.028,
+        metavar="RATE",
+        help="leave out the surface with returns in a smaller share of the scans that looked there; default: 0.028",
+    )
+    parser.add_argument(
+        "--min-component",
+        type=int,
+        default=30,
+        metavar="N",
+        help="leave out connected pieces of fewer triangles; default: 30",
+    )
+
+
+def limits_of(options: argparse.Namespace) -> dict[str, Any]:
+    """What a mesh leaves out, as arguments of ``RadarMap.mesh``."""
+    return {
+        "min_confidence": options.min_confidence,
+        "max_uncertainty": options.max_uncertainty,
+        "min_detection_rate": options.min_detection_rate,
+        "min_component_triangles": options.min_component,
+    }
 
 
 def add_box(parser: argparse.ArgumentParser) -> None:

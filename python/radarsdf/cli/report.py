@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from radarsdf.cli.map_in import add_map, load_map
-from radarsdf.cli.options import add_box, add_json, add_quiet, add_voxel, box_of, progress_of
+from radarsdf.cli.options import add_box, add_json, add_quiet, add_surface, box_of, limits_of, progress_of
 from radarsdf.cli.results import Results
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
 
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="compare intensities on the scans that radarsdf fit --holdout N left out",
     )
-    add_voxel(parser)
+    add_surface(parser)
     add_box(parser)
     add_quiet(parser)
     add_json(parser)
@@ -68,6 +68,7 @@ def run(options: argparse.Namespace) -> None:
         voxel_size_m=options.voxel,
         box=box_of(options),
         progress=progress_of(options),
+        limits=limits_of(options),
     )
     add_report(results, options.out, subject)
     results.end()

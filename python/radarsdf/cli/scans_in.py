@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -90,7 +89,7 @@ def _field(text: str) -> tuple[str, str]:
     return role, name
 
 
-def words_of(options: argparse.Namespace) -> str:
+def words_of(options: argparse.Namespace) -> list[str]:
     """The same arguments, as one would type them again."""
     words = [options.scans, options.poses]
     for name in ("extrinsic", "topic", "pose_topic"):
@@ -98,4 +97,4 @@ def words_of(options: argparse.Namespace) -> str:
         words += [f"--{name.replace('_', '-')}", value] if value is not None else []
     for text in options.field:
         words += ["--field", text]
-    return shlex.join(str(word) for word in words if word is not None)
+    return [str(word) for word in words if word is not None]

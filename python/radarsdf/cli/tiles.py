@@ -9,71 +9,95 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from radarsdf.cli.options import add_fit_options, add_json, add_voxel, config_of, progress_of
+from radarsdf.cli.options import (
+    add_config_options,
+    add_json,
+    add_quiet,
+    add_surface,
+    config_of,
+    limits_of,
+    progress_of,
+)
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
-from radarsdf.cli.scans_in import SCANS, add_scan_options, scans_of
+from radarsdf.cli.scans_in import add_scans, scans_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from radarsdf.tiles.plan import Plan
 
-STEPS = ("plan", "fit", "mesh", "status", "clean")
+STEPS = {
+    "plan": "read the scans once, and write to a file for each tile the rays that cross it",
+    "fit": "fit the tiles of a plan; those that are done are kept",
+    "mesh": "write the surface of all tiles as one mesh, which need not fit into memory",
+    "status": "name the tiles that are not done, and why",
+    "clean": "remove the rays of tiles that are done, and pieces of meshes",
+}
+"""Name of each step, and its help in one line."""
 _FIRST_SCANS = 100  # that are checked before the work
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
-    parser.add_argument(
-        "words",
-        nargs="+",
-        metavar="[STEP] PATH",
-        help=f"SCANS [POSES]: {SCANS}, and their poses; all steps are done. Or one step: plan SCANS [POSES], fit FOLDER, "
-        "mesh FOLDER, status FOLDER, clean FOLDER, which removes the rays of tiles that are done and pieces of meshes",
-    )
-    parser.add_argument(
-        "-o",
-        "--out",
-        type=Path,
-        help="the folder to write; of mesh: a .ply file, or a .json file for 3D Tiles",
-    )
+    """Declare the arguments of all steps in one go."""
+    _add_plan(parser)
+    _add_where(parser)
+    add_surface(parser)
+    add_quiet(parser)
+    add_json(parser)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    steps = "\n".join(f"  {name:<8}{text}" for name, text in STEPS.items())
+    parser.epilog = f"one step at a time: radarsdf tiles STEP; radarsdf tiles STEP --help says more\n{steps}"
+
+
+def add_step_arguments(parser: argparse.ArgumentParser, step: str) -> None:
+    """Declare the arguments of one of `STEPS`."""
+    if step == "plan":
+        _add_plan(parser)
+    else:
+        parser.add_argument("folder", type=Path, help="what radarsdf tiles plan wrote")
+    if step in ("fit", "status"):
+        parser.add_argument("--tile", action="append", metavar="NAME", help="only this tile; may be repeated")
+    if step == "mesh":
+        parser.add_argument(
+            "-o",
+            "--out",
+            type=Path,
+            help="the mesh to write: a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder",
+        )
+        add_surface(parser)
+    if step in ("plan", "fit", "mesh"):
+        _add_where(parser)
+    if step in ("plan", "fit", "mesh"):
+        add_quiet(parser)
+    add_json(parser)
+
+
+def _add_plan(parser: argparse.ArgumentParser) -> None:
+    add_scans(parser)
+    parser.add_argument("-o", "--out", type=Path, required=True, help="the folder to write")
     parser.add_argument(
         "--tile-size", type=float, metavar="M", help="edge of a tile, m; default: 512 leaf cells"
     )
     parser.add_argument("--halo", type=float, metavar="M", help="what a tile knows beyond its edges, m")
-    parser.add_argument(
-        "--tile", action="append", metavar="NAME", help="of fit: only this tile; may be repeated"
-    )
+    parser.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
+    parser.add_argument("--no-check", action="store_true", help="do not check the first scans")
+    add_config_options(parser)
+
+
+def _add_where(parser: argparse.ArgumentParser) -> None:
+    """Who does the work. A plan only estimates by it."""
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--processes", type=int, metavar="N", help="so many tiles at a time")
     where.add_argument(
         "--cluster", metavar="ADDRESS", help="the scheduler of dask.distributed, such as tcp://host:8786"
     )
-    parser.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
-    parser.add_argument("--no-check", action="store_true", help="do not check the first scans")
-    add_voxel(parser)
-    add_scan_options(parser)
-    add_fit_options(parser)
-    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Do one step, or all."""
-    step, paths = None, list(options.words)
-    if paths[0] in STEPS:
-        step = paths.pop(0)
-    if step in (None, "plan"):
-        if options.out is None or not 1 <= len(paths) <= 2:
-            msg = "give SCANS, POSES if the scans have none, and -o FOLDER"
-            raise ValueError(msg)
-        options.scans, options.poses = Path(paths[0]), Path(paths[1]) if len(paths) == 2 else None
-        folder = options.out
-    else:
-        if len(paths) != 1:
-            msg = f"{step} takes one folder that radarsdf tiles plan wrote"
-            raise ValueError(msg)
-        folder = Path(paths[0])
+    """Do one step, or plan, fit and mesh."""
+    step = getattr(options, "step", None)
+    folder: Path = options.out if step in (None, "plan") else options.folder
     results = Results(options)
     if step in (None, "plan"):
         _say_plan(results, _plan(options), folder)
@@ -83,7 +107,8 @@ def run(options: argparse.Namespace) -> int:
         _mesh(options, results, folder, None if step is None else options.out)
     if step == "clean":
         _clean(results, folder)
-    status = _status(results, folder, options.tile) if step in (None, "fit", "status") else 0
+    names = getattr(options, "tile", None)
+    status = _status(results, folder, names) if step in (None, "fit", "status") else 0
     results.end()
     return status
 
@@ -154,7 +179,9 @@ def _fit(options: argparse.Namespace, results: Results, folder: Path) -> None:
     from radarsdf.tiles.fit_tiles import run_fits
 
     with _executor(options, folder) as executor:
-        city = run_fits(folder, executor=executor, names=options.tile, progress=progress_of(options))
+        city = run_fits(
+            folder, executor=executor, names=getattr(options, "tile", None), progress=progress_of(options)
+        )
     results.add(f"{city} in {folder}", tiles_done=len(city.tiles))
 
 
@@ -167,7 +194,7 @@ def _mesh(options: argparse.Namespace, results: Results, folder: Path, out: Path
     city = TiledMap(folder)
     with _executor(options, folder) as executor:
         vertices, triangles = city.export(
-            out, options.voxel, executor=executor, progress=progress_of(options)
+            out, options.voxel, **limits_of(options), executor=executor, progress=progress_of(options)
         )
     results.add(
         f"{vertices} vertices and {triangles} triangles written to {out}",

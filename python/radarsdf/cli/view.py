@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 
 from radarsdf.cli.map_in import add_map, load_map
-from radarsdf.cli.options import add_box, add_quiet, add_voxel, box_of, progress_of
+from radarsdf.cli.options import add_box, add_quiet, add_surface, box_of, limits_of, progress_of
 from radarsdf.cli.saying import say
 from radarsdf.cli.scans_in import add_scans, scans_of
 
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     add_map(parser)
     add_scans(parser, required=False)
-    add_voxel(parser)
+    add_surface(parser)
     add_box(parser)
     parser.add_argument(
         "--max-vertices",
@@ -63,6 +63,7 @@ def run(options: argparse.Namespace) -> None:
         host=options.host,
         port=options.port,
         progress=progress_of(options),
+        **limits_of(options),
     ) as viewer:
         url = url_of(viewer.host, viewer.port)
         for note in viewer.notes:

@@ -99,6 +99,7 @@ def fit_rays(
             sensor = given.sensor_of(rays, noise)
             closed_form = ClosedForm(learnt, inside, surface, config, workers.num_threads)
             counts = {
+                "scans": len(rays.up_of_scan),
                 "returns": rays.num_given + given.movers,
                 "returns_used": len(kept),
                 "ghosts": len(learnt) - len(kept),

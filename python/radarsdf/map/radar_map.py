@@ -19,6 +19,7 @@ from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.positions import as_positions
+from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.sensor import Sensor
 
@@ -92,6 +93,13 @@ class RadarMap:
     def num_cells(self) -> int:
         """Number of leaf cells."""
         return len(self.evidence.looks)
+
+    @property
+    def extent(self) -> NDArray[np.float64]:
+        """(2, 3) lower and upper corner of all leaf cells, world, m."""
+        cells = lattice_of(self.field.cells.table.leaf_keys())
+        corners = np.stack([cells.min(axis=0), cells.max(axis=0) + 1])
+        return corners * self.config.leaf_size_m + self.origin
 
     @property
     def nbytes(self) -> int:

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -41,6 +41,8 @@ class Subject:
     """(2, 3) the part of the world that counts, m. None: all."""
     progress: bool | None = None
     """As for :meth:`RadarMap.mesh`."""
+    limits: Mapping[str, Any] = field(default_factory=dict)
+    """What the mesh leaves out, such as `min_confidence`: as :meth:`RadarMap.mesh`."""
 
     @property
     def viewpoint(self) -> NDArray[np.float64]:
@@ -54,7 +56,7 @@ class Subject:
         """The mesh that is measured, with intensities if the map has any."""
         viewpoint = self.viewpoint if self.radar_map.has_intensity else None
         return self.radar_map.mesh(
-            self.voxel_size_m, box=self.box, viewpoint=viewpoint, progress=self.progress
+            self.voxel_size_m, box=self.box, viewpoint=viewpoint, progress=self.progress, **self.limits
         )
 
     @cached_property

@@ -85,6 +85,7 @@ class TiledMap(TileBlend):
         return {
             "tiles": len(reports),
             "missing_tiles": list(self.missing),
+            "scans": self.plan.scans,
             "returns": sum(tile.returns for tile in self.plan.tiles),
             "leaf_cells": self.num_cells,
             "noise": reports[0]["noise"],
@@ -101,6 +102,14 @@ class TiledMap(TileBlend):
     def num_cells(self) -> int:
         """Number of leaf cells, each of them in the tile that it lies in."""
         return sum(len(self.leaf_cells(tile.tile, tile.tile)) for tile in self.tiles)
+
+    @cached_property
+    def extent(self) -> _Floats:
+        """(2, 3) lower and upper corner of all leaf cells, world, m."""
+        of_tiles = [cells for tile in self.tiles if len(cells := self.leaf_cells(tile.tile, tile.tile))]
+        lower = np.min([cells.min(axis=0) for cells in of_tiles], axis=0)
+        upper = np.max([cells.max(axis=0) for cells in of_tiles], axis=0)
+        return self.config.lattice.position(np.stack([lower, upper + 1]))
 
     @property
     def nbytes(self) -> int:

@@ -51,8 +51,9 @@ class Surface:
         max_vertices: int,
         box: ArrayLike | None = None,
         progress: bool | None = None,
+        **limits: Any,
     ) -> Surface:
-        """Mesh a map, and thin the mesh if it has more than `max_vertices`.
+        """Mesh a map, and thin the mesh if it has more than `max_vertices`. `limits`: as `RadarMap.mesh`.
 
         Raises
         ------
@@ -60,7 +61,7 @@ class Surface:
             If there is no surface, or as `RadarMap.mesh`.
         """
         whole_number(max_vertices, "max_vertices", _FEWEST)
-        mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress)
+        mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress, **limits)
         mesh, edge_m = thinned(mesh, max_vertices, voxel_size)
         if len(mesh.vertices) == 0:
             msg = "the map has no surface here"

@@ -61,6 +61,8 @@ class Viewer:
         Port to listen on. None: 8080, or the next that is free.
     progress : bool, optional
         Whether to show a progress bar. By default only on a terminal.
+    **limits
+        What the mesh leaves out, such as ``min_confidence``: as :meth:`RadarMap.mesh`.
 
     Raises
     ------
@@ -83,13 +85,14 @@ class Viewer:
         host: str = "127.0.0.1",
         port: int | None = None,
         progress: bool | None = None,
+        **limits: Any,
     ) -> None:
         require_viser()
         self.host = host
         self.port = free_port(host, 8080 if port is None else port, exactly=port is not None)
         self._map = radar_map
         self.surface = Surface.of(
-            radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress
+            radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
         )
         """What is shown."""
         self._server: Any = start_server(host, self.port)
