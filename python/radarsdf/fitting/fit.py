@@ -81,8 +81,8 @@ def fit(
     Interrupted
         A KeyboardInterrupt, after Ctrl-C. Its ``radar_map`` is the map so far.
     Diverged
-        A FloatingPointError, if a loss or a parameter is not finite. Its ``radar_map`` is the last finite
-        map.
+        A FloatingPointError, if a loss or a parameter is not finite, or a loss is worse than any answer of the
+        right size. Its ``radar_map`` is the last good map.
 
     Examples
     --------

@@ -26,7 +26,7 @@ from radarsdf.fitting.gradients import GradientBackend, Gradients, RandomDropout
 from radarsdf.fitting.history import LossHistory
 from radarsdf.fitting.optimiser import Adam, Optimiser, RowAdam, Soap
 from radarsdf.fitting.sampling import Batch, RaySampler
-from radarsdf.fitting.stopping import Diverged
+from radarsdf.fitting.stopping import Diverged, DivergenceWatch
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.progress import hides_bar
 from radarsdf.returns.rays import Rays
@@ -187,6 +187,7 @@ class Training:
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         self.history = LossHistory(self.iterations)
+        self._watch = DivergenceWatch(config)
         self._rows = None
         self._optimisers: dict[str, Optimiser] = {}
         rate, of_network = config.training.learning_rate, _OPTIMISERS[config.training.optimiser]
@@ -206,6 +207,7 @@ class Training:
         state = {
             "done": torch.tensor(list(self.iterations_done.values()), dtype=torch.int64, device="cpu"),
             "losses": torch.tensor(losses, dtype=torch.float64, device="cpu"),
+            "watch": self._watch.state(),
         }
         state |= {f"history.{name}": spans for name, spans in self.history.state().items()}
         state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
@@ -227,6 +229,7 @@ class Training:
         losses = zip(done, state["losses"].tolist(), strict=True)
         self.losses.update({name: loss for name, loss in losses if done[name]})
         self.history.restore(_part(state, "history"))
+        self._watch.restore(state["watch"])
         for name, parameter in self._field.named_parameters():
             parameter.data.copy_(state[f"field.{name}"])
         for name, optimiser in self._optimisers.items():
@@ -243,8 +246,8 @@ class Training:
         Raises
         ------
         Diverged
-            If a loss or a parameter is not finite. The field then has the last parameters that were checked
-            and finite.
+            If a loss or a parameter is not finite, or a loss is worse than any answer of the right size. The
+            field then has the last parameters that were checked and good.
         KeyboardInterrupt
             After Ctrl-C, between two iterations.
         """
@@ -333,10 +336,12 @@ class Training:
             share = cosine if self._config.training.cosine_schedule else 1.0
             stop = pauses.interrupted()
             write = pauses.checkpoint is not None and (stop or pauses.checkpoint.due())
-            look = stop or write or i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
+            judge = i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
+            look = stop or write or judge
             # No samples are drawn ahead before the state is written: it would contain the draw after the
             # next.
-            found, ahead = stage.gradients_of(ahead or stage.draw(), _nothing if look else stage.draw)
+            batch = ahead or stage.draw()
+            found, ahead = stage.gradients_of(batch, _nothing if look else stage.draw)
             loss = sum(found.losses.values())
             if not math.isfinite(loss):
                 give_up(f"the {_bad_losses(found)} loss is {loss}")
@@ -351,13 +356,20 @@ class Training:
                 before = stage.iterations_before if name == stage.name else 0
                 self.iterations_done[name] = min(before + i + 1, self.iterations[name])
             self.history.add(found.losses, self.iterations_done)
-            del found, move_networks  # gradients of all features are as large as these: not two at once
+            self._watch.add(found.losses, batch.sdf_m)
+            del (
+                batch,
+                found,
+                move_networks,
+            )  # gradients of all features are as large as these: not two at once
             pauses.bar.set_postfix_str(f"{stage.name} loss {loss:.3g}", refresh=False)
             pauses.bar.update()
             if look:
                 # A sum is finite only if all numbers are. A sum that overflows is no better.
                 if not all(math.isfinite(float(p.detach().sum())) for p in changing):
                     give_up("a parameter is not finite")
+                if judge and (fault := self._watch.fault()):
+                    give_up(fault)
                 for parameter, value in zip(changing, good, strict=True):
                     value.copy_(parameter.detach())
             if write and pauses.checkpoint is not None:
