@@ -28,6 +28,16 @@ def by_name(values: Any, what: str) -> dict[str, Any]:
     return dict(values)
 
 
+def first_wrong(error: ValidationError, prefix: str) -> str:
+    """One line on the first wrong value, whose name gets a prefix."""
+    first = error.errors(include_url=False)[0]
+    if first["type"] == "value_error":  # of a check of ours or of a group: its message is complete
+        return first["msg"].removeprefix("Value error, ")
+    name = prefix + ".".join(part for part in first["loc"] if isinstance(part, str))
+    must = re.sub(r"^\w+ should", "must", first["msg"])
+    return f"{name} {must}, not {first['input']!r:.50}"
+
+
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def settings(cls: _Class) -> _Class:
     """Makes a frozen dataclass that checks its values. A ValueError of one line names the wrong one."""
@@ -46,14 +56,7 @@ def settings(cls: _Class) -> _Class:
         try:
             construct(self, **values)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            name = prefix + ".".join(part for part in first["loc"] if isinstance(part, str))
-            if first["type"] == "value_error":  # of a check of ours or of a group: its message is complete
-                msg = first["msg"].removeprefix("Value error, ")
-            else:
-                must = re.sub(r"^\w+ should", "must", first["msg"])
-                msg = f"{name} {must}, not {first['input']!r:.50}"
-            raise ValueError(msg) from None
+            raise ValueError(first_wrong(error, prefix)) from None
 
     setattr(checked, "__init__", with_short_errors)  # noqa: B010 - mypy refuses a plain assignment
     return cast(_Class, checked)

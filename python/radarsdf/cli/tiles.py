@@ -232,7 +232,7 @@ def _say_plan(results: Results, plan: Plan, folder: Path) -> None:
 
 def _status(results: Results, folder: Path, names: list[str] | None) -> int:
     """Name the tiles that are not done, of all or of these `names`. The exit status is 1 if there are any."""
-    from radarsdf.tiles.plan import Plan, failure_path
+    from radarsdf.tiles.plan import Plan, failure_of
     from radarsdf.tiles.tile_fit import is_done
 
     plan = Plan.load(folder)
@@ -240,8 +240,7 @@ def _status(results: Results, folder: Path, names: list[str] | None) -> int:
     tiles = [tile for tile in plan.tiles if names is None or tile.name in names]
     for tile in tiles:
         if not is_done(folder, plan, tile):
-            path = failure_path(folder, tile)
-            missing[tile.name] = path.read_text(errors="replace") if path.is_file() else "not yet done"
+            missing[tile.name] = failure_of(folder, tile) or "not yet done"
     results.add(f"{len(tiles) - len(missing)} of {len(tiles)} tiles are done", missing=missing)
     for name, reason in missing.items():
         complain(f"radarsdf tiles: {name}: {reason}")

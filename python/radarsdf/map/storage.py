@@ -23,6 +23,7 @@ from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors
 from radarsdf.map.contents import MapContents
+from radarsdf.map.fit_report import checked_report
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
@@ -255,7 +256,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         intensity_scale=scale,
         reflectance=reflectance,
         config=config,
-        report=dict(description["report"]),
+        report=checked_report(description["report"]),
         evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
         rough_share=rough_share,
         sensor=Sensor.from_dict(description["sensor"]),

@@ -25,7 +25,7 @@ from radarsdf.map.contents import MapContents
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.grid import Tile
-from radarsdf.tiles.plan import Plan, TilePlan, failure_path, map_path
+from radarsdf.tiles.plan import Plan, TilePlan, failure_of, map_path
 from radarsdf.tiles.tile_fit import is_done
 
 _Floats = NDArray[np.float64]
@@ -90,8 +90,7 @@ class TileBlend:
         reasons = {}
         for tile in self.plan.tiles:
             if not self.has(tile.tile):
-                path = failure_path(self.folder, tile)
-                reasons[tile.name] = path.read_text(errors="replace") if path.is_file() else ""
+                reasons[tile.name] = failure_of(self.folder, tile)
         return reasons
 
     def has(self, tile: Tile) -> bool:

@@ -18,13 +18,14 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.io.files import write_whole
+from radarsdf.io.scans import arrays_of
 from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import renumbered
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
-from radarsdf.tiles.plan import folder_of
+from radarsdf.tiles.plan import folder_of, within
 
 # As in one map: cells with all corners farther from the surface than this, in leaf cells, are left out.
 _CLEARLY = 0.25
@@ -81,16 +82,48 @@ class Piece:
 
     @classmethod
     def load(cls, path: Path) -> Piece:
-        """Reads what :func:`mesh_tile` wrote."""
-        with np.load(path, allow_pickle=False) as arrays:
-            return cls(**{name: arrays[name] for name in arrays.files})
+        """Reads what :func:`mesh_tile` wrote. Raises a ValueError if the file is damaged."""
+        arrays = arrays_of(path, _ARRAYS)
+        for name, (dtype, *shape) in _ARRAYS.items():
+            array = arrays.get(name)
+            if array is None or array.dtype != dtype or not _has_shape(array, shape):
+                msg = f"{path} is not a whole piece of a mesh: {name} is missing, or of another type or shape"
+                raise ValueError(msg)
+        piece = cls(**arrays)
+        count, borders = len(piece.vertices), len(piece.border_rows)
+        if (
+            {count} != {len(piece.confidence), len(piece.uncertainty_m)}
+            or len(piece.border_edges) != borders
+            or not np.isfinite(piece.vertices).all()
+            or not all(((rows >= 0) & (rows < count)).all() for rows in (piece.faces, piece.border_rows))
+        ):
+            msg = f"{path} is not a whole piece of a mesh: its arrays do not fit together"
+            raise ValueError(msg)
+        return piece
+
+
+_ARRAYS: dict[str, tuple[Any, ...]] = {
+    "vertices": (np.float64, None, 3),
+    "faces": (np.int32, None, 3),
+    "confidence": (np.float32, None),
+    "uncertainty_m": (np.float32, None),
+    "border_rows": (np.int64, None),
+    "border_edges": (np.int64, None, 4),
+    "cells": (np.int64, 2),
+}
+"""Type and shape of each array of a `Piece`. None: any length."""
+
+
+def _has_shape(array: NDArray[Any], shape: list[int | None]) -> bool:
+    return array.ndim == len(shape) and all(n in (None, m) for m, n in zip(array.shape, shape, strict=True))
 
 
 def piece_path(city: TileBlend, tile: Tile, settings: PieceSettings) -> Path:
     """The file of a piece. The same settings of the same plan give the same file."""
     text = settings.to_json() + str([other for other in neighbours(tile) if city.has(other)])
     key = hashlib.blake2b((city.plan.digest + text).encode(), digest_size=8).hexdigest()
-    return folder_of(city.folder, city.plan.by_tile[tile]) / _FILES.replace("*", key)
+    name = _FILES.replace("*", key)
+    return within(city.folder, folder_of(city.folder, city.plan.by_tile[tile]) / name)
 
 
 def pieces_in(folder: Path) -> list[Path]:

@@ -175,7 +175,11 @@ class Planner:
         write_scans(self._folder, positions, np.concatenate(self._up))
         tiles = [
             TilePlan(
-                tile, counts.returns, counts.rays, counts.origin_cells, (counts.scans[0], counts.scans[1])
+                tile=tile,
+                returns=counts.returns,
+                rays=counts.rays,
+                origin_cells=counts.origin_cells,
+                scans=(counts.scans[0], counts.scans[1]),
             )
             for tile, counts in sorted(self._tiles.items())
         ]

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
+from radarsdf.checks import MAX_POSITION_M
+from radarsdf.io.files import check_regular_file
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.rays import Rays, rays_from
 from radarsdf.tiles.grid import Tile
-from radarsdf.tiles.plan import Plan, TilePlan
+from radarsdf.tiles.plan import Plan, TilePlan, within
 
 _RECORD = np.dtype([("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")])
 """A return in the frame of its tile, m; its scan; its intensity, sensor units, NaN if there are none."""
@@ -68,7 +70,7 @@ class RayFiles:
 
 def write_scans(folder: Path, positions: NDArray[np.float64], up: NDArray[np.float64]) -> None:
     """Writes from where each scan was seen and its z axis, (F, 3) each, world, m."""
-    np.save(folder / _SCANS, np.concatenate([positions, up], axis=1), allow_pickle=False)
+    np.save(within(folder, folder / _SCANS), np.concatenate([positions, up], axis=1), allow_pickle=False)
 
 
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[np.bool_]]:
@@ -85,18 +87,30 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
     if not path.exists():
         msg = f"{path} is gone, as after radarsdf tiles clean: fit the scans again in a new folder"
         raise ValueError(msg)
-    rows = np.fromfile(path, _RECORD)
-    if len(rows) != tile.rays or path.stat().st_size != tile.rays * _RECORD.itemsize:
-        msg = f"{path} has {len(rows)} rays instead of {tile.rays}: make the plan again"
+    check_regular_file(path)
+    found = path.stat().st_size / _RECORD.itemsize
+    if found != tile.rays:
+        msg = f"{path} has {found:g} rays instead of {tile.rays}: make the plan again"
         raise ValueError(msg)
-    table = np.load(folder / _SCANS, mmap_mode="r", allow_pickle=False)
-    if table.shape != (plan.scans, 6) or not 0 <= rows["scan"].min() <= rows["scan"].max() < plan.scans:
+    rows = np.fromfile(path, _RECORD)
+    table = _table_of_scans(within(folder, folder / _SCANS))
+    if (
+        table.shape != (plan.scans, 6)
+        or table.dtype != np.float64
+        or not 0 <= rows["scan"].min() <= rows["scan"].max() < plan.scans
+    ):
         msg = f"{folder / _SCANS} does not belong to {path}: make the plan again"
         raise ValueError(msg)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
-    of_scans = np.asarray(table[numbers], np.float64)
-    origin = plan.config.lattice.position(tile.origin_cells)
+    of_scans = np.array(table[numbers])
     points = np.ascontiguousarray(rows["point"])
+    if not ((np.abs(points) <= MAX_POSITION_M).all() and (np.abs(of_scans) <= MAX_POSITION_M).all()):
+        msg = f"{path} or {folder / _SCANS} holds something other than finite positions: make the plan again"
+        raise ValueError(msg)
+    if plan.intensity_range is not None and not np.isfinite(rows["intensity"]).all():
+        msg = f"{path} holds an intensity that is not finite: make the plan again"
+        raise ValueError(msg)
+    origin = plan.config.lattice.position(tile.origin_cells)
     rays = rays_from(
         points,
         (of_scans[:, :3] - origin)[scans],
@@ -114,6 +128,17 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
     return rays, inside
 
 
+def _table_of_scans(path: Path) -> NDArray[np.float64]:
+    """What :func:`write_scans` wrote, in the file."""
+    check_regular_file(path)
+    try:
+        # A memory map: few rows are needed, and a header that claims more than the file holds is refused.
+        return np.load(path, mmap_mode="r", allow_pickle=False)  # type: ignore[no-any-return]
+    except (ValueError, EOFError) as error:
+        msg = f"{path} is not a whole .npy file: {error}"
+        raise ValueError(msg) from error
+
+
 def rays_path(folder: Path, name: str) -> Path:
     """The rays of the tile of this name."""
-    return folder / "tiles" / name / "rays.bin"
+    return within(folder, folder / "tiles" / name / "rays.bin")

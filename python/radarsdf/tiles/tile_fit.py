@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import write_whole
 from radarsdf.io.tensors import open_tensors
+from radarsdf.map.fit_report import checked_report
 from radarsdf.tiles.plan import Plan, TilePlan, failure_path, map_path
 from radarsdf.tiles.ray_files import read_rays
 
@@ -70,15 +71,38 @@ def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
 
 
 def is_done(root: Path, plan: Plan, tile: TilePlan) -> bool:
-    """Whether the map of a tile is there, and of this plan. Only the beginning of its file is read."""
+    """Whether the map of a tile is there, and of this plan. Only the beginning of its file is read.
+
+    Raises
+    ------
+    ValueError
+        If a link leads out of the folder.
+    """
+    path = map_path(root, tile)
     try:
-        return bool(report_of(root, tile)["plan"] == plan.digest)
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError):
+        return bool(_report(path)["plan"] == plan.digest)
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError):
         return False
 
 
 def report_of(root: Path, tile: TilePlan) -> dict[str, Any]:
-    """The report of the fit of a tile that is done; see :attr:`RadarMap.report`. Nothing else is read."""
-    with open_tensors(map_path(root, tile), "np") as file:
-        report: dict[str, Any] = json.loads((file.metadata() or {})["description"])["report"]
-    return report
+    """The report of the fit of a tile that is done; see :attr:`RadarMap.report`. Nothing else is read.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
+    OSError
+        If it cannot be read.
+    """
+    path = map_path(root, tile)
+    try:
+        return checked_report(_report(path))
+    except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
+        msg = f"{path} is not a whole radarsdf map: {error}"
+        raise ValueError(msg) from error
+
+
+def _report(path: Path) -> Any:
+    with open_tensors(path, "np") as file:
+        return json.loads((file.metadata() or {})["description"])["report"]

@@ -80,7 +80,7 @@ class TiledMap(TileBlend):
         reports = [report_of(self.folder, tile) for tile in self.tiles]
         skipped: dict[str, float | None] = {}
         for report in reports:
-            for words, seconds in zip(report["skipped"], report["skipped_s"], strict=True):
+            for words, seconds in zip(report.get("skipped", []), report.get("skipped_s", []), strict=True):
                 skipped[words] = None if seconds is None else (skipped.get(words) or 0.0) + seconds
         return {
             "tiles": len(reports),
@@ -88,11 +88,11 @@ class TiledMap(TileBlend):
             "scans": self.plan.scans,
             "returns": sum(tile.returns for tile in self.plan.tiles),
             "leaf_cells": self.num_cells,
-            "noise": reports[0]["noise"],
+            **{name: value for name, value in reports[0].items() if name == "noise"},
             "skipped": list(skipped),
             "skipped_s": list(skipped.values()),
             **{
-                step: sum(report[step] for report in reports)
+                step: sum(report.get(step, 0.0) for report in reports)
                 for step, seconds in reports[0].items()
                 if step.endswith("_s") and isinstance(seconds, float)
             },
