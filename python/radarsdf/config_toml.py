@@ -33,7 +33,7 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
         If it cannot be read.
     """
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except ValueError as error:  # invalid TOML or invalid UTF-8
         msg = f"{path} is not a TOML file: {error}"
         raise ValueError(msg) from error

@@ -162,7 +162,13 @@ def test_damaged_posed_folders(posed):
     write_pcd(posed / "radar" / stamp(0.2), radar_cloud([[1, 2, 3]]))
     with pytest.raises(ValueError, match="lacks the field power"):
         read_posed_folder(posed)
+    first, *others = sorted((posed / "radar").iterdir())
+    write_pcd(first, radar_cloud([[1, 2, 3]]))  # the other way round
+    write_pcd(others[0], radar_cloud([[1, 2, 3]], power=[1]))
+    with pytest.raises(ValueError, match="has the field power, which scans before it lack"):
+        read_posed_folder(posed)
     write_pcd(posed / "radar" / stamp(0.2), {"x": np.zeros(1), "power": np.zeros(1)})
+    write_pcd(first, radar_cloud([[1, 2, 3]], power=[1]))
     with pytest.raises(ValueError, match="lacks the fields y, z"):
         read_posed_folder(posed)
     (posed / "radar" / "first.pcd").touch()

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Sequence
 from os import PathLike
@@ -21,6 +22,7 @@ from radarsdf.io.las import INTENSITY as RADAR_INTENSITY
 from radarsdf.io.laz import check_las_points, check_las_records
 from radarsdf.io.origin import origin_of
 from radarsdf.io.pcd import read_pcd
+from radarsdf.io.text import COMMENTS, check_header, read_text, with_points, without_comment
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
 CLOUD_SUFFIXES = (".pcd", ".ply", ".bin", ".npy", *TEXT_SUFFIXES, ".las", ".laz")
@@ -28,7 +30,7 @@ CLOUD_SUFFIXES = (".pcd", ".ply", ".bin", ".npy", *TEXT_SUFFIXES, ".las", ".laz"
 
 _KITTI_COLUMNS = 4
 _PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
-_SEPARATORS = (",", ";", "\t", None)  # None: any white space
+_SEPARATORS = (";", ",", "\t", None)  # None: any white space
 
 Columns = dict[str, NDArray[Any]]
 
@@ -158,21 +160,24 @@ def _npy(path: Path, columns: int | Sequence[str] | None) -> Columns:
 
 
 def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
-    with path.open(encoding="utf-8") as file:
-        skipped, first = 0, ""
-        for line in file:
-            first = line.strip()
-            if first and not _is_comment(first):
-                break
-            skipped, first = skipped + 1, ""
+    text = with_points(read_text(path))
+    skipped, first = 0, ""
+    for line in text.split("\n"):
+        first = line.strip()
+        if first and not _is_comment(first):
+            break
+        skipped, first = skipped + 1, ""
     if not first:
         return {name: np.zeros(0) for name in names_of(3, None)}
+    first = without_comment(first.lstrip("/#% "))  # names may be after a comment sign
     separator = next(s for s in _SEPARATORS if s is None or s in first)
     words = [word.strip().strip('"') for word in first.split(separator)]
     header = not are_numbers(words)
-    table = np.loadtxt(path, delimiter=separator, skiprows=skipped + header, ndmin=2, comments=("#", "//"))
     if header:
-        words = [word.lstrip("/#").strip() for word in words]
+        check_header(words)
+    rows = io.StringIO(text)
+    table = np.loadtxt(rows, delimiter=separator, skiprows=skipped + header, ndmin=2, comments=COMMENTS)
+    if header:
         if table.size == 0:
             return {name: np.zeros(0) for name in words}
         if table.shape[1] != len(words) or len(set(words)) != len(words):
@@ -184,9 +189,9 @@ def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
 
 def _is_comment(line: str) -> bool:
     """Whether a line is a comment. Names of columns after a comment sign, as CloudCompare writes them, are a header."""
-    if not line.startswith(("#", "//")):
+    if not line.startswith(COMMENTS):
         return False
-    return not {"x", "y", "z"} <= set(re.split(r"[\s,;]+", line.lstrip("/#").strip().lower()))
+    return not {"x", "y", "z"} <= set(re.split(r"[\s,;]+", line.lstrip("/#%").strip().lower()))
 
 
 def _ply(path: Path) -> Columns:

@@ -26,6 +26,7 @@ from radarsdf.io.poses import ScanPoses, poses_of, read_calibration, trajectory_
 from radarsdf.io.sequence import Scans
 from radarsdf.io.snail_radar import SnailRadar, is_snail_radar
 from radarsdf.io.sources import RawScan, Request, files_source, natural, posed, scan_poses
+from radarsdf.io.text import read_text
 from radarsdf.io.trajectory import read_table
 
 Truth = Callable[[], NDArray[np.float64] | None] | None
@@ -197,7 +198,7 @@ class ViewOfDelft:
         path = lidar / "pose" / f"{frame}.json"
         T_map_camera = None
         try:
-            for line in path.read_text("utf-8").splitlines():  # an object a line
+            for line in read_text(path).splitlines():  # an object a line
                 if line.strip() and "mapToCamera" in (record := json.loads(line)):
                     T_map_camera = np.array(record["mapToCamera"], np.float64).reshape(4, 4)
             if T_map_camera is None:
@@ -329,9 +330,7 @@ def _translation_and_quaternion(path: Path) -> NDArray[np.float64]:
     """T_base_sensor (4, 4) of two lines: x y z, and qx qy qz qw."""
     try:
         rows = [
-            [float(word) for word in line.split()]
-            for line in path.read_text("utf-8").splitlines()
-            if line.strip()
+            [float(word) for word in line.split()] for line in read_text(path).splitlines() if line.strip()
         ]
         if [len(row) for row in rows] != [3, 4]:
             msg = "it has not one line x y z and one line qx qy qz qw"

@@ -181,6 +181,20 @@ class Fields:
             int((~finite).sum()),
         )
 
+    def check_no_more(self, others: Fields, what: str, first: str) -> None:
+        """Raises a ValueError if the cloud `what` has a role that these fields, of the cloud `first`, leave out."""
+        more = [
+            role
+            for role in ("intensity", "doppler", *_SIGMA)
+            if role in others.names and role not in self.names
+        ]
+        if more:
+            msg = (
+                f"{what} has the field {others.names[more[0]]} for {more[0]}, which {first} lacks: leave it out of all scans "
+                f"by fields={{{more[0]!r}: None}}"
+            )
+            raise ValueError(msg)
+
     def _column(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[np.float32] | None:
         if role not in self.names:
             return None

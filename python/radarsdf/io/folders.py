@@ -127,6 +127,9 @@ def read_stamped_scans(
         else:
             msg = f"{path} lacks the field {field}, which other scans have"
             raise ValueError(msg)
+        if field is None and (found := [name for name in INTENSITY_FIELDS if name in columns]):
+            msg = f"{path} has the field {found[0]}, which scans before it lack"
+            raise ValueError(msg)
         finite = np.isfinite(xyz).all(axis=1) & np.isfinite(values)
         if finite.any():
             times_s.append(time_s)

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check_poses, real_array
-from radarsdf.io.files import are_numbers, check_regular_file
+from radarsdf.io.files import check_regular_file
 from radarsdf.io.sequence import Notes
-from radarsdf.io.trajectory import Trajectory, trajectory_of_table
+from radarsdf.io.text import number_rows, read_text
+from radarsdf.io.trajectory import Trajectory, in_seconds, trajectory_of_table
 
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 """Names of files of poses that are found beside scans."""
@@ -136,7 +137,8 @@ def read_poses(
         - our own: 4 x 4 matrices T_world_base, as lines of sixteen numbers or blocks of four lines, or an array
           (F, 4, 4) in an ``.npy`` file.
 
-        Text may have commas, and comments after ``#``.
+        Text may have commas or semicolons, names in its first line, and comments after ``#``. Times of TUM may be in ms,
+        µs or ns since 1970.
     notes : Notes
         Is told what was assumed.
     calibration : sequence of Path
@@ -159,6 +161,7 @@ def read_poses(
         return _checked(_npy(path), path)
     table = _table(path)
     if table.shape[1] == _TUM_COLUMNS:
+        table[:, 0] = in_seconds(table[:, 0], path, notes)
         return trajectory_of_table(table, path)
     if table.shape[1] == _KITTI_COLUMNS:
         poses = np.tile(np.eye(4), (len(table), 1, 1))
@@ -198,7 +201,7 @@ def read_calibration(path: Path) -> NDArray[np.float64] | None:
     """
     check_regular_file(path)
     try:
-        lines = [line.partition(":") for line in path.read_text("utf-8").splitlines()]
+        lines = [line.partition(":") for line in read_text(path).splitlines()]
         found = {key.strip(): values.split() for key, _, values in lines}
         key = next((key for key in _CALIBRATION_KEYS if key in found), None)
         if key is None:
@@ -238,11 +241,7 @@ def trajectory_of(
 def _table(path: Path) -> NDArray[np.float64]:
     """(R, columns) float64 of a text file of numbers."""
     try:
-        lines = [line.partition("#")[0].replace(",", " ") for line in path.read_text("utf-8").splitlines()]
-        rows = [line.split() for line in lines if line.strip()]
-        if rows and not are_numbers(rows[0]):
-            rows = rows[1:]  # a header
-        table = np.array(rows, np.float64)
+        table = np.array(number_rows(path), np.float64)
     except ValueError as error:
         msg = f"{path} is not a table of poses: {error}"
         raise ValueError(msg) from error

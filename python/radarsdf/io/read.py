@@ -20,7 +20,15 @@ from radarsdf.io.folders import base_T_radar, lidar_map
 from radarsdf.io.poses import POSE_FILES, extrinsic_of, poses_of
 from radarsdf.io.scans import read_scans
 from radarsdf.io.sequence import Notes, Scan, Scans
-from radarsdf.io.sources import NOT_FINITE, Request, cloud_files, files_source, posed, scan_poses, times_of
+from radarsdf.io.sources import (
+    NOT_FINITE,
+    Request,
+    cloud_files,
+    files_source,
+    in_order_of_time,
+    posed,
+    scan_poses,
+)
 from radarsdf.io.trajectory import MAX_GAP_S
 
 _STAMPS = (None, "header", "record")
@@ -187,15 +195,11 @@ def _files(
     if isinstance(poses, (str, PathLike)):
         places = dict.fromkeys((Path(poses).parent, *places))
     calibrations = [place / name for place in places for name in _CALIBRATIONS]
-    times_s: Sequence[float] | None = times_of(files)
-    if times_s is not None:
-        order = np.argsort(times_s, kind="stable")
-        files, times_s = [files[i] for i in order], [times_s[i] for i in order]
+    given = poses_of(poses, request.notes, calibrations)
+    files, times_s, given = in_order_of_time(files, given, request.notes)
     T_base_sensor = request.extrinsic if request.extrinsic is not None else base_T_radar(folder)
-    matched, times_s = scan_poses(
-        poses_of(poses, request.notes, calibrations), len(files), times_s, T_base_sensor, request
-    )
-    source = posed(files_source(files, times_s, request), matched, request)
+    matched, known_s = scan_poses(given, len(files), times_s, T_base_sensor, request)
+    source = posed(files_source(files, known_s, request), matched, request)
     return Scans.of_source(source, request.notes, truth)
 
 

@@ -17,7 +17,8 @@ from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_colu
 from radarsdf.io.fields import Fields
 from radarsdf.io.poses import POSE_FILES, ScanPoses, StampedPoses
 from radarsdf.io.sequence import Notes, Scan
-from radarsdf.io.trajectory import MAX_GAP_S, Trajectory
+from radarsdf.io.text import number_rows
+from radarsdf.io.trajectory import MAX_GAP_S, Trajectory, in_seconds
 
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
 """Names of files with a time, s, for each scan, one a line."""
@@ -78,6 +79,7 @@ def posed(
 
     def source() -> Iterator[Scan]:
         fields: Fields | None = None
+        first_name, names = "", list[str]()
         first_s: float | None = None
         taken = 0
         for number, raw in enumerate(raw_scans()):
@@ -94,10 +96,16 @@ def posed(
                 notes.count(_NO_RETURNS, 1)
                 continue
             if fields is None:
-                fields = Fields.of(list(columns), request.fields, raw.name)
+                fields, first_name, names = (
+                    Fields.of(list(columns), request.fields, raw.name),
+                    raw.name,
+                    list(columns),
+                )
                 if fields.dialect is not None and fields.dialect.note:
                     notes.add(fields.dialect.note)
             cloud = fields.read(columns, raw.name)
+            if list(columns) != names:
+                fields.check_no_more(Fields.of(list(columns), request.fields, raw.name), raw.name, first_name)
             notes.count(NOT_FINITE, cloud.dropped)
             if len(cloud.points) == 0:
                 notes.count(_NO_RETURNS, 1)
@@ -140,8 +148,32 @@ def natural(path: Path) -> tuple[Any, ...]:
     return tuple((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts))
 
 
-def times_of(files: list[Path]) -> list[float] | None:
-    """Times of scans, s, by their names, or by a file of times beside them; None if there are none.
+def in_order_of_time(
+    files: list[Path], poses: StampedPoses | NDArray[np.float64], notes: Notes
+) -> tuple[list[Path], list[float] | None, StampedPoses | NDArray[np.float64]]:
+    """Scans in the order of their times, these times, s, None if there are none, and the poses.
+
+    Poses without times belong to the files by number: in the order of the times in their names, or, where a file has the
+    times line by line, in the order of these lines.
+    """
+    times, listed = times_of(files, notes)
+    if times is None:
+        return files, None, poses
+    order = np.argsort(times, kind="stable")
+    if (np.diff(order) < 0).any():
+        if listed is not None:
+            notes.add(f"{listed.name} is not ascending: scans are read in the order of their times")
+            if isinstance(poses, np.ndarray) and len(poses) == len(files):
+                poses = poses[order]
+        elif isinstance(poses, np.ndarray):
+            notes.add(
+                "the times in the names of the scans are in another order than the names: poses are in that of times"
+            )
+    return [files[i] for i in order], [times[i] for i in order], poses
+
+
+def times_of(files: list[Path], notes: Notes) -> tuple[list[float] | None, Path | None]:
+    """Times of scans, s, by their names, or by a file of times beside them, and this file; None if there are none.
 
     A name that ends in a number with a point is a time in s; in 12, 15 or 18 digits or more, in ms, µs or ns. Shorter
     ones are numbers of scans.
@@ -149,12 +181,14 @@ def times_of(files: list[Path]) -> list[float] | None:
     named = [_time_of(path.stem) for path in files]
     times = [time for time in named if time is not None]
     if len(times) == len(files) and len(set(times)) == len(files):
-        return times
+        return times, None
+    if len(times) == len(files) > 1:
+        notes.add("several scans have the same time in their names: these times are not used")
     for folder in (files[0].parent, files[0].parent.parent):
         for name in TIME_FILES:
             if (path := folder / name).is_file():
-                return _listed_times(path, len(files))
-    return None
+                return _listed_times(path, len(files), notes), path
+    return None, None
 
 
 def _time_of(stem: str) -> float | None:
@@ -169,16 +203,19 @@ def _time_of(stem: str) -> float | None:
     return int(found[1]) * unit
 
 
-def _listed_times(path: Path, count: int) -> list[float]:
+def _listed_times(path: Path, count: int, notes: Notes) -> list[float]:
     try:
-        times = [float(line.split()[-1]) for line in path.read_text("utf-8").splitlines() if line.strip()]
+        times = np.array([float(row[-1]) for row in number_rows(path)])
     except ValueError as error:
         msg = f"{path} does not hold a time in seconds in each line: {error}"
         raise ValueError(msg) from error
     if len(times) != count:
         msg = f"{path} has {len(times)} times for {count} scans"
         raise ValueError(msg)
-    return times
+    seconds: list[float] = in_seconds(times, path, notes).tolist()
+    if len(set(seconds)) < count:
+        notes.add(f"{path.name} has the same time for several scans")
+    return seconds
 
 
 def scan_poses(

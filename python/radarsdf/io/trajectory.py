@@ -13,9 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from radarsdf.io.sequence import Notes
+from radarsdf.io.text import number_rows
+
 MAX_GAP_S = 0.5
 """Longest time between two poses over which poses are interpolated, by default."""
 
+_UNITS = ((1e17, "ns", 1e-9), (1e14, "µs", 1e-6), (1e11, "ms", 1e-3))  # from so much on, since 1970
 _MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
 _ROUNDED_S = 1e-3
 _NEARLY_SAME = 1 - 1e-9  # cosine of half an angle so small that its sine and itself are equal to rounding
@@ -144,6 +148,30 @@ def _matrix(quaternion: NDArray[np.float64]) -> list[list[float]]:
     ]
 
 
+def in_seconds(times: NDArray[np.float64], path: Path, notes: Notes) -> NDArray[np.float64]:
+    """Times (N,) of a file, s. They may be in ms, µs or ns since 1970, which is noted.
+
+    Raises
+    ------
+    ValueError
+        If a time is not finite, or times are of different units.
+    """
+    if not np.isfinite(times).all():
+        msg = f"{path} holds a time that is not finite"
+        raise ValueError(msg)
+    units = {
+        next((unit for unit in _UNITS if abs(time) >= unit[0]), None) for time in times[times != 0].tolist()
+    }
+    if len(units) > 1:
+        msg = f"{path} holds times of different units, such as s and ns"
+        raise ValueError(msg)
+    (unit,) = units or {None}
+    if unit is None:
+        return times
+    notes.add(f"times of {path.name} are taken as {unit[1]} since 1970")
+    return times * unit[2]
+
+
 def read_trajectory(path: Path) -> Trajectory:
     """Reads a trajectory in the TUM format: lines of ``time x y z qx qy qz qw``, s and m, and comments after ``#``.
 
@@ -180,8 +208,7 @@ def read_table(path: Path, columns: int) -> NDArray[np.float64]:
         If the file cannot be read.
     """
     try:
-        lines = [line.partition("#")[0] for line in path.read_text("utf-8").splitlines()]
-        table = np.array([line.split() for line in lines if line.strip()], np.float64)
+        table = np.array(number_rows(path), np.float64)
     except ValueError as error:
         msg = f"{path} is not a table of {columns} columns of numbers: {error}"
         raise ValueError(msg) from error

@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Text files of numbers, as programs write them: one way to read them, in which no line is lost without a word."""
+
+from __future__ import annotations
+
+import codecs
+import itertools
+import re
+from pathlib import Path
+
+from radarsdf.io.files import are_numbers
+
+# Of UTF-32 before UTF-16, whose mark is the beginning of the other's.
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+COMMENTS = ("#", "//", "%")
+"""Signs after which the rest of a line is a comment."""
+_COMMENT = re.compile("(" + "|".join(COMMENTS) + ").*")
+_DECIMAL_COMMA = r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?"
+_IN_CELL = re.compile(rf"(?:^|;)[ \t]*{_DECIMAL_COMMA}(?=[ \t]*(?:;|$))", re.MULTILINE)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, with a line feed after each line.
+
+    It is in UTF-8, or in another encoding of Unicode that a byte order mark names, which is left out. Lines may end as
+    those of any system.
+
+    Raises
+    ------
+    ValueError
+        If the file is no such text.
+    OSError
+        If it cannot be read.
+    """
+    data = path.read_bytes()
+    encoding = next((encoding for mark, encoding in _MARKS if data.startswith(mark)), "utf-8")
+    return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def with_points(text: str) -> str:
+    """The same numbers with decimal points, if there are decimal commas: then semicolons separate numbers.
+
+    Raises
+    ------
+    ValueError
+        If there are decimal commas, and numbers are separated by spaces: it could be twice as many numbers.
+    """
+    bare = map(without_comment, text.split("\n"))
+    rows = list(itertools.islice(filter(None, bare), 2))  # a line of names, and one of numbers
+    if any(";" in row for row in rows):
+        return _IN_CELL.sub(lambda cell: cell[0].replace(",", "."), text)
+    for words in map(str.split, rows):
+        if len(words) > 1 and all(re.fullmatch(_DECIMAL_COMMA, word) for word in words):
+            msg = "it has decimal commas between spaces: write decimal points, or semicolons between the numbers"
+            raise ValueError(msg)
+    return text
+
+
+def without_comment(line: str) -> str:
+    """A line without a comment, and without white space at its ends."""
+    return _COMMENT.sub("", line).strip()
+
+
+def check_header(words: list[str]) -> None:
+    """Raises a ValueError if the words above numbers are no names, but a row of numbers with something else in it."""
+    number = next((word for word in words if are_numbers([word])), None)
+    if number is not None:
+        wrong = next(word for word in words if not are_numbers([word]))
+        msg = f"its first line has the number {number:.50} and {wrong!r:.50}, which is none"
+        raise ValueError(msg)
+
+
+def number_rows(path: Path) -> list[list[str]]:
+    """The rows of a text file of numbers, which are separated by commas, semicolons or white space.
+
+    Comments after ``#``, ``//`` or ``%`` and blank lines are left out, and a first line of names.
+
+    Raises
+    ------
+    ValueError
+        If a row has a word that is no number, or another number of words than the first.
+    OSError
+        If the file cannot be read.
+    """
+    rows: list[list[str]] = []
+    above = 0
+    for number, line in enumerate(with_points(read_text(path)).split("\n"), 1):
+        bare = without_comment(line)
+        if not bare:
+            continue
+        words = re.split(r"\s*[,;]\s*|\s+", bare.rstrip(",; \t"))
+        if not (rows or above or are_numbers(words)):
+            check_header(words)
+            above = number
+            continue
+        if not are_numbers(words):
+            wrong = next(word for word in words if not are_numbers([word]))
+            msg = f"line {number} has {wrong!r:.50} where a number must be"
+            raise ValueError(msg)
+        if rows and len(words) != len(rows[0]):
+            msg = f"line {number} has {len(words)} numbers, and lines before it have {len(rows[0])}"
+            raise ValueError(msg)
+        rows.append(words)
+    return rows

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Text as other programs write it: the same numbers, or an error, and never a line less."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from radarsdf import config_toml
+from radarsdf.io import read
+from radarsdf.io.clouds import read_columns
+from radarsdf.io.poses import read_calibration, read_poses
+from radarsdf.io.sequence import Notes
+from radarsdf.io.text import number_rows
+from radarsdf.io.trajectory import read_trajectory
+
+ROWS = np.array([[1.5, -2, 3, 40.25], [4, 5.125, 6, 70], [7, 8, 9e-2, 10]])
+TUM = np.array([[10.0, 1, 2, 3, 0, 0, 0, 1], [10.25, 2, 2, 3, 0, 0, 1, 0], [10.5, 3, 2, 3, 0, 0, 0, 1]])
+
+
+def table(rows, separator=" ", comma=".", end="\n"):
+    return "".join(
+        separator.join(repr(number).replace(".", comma) for number in row) + end for row in rows.tolist()
+    )
+
+
+ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-32"]
+LAYOUTS = {
+    "spaces": table,
+    "commas": lambda rows: table(rows, ", "),
+    "tabs": lambda rows: table(rows, "\t"),
+    "semicolons": lambda rows: table(rows, ";"),
+    "decimal commas": lambda rows: table(rows, " ; ", ","),
+    "CR": lambda rows: table(rows, end="\r"),
+    "CRLF": lambda rows: table(rows, ",", end="\r\n"),
+    "blank lines": lambda rows: "\n\n" + table(rows, end="\n\n") + "\n  \n\n",
+    "comments": lambda rows: "# by; hand, twice\n// and more\n% here\n" + table(rows, ",", end=" # a; 1,5\n"),
+}
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_same_numbers_in_all_layouts(tmp_path, layout, encoding):
+    (tmp_path / "a.csv").write_bytes(LAYOUTS[layout](ROWS).encode(encoding))
+    assert_array_equal(np.transpose(list(read_columns(tmp_path / "a.csv").values())), ROWS)
+    (tmp_path / "poses.txt").write_bytes(LAYOUTS[layout](TUM).encode(encoding))
+    for trajectory in (read_poses(tmp_path / "poses.txt", Notes()), read_trajectory(tmp_path / "poses.txt")):
+        assert_array_equal(trajectory.times_s, TUM[:, 0])
+        assert_array_equal(trajectory.positions, TUM[:, 1:4])
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_names_of_columns(tmp_path, encoding, separator):
+    text = separator.join(["x", "y", "z", "power"]) + "\r\n" + table(ROWS, separator, end="\r\n")
+    (tmp_path / "a.csv").write_bytes(text.encode(encoding))
+    columns = read_columns(tmp_path / "a.csv")
+    assert list(columns) == ["x", "y", "z", "power"]
+    assert_array_equal(np.transpose(list(columns.values())), ROWS)
+
+
+def test_a_calibration_and_settings_with_a_byte_order_mark(tmp_path):
+    matrix = " ".join(map(str, np.eye(4)[:3].ravel()))
+    (tmp_path / "calib.txt").write_text(f"Tr: {matrix}\n", "utf-8-sig")
+    assert_array_equal(read_calibration(tmp_path / "calib.txt"), np.eye(4))
+    (tmp_path / "a.toml").write_text("seed = 3\n", "utf-8-sig")
+    assert config_toml.read_toml(tmp_path / "a.toml") == {"seed": 3}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("\x001 2 3\n4 5 6\n", "a.csv"),
+        ("1 2 3\n4 5 six\n", "a.csv"),
+        ("x1 2 3\n4 5 6\n", "first line has the number 2"),
+        ("1,5 2,5 3,5\n4,5 5,5 6,5\n", "decimal commas between spaces"),
+        ("x y z\n1,5 2,5 3,5\n", "decimal commas between spaces"),
+        ("1 2 3\n4 5\n", "a.csv"),
+        ("1,2,3\n4,,6\n", "a.csv"),
+        ("x y z\nm m m\n1 2 3\n", "a.csv"),
+    ],
+)
+def test_no_line_is_lost(tmp_path, text, message):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_columns(tmp_path / "a.csv")
+    with pytest.raises(ValueError, match=message.replace("a.csv", "line")):
+        number_rows(tmp_path / "a.csv")
+
+
+def test_rows_of_numbers_may_have_names_and_a_comma_at_their_end(tmp_path):
+    (tmp_path / "a.txt").write_text("time, x,\n1, 2,\n3, nan,\n")
+    assert number_rows(tmp_path / "a.txt") == [["1", "2"], ["3", "nan"]]
+
+
+# What belongs to what in a folder.
+
+POSES = np.tile(np.eye(4), (4, 1, 1))
+POSES[:, 0, 3] = [10, 20, 30, 40]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Four scans, 0.csv to 3.csv, of which number i has its return at x = i + 1, and poses of KITTI at 10 (i + 1)."""
+    for i in range(4):
+        (tmp_path / f"{i}.csv").write_text(f"{i + 1} 0 0 {i}\n")
+    (tmp_path / "poses.txt").write_text("".join(" ".join(map(str, p[:3].ravel())) + "\n" for p in POSES))
+    return tmp_path
+
+
+def pairs(scans):
+    """The place of the return and of the sensor in each scan."""
+    return [(float(scan.points[0, 0]), float(scan.T_world_sensor[0, 3])) for scan in scans]
+
+
+def test_each_scan_keeps_its_pose_where_times_do_not_ascend(folder):
+    (folder / "times.txt").write_text("0.3\n0.1\n0.2\n0.4\n")
+    for poses in (None, POSES):
+        scans = read(folder, poses)
+        assert pairs(scans) == [(2, 20), (3, 30), (1, 10), (4, 40)]
+        assert scans.times_s.tolist() == [0.1, 0.2, 0.3, 0.4]
+        assert "times.txt is not ascending: scans are read in the order of their times" in scans.notes
+    (folder / "times.txt").write_text("0.1\n0.2\n0.3\n0.4\n")
+    assert not any("times.txt" in note for note in read(folder).notes)
+    (folder / "times.txt").write_text("0.1\n0.1\n0.3\n0.4\n")
+    assert pairs(read(folder)) == [(1, 10), (2, 20), (3, 30), (4, 40)]
+    assert "times.txt has the same time for several scans" in read(folder).notes
+
+
+def test_times_may_be_in_other_units(folder):
+    start_s = 1_700_000_000
+    tum = "".join(f"{start_s + i} {10 * i + 10} 0 0 0 0 0 1\n" for i in range(4))
+    (folder / "poses.txt").write_text(tum)
+    (folder / "times.txt").write_text("".join(f"{1_000_000_000 * (start_s + i)}\n" for i in range(4)))
+    scans = read(folder, max_gap_s=1.5)
+    assert pairs(scans) == [(1, 10), (2, 20), (3, 30), (4, 40)]
+    assert "times of times.txt are taken as ns since 1970" in scans.notes
+    (folder / "poses.txt").write_text(tum.replace(" ", "000 ", 1))
+    with pytest.raises(ValueError, match=r"poses\.txt holds times of different units"):
+        read(folder)
+
+
+@pytest.mark.parametrize("times", ["0.1\nnan\n0.3\n0.4\n", "0.1\ninf\n0.3\n0.4\n", "0.1\n0.2\n0.3\n1e18\n"])
+def test_times_that_are_none(folder, times):
+    (folder / "times.txt").write_text(times)
+    with pytest.raises(ValueError, match=r"times\.txt holds "):
+        read(folder)
+
+
+def test_scans_of_one_time_in_their_names(folder):
+    for i in range(4):
+        (folder / f"{i}.csv").rename(folder / f"scan{i}_100.5.csv")
+    scans = read(folder)
+    assert pairs(scans) == [(1, 10), (2, 20), (3, 30), (4, 40)]
+    assert scans.times_s is None
+    assert "several scans have the same time in their names: these times are not used" in scans.notes
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "role", "names"),
+    [
+        ("x,y,z\n1,0,0\n", "x,y,z,power\n2,0,0,5\n", "intensity", "power"),
+        ("x,y,z,power\n1,0,0,5\n", "x,y,z,power,doppler\n2,0,0,5,1\n", "doppler", "doppler"),
+        ("x,y,z,power\n1,0,0,5\n", "x,y,z\n2,0,0\n", None, "power"),
+        ("x,y,z,doppler\n1,0,0,5\n", "x,y,z\n2,0,0\n", None, "doppler"),
+    ],
+)
+def test_a_column_that_not_all_scans_have_is_said(folder, first, later, role, names):
+    for i in range(4):
+        (folder / f"{i}.csv").write_text(first if i == 0 else later)
+    with pytest.raises(ValueError, match=f"the field {names}"):
+        len(read(folder))
+    left_out = {role or {"power": "intensity"}.get(names, names): None}
+    scans = read(folder, fields=left_out)
+    assert len(scans) == 4
+    assert not any("field" in note for note in scans.notes)
