@@ -169,7 +169,10 @@ class Glb(NamedTuple):
         a, b, c, d, e = light._FIT
         x = self.light.astype(np.float64) @ light._IN.T / light._EXPOSURE
         linear = np.clip((x * (x + a) - b) / (x * (c * x + d) + e) @ light._OUT.T, 0, 1)
-        return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        shown: NDArray[np.float64] = 255 * np.where(
+            linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+        )
+        return shown
 
     @classmethod
     def of(cls, data: bytes) -> Glb:

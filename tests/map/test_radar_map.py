@@ -245,12 +245,15 @@ def test_nbytes_is_that_of_features_and_weights(scene, sharp_map):
     assert without.nbytes == features + 4 * sdf
 
 
-def test_repr_says_what_it_is(scene, sharp_map):
+def test_repr_says_what_it_is_and_what_its_file_takes(scene, sharp_map, tmp_path):
     cells = sharp_map.report["leaf_cells"]
     assert (
         repr(sharp_map)
-        == f"RadarMap(surface and reflectance, {cells} cells, {sharp_map.nbytes / 1e6:.1f} MB)"
+        == f"RadarMap(surface and reflectance, {cells} cells, {sharp_map.file_bytes / 1e6:.1f} MB)"
     )
+    sharp_map.save(tmp_path / "map.safetensors")
+    names = (tmp_path / "map.safetensors").stat().st_size - sharp_map.file_bytes
+    assert 0 < names < 2000
     config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     assert repr(radarsdf.fit(scene.points, scene.poses, config=config)).startswith("RadarMap(surface, ")
 

@@ -163,7 +163,7 @@ def _say(
         ),
         noise=noise,
     )
-    results.add(f"written to {out}", out=out, leaf_cells=report["leaf_cells"], map_bytes=radar_map.nbytes)
+    results.add(f"written to {out}", out=out, leaf_cells=report["leaf_cells"], map_bytes=radar_map.file_bytes)
     following = ["radarsdf", "mesh", str(out), "-o", str(out.with_suffix(".ply"))]
     if options.quick:
         following += ["--voxel", "0.2"]

@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> None:
 def _add_map(results: Results, radar_map: AnyMap) -> None:
     scale, sensor = radar_map.intensity_scale, radar_map.sensor
     limits = None if scale is None else (scale.low, scale.high)
-    cells, edge_m, size = radar_map.num_cells, radar_map.config.leaf_size_m, radar_map.nbytes
+    cells, edge_m, size = radar_map.num_cells, radar_map.config.leaf_size_m, radar_map.file_bytes
     results.add(_line("map", repr(radar_map)), map=repr(radar_map))
     report = radar_map.report
     counted_in = {name: report[name] for name in ("scans", "returns") if name in report}

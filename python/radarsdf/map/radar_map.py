@@ -44,7 +44,7 @@ class RadarMap:
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
-        return f"RadarMap({kind}, {self.num_cells} cells, {self.nbytes / 1e6:.1f} MB)"
+        return f"RadarMap({kind}, {self.num_cells} cells, {self.file_bytes / 1e6:.1f} MB)"
 
     def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
         return _from_pickle, storage.to_pickle(self._contents)
@@ -105,6 +105,11 @@ class RadarMap:
     def nbytes(self) -> int:
         """Size of features and networks, bytes. 3QFP calls this the size of the map."""
         return sum(p.numel() * p.element_size() for p in self.field.parameters())
+
+    @property
+    def file_bytes(self) -> int:
+        """Size of the file that :meth:`save` writes, without the names of its arrays: less than 2 kB; bytes."""
+        return storage.file_bytes(self._contents)
 
     @property
     def field(self) -> Field:

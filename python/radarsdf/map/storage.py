@@ -70,6 +70,13 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     write_whole(path, to_bytes(tensors, metadata))
 
 
+def file_bytes(contents: MapContents) -> int:
+    """Size of the file of :func:`save_contents`, without the names of its arrays, bytes."""
+    tensors, description = parts_of(contents)
+    quoted = json.dumps(json.dumps(description))  # as it stands in the header, which is JSON itself
+    return sum(tensor.nbytes for tensor in tensors.values()) + len(quoted)
+
+
 def to_pickle(contents: MapContents) -> tuple[bytes, dict[str, Any]]:
     """The contents of a map's pickle: tensors as bytes, so that it does not contain classes of PyTorch."""
     tensors, description = parts_of(contents)

@@ -82,5 +82,5 @@ def _facts(subject: Subject) -> list[tuple[str, str]]:
             ("Fit", f"{sum(v for k, v in report.items() if k.endswith('_s') and k != 'skipped_s'):.1f} s")
         )
     facts.append(("Surface", f"{subject.mesh.area:,.0f} m²"))
-    facts.append(("Map", f"{subject.radar_map.nbytes / 1e6:.1f} MB"))
+    facts.append(("Map", f"{subject.radar_map.file_bytes / 1e6:.1f} MB"))
     return facts

@@ -112,7 +112,7 @@ class TiledMap(TileBlend):
         return self.config.lattice.position(np.stack([lower, upper + 1]))
 
     @property
-    def nbytes(self) -> int:
+    def file_bytes(self) -> int:
         """Size of the files of the tiles, bytes."""
         return sum(map_path(self.folder, tile).stat().st_size for tile in self.tiles)
 
