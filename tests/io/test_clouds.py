@@ -237,7 +237,7 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     with pytest.raises(ImportError, match=r'pip install "laspy\[lazrs\]>=2.5"'):
         read_points(tmp_path / "a.las")
     (tmp_path / "a.bag").touch()
-    with pytest.raises(ImportError, match='pip install "rosbags>=0.11"'):
+    with pytest.raises(ImportError, match=r'pip install "rosbags>=0\.11"'):
         read(tmp_path / "a.bag")
 
 
