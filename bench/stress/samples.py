@@ -111,6 +111,11 @@ def _settings(config: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
     return [(group, name) for group in groups for name in group]
 
 
+def _change_one(rng: np.random.Generator, parts: Any, value: Any) -> None:
+    if isinstance(parts, dict) and parts:
+        parts[list(parts)[rng.integers(len(parts))]] = value
+
+
 def hostile_map(rng: np.random.Generator) -> bytes:
     """A map whose header is valid JSON of the correct length, with one to three changed values."""
     data = maps()[rng.integers(2)]
@@ -121,7 +126,7 @@ def hostile_map(rng: np.random.Generator) -> bytes:
         value = _VALUES[rng.integers(len(_VALUES))]
         tensors = [name for name in header if name != "__metadata__"]
         tensor = header[tensors[rng.integers(len(tensors))]]
-        match rng.integers(6):
+        match rng.integers(7):
             case 0 | 1:
                 config = description.get("config")
                 settings = _settings(config) if isinstance(config, dict) else []
@@ -130,6 +135,9 @@ def hostile_map(rng: np.random.Generator) -> bytes:
                     group[name] = value
             case 2:
                 description[str(rng.choice(["config", "report", "intensity_scale", "more"]))] = value
+            case 6:
+                _change_one(rng, description["sensor"], value)
+                _change_one(rng, description.get("report"), value)
             case 3:
                 shapes = [value, [2**32, 2**32], [0, 2**63], [10**12], [-1], [8, 8]]
                 tensor["shape"] = shapes[rng.integers(len(shapes))]

@@ -34,7 +34,10 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except ValueError as error:  # invalid TOML or invalid UTF-8
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # invalid TOML or invalid UTF-8, or lists in lists without end
         msg = f"{path} is not a TOML file: {error}"
         raise ValueError(msg) from error
 

@@ -69,6 +69,7 @@ def test_what_config_prints_is_the_same_configuration(capsys, tmp_path, preset):
     ("text", "said"),
     [
         ("seed =", "is not a TOML file"),
+        ("seed = " + "[" * 5000, "is not a TOML file"),
         ("colour = 1", "unknown setting colour"),
         ("[training]\nbar = 1", "unknown setting training.bar"),
     ],

@@ -232,6 +232,27 @@ def test_pieces_that_are_damaged_are_refused(copy):
             radarsdf.load(copy).mesh(0.2, progress=False)
 
 
+def test_a_map_of_another_tile_is_refused(copy):
+    first, second = (map_path(copy, tile) for tile in Plan.load(copy).tiles[:2])
+    shutil.copy(second, first)
+    city = radarsdf.load(copy)
+    with pytest.raises(ValueError, match="is not the map of this tile"):
+        city.contents_of(city.tiles[0].tile)
+
+
+def test_leaf_keys_that_are_damaged_are_refused(copy):
+    path = map_path(copy, Plan.load(copy).tiles[0])
+    data = path.read_bytes()
+    for old, new in (
+        (b'"leaf_keys"', b'"leaf_kexs"'),
+        (b'"leaf_keys":{"dtype":"I64"', b'"leaf_keys":{"dtype":"F64"'),
+    ):
+        assert old in data
+        path.write_bytes(data.replace(old, new))
+        with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+            radarsdf.load(copy).num_cells  # noqa: B018 - it reads
+
+
 def test_each_field_of_a_report_is_checked(copy):
     tile = Plan.load(copy).tiles[0]
     report = report_of(copy, tile)

@@ -177,18 +177,36 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
     except (OSError, _OtherFileError):
         raise
     except SafetensorError as error:
-        msg = f"{path} is not a whole radarsdf map: it is cut off, damaged, or of another kind; radarsdf fit writes maps"
-        raise ValueError(msg) from error
+        raise _damaged(path) from error
     except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} is not a whole radarsdf map: {error}"
         raise ValueError(msg) from error
 
 
 def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
-    """(C,) Morton keys of the leaf cells of a map, ascending. Nothing else of its file is read or checked."""
-    with open_tensors(path, "np") as file:
-        keys: NDArray[np.uint64] = file.get_tensor("leaf_keys").astype(np.uint64)
-    return keys
+    """(C,) Morton keys of the leaf cells of a map, ascending. Nothing else of its file is read or checked.
+
+    Raises
+    ------
+    ValueError
+        If the file has none.
+    OSError
+        If it cannot be read.
+    """
+    try:
+        with open_tensors(path, "np") as file:
+            keys: NDArray[Any] = file.get_tensor("leaf_keys")
+    except SafetensorError as error:
+        raise _damaged(path) from error
+    if keys.dtype != np.int64 or keys.ndim != 1 or not (np.diff(keys, prepend=-1) > 0).all():
+        raise _damaged(path)
+    return keys.astype(np.uint64)
+
+
+def _damaged(path: str | PathLike[str]) -> ValueError:
+    return ValueError(
+        f"{path} is not a whole radarsdf map: it is cut off, damaged, or of another kind; radarsdf fit writes maps"
+    )
 
 
 class _OtherFileError(ValueError):

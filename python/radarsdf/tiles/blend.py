@@ -26,7 +26,7 @@ from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.plan import Plan, TilePlan, failure_of, map_path
-from radarsdf.tiles.tile_fit import is_done
+from radarsdf.tiles.tile_fit import contents_of_tile, is_done
 
 _Floats = NDArray[np.float64]
 MEMORY_BYTES = 1 << 30
@@ -144,7 +144,7 @@ class TileBlend:
         """The map of a tile that is done. It is read, unless it is in memory."""
         with self._lock:
             if tile not in self._held:
-                contents = storage.load_contents(map_path(self.folder, self.plan.by_tile[tile]))
+                contents = contents_of_tile(self.folder, self.plan, self.plan.by_tile[tile])
                 size = round(_OF_FEATURES * contents.field.cells.features.nbytes)
                 while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
                     self._held.popitem(last=False)

@@ -8,12 +8,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from safetensors import SafetensorError
 
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import write_whole
 from radarsdf.io.tensors import open_tensors
+from radarsdf.map.contents import MapContents
 from radarsdf.map.fit_report import checked_report
+from radarsdf.map.storage import load_contents
 from radarsdf.tiles.plan import Plan, TilePlan, failure_path, map_path
 from radarsdf.tiles.ray_files import read_rays
 
@@ -83,6 +86,28 @@ def is_done(root: Path, plan: Plan, tile: TilePlan) -> bool:
         return bool(_report(path)["plan"] == plan.digest)
     except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError):
         return False
+
+
+def contents_of_tile(root: Path, plan: Plan, tile: TilePlan) -> MapContents:
+    """The map of a tile that is done.
+
+    Raises
+    ------
+    ValueError
+        If its file is damaged, or is not of this plan.
+    OSError
+        If it cannot be read.
+    """
+    path = map_path(root, tile)
+    contents = load_contents(path)
+    if (
+        contents.config != plan.config
+        or contents.intensity_scale != plan.scale
+        or not np.array_equal(contents.origin, plan.config.lattice.position(tile.origin_cells))
+    ):
+        msg = f"{path} is not the map of this tile, by its settings, its place or its intensities"
+        raise ValueError(msg)
+    return contents
 
 
 def report_of(root: Path, tile: TilePlan) -> dict[str, Any]:
