@@ -126,14 +126,16 @@ def _errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
     normals[on_side, 1] = -np.sign(hits[on_side, 1])
     normals[~on_ground & ~on_side, 0] = -np.sign(rays[~on_ground & ~on_side, 0])
     known = radar_map.observed(hits)
-    front, back = (radar_map.sdf(hits[known] + side * _OFF_M * normals[known]) for side in (1, -1))
+    front, back = (
+        radar_map.sdf(hits[known] + side * _OFF_M * normals[known], extrapolate=True) for side in (1, -1)
+    )
     right = float(((front > 0).mean() + (back < 0).mean()) / 2)
     if not right > _LEAST_RIGHT:
         msg = f"only {right:.0%} of the signs are correct, and 50% would be chance"
         raise RuntimeError(msg)
     errors = {"right": right}
     if radar_map.has_intensity:
-        predicted = radar_map.intensity(hits[known], sensors[known])
+        predicted = radar_map.intensity(hits[known], sensors[known], extrapolate=True)
         errors["mae"] = float(np.abs(predicted - scans.hit_intensities[known]).mean())
         spread = float(np.abs(scans.hit_intensities - np.median(scans.hit_intensities)).mean())
         if not errors["mae"] < spread:

@@ -58,7 +58,7 @@ def _repetition(scene: Scene, options: Options, base: str, variant: str, seed: i
     train, test = scene.split()
     config = options.config(base, scene, seed=seed, **merged(_FULL, _VARIANTS[variant]))
     x, sensors, measured = world_returns(test)
-    metrics = intensity_metrics(fit(train, config).intensity(x, sensors), measured)
+    metrics = intensity_metrics(fit(train, config).intensity(x, sensors, extrapolate=True), measured)
     return [{"scene": scene.name, "base": base, "variant": variant, "seed": seed, **metrics}]
 
 

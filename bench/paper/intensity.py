@@ -56,7 +56,7 @@ def _repetition(scene: Scene, options: Options, base: str, seed: int) -> list[Ro
     train, test = scene.split()
     radar_map = fit(train, options.config(base, scene, seed=seed))
     x, sensors, measured = world_returns(test)
-    metrics = intensity_metrics(radar_map.intensity(x, sensors), measured)
+    metrics = intensity_metrics(radar_map.intensity(x, sensors, extrapolate=True), measured)
     return [{"scene": scene.name, "method": _NAMES[base], "seed": seed, **metrics}]
 
 

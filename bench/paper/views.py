@@ -38,7 +38,11 @@ def _rows(scene: Scene, options: Options, base: str, variant: str) -> list[Row]:
     x, sensors, measured = world_returns(test)
     reflector = _reflector(scene)
     row |= {"angle_deg": _angle_deg(sensors, reflector), "distance_m": np.linalg.norm(x - reflector, axis=1)}
-    row |= {"x": x - reflector, "measured": measured, "predicted": radar_map.intensity(x, sensors)}
+    row |= {
+        "x": x - reflector,
+        "measured": measured,
+        "predicted": radar_map.intensity(x, sensors, extrapolate=True),
+    }
     if test.simulation is not None:
         row["truth"] = _noiseless(test)
     return [row]

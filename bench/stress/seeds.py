@@ -30,7 +30,7 @@ def rows_of(scene: Scene, options: Options) -> list[Row]:
                 row |= {name: 100 * metrics[name] for name in ("f_score", "f_score_all")}
         if test.intensities is not None:
             x, sensors, measured = world_returns(test)
-            row["mae"] = intensity_metrics(radar_map.intensity(x, sensors), measured)["mae"]
+            row["mae"] = intensity_metrics(radar_map.intensity(x, sensors, extrapolate=True), measured)["mae"]
         rows.append(row)
     return rows
 

@@ -75,7 +75,11 @@ def fitted(changes: Changes, iterations: int) -> tuple[RadarMap, str]:
     assert all(value.isfinite().all() for value in radar_map.field.state_dict().values())
     assert all(np.isfinite(loss) for loss in radar_map.report["losses"].values())
     x = np.random.default_rng(1).uniform(-4.5, 4.5, (2000, 3))
-    for values in (radar_map.sdf(x), radar_map.gradient(x), radar_map.intensity(x, poses[0, :3, 3])):
+    for values in (
+        radar_map.sdf(x, extrapolate=True),
+        radar_map.gradient(x, extrapolate=True),
+        radar_map.intensity(x, poses[0, :3, 3], extrapolate=True),
+    ):
         assert np.isfinite(values).all()
     assert np.isfinite(radar_map.mesh(0.2, progress=False).vertices).all()
     return radar_map, end

@@ -76,7 +76,7 @@ def test_anywhere(origin):
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK, progress=False)
     _, mesh = finite(radar_map, scene.poses[0, :3, 3])
     assert wall_error_m(radar_map, T) < 0.1
-    assert (radar_map.sdf(scene.poses[:, :3, 3]) > 0).all()
+    assert (radar_map.sdf(scene.poses[:, :3, 3], extrapolate=True) > 0).all()
     assert np.abs(mesh.vertices - scene.poses[0, :3, 3]).max() < 30
 
 
@@ -295,7 +295,7 @@ def test_intensities_of_any_kind(name):
     assert (found >= low - spread).all()
     assert (found <= high + spread).all()
     kept = prepare(scene.points, scene.poses, values)
-    predicted = radar_map.intensity(*kept.in_world())
+    predicted = radar_map.intensity(*kept.in_world(), extrapolate=True)
     assert np.isfinite(predicted).all()
     if name in ("negative", "huge", "tiny spread"):  # a change of units: as well fitted as without
         errors = np.abs(predicted - kept.intensities) / spread

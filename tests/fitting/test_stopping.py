@@ -79,7 +79,7 @@ except KeyboardInterrupt as error:
     assert type(error) is radarsdf.Interrupted
     assert 190 < done["sdf"] < 1_000_000, done
     assert radar_map.report["training_s"] > 0
-    assert (radar_map.sdf(scene.poses[:, :3, 3]) > 0).all()
+    assert (radar_map.sdf(scene.poses[:, :3, 3], extrapolate=True) > 0).all()
     assert radar_map.confidence(scene.poses[:, :3, 3]).max() == 0
     assert len(radar_map.mesh(0.2).faces) > 100
     print("a map")
@@ -285,7 +285,9 @@ def test_a_gradient_that_is_not_finite_never_reaches_the_map(scene, poisoned):
     radar_map = caught.value.radar_map
     assert all(value.isfinite().all() for value in radar_map.field.state_dict().values())
     assert 229 <= radar_map.report["iterations_done"]["sdf"] <= 300
-    assert (radar_map.sdf(scene.poses[:, :3, 3]) > 0).all()  # as learnt before, not as at the start
+    assert (
+        radar_map.sdf(scene.poses[:, :3, 3], extrapolate=True) > 0
+    ).all()  # as learnt before, not as at the start
 
 
 def test_the_last_step_is_looked_at_too(scene, poisoned):
@@ -324,7 +326,7 @@ def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypat
     with pytest.raises(Diverged, match=expected) as caught:
         radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     assert isinstance(caught.value, FloatingPointError)
-    assert np.isfinite(caught.value.radar_map.sdf(np.zeros((1, 3)))).all()
+    assert np.isfinite(caught.value.radar_map.sdf(np.zeros((1, 3)), extrapolate=True)).all()
 
 
 def test_the_map_after_a_divergence_has_no_gradients_and_threads_are_restored(scene):

@@ -102,9 +102,10 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
     copy = tmp_path / "map.safetensors"
     copy.write_bytes(path.read_bytes())
     radar_map = radarsdf.load(copy)
-    expected = radar_map.sdf(np.zeros((1, 3)))
+    x = np.array([[0.0, 0, 0]])
+    expected = radar_map.sdf(x, extrapolate=True)
     copy.write_bytes(b"\0" * len(path.read_bytes()))
-    assert radar_map.sdf(np.zeros((1, 3))) == expected
+    assert radar_map.sdf(x, extrapolate=True) == expected
     assert not any(p.requires_grad for p in radar_map.field.parameters())
 
 
@@ -368,7 +369,7 @@ def test_intensities_in_closed_form_are_kept(scene, saved_closed_form):
     radar_map, path, _, _ = saved_closed_form
     points = scene.points[0] + scene.poses[0, :3, 3]
     expected = radar_map.intensity(points, SENSOR)
-    assert expected.std() > 0
+    assert np.nanstd(expected) > 0
     for other in (radarsdf.load(path), pickle.loads(pickle.dumps(radar_map))):
         np.testing.assert_array_equal(other.intensity(points, SENSOR), expected)
 
@@ -381,7 +382,9 @@ def test_what_the_network_leaves_is_added_and_kept(scene, tmp_path):
     sensors = [np.broadcast_to(pose[:3, 3], x.shape) for x, pose in zip(world, scene.poses, strict=True)]
     asked = np.concatenate(world), np.concatenate(sensors)
     measured = np.concatenate(scene.intensities)
-    errors = [np.abs(radar_map.intensity(*asked) - measured).mean() for radar_map in (alone, both)]
+    errors = [
+        np.abs(radar_map.intensity(*asked, extrapolate=True) - measured).mean() for radar_map in (alone, both)
+    ]
     assert errors[1] < 0.9 * errors[0]
     both.save(tmp_path / "map.safetensors")
     again = radarsdf.load(tmp_path / "map.safetensors")

@@ -233,7 +233,11 @@ def measure(
         surface = surface_metrics(mesh, scene.ground_truth, samples=MESH_SAMPLES)
         f_score, outliers = 100 * surface["f_score_all"], 100 * surface["outlier_ratio"]
     x, sensors, measured = world_returns(test)
-    mae = intensity_metrics(radar_map.intensity(x, sensors), measured)["mae"] if intensities else 0.0
+    mae = (
+        intensity_metrics(radar_map.intensity(x, sensors, extrapolate=True), measured)["mae"]
+        if intensities
+        else 0.0
+    )
     return Quality(f_score, outliers, mae)
 
 

@@ -37,7 +37,7 @@ def job(request):
 def test_held_out_intensities_are_better_than_the_neighbours(job):
     radar_map, train, test = job
     x, sensors, measured = rays_of(test)
-    ours = intensity_metrics(radar_map.intensity(x, sensors), measured)
+    ours = intensity_metrics(radar_map.intensity(x, sensors, extrapolate=True), measured)
     known = prepare(train.points, train.poses, train.intensities, min_range_m=2.5, max_range_m=60.0)
     knn = KNNIntensity.chosen(*rays_of(train), known.scans)
     neighbours = intensity_metrics(knn.predict(x, sensors), measured)

@@ -120,7 +120,7 @@ def extract_mesh(
     mesh.vertex_attributes["confidence"] = surface.confidence[kept]
     mesh.vertex_attributes["uncertainty_m"] = surface.uncertainty_m[kept]
     if sensor_position is not None:
-        local = _local(contents, np.array(mesh.vertices, np.float64))
+        local, _ = queries.into_cells(contents, _local(contents, np.array(mesh.vertices, np.float64)))
         sensors = _local(contents, np.array(sensor_position[None])).expand(len(local), 3)
         assert contents.intensity_scale is not None
         add_intensity(mesh, queries.intensity(contents, local, sensors).numpy(), contents.intensity_scale)

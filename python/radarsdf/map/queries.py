@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -42,6 +43,7 @@ _RATE_DEVIATIONS = 0.5
 VOXEL_M = 0.1
 MIN_DETECTION_RATE = 0.028
 MIN_COMPONENT_TRIANGLES = 30
+INWARD = 1e-3  # how far points on the border of a map are moved into it, edges of a cell
 _CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
 _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
 
@@ -74,6 +76,40 @@ def gradient(contents: MapContents, points: Tensor) -> Tensor:
 def occupied(contents: MapContents, points: Tensor) -> Tensor:
     """(N,) bool, whether each point lies in an occupied leaf cell."""
     return evaluate(contents.field.cells.occupied, points)
+
+
+@torch.inference_mode(mode=False)
+def into_cells(contents: MapContents, points: Tensor, size_m: float | None = None) -> tuple[Tensor, Tensor]:
+    """Points, of which those on the border of the occupied leaf cells are moved a little into one, and which are inside.
+
+    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features. It is moved by
+    a thousandth of `size_m`, by default of a leaf cell.
+    """
+    size_m = contents.config.leaf_size_m if size_m is None else size_m
+    inside, step_m = occupied(contents, points), INWARD * size_m
+    place = points / contents.config.leaf_size_m
+    on_face = ((place - place.round()).abs() * contents.config.leaf_size_m <= step_m).any(dim=1)
+    left = torch.nonzero(~inside & on_face)[:, 0]
+    if len(left):
+        points, inside = points.clone(), inside.clone()
+    for shift in itertools.product((-step_m, step_m), repeat=3):
+        moved = points[left] + torch.tensor(shift, dtype=torch.float32, device="cpu")
+        found = occupied(contents, moved)
+        points[left[found]] = moved[found]
+        inside[left[found]] = True
+        left = left[~found]
+    return points, inside
+
+
+@torch.inference_mode(mode=False)
+def where(known: Tensor, *inputs: Tensor, function: Callable[..., Tensor]) -> Tensor:
+    """function(*inputs) of the rows that are `known` (N,), NaN in others. What is unknown does not reach the function."""
+    if bool(known.all()):
+        return function(*inputs)
+    found = function(*(rows[known] for rows in inputs))
+    result = found.new_full((len(known), *found.shape[1:]), torch.nan)
+    result[known] = found
+    return result
 
 
 class EvidenceAt(NamedTuple):

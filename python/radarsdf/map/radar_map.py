@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any, overload
 
@@ -37,6 +37,10 @@ class RadarMap:
     for float64 coordinates and lists, otherwise float32. Coordinates are converted to the local frame in
     float64, so large ones such as UTM lose no precision. Several threads may query a map at once. A map can
     be pickled for other processes.
+
+    A map knows the cells near returns, see :meth:`observed`. Elsewhere, in free space too, and at positions that are
+    not finite, the signed distance, gradient and intensity are NaN. Where there are no returns round a position, the
+    uncertainty is NaN and the confidence 0.
     """
 
     def __init__(self, contents: MapContents) -> None:
@@ -117,23 +121,27 @@ class RadarMap:
         return self._contents.field
 
     @overload
-    def sdf(self, x: Tensor) -> Tensor: ...
+    def sdf(self, x: Tensor, *, extrapolate: bool = False) -> Tensor: ...
     @overload
-    def sdf(self, x: ArrayLike) -> NDArray[Any]: ...
-    def sdf(self, x: Any) -> Any:
+    def sdf(self, x: ArrayLike, *, extrapolate: bool = False) -> NDArray[Any]: ...
+    def sdf(self, x: Any, *, extrapolate: bool = False) -> Any:
         """Signed distance to the surface.
 
         Parameters
         ----------
         x : (N, 3) array or tensor
             World, m.
+        extrapolate : bool
+            Whether to answer where nothing was observed, too: with what the field happens to be there. Neither its
+            sign nor its size means anything then.
 
         Returns
         -------
         (N,) array or tensor
-            Signed distance, m, positive in free space and zero on the surface. It is meaningful near the
-            surface, within a few `sigma_m`; see :meth:`observed`. It is learnt along the sensor's rays. So it
-            is longer than the shortest distance where rays meet the surface at a flat angle.
+            Signed distance, m, positive in free space and zero on the surface. NaN where `x` is not
+            :meth:`observed`, or not finite: free space far from surfaces is not told from the unknown. It is learnt
+            along the sensor's rays. So it is longer than the shortest distance where rays meet the surface at a flat
+            angle.
 
         Raises
         ------
@@ -141,32 +149,35 @@ class RadarMap:
             If `x` does not have shape (N, 3).
         """
         points, answer = self._local(x)
-        return answer(queries.signed_distance(self._contents, points))
+        distance = partial(queries.signed_distance, self._contents)
+        return answer(queries.where(*self._known(points, extrapolate), function=distance))
 
     @overload
-    def gradient(self, x: Tensor) -> Tensor: ...
+    def gradient(self, x: Tensor, *, extrapolate: bool = False) -> Tensor: ...
     @overload
-    def gradient(self, x: ArrayLike) -> NDArray[Any]: ...
-    def gradient(self, x: Any) -> Any:
+    def gradient(self, x: ArrayLike, *, extrapolate: bool = False) -> NDArray[Any]: ...
+    def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
         """Gradient of :meth:`sdf` at x (N, 3), world, m: (N, 3), towards free space.
 
         Its length is about 1 where rays met the surface at a right angle, and more where they met it at a
-        flat angle.
+        flat angle. It is NaN where that is, and `extrapolate` does the same.
         """
         points, answer = self._local(x)
-        return answer(queries.gradient(self._contents, points))
+        gradient = partial(queries.gradient, self._contents)
+        return answer(queries.where(*self._known(points, extrapolate), function=gradient))
 
     @overload
     def observed(self, x: Tensor) -> Tensor: ...
     @overload
     def observed(self, x: ArrayLike) -> NDArray[np.bool_]: ...
     def observed(self, x: Any) -> Any:
-        """Whether x (N, 3), world, m, is in a leaf cell of the map: (N,) bool.
+        """Whether x (N, 3), world, m, is in a leaf cell of the map, or on its border: (N,) bool.
 
-        These are the cells near returns, and those that bridge a small gap between two of them.
+        These are the cells near returns, and those that bridge a small gap between two of them. Where it is False,
+        :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN. A position that is not finite was not observed.
         """
         points, answer = self._local(x)
-        return answer(queries.occupied(self._contents, points))
+        return answer(queries.into_cells(self._contents, points)[1])
 
     @overload
     def confidence(self, x: Tensor) -> Tensor: ...
@@ -183,7 +194,8 @@ class RadarMap:
         Returns
         -------
         (N,) array or tensor
-            Probability that a true surface is within the edge of a leaf cell, in [0, 1]. 0 without returns.
+            Probability that a true surface is within the edge of a leaf cell, in [0, 1]. 0 where there are no returns in the cells
+            round `x`, and where it is not finite.
             A logistic function of how precisely the returns agree (:meth:`uncertainty` without its floor), of
             the share of scans with returns there among those that looked there, and of the share of the map's
             returns that lie on no thin surface; at most the share of a normal distribution of that error within a
@@ -213,9 +225,9 @@ class RadarMap:
             a floor that no number of returns makes smaller, added in quadrature; m. The noise σ of a return is
             that along the beam and across it together; see ``report["noise"]``. It grows with the range, so that
             far returns tell less than near ones. The floor is 0.05 leaf cells, and up to 1.1 more where much
-            of the returns lies on no thin surface (:attr:`rough_share`). NaN where nothing was observed. Errors of
-            the poses count if ``returns.pose_sigma_m`` and ``pose_sigma_rad`` in the :class:`FitConfig` state
-            them.
+            of the returns lies on no thin surface (:attr:`rough_share`). NaN where there are no returns in the
+            cells round `x`, and where it is not finite. Errors of the poses count if ``returns.pose_sigma_m`` and
+            ``pose_sigma_rad`` in the :class:`FitConfig` state them.
 
         Raises
         ------
@@ -226,10 +238,12 @@ class RadarMap:
         return answer(queries.uncertainty(self._contents, queries.evidence(self._contents, points)))
 
     @overload
-    def intensity(self, x: Tensor, sensor_positions: Tensor) -> Tensor: ...
+    def intensity(self, x: Tensor, sensor_positions: Tensor, *, extrapolate: bool = False) -> Tensor: ...
     @overload
-    def intensity(self, x: ArrayLike, sensor_positions: ArrayLike) -> NDArray[Any]: ...
-    def intensity(self, x: Any, sensor_positions: Any) -> Any:
+    def intensity(
+        self, x: ArrayLike, sensor_positions: ArrayLike, *, extrapolate: bool = False
+    ) -> NDArray[Any]: ...
+    def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
         """Predicts the intensity of the return that a sensor gets from each point.
 
         Parameters
@@ -238,11 +252,15 @@ class RadarMap:
             World, m.
         sensor_positions : (N, 3) or (3,) array or tensor
             World, m.
+        extrapolate : bool
+            Whether to answer where nothing was observed, too. It serves to compare with all returns of a scan that the
+            map has not seen, of which some are where it knows nothing.
 
         Returns
         -------
         (N,) array or tensor
-            Intensity, sensor units, as given to the fit.
+            Intensity, sensor units, as given to the fit. NaN where `x` is not :meth:`observed`, and where a position is
+            not finite.
 
         Raises
         ------
@@ -254,7 +272,10 @@ class RadarMap:
             raise ValueError(msg)
         points, answer = self._local(x)
         sensors, _ = self._local(sensor_positions, rows=len(points))
-        return answer(queries.intensity(self._contents, points, sensors))
+        known, points = self._known(points, extrapolate)
+        known = known & sensors.isfinite().all(dim=1)
+        intensity = partial(queries.intensity, self._contents)
+        return answer(queries.where(known, points, sensors, function=intensity))
 
     def mesh(
         self,
@@ -390,6 +411,11 @@ class RadarMap:
         An old file is replaced only once the new one is complete. An OSError says why it cannot be written.
         """
         storage.save_contents(self._contents, path)
+
+    def _known(self, points: Tensor, extrapolate: bool) -> tuple[Tensor, Tensor]:
+        """Where to answer (N,) bool, and for which points (N, 3), local frame, m: those observed, or all finite ones."""
+        points, observed = queries.into_cells(self._contents, points)
+        return (points.isfinite().all(dim=1) if extrapolate else observed), points
 
     def _local(self, x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
         """`x` as (N, 3) float32, local frame, and a function that gives results the kind and precision of `x`.

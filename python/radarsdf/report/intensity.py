@@ -110,7 +110,7 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]
 
 def _incidence_deg(subject: Subject, x: _Floats, directions: _Floats) -> _Floats:
     """(N,) angle between the rays and the normals of the field at returns x (N, 3), degrees. NaN where it has none."""
-    normal = np.asarray(subject.radar_map.gradient(x), np.float64)
+    normal = np.asarray(subject.radar_map.gradient(x, extrapolate=True), np.float64)
     length = np.linalg.norm(normal, axis=1)
     cosine = np.abs((normal * directions).sum(axis=1)) / np.where(length > 0, length, np.nan)
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0))))

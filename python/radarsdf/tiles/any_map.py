@@ -52,6 +52,6 @@ def lacking(radar_map: AnyMap) -> str:
 
 def predicted(radar_map: AnyMap, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
     """The intensities (N,) that a map predicts for rays, sensor units, and these rays: those in no tile are left out."""
-    found = np.asarray(radar_map.intensity(*rays.in_world()), np.float64)
+    found = np.asarray(radar_map.intensity(*rays.in_world(), extrapolate=True), np.float64)
     known = np.isfinite(found)
     return (rays, found) if known.all() else (rays.select(np.flatnonzero(known)), found[known])

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -25,14 +25,13 @@ from radarsdf.map.contents import MapContents
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.grid import Tile
+from radarsdf.tiles.knowledge import knowledge
 from radarsdf.tiles.plan import Plan, TilePlan, failure_of, map_path
 from radarsdf.tiles.tile_fit import contents_of_tile, is_done
 
 _Floats = NDArray[np.float64]
 MEMORY_BYTES = 1 << 30
 _OF_FEATURES = 2.4  # bytes in memory for each of the features: measured; tables of cells, evidence
-_INWARD = 1e-3  # edges of a voxel
-_SHIFTS = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
 
 
 class Share(NamedTuple):
@@ -45,9 +44,19 @@ class Share(NamedTuple):
     weights: _Floats
     """(M,) there."""
     slopes: _Floats
-    """(M, 2) derivatives of the weights by x and y, 1/m."""
+    """(M, 3) derivatives of the weights, 1/m."""
     local: Tensor
     """(M, 3) the positions in the frame of the tile, m."""
+
+    def select(self, chosen: NDArray[np.bool_]) -> Share:
+        """The share at some (M,) of its positions."""
+        return Share(
+            self.contents,
+            self.rows[chosen],
+            self.weights[chosen],
+            self.slopes[chosen],
+            self.local[torch.from_numpy(chosen)],
+        )
 
 
 class TileBlend:
@@ -131,13 +140,16 @@ class TileBlend:
         return self.contents_of(next(tile.tile for tile in self.plan.tiles if self.has(tile.tile)))
 
     def evidence(self, world: _Floats) -> queries.EvidenceAt:
-        """Evidence of a surface at positions (N, 3), world, m. 0 without tiles."""
+        """Evidence of a surface at positions (N, 3), world, m. 0 without tiles.
 
-        def of_tile(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:
+        All tiles count, because each one's evidence ends smoothly: less is known where a tile that looked has no returns.
+        """
+
+        def of_tile(share: Share) -> _Floats:
             columns = torch.stack(list(queries.evidence(share.contents, share.local)), 1)
-            return columns.numpy().astype(np.float64), np.ones(len(share.rows), bool)
+            return columns.numpy().astype(np.float64)
 
-        found = np.nan_to_num(self.averages(world, of_tile, columns=3)).astype(np.float32)
+        found = np.nan_to_num(averages(self.shares(world), len(world), of_tile, columns=3)).astype(np.float32)
         return queries.EvidenceAt(*torch.from_numpy(found).unbind(1))
 
     def contents_of(self, tile: Tile) -> MapContents:
@@ -160,7 +172,10 @@ class TileBlend:
         return cells[inside]
 
     def shares(self, world: _Floats) -> Iterator[Share]:
-        """What each tile adds at positions (N, 3), world, m: in ascending order, on which the bits of sums depend."""
+        """What each tile adds at positions (N, 3), world, m: in ascending order, on which the bits of sums depend.
+
+        Weights depend on the borders between tiles alone, not on what a tile observed.
+        """
         for tile in self.plan.grid.counting(world) if len(world) else ():
             if not self.has(tile):
                 continue
@@ -169,56 +184,64 @@ class TileBlend:
             if len(rows):
                 contents = self.contents_of(tile)
                 local = queries.to_local(contents, torch.from_numpy(world[rows]))
-                yield Share(contents, rows, weights, slopes, local)
+                yield Share(contents, rows, weights, np.pad(slopes, ((0, 0), (0, 1))), local)
 
-    def averages(
-        self,
-        world: _Floats,
-        of_tile: Callable[[Share], tuple[_Floats, NDArray[np.bool_]]],
-        columns: int = 1,
-    ) -> _Floats:
-        """(N, columns) weighted averages of what the tiles say. NaN where there is none.
-
-        `of_tile` gives values (M, columns), and which of them (M,) are observed. Others count only where none is.
-        """
-        sums, totals = np.zeros((2, len(world), columns)), np.zeros((2, len(world)))
+    def seen(self, world: _Floats) -> NDArray[np.bool_]:
+        """(N,) whether a tile that counts at positions (N, 3), world, m, observed them."""
+        found = np.zeros(len(world), bool)
         for share in self.shares(world):
-            values, observed = of_tile(share)
-            for kind, chosen in enumerate((observed, ~observed)):
-                weights = share.weights[chosen]
-                sums[kind, share.rows[chosen]] += weights[:, None] * values[chosen]
-                totals[kind, share.rows[chosen]] += weights
-        with np.errstate(invalid="ignore", divide="ignore"):
-            seen, others = sums / totals[:, :, None]
-        found: _Floats = np.where((totals[0] > 0)[:, None], seen, others)
+            found[share.rows] |= queries.into_cells(share.contents, share.local)[1].numpy()
         return found
+
+    def known_shares(self, world: _Floats, *, extrapolate: bool = False) -> Iterator[Share]:
+        """The :meth:`shares` of the tiles that observed a position: weights fall to zero where a tile stops knowing.
+
+        `extrapolate`: where no tile observed a position, all of them count.
+        """
+        alone = np.zeros(len(world), bool)
+        if extrapolate:
+            alone = np.isfinite(world).all(axis=1) & ~self.seen(world)
+        for share in self.shares(world):
+            local, _ = queries.into_cells(share.contents, share.local)
+            known, slopes = knowledge(share.contents, local)
+            known[alone[share.rows]] = 1.0
+            weights = share.weights * known
+            slopes = share.slopes * known[:, None] + slopes * share.weights[:, None]
+            yield share._replace(weights=weights, slopes=slopes, local=local).select(weights > 0)
 
     def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
         """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, numbered from the lattice's first corner.
 
         They have the same bits whichever tile asks. NaN where no tile has an adjacent cell.
         """
-        steps = round(self.config.leaf_size_m / voxel_m)
-
-        def of_tile(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:
-            # From integers: the same float32 position for every tile that asks.
-            origin_cells = np.round(self.config.lattice.cells(share.contents.origin)).astype(np.int64)
-            tile_lattice = lattice[share.rows] - origin_cells * steps
-            points = torch.from_numpy((tile_lattice * voxel_m).astype(np.float32))
-            inside = queries.occupied(share.contents, points)
-            # A corner on the border of the map may be in a cell beyond it, which has no features. It is moved a little into
-            # the first cell of this tile that touches it.
-            for shift in _SHIFTS:
-                left = torch.nonzero(~inside)[:, 0]
-                moved = points[left] + torch.tensor(shift, dtype=torch.float32, device="cpu") * (
-                    _INWARD * voxel_m
-                )
-                found = queries.occupied(share.contents, moved)
-                points[left[found]] = moved[found]
-                inside[left[found]] = True
-            values = np.full((len(points), 1), np.nan)
-            values[inside.numpy(), 0] = queries.signed_distance(share.contents, points[inside]).numpy()
-            return values, inside.numpy()
-
         world = np.asarray(lattice * voxel_m, np.float64)
-        return self.averages(world, of_tile)[:, 0].astype(np.float32)
+        touching = (self._touching(share, lattice[share.rows], voxel_m) for share in self.shares(world))
+        return averages(touching, len(world), distance)[:, 0].astype(np.float32)
+
+    def _touching(self, share: Share, lattice: NDArray[np.int64], voxel_m: float) -> Share:
+        """The share of a tile at those of its corners (M, 3) of voxels that are in one of its cells, or touch one."""
+        steps = round(self.config.leaf_size_m / voxel_m)
+        # From integers: the same float32 position for every tile that asks.
+        origin_cells = np.round(self.config.lattice.cells(share.contents.origin)).astype(np.int64)
+        points = torch.from_numpy(((lattice - origin_cells * steps) * voxel_m).astype(np.float32))
+        # A corner on the border of the map may be in a cell beyond it, which has no features.
+        points, inside = queries.into_cells(share.contents, points, voxel_m)
+        return share._replace(local=points).select(inside.numpy())
+
+
+def averages(
+    shares: Iterable[Share], count: int, of_tile: Callable[[Share], _Floats], columns: int = 1
+) -> _Floats:
+    """(N, columns) weighted averages of what tiles say, (M, columns) each, at `count` positions. NaN without a share."""
+    sums, totals = np.zeros((count, columns)), np.zeros(count)
+    for share in shares:
+        sums[share.rows] += share.weights[:, None] * of_tile(share)
+        totals[share.rows] += share.weights
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found: _Floats = sums / totals[:, None]
+    return found
+
+
+def distance(share: Share) -> _Floats:
+    """(M, 1) the signed distance that a tile says, m."""
+    return queries.signed_distance(share.contents, share.local).numpy().astype(np.float64)[:, None]

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from torch import Tensor
 from radarsdf.checks import check_poses, real_array
 from radarsdf.map import queries, storage
 from radarsdf.map.positions import as_positions
-from radarsdf.tiles.blend import Share, TileBlend
+from radarsdf.tiles.blend import Share, TileBlend, averages, distance
 from radarsdf.tiles.plan import map_path
 from radarsdf.tiles.ray_files import rays_path
 from radarsdf.tiles.tile_fit import report_of
@@ -116,46 +116,38 @@ class TiledMap(TileBlend):
         """Size of the files of the tiles, bytes."""
         return sum(map_path(self.folder, tile).stat().st_size for tile in self.tiles)
 
-    def sdf(self, x: Any) -> Any:
-        """Signed distance, m; see :meth:`RadarMap.sdf`. NaN where there is no tile."""
+    def sdf(self, x: Any, *, extrapolate: bool = False) -> Any:
+        """Signed distance, m; see :meth:`RadarMap.sdf`. NaN where not observed; with `extrapolate` where there is no tile."""
         world, answer = _given(x)
-        return answer(torch.from_numpy(self.averages(world, _distance)[:, 0]))
+        shares = self.known_shares(world, extrapolate=extrapolate)
+        return answer(torch.from_numpy(averages(shares, len(world), distance)[:, 0]))
 
-    def gradient(self, x: Any) -> Any:
-        """Gradient of :meth:`sdf`, (N, 3); see :meth:`RadarMap.gradient`. NaN where there is no tile."""
+    def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
+        """Gradient of :meth:`sdf`, (N, 3); see :meth:`RadarMap.gradient`. NaN as there."""
         world, answer = _given(x)
         # Of the quotient of two sums, of w f and of w: the weights change with the position, too.
-        seen = self.observed(world)
         sums, distances, slopes = (
             np.zeros((len(world), 4)),
-            np.zeros((len(world), 2)),
-            np.zeros((len(world), 2)),
+            np.zeros((len(world), 3)),
+            np.zeros((len(world), 3)),
         )
         totals = np.zeros(len(world))
-        for share in self.shares(world):
-            values = np.column_stack([
-                queries.signed_distance(share.contents, share.local).numpy(),
-                queries.gradient(share.contents, share.local).numpy(),
-            ]).astype(np.float64)  # fmt: skip
-            # As for the distance: a tile counts where it has observed, if any has.
-            here = queries.occupied(share.contents, share.local).numpy() | ~seen[share.rows]
-            sums[share.rows] += (here * share.weights)[:, None] * values
-            totals[share.rows] += here * share.weights
-            distances[share.rows] += (here * values[:, 0])[:, None] * share.slopes
-            slopes[share.rows] += here[:, None] * share.slopes
+        for share in self.known_shares(world, extrapolate=extrapolate):
+            gradients = queries.gradient(share.contents, share.local).numpy().astype(np.float64)
+            values = np.column_stack([distance(share), gradients])
+            sums[share.rows] += share.weights[:, None] * values
+            totals[share.rows] += share.weights
+            distances[share.rows] += values[:, :1] * share.slopes
+            slopes[share.rows] += share.slopes
         with np.errstate(invalid="ignore", divide="ignore"):
             means = sums / totals[:, None]
-            found = means[:, 1:]
-            found[:, :2] += (distances - means[:, :1] * slopes) / totals[:, None]
-        return answer(torch.from_numpy(np.ascontiguousarray(found)))
+            found = means[:, 1:] + (distances - means[:, :1] * slopes) / totals[:, None]
+        return answer(torch.from_numpy(found))
 
     def observed(self, x: Any) -> Any:
         """Whether x (N, 3) is in a leaf cell of the map, (N,) bool; see :meth:`RadarMap.observed`."""
         world, answer = _given(x)
-        found = np.zeros(len(world), bool)
-        for share in self.shares(world):
-            found[share.rows] |= queries.occupied(share.contents, share.local).numpy()
-        return answer(torch.from_numpy(found))
+        return answer(torch.from_numpy(self.seen(world)))
 
     def confidence(self, x: Any) -> Any:
         """Probability of a surface, (N,); see :meth:`RadarMap.confidence`."""
@@ -167,22 +159,22 @@ class TiledMap(TileBlend):
         world, answer = _given(x)
         return answer(queries.uncertainty(self.any_contents, self.evidence(world)))
 
-    def intensity(self, x: Any, sensor_positions: Any) -> Any:
-        """Intensity of a return, (N,), sensor units; see :meth:`RadarMap.intensity`. NaN where there is no tile."""
+    def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
+        """Intensity of a return, (N,), sensor units; see :meth:`RadarMap.intensity`. NaN as for :meth:`sdf`."""
         if not self.has_intensity:
             msg = "this map was fitted without intensities"
             raise ValueError(msg)
         world, answer = _given(x)
         sensors = as_positions(sensor_positions, rows=len(world))[0].double().numpy()
 
-        def of_tile(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:
+        def of_tile(share: Share) -> _Floats:
             there = queries.to_local(
                 share.contents, torch.from_numpy(np.ascontiguousarray(sensors[share.rows]))
             )
-            values = queries.intensity(share.contents, share.local, there).numpy()
-            return values[:, None].astype(np.float64), queries.occupied(share.contents, share.local).numpy()
+            return queries.intensity(share.contents, share.local, there).numpy().astype(np.float64)[:, None]
 
-        return answer(torch.from_numpy(self.averages(world, of_tile)[:, 0]))
+        shares = self.known_shares(world, extrapolate=extrapolate)
+        return answer(torch.from_numpy(averages(shares, len(world), of_tile)[:, 0]))
 
     def mesh(
         self,
@@ -214,7 +206,7 @@ class TiledMap(TileBlend):
             min_detection_rate=min_detection_rate,
         )  # fmt: skip
         if sensor_position is not None and self.intensity_scale is not None:
-            values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position)
+            values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position, extrapolate=True)
             add_intensity(mesh, values.astype(np.float32), self.intensity_scale)
         return mesh
 
@@ -247,7 +239,9 @@ class TiledMap(TileBlend):
         if held is None or held[0] != tiles:
             held = self._viewed = (
                 tiles,
-                viewed_tiles(self, tiles, self.intensity if self.has_intensity else None),
+                viewed_tiles(
+                    self, tiles, partial(self.intensity, extrapolate=True) if self.has_intensity else None
+                ),
             )
         return view_from(held[1], pose, sensor, returns=returns, noise=noise, seed=seed)
 
@@ -306,11 +300,6 @@ class TiledMap(TileBlend):
                 freed += path.stat().st_size
                 path.unlink()
         return freed
-
-
-def _distance(share: Share) -> tuple[_Floats, NDArray[np.bool_]]:
-    values = queries.signed_distance(share.contents, share.local).numpy().astype(np.float64)
-    return values[:, None], queries.occupied(share.contents, share.local).numpy()
 
 
 def _given(x: Any) -> tuple[_Floats, Callable[[Tensor], Any]]:

@@ -83,7 +83,9 @@ def quantities_of(
     if radar_map.has_intensity:
 
         def intensity(rows: _Rows, sensor: _Position) -> NDArray[Any]:
-            values: NDArray[Any] = radar_map.intensity(surface.vertices[rows], np.array(sensor))
+            values: NDArray[Any] = radar_map.intensity(
+                surface.vertices[rows], np.array(sensor), extrapolate=True
+            )
             return values
 
         some = np.arange(0, len(surface.vertices), max(1, len(surface.vertices) // _SAMPLES))

@@ -89,7 +89,8 @@ class Walk:
         error = ""
         if measured is not None and self._map.has_intensity:
             errors = np.abs(
-                self._map.intensity(world, self._poses[index, :3, 3]) - np.asarray(measured, np.float64)
+                self._map.intensity(world, self._poses[index, :3, 3], extrapolate=True)
+                - np.asarray(measured, np.float64)
             )
             errors = errors[np.isfinite(errors)]
             error = f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""

@@ -1,0 +1,109 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Where one tile has observed a point and its neighbour has not, answers have no step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from radarsdf.map import queries
+from radarsdf.tiles.knowledge import knowledge
+
+from .conftest import TILE_M
+
+OFFSET_M = 0.3  # between what the two tiles say
+STEP_M = 2e-3
+SENSOR = [0.0, 0.0, 1.0]
+
+
+@pytest.fixture
+def disputed(city, points_on_border, monkeypatch):
+    """A city of which one tile knows nothing in every second cell in height, and says other distances than the rest."""
+    tile = city.plan.grid.counting(points_on_border)[0]
+    contents = city.contents_of(tile)
+    cells, field, leaf_m = contents.field.cells, contents.field, city.config.leaf_size_m
+    occupied, signed_distance = cells.occupied, field.signed_distance
+    monkeypatch.setattr(
+        cells, "occupied", lambda p: occupied(p) & (torch.floor(p[:, 2] / (4 * leaf_m)) % 2 == 0)
+    )
+    monkeypatch.setattr(field, "signed_distance", lambda p: signed_distance(p) + OFFSET_M)
+    return city
+
+
+@pytest.fixture
+def points_on_border(drive):
+    """Returns of the wall near a border between two tiles, (N, 3)."""
+    points = np.concatenate([scan.world_points for scan in drive])
+    return points[np.abs(points[:, 1] - np.round(points[:, 1] / TILE_M) * TILE_M) < 1.0][:200]
+
+
+def test_answers_have_no_step_where_one_tile_stops_knowing(disputed, points_on_border):
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=points_on_border.shape)
+    ways *= STEP_M / np.linalg.norm(ways, axis=1, keepdims=True)
+    lines = points_on_border[:, None] + np.arange(-100, 100)[None, :, None] * ways[:, None]
+    seen = disputed.observed(lines.reshape(-1, 3)).reshape(lines.shape[:2])
+    distance_m = disputed.sdf(lines.reshape(-1, 3)).reshape(lines.shape[:2])
+    both = seen[:, 1:] & seen[:, :-1]
+    assert both.sum() > 10_000
+    # Over an edge of a cell, 0.2 m, one tile hands over to the other, and both change themselves.
+    assert np.abs(np.diff(distance_m))[both].max() < 2 * STEP_M + STEP_M * OFFSET_M / 0.2
+
+
+def test_the_gradient_is_that_of_the_distance_there(disputed, points_on_border):
+    x = points_on_border + [0.05, 0.03, 0.02]
+    x = x[disputed.observed(x)]
+    step = 1e-3
+    ends = [[disputed.sdf(x + sign * step * axis) for sign in (1, -1)] for axis in np.eye(3)]
+    expected = np.stack([(after - before) / (2 * step) for after, before in ends], axis=1)
+    error = np.linalg.norm(disputed.gradient(x) - expected, axis=1)
+    assert np.nanmedian(error) < 0.01
+    assert np.nanquantile(error, 0.8) < 0.1
+
+
+def test_what_one_tile_alone_knows_is_its_answer(disputed, points_on_border):
+    knowing = [share.rows for share in disputed.known_shares(points_on_border)]
+    tiles = np.bincount(np.concatenate(knowing), minlength=len(points_on_border))
+    alone = 0
+    for share in disputed.known_shares(points_on_border):
+        rows = share.rows[tiles[share.rows] == 1]
+        local = share.local[torch.from_numpy(tiles[share.rows] == 1)]
+        expected = queries.signed_distance(share.contents, local).numpy()
+        found = disputed.sdf(points_on_border.astype(np.float64))[rows].astype(np.float32)
+        np.testing.assert_array_equal(found, expected)
+        alone += len(rows)
+    assert alone > 10
+    assert (tiles == 2).sum() > 10
+
+
+def test_knowledge_is_the_distance_to_what_is_not_observed(city):
+    tile = city.tiles[0].tile
+    contents = city.contents_of(tile)
+    leaf_m = city.config.leaf_size_m
+    cells = contents.field.cells.table.leaf_cells()[::50].astype(np.float32)
+    points = torch.from_numpy(
+        (cells + np.random.default_rng(0).uniform(0.05, 0.95, cells.shape)).astype(np.float32) * leaf_m
+    )
+    known, slopes = knowledge(contents, points)
+    assert (known > 0).all()
+    # Nothing nearer than that is unobserved, and something just beyond it is.
+    ways = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    shares = []
+    for scale in (0.98, 1.05):
+        moved = points.numpy()[:, None] + scale * leaf_m * known[:, None, None] * ways
+        shares.append(
+            queries.occupied(contents, torch.from_numpy(moved.reshape(-1, 3).astype(np.float32)))
+            .numpy().reshape(len(points), -1)
+        )  # fmt: skip
+    assert shares[0].all()
+    assert not shares[1].all(axis=1)[known < 0.9].any()
+    step = 1e-3 * leaf_m
+    for axis in range(3):
+        way = torch.zeros(3)
+        way[axis] = step
+        difference = (knowledge(contents, points + way)[0] - knowledge(contents, points - way)[0]) / (
+            2 * step
+        )
+        assert np.quantile(np.abs(difference - slopes[:, axis]), 0.95) < 1e-2
+    assert knowledge(contents, torch.tensor([[0.0, 0.0, 1e4]]))[0] == 0
