@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.evaluation import intensity_metrics, surface_metrics
+from radarsdf.io import Scans
 
 from .conftest import HOSTILE
 from .reading import Page
 
 SECTIONS = [
-    "surface", "errors", "uncertainty", "intensity", "training", "skipped", "check", "configuration", "versions",
+    "conclusion", "check", "surface", "errors", "uncertainty", "intensity", "training", "skipped", "configuration",
+    "versions",
 ]  # fmt: skip
 
 
@@ -44,7 +46,9 @@ def test_nothing_that_is_read_is_executed(written):
     path, page = written
     assert page.all("script") == []  # only the frame has some, which has no access to this page
     assert page.all("iframe")[0]["sandbox"] == "allow-scripts"
-    assert page.all("b") == [{}]  # the name of the finding, and not its text
+    assert page.sections["check"].count("made_up") == 1
+    assert all(found == {} for found in page.all("b"))
+    assert len(page.all("b")) == len(page.all("li"))  # the names in lists, and not the text of the finding
     assert page.all("i") == [found for found in page.all("i") if "style" in found]
     assert "<b>1 of 2</b> Mend <i>it</i>." in page.sections["check"]
     title = re.search(r"<title>(.*?)</title>", path.read_text("utf-8"))[1]
@@ -59,6 +63,67 @@ def test_pictures_are_said_in_words(written):
     assert page.all("iframe")[0]["title"]
     assert page.all("html") == [{"lang": "en"}]
     assert {"name": "viewport", "content": "width=device-width, initial-scale=1"} in page.all("meta")
+
+
+def verdicts(page):
+    """The sentences of the conclusion by what they are about."""
+    text = re.sub(r"\s+", " ", page.sections["conclusion"].replace("\xa0", " "))
+    names = ("Radar noise", "Scans and poses", "Surface", "Uncertainty", "Intensity", "Next")
+    found = re.split(f"(?:good|warning|error|note) ({'|'.join(names)})", text)[1:]
+    return dict(zip(found[::2], found[1::2], strict=True))
+
+
+def test_the_conclusion_says_in_words_what_the_figures_are(written, subject):
+    _, page = written
+    said, report = verdicts(page), subject.radar_map.report
+    assert list(said) == ["Radar noise", "Scans and poses", "Surface", "Uncertainty", "Intensity", "Next"]
+    assert f"{report['noise']['range_m']:.3f} m along the beam" in said["Radar noise"]
+    assert "as expected" in said["Radar noise"]
+    assert "The check found made_up." in said["Scans and poses"]
+    metrics = surface_metrics(subject.mesh, subject.scans.ground_truth, samples=20_000)
+    assert f"F-score is {100 * metrics['f_score_all']:.1f} %" in said["Surface"]
+    share = re.search(r"([\d.]+)\s% of them are within one standard error", page.sections["uncertainty"])[1]
+    assert (
+        f"{share} % of its errors are within one standard error, where 68 % are expected"
+        in said["Uncertainty"]
+    )
+    mae, neighbours = re.findall(r"(?:This map|Nearest neighbours) ([\d.]+)", page.sections["intensity"])
+    assert f"mean error is {mae} sensor units, beside {neighbours} of the nearest" in said["Intensity"]
+    assert "on scans that the fit left out" in said["Intensity"]
+    assert "Mend <i>it</i>. Then fit again." in said["Next"]
+
+
+def test_the_conclusion_follows_the_figures(subject, tmp_path):
+    noise = {"range_m": 0.4, "azimuth_rad": 0.001, "elevation_rad": 0.001}
+    contents = subject.radar_map._contents
+    noisy = radarsdf.RadarMap(dataclasses.replace(contents, report=contents.report | {"noise": noise}))
+    scans = Scans(subject.scans.points, subject.scans.poses, subject.scans.intensities)
+    page = other(subject, tmp_path / "noisy.html", radar_map=noisy, scans=scans, findings=[], held_out=None)
+    said = verdicts(page)
+    assert "more than expected" in said["Radar noise"]
+    assert "The scans agree" in said["Scans and poses"]
+    assert "--holdout 10" in said["Next"]
+    assert "may have been trained on" in said["Intensity"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("lidar", "lidar point"),
+        ("simulated", "point of the simulated truth"),
+        ("given", "point of the given truth"),
+    ],
+)
+def test_the_truth_has_the_name_of_its_kind(subject, kind, words):
+    from radarsdf.report.truth import truth_section, uncertainty_section  # noqa: PLC0415
+
+    scans = subject.scans.select(np.arange(len(subject.scans)))
+    scans.truth_kind = kind
+    same = dataclasses.replace(subject, scans=scans, voxel_size_m=0.5)
+    for section, *_ in (truth_section(same), uncertainty_section(same)):
+        text = re.sub("<img[^>]*>", "", "".join(section.body))
+        assert words in text
+        assert ("lidar" in text) == (kind == "lidar")
 
 
 def test_errors_are_those_of_the_evaluation(written, subject):
@@ -100,8 +165,12 @@ def other(subject, path, **changes):
 def test_a_map_alone(subject, tmp_path):
     page = other(subject, tmp_path / "alone.html", scans=None, held_out=None, findings=None)
     assert [found["id"] for found in page.all("section")] == SECTIONS
-    for name in ("errors", "intensity", "check"):
+    for name in ("conclusion", "errors", "intensity", "check"):
         assert "without scans" in page.sections[name]
+    said = verdicts(page)
+    assert "not checked" in said["Scans and poses"]
+    assert "was not measured" in said["Surface"]
+    assert "Give the scans" in said["Next"]
 
 
 def test_scans_that_the_fit_may_have_seen_are_said_to_be(subject, tmp_path):
@@ -153,6 +222,7 @@ def test_an_old_file_stays_if_the_new_one_cannot_be_made(subject, tmp_path, monk
 
 def test_100000_vertices_stay_under_5_mb(written):
     from radarsdf.report.scene import scene_page  # noqa: PLC0415
+    from radarsdf.view.framing import Look  # noqa: PLC0415
 
     rng = np.random.default_rng(0)
     side = 317
@@ -164,7 +234,7 @@ def test_100000_vertices_stay_under_5_mb(written):
     colors = rng.integers(0, 256, (len(vertices), 3), np.uint8)  # noise: no map is harder to compress
     assert len(vertices) > 100_000
     eye = np.array([10.0, -20.0, 20.0])
-    page = scene_page(vertices, faces, colors, vertices[:100], eye, np.zeros(3))
+    page = scene_page(vertices, faces, colors, vertices[:100], Look(eye, np.zeros(3)))
     rest = written[0].stat().st_size - len(written[1].all("iframe")[0]["srcdoc"])
     assert rest < 700_000  # with small pictures, of which there are five; large ones have up to 150 kB each
     assert len(page) + rest + 5 * 150_000 < 5_000_000

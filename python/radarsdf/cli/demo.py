@@ -60,7 +60,13 @@ def run(options: argparse.Namespace) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     check_outputs(options.out / name for name in ("scans.npz", "map.safetensors", "mesh.ply", "picture.png"))
     simulation = radarsdf.simulate.SCENES[options.scene](frames=options.frames)
-    scans = Scans(simulation.points, simulation.poses, simulation.intensities, simulation.ground_truth)
+    scans = Scans(
+        simulation.points,
+        simulation.poses,
+        simulation.intensities,
+        simulation.ground_truth,
+        truth_kind="simulated",
+    )
     train, test = holdout(len(scans.points))
     results = Results(options)
     returns = sum(map(len, scans.points))

@@ -134,8 +134,12 @@ def read(
         paths = [Path(part) for part in path]
         for part in paths:
             _check_exists(part)
-        return bags.read_bags(paths, request, truth)
-    return _read(Path(path), request, truth)
+        found = bags.read_bags(paths, request, truth)
+    else:
+        found = _read(Path(path), request, truth)
+    if truth is not None:
+        found.truth_kind = "given"
+    return found
 
 
 def _read(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
@@ -226,7 +230,9 @@ def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] |
                 values, doppler, sigma = (None if part is None else part[finite] for part in parts)
                 yield Scan(scan.points[finite], scan.T_world_sensor, values, doppler, scan.time_s, sigma)
 
-    return Scans.of_source(source, request.notes, truth or (lambda: scans.ground_truth))
+    found = Scans.of_source(source, request.notes, truth or (lambda: scans.ground_truth))
+    found.truth_kind = scans.truth_kind
+    return found
 
 
 def _truth(ground_truth: Any) -> Callable[[], NDArray[np.float64] | None] | None:

@@ -20,7 +20,18 @@ from radarsdf.io.unpacking import check_unpacked
 
 __all__ = ["Scan", "Scans", "read_scans", "write_scans"]
 
-_ARRAYS = ("points", "frame", "poses", "intensity", "static", "lidar_points", "doppler", "times", "sigma")
+_ARRAYS = (
+    "points",
+    "frame",
+    "poses",
+    "intensity",
+    "static",
+    "lidar_points",
+    "doppler",
+    "times",
+    "sigma",
+    "simulated",
+)
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:
@@ -37,6 +48,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         - ``intensity`` (N,), optional: sensor units;
         - ``static`` (N,) bool, optional: only returns with True are used;
         - ``lidar_points`` (M, 3), optional: ground truth, world frame, m;
+        - ``simulated``, optional: not 0 if the ground truth is that of a simulator;
         - ``doppler`` (N,), optional: m/s;
         - ``times`` (F,), optional: when each scan was taken, s;
         - ``sigma`` (N, 3), optional: the sensor's own deviations of range, azimuth and elevation, m, rad, rad.
@@ -101,6 +113,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         doppler_mps=per_return["doppler"],
         times_s=arrays["times"][frames].astype(np.float64) if "times" in arrays else None,
         sigmas=per_return["sigma"],
+        truth_kind="simulated" if "simulated" in arrays and arrays["simulated"].any() else "lidar",
     )
 
 
@@ -164,6 +177,8 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
         arrays["times"] = scans.times_s
     if scans.ground_truth is not None:
         arrays["lidar_points"] = scans.ground_truth
+        if scans.truth_kind == "simulated":
+            arrays["simulated"] = np.array(1, np.uint8)
     file = io.BytesIO()
     np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     target = Path(path)

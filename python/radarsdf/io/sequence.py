@@ -7,12 +7,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 _LOG = logging.getLogger("radarsdf.io")
+
+TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
+"""Where ground truth comes from: the lidar of a recording, a simulator, or the user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +105,8 @@ class Scans:
         As `Scan.doppler_mps` and `Scan.sigma`.
     times_s : (F,) ndarray, optional
         When the scans were taken, s.
+    truth_kind : {"lidar", "simulated", "given"}
+        Where the ground truth comes from.
     """
 
     def __init__(
@@ -114,6 +119,7 @@ class Scans:
         doppler_mps: Sequence[NDArray[Any]] | None = None,
         times_s: NDArray[np.float64] | None = None,
         sigmas: Sequence[NDArray[Any]] | None = None,
+        truth_kind: TruthKind = "lidar",
     ) -> None:
         self._source: Callable[[], Iterator[Scan]] | None = None
         self._notes = Notes()
@@ -125,6 +131,8 @@ class Scans:
         self._times_s = times_s
         self._ground_truth: Callable[[], NDArray[Any] | None] = lambda: ground_truth
         self._truth_known = False
+        self.truth_kind: TruthKind = truth_kind
+        """Where the ground truth comes from."""
         self._truth: NDArray[Any] | None = None
 
     @classmethod
@@ -233,6 +241,7 @@ class Scans:
             doppler_mps=chosen(self.doppler_mps),
             times_s=None if self.times_s is None else self.times_s[frames],
             sigmas=chosen(self.sigmas),
+            truth_kind=self.truth_kind,
         )
 
     def _scan(self, i: int) -> Scan:

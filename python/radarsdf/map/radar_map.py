@@ -112,7 +112,7 @@ class RadarMap:
 
     @property
     def file_bytes(self) -> int:
-        """Size of the file that :meth:`save` writes, without the names of its arrays: less than 2 kB; bytes."""
+        """Size of the file that :meth:`save` writes, without the names of its arrays: less than 4 kB; bytes."""
         return storage.file_bytes(self._contents)
 
     @property

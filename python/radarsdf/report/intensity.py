@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from radarsdf.evaluation import KNNIntensity, intensity_metrics
 from radarsdf.report import plots
-from radarsdf.report.page import Section, grid, image, note, paragraph, table
+from radarsdf.report.page import Section, Verdict, grid, image, note, paragraph, table
 from radarsdf.report.subject import Subject
 from radarsdf.returns.movers import rays_as_measured
 from radarsdf.tiles.any_map import predicted
@@ -22,15 +22,15 @@ _ANGLE_BIN_DEG = 7.5
 _RANGE_BINS = 16
 
 
-def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]:
-    """Errors of the intensities on scans that the fit left out, else on those that it was given."""
+def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]], list[Verdict]]:
+    """Errors of the intensities on scans that the fit left out, else on those that it was given; and what they say."""
     anchor, title = "intensity", "Intensity"
     scans = subject.scans if subject.held_out is None else subject.held_out
     if not subject.radar_map.has_intensity:
-        return Section(anchor, title, [paragraph("The map was fitted without intensities.")]), []
+        return Section(anchor, title, [paragraph("The map was fitted without intensities.")]), [], []
     if scans is None or scans.intensities is None:
         why = "This report was made without scans." if scans is None else "The scans have no intensities."
-        return Section(anchor, title, [paragraph(f"Not compared with measurements. {why}")]), []
+        return Section(anchor, title, [paragraph(f"Not compared with measurements. {why}")]), [], []
     radar_map, config = subject.radar_map, subject.radar_map.config
     rays = rays_as_measured(scans, config)
     total = len(rays)
@@ -42,16 +42,18 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]
     measured = values.astype(np.float64)
     metrics = intensity_metrics(found, measured)
     rows = [("This map", f"{metrics['mae']:.2f}", f"{metrics['medae']:.2f}")]
+    others = {}
     if subject.held_out is not None and subject.scans is not None:
         known = rays_as_measured(subject.scans, config)
         assert known.intensities is not None
         knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
         nearest = intensity_metrics(knn.predict(x, sensors), measured)
+        others["the nearest neighbours"] = nearest["mae"]
         rows.append(("Nearest neighbours", f"{nearest['mae']:.2f}", f"{nearest['medae']:.2f}"))
         which = f"{len(scans)} scan{'s' * (len(scans) > 1)} that the fit left out"
     else:
         which = "scans of this report"
-    spread = float(np.abs(measured - np.median(measured)).mean())
+    spread = others["the median of all"] = float(np.abs(measured - np.median(measured)).mean())
     rows.append(
         ("Always the median", f"{spread:.2f}", f"{np.median(np.abs(measured - np.median(measured))):.2f}")
     )
@@ -105,7 +107,18 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]]]
             "errors. A prediction has less spread than a measurement, since the noise of a single return cannot be predicted."
         ),
     ]
-    return Section(anchor, title, body), [(f"Intensity error, {_UNIT}", f"{metrics['mae']:.2f}")]
+    compared = " and ".join(f"{mae:.2f} of {name}" for name, mae in others.items())
+    on = (
+        "scans that the fit left out"
+        if subject.held_out is not None
+        else "scans that it may have been trained on"
+    )
+    verdict = Verdict(
+        "good" if metrics["mae"] < min(others.values()) else "warning",
+        "Intensity",
+        f"The mean error is {metrics['mae']:.2f} {_UNIT}, beside {compared}, on {on}.",
+    )
+    return Section(anchor, title, body), [(f"Intensity error, {_UNIT}", f"{metrics['mae']:.2f}")], [verdict]
 
 
 def _incidence_deg(subject: Subject, x: _Floats, directions: _Floats) -> _Floats:

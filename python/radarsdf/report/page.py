@@ -8,6 +8,7 @@ import base64
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Literal, NamedTuple
 
 from radarsdf.report.template import TEMPLATE
 
@@ -21,6 +22,15 @@ class Section:
     title: str
     body: Sequence[str]
     """HTML, from the functions below."""
+
+
+class Verdict(NamedTuple):
+    """A sentence of the conclusion."""
+
+    mark: Literal["good", "warning", "error", "note"]
+    name: str
+    """What it is about."""
+    text: str
 
 
 def page(title: str, subtitle: str, facts: Sequence[tuple[str, str]], sections: Iterable[Section]) -> str:

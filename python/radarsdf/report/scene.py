@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.view.framing import FOV_RAD, Look
 from radarsdf.view.glb import glb
 from radarsdf.view.serving import free_port, start_server, stop_server
 
@@ -26,8 +27,7 @@ def scene_page(
     faces: NDArray[np.int32],
     colors: NDArray[np.uint8],
     sensors: NDArray[np.float64] | None,
-    eye: NDArray[np.float64],
-    target: NDArray[np.float64],
+    look: Look,
 ) -> str:
     """HTML of a page that shows a mesh. It holds all that it needs.
 
@@ -37,8 +37,8 @@ def scene_page(
         (V, 3) m in a frame near the origin, since they are drawn in float32; (F, 3); (V, 3) sRGB.
     sensors
         (F, 3) positions of the sensor in the same frame, which are drawn as points.
-    eye, target
-        (3,) where the view begins, and what it turns round.
+    look
+        Where the view begins.
 
     Notes
     -----
@@ -55,12 +55,12 @@ def scene_page(
                 "/sensor",
                 sensors.astype(np.float32),
                 _SENSOR_COLOR,
-                point_size=_POINT_SHARE * float(np.linalg.norm(eye - target)),
+                point_size=_POINT_SHARE * float(np.linalg.norm(look.position - look.look_at)),
                 point_shape="circle",
                 precision="float32",
             )
-        server.initial_camera.position = tuple(eye.tolist())
-        server.initial_camera.look_at = tuple(target.tolist())
+        server.initial_camera.fov = FOV_RAD
+        server.initial_camera.position, server.initial_camera.look_at = map(tuple, look)
         document: str = server.get_scene_serializer().as_html()
     finally:
         stop_server(server)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.checking.finding import Finding
-from radarsdf.io.sequence import Scans
+from radarsdf.io.sequence import Scans, TruthKind
 from radarsdf.tiles.any_map import AnyMap
 from radarsdf.view.thinning import thinned
 
@@ -66,7 +66,7 @@ class Subject:
 
     @cached_property
     def ground_truth(self) -> NDArray[np.float64] | None:
-        """(M, 3) lidar points in the box, world, m. None if there are none."""
+        """(M, 3) points of the truth in the box, world, m. None if there are none."""
         truth = None if self.scans is None else self.scans.ground_truth
         if truth is None:
             return None
@@ -76,7 +76,12 @@ class Subject:
             truth = truth[((truth >= low) & (truth <= high)).all(axis=1)]
         return truth if len(truth) else None
 
+    @property
+    def truth_kind(self) -> TruthKind:
+        """Where the truth comes from."""
+        return "lidar" if self.scans is None else self.scans.truth_kind
+
     @cached_property
     def truth_tree(self) -> Any:
-        """The lidar points, to be asked for the nearest. Only where there are some."""
+        """The points of the truth, to be asked for the nearest. Only where there are some."""
         return cKDTree(self.ground_truth)

@@ -15,8 +15,10 @@ from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.report.page import Section, color_bar, frame, grid, image, note, paragraph
 from radarsdf.report.scene import scene_page
 from radarsdf.report.subject import Subject
+from radarsdf.view.framing import look_at_all
 
 _WIDTH, _HEIGHT = 1040, 650  # pixels
+_FRAME_ASPECT = 8 / 5  # of the frame of the 3D scene on any screen, as in the page's style
 _JPEG_QUALITY = 82
 _SIDES = {
     "One long side": (25.0, 36.0),
@@ -104,13 +106,14 @@ def _scene(subject: Subject, colors: NDArray[np.uint8]) -> str:
     mesh, _ = subject.shown
     origin = subject.radar_map.origin
     vertices = np.asarray(mesh.vertices, np.float64) - origin
+    sensors = None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin
     center, _ = middle_of(vertices)
-    eye = eye_around(vertices, *_SIDES["One long side"])
+    everything = vertices if sensors is None else np.concatenate([vertices, sensors])
+    look = look_at_all(everything, eye_around(vertices, *_SIDES["One long side"]) - center, _FRAME_ASPECT)
     return scene_page(
         vertices,
         np.asarray(mesh.faces, np.int32),
         colors if len(colors) else np.full((len(vertices), 3), NEUTRAL, np.uint8),
-        None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin,
-        0.38 * eye + 0.62 * center,  # nearer: what is to be turned may reach beyond the frame
-        center,
+        sensors,
+        look,
     )

@@ -39,7 +39,7 @@ section { background: var(--card); border: 1px solid var(--line); border-radius:
 figure { margin: 0 0 12px; min-width: 0; max-width: 620px; }
 img { display: block; width: 100%; height: auto; background: #fff; border: 1px solid var(--line); border-radius: 6px; }
 figcaption { margin-top: 6px; }
-iframe { display: block; width: 100%; height: min(62vh, 560px); background: #fff; border: 1px solid var(--line);
+iframe { display: block; width: 100%; aspect-ratio: 8 / 5; background: #fff; border: 1px solid var(--line);
   border-radius: 6px; margin-bottom: 8px; }
 .bar { display: flex; flex-wrap: wrap; align-items: center; gap: 2px 8px; font-size: .8125rem; color: var(--soft);
   margin: 6px 0; font-variant-numeric: tabular-nums; }
@@ -60,7 +60,7 @@ pre { overflow: auto; max-height: 70vh; margin: 0 0 12px; padding: 12px; border:
   background: var(--back); font: .8125rem/1.45 ui-monospace, monospace; }
 footer { padding-bottom: 28px; }
 @media (max-width: 600px) { header, nav, main, footer { padding: 0 12px; } section { padding: 12px; }
-  iframe { width: calc(100% - 24px); margin-left: 12px; height: min(56vh, 330px); } th, td { padding-right: 12px; } }
+  iframe { width: calc(100% - 24px); margin-left: 12px; } th, td { padding-right: 12px; } }
 @media print { iframe, nav { display: none; } section { break-inside: avoid; } }
 """
 

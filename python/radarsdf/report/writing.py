@@ -8,6 +8,7 @@ import time
 from os import PathLike
 
 from radarsdf.io.files import write_whole
+from radarsdf.report.conclusion import conclusion_section
 from radarsdf.report.extras import require_extras
 from radarsdf.report.intensity import intensity_section
 from radarsdf.report.page import page
@@ -50,16 +51,18 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
         If the file cannot be written.
     """
     require_extras()
-    errors, error_facts = truth_section(subject)
-    intensity, intensity_facts = intensity_section(subject)
+    errors, error_facts, of_surface = truth_section(subject)
+    uncertainty, of_uncertainty = uncertainty_section(subject)
+    intensity, intensity_facts, of_intensity = intensity_section(subject)
     sections = [
+        conclusion_section(subject, [*of_surface, *of_uncertainty, *of_intensity]),
+        findings_section(subject),
         surface_section(subject),
         errors,
-        uncertainty_section(subject),
+        uncertainty,
         intensity,
         training_section(subject),
         skipped_section(subject),
-        findings_section(subject),
         configuration_section(subject),
         versions_section(),
     ]
