@@ -23,6 +23,11 @@ def test_a_browser_shows_it_without_a_network(written, width):
         box = canvas.bounding_box()
         assert box["width"] > 0.8 * page.tab.locator("iframe").bounding_box()["width"]
 
+        # The scene fits into its frame: nothing is drawn at its sides and at its bottom.
+        seen = page.screenshot_of("iframe")
+        for edge in (seen[4:-4, 4:8], seen[4:-4, -8:-4], seen[-8:-4, 4:-4]):
+            assert (edge > 235).all()
+
         assert page.tab.title()
         assert [name for name in page.requests if not name.startswith(("data:", "blob:", "about:"))] == [
             path.as_uri()
