@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 FOV_RAD = 0.85
 """Vertical field of view of the first look: less than viser's, so that walls stay upright."""
 _MARGIN = 1.08
+_STEPS = 4
 
 _Floats = NDArray[np.float64]
 
@@ -46,11 +47,16 @@ def look_at_all(points: _Floats, to_eye: _Floats, aspect: float, fov_rad: float 
     up = np.cross(back, right)
     tangent = math.tan(fov_rad / 2) / _MARGIN
     depth_m = points @ back
-    middle, far_m = np.zeros(3), -math.inf
-    for axis, slope in ((right, tangent * aspect), (up, tangent)):
-        # An eye at a along the axis and t back sees a point x if |x - a| <= slope * (t - depth).
-        one, other = (float((depth_m + sign * (points @ axis) / slope).max()) for sign in (1, -1))
-        middle = middle + slope * (one - other) / 2 * axis
-        far_m = max(far_m, (one + other) / 2)
+    # An eye at a along an axis and t back sees a point x if |x - a| <= slope * (t - depth).
+    sides = [(axis, points @ axis, slope) for axis, slope in ((right, tangent * aspect), (up, tangent))]
+    ends = [((depth_m + x / slope).max(), (depth_m - x / slope).max(), slope) for _, x, slope in sides]
+    far_m = max(float(one + other) / 2 for one, other, _ in ends)
+    middle = np.zeros(3)
+    for (axis, x, _), (one, other, slope) in zip(sides, ends, strict=True):
+        a = slope * (one - other) / 2
+        for _ in range(_STEPS):  # where the frame is wider than needed, the middle is elsewhere
+            at = (x - a) / (far_m - depth_m)
+            a += (at.max() + at.min()) / 2 * float(far_m - depth_m.mean())
+        middle = middle + a * axis
     center_m = float(depth_m.min() + depth_m.max()) / 2
     return Look(middle + far_m * back, middle + center_m * back)
