@@ -76,7 +76,7 @@ def main() -> None:
     seconds, peak = time.perf_counter() - started, memory_bytes("VmHWM")
     answers: dict[str, Any] = {}
     if queries is not None and made.intensity is not None:
-        answers["intensity"] = made.intensity(*queries, extrapolate=True)
+        answers["intensity"] = made.intensity(*queries)
     np.savez(
         result_path,
         vertices=np.asarray(made.vertices, np.float64).reshape(-1, 3),

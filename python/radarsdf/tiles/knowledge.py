@@ -38,8 +38,7 @@ def knowledge(contents: MapContents, points: Tensor) -> tuple[_Floats, _Floats]:
     lacks = ~queries.occupied(contents, torch.from_numpy(centres.reshape(-1, 3)))
     lacks_round: NDArray[np.bool_] = lacks.numpy().reshape(-1, len(_ROUND))
     known[inside] = 1 - queries.INWARD
-    is_near: NDArray[np.bool_] = lacks_round.any(axis=1)
-    near = is_near[of_point]
+    near = np.any(lacks_round, axis=1)[of_point]
     inside, of_point = inside[near], of_point[near]
     below = (place - cell)[near].astype(np.float64)
     nearest, ways = np.ones(len(inside)), np.zeros((len(inside), 3))
