@@ -4,14 +4,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 MAX_POSITION_M = 1e12
 """Largest coordinate, m. Squares of it, and products of three, are far from overflow in float64."""
+
+_Kind = TypeVar("_Kind")
 
 _MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; scaled or sheared ones do not
 
@@ -22,10 +26,10 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
     Raises
     ------
     TypeError
-        If `values` are not real numbers. NumPy would drop the imaginary part of complex numbers, and parse
-        text.
+        If `values` are not real numbers, or rows have different lengths. NumPy would drop the imaginary part of
+        complex numbers, and parse text.
     ValueError
-        If rows have different lengths, a value is masked, or an integer is too large for float64.
+        If a value is masked, or an integer is too large for float64.
     """
     refuse_masked(values, name)
     try:
@@ -37,6 +41,9 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
         raise ValueError(msg) from error
     except RuntimeError as error:  # a tensor that requires a gradient
         msg = f"{name}: {error}"
+        raise TypeError(msg) from error
+    except (TypeError, ValueError) as error:
+        msg = f"{name} must be real numbers, and all rows equally long"
         raise TypeError(msg) from error
     if array.dtype.kind not in "biuf":
         msg = f"{name} must be real numbers, not {array.dtype}"
@@ -137,14 +144,49 @@ def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
     return T_world_sensor
 
 
+def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:
+    """`value`, if it is of this kind."""
+    if not isinstance(value, kind):
+        msg = f"{name} must be a {kind.__name__}, not {_said(value)}"
+        raise TypeError(msg)
+    return value
+
+
+def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
+    """`values`, if they can be taken one after another."""
+    try:
+        iter(values)
+    except TypeError as error:
+        msg = f"{name} must be a list of arrays, one a scan, not {_said(values)}"
+        raise TypeError(msg) from error
+    found: Iterable[Any] = values
+    return found
+
+
+def path_of(value: Any, name: str) -> Path:
+    """`value` as a path."""
+    if not isinstance(value, (str, os.PathLike)):
+        msg = f"{name} must be a path, not {_said(value)}"
+        raise TypeError(msg)
+    return Path(value)
+
+
+def flag(value: Any, name: str) -> bool:
+    """`value` as a bool."""
+    if not isinstance(value, (bool, np.bool_)):
+        msg = f"{name} must be True or False, not {_said(value)}"
+        raise TypeError(msg)
+    return bool(value)
+
+
 def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:
     """`value` as an int, `lowest` ≤ value ≤ `highest`."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        msg = f"{name} must be a whole number, not {value!r:.50}"
+        msg = f"{name} must be a whole number, not {_said(value)}"
         raise TypeError(msg)
     if not lowest <= value <= highest:
         least = "positive" if lowest == 1 else f"at least {lowest}"
-        msg = f"{name} must be {least} and at most {highest}, not {value!r:.50}"
+        msg = f"{name} must be {least} and at most {highest}, not {_said(value)}"
         raise ValueError(msg)
     return int(value)
 
@@ -153,7 +195,7 @@ def positive(value: Any, name: str) -> float:
     """`value` as a float, positive and finite."""
     array = real_array(value, name)
     if array.shape != () or not 0 < array < np.inf:
-        msg = f"{name} must be positive and finite, not {value!r:.50}"
+        msg = f"{name} must be positive and finite, not {_said(value)}"
         raise ValueError(msg)
     return float(array)
 
@@ -162,7 +204,7 @@ def not_negative(value: Any, name: str) -> float:
     """`value` as a float, at least 0 and finite."""
     array = real_array(value, name)
     if array.shape != () or not 0 <= array < np.inf:
-        msg = f"{name} must be at least 0 and finite, not {value!r:.50}"
+        msg = f"{name} must be at least 0 and finite, not {_said(value)}"
         raise ValueError(msg)
     return float(array)
 
@@ -171,6 +213,11 @@ def number(value: Any, name: str) -> float:
     """`value` as a float. Infinity is allowed, NaN is not."""
     array = real_array(value, name)
     if array.shape != () or np.isnan(array):
-        msg = f"{name} must be a number, not {value!r:.50}"
+        msg = f"{name} must be a number, not {_said(value)}"
         raise ValueError(msg)
     return float(array)
+
+
+def _said(value: Any) -> str:
+    """A value in the line of an error."""
+    return " ".join(f"{value!r:.50}".split())

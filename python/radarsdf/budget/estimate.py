@@ -16,6 +16,7 @@ from radarsdf._core import FEATURE_DIM, CellSet, sample_cells, sample_rays
 from radarsdf.budget.durations import SECONDS, shared, work_of
 from radarsdf.budget.extent import check_extent
 from radarsdf.budget.schedule import Schedule, seen_jointly
+from radarsdf.checks import instance
 from radarsdf.config import FitConfig
 from radarsdf.field.widths import fourier_width, intensity_widths, parameters_of, sdf_widths
 from radarsdf.returns.cells import lattice_of
@@ -110,7 +111,7 @@ def estimate(
     >>> 10e6 < estimate.peak_memory_bytes < 1e9
     True
     """
-    config = FitConfig() if config is None else config
+    config = FitConfig() if config is None else instance(config, FitConfig, "config")
     rays = prepare(points, poses, intensities, **config.preparation)
     check_extent(rays, config)
     return estimate_rays(rays, config)

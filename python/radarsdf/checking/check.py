@@ -14,6 +14,7 @@ from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.finding import SEVERITIES, Finding
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
+from radarsdf.checks import instance
 from radarsdf.config import FitConfig
 from radarsdf.io.sequence import Scans
 
@@ -67,7 +68,7 @@ def check(
     >>> findings[0].name, findings[0].severity
     ('poses_inverted', 'error')
     """
-    config = FitConfig() if config is None else config
+    config = FitConfig() if config is None else instance(config, FitConfig, "config")
     if isinstance(points, Scans):
         scans, points = points, points.points  # first: it reads all there is, in one pass
         poses = scans.poses if poses is None else poses

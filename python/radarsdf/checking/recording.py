@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import (
     check_scan_shapes,
     check_values_of_scans,
+    one_for_each_scan,
     pose_matrices,
     real_array,
     refuse_masked,
@@ -49,7 +50,7 @@ class Recording:
         times_s: ArrayLike | None,
     ) -> Recording:
         """The arrays, if their shapes fit together. Else a TypeError or a ValueError that names the argument."""
-        scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(points)]
+        scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(one_for_each_scan(points, "points"))]
         check_scan_shapes(scans)
         T_world_sensor = pose_matrices(poses, len(scans))
         times = None if times_s is None else real_array(times_s, "times_s")
@@ -99,6 +100,8 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
 
 
 def _values_of(given: Sequence[ArrayLike], scans: list[NDArray[Any]], name: str) -> list[NDArray[Any]]:
-    values = [_numbers(value, f"{name} of scan {i}") for i, value in enumerate(given)]
+    values = [
+        _numbers(value, f"{name} of scan {i}") for i, value in enumerate(one_for_each_scan(given, name))
+    ]
     check_values_of_scans(values, scans, name)
     return values

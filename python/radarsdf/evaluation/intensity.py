@@ -109,7 +109,9 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
         numbers = np.arange(whole_number(frames, "frames", 0, _MAX_FRAMES))
     else:
         refuse_masked(frames, "frames")
-        numbers = np.unique(np.asarray(frames))
+        real_array(frames, "frames")
+        numbers = np.asarray(frames)
+        numbers = np.unique(numbers) if numbers.dtype.kind in "iu" else numbers
     if numbers.ndim != 1 or not (numbers.size == 0 or np.issubdtype(numbers.dtype, np.integer)):
         msg = "frames must be a number of scans or integer frame numbers"
         raise ValueError(msg)

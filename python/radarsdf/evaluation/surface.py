@@ -136,7 +136,7 @@ def surface_metrics(
     # From here on relative to the mean: differences of large coordinates would lose digits.
     origin = points.mean(axis=0)
     points = points - origin
-    vertices = positions(mesh.vertices, "mesh.vertices") - origin
+    vertices = _vertices(mesh) - origin
     faces = _faces(mesh)
     if corners is not None:
         corners = corners - origin
@@ -147,7 +147,9 @@ def surface_metrics(
     completion = np.full(len(points), float(truncation_m))
     total = kept = right_kept = right = 0
     kept_sum = 0.0
-    for block in _sample_blocks(vertices, faces, corners, samples, np.random.default_rng(seed)):
+    for block in _sample_blocks(
+        vertices, faces, corners, samples, np.random.default_rng(whole_number(seed, "seed", 0))
+    ):
         # The search finds distances strictly below its bound, and a sample at outlier_m exactly is an inlier.
         distance, _ = tree.query(block, distance_upper_bound=np.nextafter(reach, np.inf), workers=workers)
         inliers = distance[distance <= outlier_m]
@@ -213,7 +215,7 @@ def adjacent_angles(mesh: trimesh.Trimesh, *, box: ArrayLike | None = None) -> N
     ValueError
         If a vertex is not finite or the box has a wrong shape.
     """
-    vertices, faces = positions(mesh.vertices, "mesh.vertices"), _faces(mesh)
+    vertices, faces = _vertices(mesh), _faces(mesh)
     if len(faces) == 0:
         return np.zeros(0)
     origin = vertices.mean(axis=0)
@@ -261,6 +263,13 @@ def _check_box(box: ArrayLike) -> _Points:
         msg = f"box must be finite, and within {MAX_POSITION_M:g} m"
         raise ValueError(msg)
     return corners
+
+
+def _vertices(mesh: trimesh.Trimesh) -> _Points:
+    if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
+        msg = f"mesh must have vertices and faces, not be {mesh!r:.50}"
+        raise TypeError(msg)
+    return positions(mesh.vertices, "mesh.vertices")
 
 
 def _faces(mesh: trimesh.Trimesh) -> NDArray[np.int64]:

@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import number
+from radarsdf.checks import real_array
 
 
 @dataclass(frozen=True)
@@ -29,13 +28,13 @@ class IntensityScale:
         return None if intensities is None else cls(float(intensities.min()), float(intensities.max()))
 
     @classmethod
-    def between(cls, low: float, high: float) -> IntensityScale:
-        """A range that is given. Raises a ValueError unless it is finite and ascending."""
-        low, high = number(low, "intensity_range"), number(high, "intensity_range")
-        if not -math.inf < low < high < math.inf:
-            msg = f"the range of intensities must be finite and ascending, not {low} to {high}"
+    def between(cls, intensity_range: ArrayLike) -> IntensityScale:
+        """A range (low, high) that is given. Raises a ValueError unless it is finite and ascending."""
+        ends = real_array(intensity_range, "intensity_range")
+        if ends.shape != (2,) or not -np.inf < ends[0] < ends[1] < np.inf:
+            msg = "intensity_range must be two finite numbers, the lower one first"
             raise ValueError(msg)
-        return cls(low, high)
+        return cls(*ends.tolist())
 
     def to_unit(self, intensities: NDArray[np.float32]) -> NDArray[np.float32]:
         """Intensities (N,) from sensor units to [0, 1]. Those beyond the range are moved to its ends."""

@@ -9,7 +9,6 @@ import json
 import time
 import warnings
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
@@ -17,6 +16,7 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from radarsdf import _core
+from radarsdf.checks import path_of
 from radarsdf.config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
@@ -59,7 +59,7 @@ class Checkpoint:
     def __init__(
         self, path: str | PathLike[str], rays: Rays, scale: IntensityScale | None, config: FitConfig
     ) -> None:
-        self._path = Path(path)
+        self._path = path_of(path, "checkpoint")
         settings = {k: v for k, v in config.to_dict().items() if k not in _SETTINGS_NOT_COMPARED}
         self._identity: dict[str, Any] = json.loads(
             json.dumps({"version": _core.__version__, "scans": _digest(rays, scale), "config": settings})

@@ -9,6 +9,7 @@ from os import PathLike
 
 from numpy.typing import ArrayLike
 
+from radarsdf.checks import instance
 from radarsdf.config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.steps import Clock, FitInput, fit_rays
@@ -93,7 +94,7 @@ def fit(
     >>> bool((distance_m > 0).all())
     True
     """
-    config = FitConfig() if config is None else config
+    config = FitConfig() if config is None else instance(config, FitConfig, "config")
     clock = Clock()
     try:
         points, poses, intensities, doppler_mps = _given(points, poses, intensities, doppler_mps)
@@ -101,7 +102,7 @@ def fit(
         rays = prepare(standing.points, poses, standing.intensities, origin=origin, **config.preparation)
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
-            scale = IntensityScale.between(*intensity_range)
+            scale = IntensityScale.between(intensity_range)
         given = FitInput(rays, scale, lambda rays, noise: Sensor.of_rays(rays, poses, noise))
         given.movers, given.why_no_movers = standing.movers, standing.why_none
         del rays  # the fit lets go of them when it has no more use for them

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from radarsdf.checks import path_of
 from radarsdf.io.files import whole_file
 from radarsdf.io.las import las_writer
 from radarsdf.io.origin import origin_for, write_origin
@@ -44,7 +45,7 @@ class CloudWritten(NamedTuple):
 
 def check_cloud_path(path: str | PathLike[str]) -> None:
     """Raises a ValueError unless `path` ends like a format that :func:`write_cloud` writes."""
-    if Path(path).suffix.lower() not in CLOUD_OUT_SUFFIXES:
+    if path_of(path, "path").suffix.lower() not in CLOUD_OUT_SUFFIXES:
         msg = f"{path}: a point cloud can be written as {', '.join(CLOUD_OUT_SUFFIXES)}"
         raise ValueError(msg)
 

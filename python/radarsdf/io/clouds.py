@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.interrupts import whole_import
 from radarsdf.io.fields import COLUMNS, Fields
@@ -107,7 +108,7 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     ImportError
         If it takes a library that is not installed; the message says which.
     """
-    columns = read_columns(Path(path))
+    columns = read_columns(path_of(path, "path"))
     fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
     points = fields.read(columns, str(path)).points.astype(np.float64)
     if len(points) == 0:

@@ -15,6 +15,8 @@ from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
+from radarsdf.checks import path_of
+
 _MAX_NAME_BYTES = 255  # of nearly all file systems
 _MAX_PART_OF_NAME = (
     50  # characters, of at most four bytes: the temporary name must not be longer than the limit
@@ -123,7 +125,7 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
     OSError
         If the file cannot be written.
     """
-    target = Path(os.path.realpath(path))
+    target = Path(os.path.realpath(path_of(path, "path")))
     mode = _check_target(target, path)
     descriptor, temporary = _open_beside(target)
     try:

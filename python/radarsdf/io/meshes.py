@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import path_of
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.origin import origin_for, origin_of, write_origin
@@ -40,7 +41,7 @@ def holds_mesh(path: str | PathLike[str]) -> bool:
 
 def check_mesh_path(path: str | PathLike[str]) -> None:
     """Raises a ValueError unless `path` ends like a format that :func:`write_mesh` writes."""
-    if Path(path).suffix.lower() not in MESH_SUFFIXES:
+    if path_of(path, "path").suffix.lower() not in MESH_SUFFIXES:
         msg = f"{path}: a mesh can be written as {', '.join(MESH_SUFFIXES)}"
         raise ValueError(msg)
 
@@ -106,7 +107,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     OSError
         If it cannot be opened.
     """
-    file = Path(path)
+    file = path_of(path, "path")
     check_regular_file(file)
     if file.suffix.lower() not in MESH_SUFFIXES:
         msg = f"{path} is no mesh that can be read: those end in {', '.join(MESH_SUFFIXES)}"

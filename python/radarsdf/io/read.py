@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import positions, positive
+from radarsdf.checks import path_of, positions, positive
 from radarsdf.io import bags, datasets
 from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
 from radarsdf.io.folders import base_T_radar, lidar_map
@@ -112,7 +112,7 @@ def read(
     >>> scans.notes
     ['1 returns left out: a coordinate or the intensity is not a finite number']
     """
-    if stamps not in _STAMPS:
+    if not isinstance(stamps, (str, type(None))) or stamps not in _STAMPS:
         msg = f'stamps must be "header" or "record", not {stamps!r:.50}'
         raise ValueError(msg)
     request = Request(
@@ -131,7 +131,7 @@ def read(
     if isinstance(poses, (str, PathLike)):
         _check_exists(Path(poses))
     if not isinstance(path, (str, PathLike)):
-        paths = [Path(part) for part in path]
+        paths = [path_of(part, "path") for part in (path if isinstance(path, Iterable) else [path])]
         for part in paths:
             _check_exists(part)
         found = bags.read_bags(paths, request, truth)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import instance, path_of
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.sequence import Scan, Scans
 from radarsdf.io.unpacking import check_unpacked
@@ -65,7 +66,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     OSError
         If the file cannot be read.
     """
-    if Path(path).suffix != ".npz":
+    if path_of(path, "path").suffix != ".npz":
         msg = f"{path} is not an .npz file: only .npz files of scans can be read"
         raise ValueError(msg)
     arrays = arrays_of(path, _ARRAYS)
@@ -163,6 +164,7 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     OSError
         If the file cannot be written.
     """
+    instance(scans, Scans, "scans")
     arrays: dict[str, NDArray[Any]] = {
         "points": np.concatenate(scans.points),
         "frame": np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points]),
@@ -181,7 +183,7 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
             arrays["simulated"] = np.array(1, np.uint8)
     file = io.BytesIO()
     np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-    target = Path(path)
+    target = path_of(path, "path")
     write_whole(
         target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz"), file.getvalue()
     )

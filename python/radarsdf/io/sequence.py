@@ -12,6 +12,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import one_for_each_scan
+
 _LOG = logging.getLogger("radarsdf.io")
 
 TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
@@ -123,11 +125,11 @@ class Scans:
     ) -> None:
         self._source: Callable[[], Iterator[Scan]] | None = None
         self._notes = Notes()
-        self._points: list[NDArray[Any]] | None = list(points)
+        self._points: list[NDArray[Any]] | None = list(one_for_each_scan(points, "points"))
         self._poses: NDArray[np.float64] | None = poses
-        self._intensities = _listed(intensities)
-        self._doppler_mps = _listed(doppler_mps)
-        self._sigmas = _listed(sigmas)
+        self._intensities = _listed(intensities, "intensities")
+        self._doppler_mps = _listed(doppler_mps, "doppler_mps")
+        self._sigmas = _listed(sigmas, "sigmas")
         self._times_s = times_s
         self._ground_truth: Callable[[], NDArray[Any] | None] = lambda: ground_truth
         self._truth_known = False
@@ -284,8 +286,8 @@ class Scans:
         self._points = [scan.points for scan in scans]
 
 
-def _listed(arrays: Sequence[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
-    return None if arrays is None else list(arrays)
+def _listed(arrays: Sequence[NDArray[Any]] | None, name: str) -> list[NDArray[Any]] | None:
+    return None if arrays is None else list(one_for_each_scan(arrays, name))
 
 
 def _all_or_none(arrays: list[NDArray[Any] | None]) -> list[NDArray[Any]] | None:

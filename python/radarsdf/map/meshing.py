@@ -131,6 +131,7 @@ def check_limits(
     contents: MapContents, min_confidence: float, max_uncertainty: float | None, min_detection_rate: float
 ) -> tuple[float, float, float]:
     """These arguments of :meth:`RadarMap.mesh` as numbers. Raises a ValueError if they are out of range."""
+    min_confidence = number(min_confidence, "min_confidence")
     if not 0 <= min_confidence <= 1:
         msg = f"min_confidence must be in [0, 1], not {min_confidence}"
         raise ValueError(msg)
@@ -140,7 +141,7 @@ def check_limits(
     if max_uncertainty < 0:
         msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
         raise ValueError(msg)
-    return float(min_confidence), max_uncertainty, not_negative(min_detection_rate, "min_detection_rate")
+    return min_confidence, max_uncertainty, not_negative(min_detection_rate, "min_detection_rate")
 
 
 def _local(contents: MapContents, world: NDArray[np.float64]) -> torch.Tensor:

@@ -243,8 +243,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         raise ValueError(msg)
     scale = None
     if description["intensity_scale"] is not None:
-        low, high = description["intensity_scale"]
-        scale = IntensityScale.between(low, high)
+        scale = IntensityScale.between(description["intensity_scale"])
     rough_share = float(description["rough_share"])
     if not 0 <= rough_share <= 1:
         msg = f"rough_share must be in [0, 1], not {rough_share}"

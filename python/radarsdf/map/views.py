@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import cell_keys
 from radarsdf.budget.estimate import check_views
-from radarsdf.checks import check_poses, number, real_array
+from radarsdf.checks import check_poses, flag, instance, number, real_array, whole_number
 from radarsdf.io.sequence import Scan, Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
@@ -144,7 +144,7 @@ def view_from(
         raise ValueError(msg)
     pose = check_poses(pose[None], 1)[0]
     surface = viewed.surface
-    sensor = viewed.sensor if sensor is None else sensor
+    sensor = viewed.sensor if sensor is None else instance(sensor, Sensor, "sensor")
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
     if not 0 <= wanted <= 1e8:
         msg = f"returns must be in [0, 10^8], not {returns}"
@@ -160,7 +160,8 @@ def view_from(
     if intensities is not None:
         detected = intensities >= sensor.threshold(np.linalg.norm(points, axis=1))
         points, intensities = points[detected], intensities[detected]
-    if noise:
+    if flag(noise, "noise"):
+        seed = seed if isinstance(seed, np.random.Generator) else whole_number(seed, "seed", 0)
         points = _with_noise(points, sensor, np.random.default_rng(seed))
     ranges_m, beam_intensities = _first_surface(viewed, pose[:3, :3], position, sensor, azimuth, elevation)
     return View(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import check_values_of_scans, real_array
+from radarsdf.checks import check_values_of_scans, one_for_each_scan, real_array
 from radarsdf.config import FitConfig, ReturnsConfig
 from radarsdf.io.sequence import Scans
 from radarsdf.returns.doppler import MIN_RETURNS, sensor_velocities
@@ -96,8 +96,8 @@ class Standing:
         """All returns, if there is no Doppler or ``config.drop_movers`` says so; else see :meth:`Movers.of`."""
         if doppler_mps is None or not config.drop_movers:
             return cls(points, intensities, 0, None)
-        points = list(points)
-        intensities = None if intensities is None else list(intensities)
+        points = list(one_for_each_scan(points, "points"))
+        intensities = None if intensities is None else list(one_for_each_scan(intensities, "intensities"))
         if intensities is not None:
             check_scans(points, intensities)
         movers = Movers.of(points, doppler_mps)
@@ -106,7 +106,10 @@ class Standing:
 
 
 def _checked(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
-    speeds = [real_array(values, f"doppler_mps of scan {i}") for i, values in enumerate(doppler_mps)]
+    speeds = [
+        real_array(values, f"doppler_mps of scan {i}")
+        for i, values in enumerate(one_for_each_scan(doppler_mps, "doppler_mps"))
+    ]
     check_values_of_scans(speeds, scans, "doppler_mps")
     return speeds
 

@@ -21,6 +21,7 @@ from radarsdf.checks import (
     check_scan_shapes,
     check_values_of_scan,
     number,
+    one_for_each_scan,
     real_array,
     whole_number,
 )
@@ -129,7 +130,11 @@ def _checked(
     how many they are.
     """
     num_scans = num_values = num_returns = num_bad = first_bad = 0
-    both = zip_longest(points, () if intensities is None else intensities, fillvalue=_MISSING)
+    both = zip_longest(
+        points,
+        () if intensities is None else one_for_each_scan(intensities, "intensities"),
+        fillvalue=_MISSING,
+    )
     for i, (given, given_values) in enumerate(both):
         num_scans += given is not _MISSING
         num_values += given_values is not _MISSING
@@ -227,7 +232,8 @@ def prepare(
         ranges.
     """
     # Of an iterator, the number of scans is known only in the end.
-    num_scans = len(points) if isinstance(points, Sized) else len(real_array(poses, "poses"))
+    points = one_for_each_scan(points, "points")
+    num_scans = len(points) if isinstance(points, Sized) else len(np.atleast_1d(real_array(poses, "poses")))
     if num_scans == 0:
         check_scan_shapes([])
     T_world_sensor = check_poses(poses, num_scans)

@@ -4,10 +4,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from radarsdf.checks import number
 
 __all__ = [
     "ASPHALT",
@@ -51,6 +54,9 @@ class Material:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        for field in dataclasses.fields(self):
+            if field.name != "name":
+                number(getattr(self, field.name), field.name)
         if not 0 <= self.specular <= 1:
             msg = f"specular must be in [0, 1], not {self.specular}"
             raise ValueError(msg)

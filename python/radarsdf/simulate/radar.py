@@ -78,7 +78,7 @@ class _Echoes(NamedTuple):
 
 def generator(seed: int, *key: int) -> np.random.Generator:
     """Random number generator of the part `key` of a simulation. Different keys give independent streams."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+    return np.random.default_rng(np.random.SeedSequence(whole_number(seed, "seed", 0), spawn_key=key))
 
 
 @dataclass(frozen=True)

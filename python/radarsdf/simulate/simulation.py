@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import check_poses
+from radarsdf.checks import check_poses, instance, real_array, whole_number
 
 from .radar import Origin, RadarSensor, generator, unit_vectors
 from .scene import Scene
@@ -106,7 +106,11 @@ def simulate(
     ValueError
         If a pose is not a rigid transform.
     """
-    poses = check_poses(poses, len(poses))
+    instance(scene, Scene, "scene")
+    instance(sensor, RadarSensor, "sensor")
+    whole_number(lidar_rays, "lidar_rays", 0)
+    poses = real_array(poses, "poses")
+    poses = check_poses(poses, len(poses) if poses.ndim else 0)
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
     return Simulation(
         points=[scan.points for scan in scans],

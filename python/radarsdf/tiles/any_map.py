@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 from os import PathLike
-from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import path_of
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.radar_map import load as load_file
 from radarsdf.returns.rays import Rays
@@ -40,7 +40,8 @@ def load(path: str | PathLike[str]) -> AnyMap:
     OSError
         If it cannot be read.
     """
-    return TiledMap(path) if Path(path).is_dir() else load_file(path)
+    path = path_of(path, "path")
+    return TiledMap(path) if path.is_dir() else load_file(path)
 
 
 def lacking(radar_map: AnyMap) -> str:

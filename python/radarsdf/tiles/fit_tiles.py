@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from radarsdf.checks import positive
+from radarsdf.checks import instance, one_for_each_scan, path_of, positive
 from radarsdf.config import FitConfig
 from radarsdf.io.files import write_whole
 from radarsdf.io.read import read
@@ -100,7 +100,8 @@ def plan_tiles(
 
     `threads`: of each fit, if the configuration does not say. Default: as many as PyTorch uses.
     """
-    folder, config = Path(out), FitConfig() if config is None else config
+    folder = path_of(out, "out")
+    config = FitConfig() if config is None else instance(config, FitConfig, "config")
     grid = _grid(config, tile_size, halo)
     given = read(scans) if isinstance(scans, (str, PathLike)) else scans
     if not (folder / PLAN).is_file():
@@ -128,7 +129,7 @@ def run_fits(
     progress: bool | None = None,
 ) -> TiledMap:
     """The second step: fits the tiles of a plan that are not done, all or those of these `names`."""
-    root = Path(folder)
+    root = path_of(folder, "folder")
     plan = Plan.load(root)
     wanted = {tile.name for tile in plan.tiles} if names is None else set(names)
     if unknown := wanted - {tile.name for tile in plan.tiles}:
@@ -168,7 +169,7 @@ def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> Til
 
 
 def _checked(scans: Iterable[Any]) -> Iterable[Scan]:
-    for i, scan in enumerate(scans):
+    for i, scan in enumerate(one_for_each_scan(scans, "scans")):
         if not isinstance(scan, Scan):
             msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
             raise TypeError(msg)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.budget.estimate import check_triangles
-from radarsdf.checks import positive, whole_number
+from radarsdf.checks import path_of, positive, whole_number
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import whole_file
 from radarsdf.io.records import ply_header, records
@@ -62,7 +62,7 @@ def export_mesh(
     **limits: Any,
 ) -> tuple[int, int]:
     """See :meth:`TiledMap.export`."""
-    suffix = Path(path).suffix.lower()
+    suffix = path_of(path, "path").suffix.lower()
     if suffix not in {".ply", ".json"}:
         msg = f"{path}: a mesh of tiles is written as .ply, or as .json for 3D Tiles"
         raise ValueError(msg)

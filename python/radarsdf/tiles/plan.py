@@ -101,7 +101,7 @@ class Plan:
             msg = f"plan.halo_m must be at most plan.tile_m, {self.tile_m}, not {self.halo_m}"
             raise ValueError(msg)
         if self.intensity_range is not None:
-            IntensityScale.between(*self.intensity_range)
+            IntensityScale.between(self.intensity_range)
         if any(a.tile >= b.tile for a, b in itertools.pairwise(self.tiles)):
             msg = "plan.tiles must be in ascending order, each of them once"
             raise ValueError(msg)
@@ -130,7 +130,7 @@ class Plan:
     @property
     def scale(self) -> IntensityScale | None:
         """Of the intensities."""
-        return None if self.intensity_range is None else IntensityScale.between(*self.intensity_range)
+        return None if self.intensity_range is None else IntensityScale.between(self.intensity_range)
 
     @property
     def tile_cells(self) -> int:

@@ -15,9 +15,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import check_poses, real_array
+from radarsdf.checks import check_poses, instance, real_array
 from radarsdf.map import queries, storage
 from radarsdf.map.positions import as_positions
+from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.blend import Share, TileBlend, averages, distance
 from radarsdf.tiles.plan import map_path
 from radarsdf.tiles.ray_files import rays_path
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     import trimesh
 
     from radarsdf.map.views import View, ViewedMap
-    from radarsdf.returns.sensor import Sensor
     from radarsdf.tiles.grid import Tile
 
 _Floats = NDArray[np.float64]
@@ -232,7 +232,7 @@ class TiledMap(TileBlend):
         from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - likewise
 
         pose = check_poses(np.asarray(real_array(T_world_sensor, "T_world_sensor"))[None], 1)[0]
-        range_m = (self.sensor if sensor is None else sensor).range_m[1]
+        range_m = (self.sensor if sensor is None else instance(sensor, Sensor, "sensor")).range_m[1]
         # Of a pose far away from all tiles, any will do to see nothing.
         tiles = tiles_within(self, pose[:3, 3], range_m) or [self.tiles[0].tile]
         held = self._viewed
