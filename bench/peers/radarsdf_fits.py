@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,6 +35,10 @@ def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], mesh: di
     started = time.perf_counter()
     surface = radar_map.mesh(**mesh, progress=False)
     report = radar_map.report | {"mesh_s": time.perf_counter() - started}
-    # Held-out returns may lie where the map observed nothing; the nearest neighbours answer there, too.
-    intensity = partial(radar_map.intensity, extrapolate=True) if radar_map.has_intensity else None
-    return Made(surface.vertices, surface.faces, radar_map.nbytes, report, intensity)
+
+    def intensity(points: np.ndarray, sensors: np.ndarray) -> np.ndarray:
+        # Held-out returns may lie where the map observed nothing; the nearest neighbours answer there, too.
+        return radar_map.intensity(points, sensors, extrapolate=True)
+
+    answers = intensity if radar_map.has_intensity else None
+    return Made(surface.vertices, surface.faces, radar_map.nbytes, report, answers)

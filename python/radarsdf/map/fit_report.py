@@ -33,6 +33,7 @@ class _Report(TypedDict, total=False):
 
     __pydantic_config__ = _RULES  # type: ignore[misc]
 
+    scans: _Count
     returns: _Count
     returns_used: _Count
     ghosts: _Count
