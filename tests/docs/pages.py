@@ -21,7 +21,7 @@ from radarsdf.cli import main
 _FENCE = re.compile(r"^```(\S*)\s*$")
 _NOT_RUN = re.compile(r"^<!-- not run: (.+) -->$")
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")
-_ANY_LINES = "…"
+_LEFT_OUT = "…"
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def run_shell(block: Block, environment: dict[str, str]) -> str:
 def run_console(block: Block, environment: dict[str, str]) -> None:
     """Run each line that begins with `$`, and compare what comes back with what the page has.
 
-    Numbers may differ. A line … stands for any lines. Where a command is said to fail is not written, so its status does
+    Numbers may differ. A line … stands for any lines, and … within a line for a number that is left out. Where a command is said to fail is not written, so its status does
     not count.
     """
     for command, expected in _commands(block):
@@ -102,9 +102,9 @@ def _commands(block: Block) -> Iterator[tuple[str, list[str]]]:
 
 def _same(expected: list[str], printed: list[str]) -> bool:
     def plain(line: str) -> str:
-        return _NUMBER.sub("#", line) + "\n"
+        return _NUMBER.sub("#", line.replace(_LEFT_OUT, "#")) + "\n"
 
-    whole = "".join(r"(.*\n)*?" if line == _ANY_LINES else re.escape(plain(line)) for line in expected)
+    whole = "".join(r"(.*\n)*?" if line == _LEFT_OUT else re.escape(plain(line)) for line in expected)
     return re.fullmatch(whole, "".join(map(plain, printed))) is not None
 
 
