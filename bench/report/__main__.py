@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""`python -m bench.report run` measures, and `python -m bench.report write` makes `BENCHMARK.md` and its plots of it."""
+"""`python -m bench.report run` measures; `write` makes `BENCHMARK.md`, its plots and the figures of other pages of it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 from bench.paper.report import ROOT, write_json
 
-from . import results
+from . import pages, results
 from .document import DOCUMENT, WORD_LIMIT, document
-from .experiments import EXPERIMENTS, NAMES, run
+from .experiments import EXPERIMENTS, NAMES, REAL, run
 from .plots import PLOTS, draw
 
 _RESULTS = ROOT / "bench" / "results.json"
@@ -40,8 +40,12 @@ def _measure(words: argparse.Namespace) -> None:
     Raises
     ------
     ValueError
-        If the file is of another run, or an experiment failed; the others are in the file all the same.
+        If the file is of another run, or an experiment failed; the others are in the file all the same. If recorded
+        scans are asked for, and not given.
     """
+    if REAL in words.only and not words.real:
+        msg = f"{REAL} needs recorded scans: --real FILE.npz ..."
+        raise ValueError(msg)
     size = "quick" if words.quick else "long" if words.long else "usual"
     joins = bool(words.only) and words.out.exists()
     collected = results.read(words.out) if joins else None
@@ -49,12 +53,8 @@ def _measure(words: argparse.Namespace) -> None:
         results.merge(collected, results.begin(quick=words.quick))  # to refuse now, and not after minutes
     words.out.parent.mkdir(parents=True, exist_ok=True)
     failed: list[str] = []
-    for name in words.only or NAMES:
-        about = (
-            f"about {EXPERIMENTS[name].minutes:g} minutes"
-            if size == "usual" and name in EXPERIMENTS
-            else size
-        )
+    for name in words.only or [name for name in NAMES if words.real or name != REAL]:
+        about = f"about {EXPERIMENTS[name].minutes:g} minutes" if size == "usual" else size
         _say(f"{name}: {about} …")
         new = results.begin(quick=words.quick)
         new["experiments"][name] = part = run(name, size=size, real=words.real)
@@ -71,14 +71,18 @@ def _measure(words: argparse.Namespace) -> None:
 def _write(path: Path, root: Path) -> None:
     found = results.read(path)
     text = document(found)
+    filled = {page: pages.measured(old, found) for page, old in pages.pages(root).items()}
     (root / "docs").mkdir(parents=True, exist_ok=True)
     (root / DOCUMENT).write_text(text, encoding="utf-8")
     draw(found, root)
-    _say(f"written: {DOCUMENT}, {len(text.split())} of {WORD_LIMIT} words; {', '.join(PLOTS)}")
+    for page, new in filled.items():
+        page.write_text(new, encoding="utf-8")
+    names = [*PLOTS, *(str(page.relative_to(root)) for page in filled)]
+    _say(f"written: {DOCUMENT}, {len(text.split())} of {WORD_LIMIT} words; {', '.join(names)}")
 
 
 def _check(path: Path, root: Path) -> None:
-    """Whether document and plots are what the results give.
+    """Whether document, plots and the figures of pages are what the results give.
 
     Raises
     ------
@@ -95,7 +99,11 @@ def _check(path: Path, root: Path) -> None:
         if mark not in (root / name).read_bytes():
             msg = f"{name} was not drawn from {path}; {again}"
             raise ValueError(msg)
-    _say(f"{DOCUMENT} and its plots are what {path} gives")
+    for page, text in pages.pages(root).items():
+        if pages.measured(text, found) != text:
+            msg = f"the figures of {page.relative_to(root)} are not those of {path}; {again}"
+            raise ValueError(msg)
+    _say(f"{DOCUMENT}, its plots and the figures of pages are what {path} gives")
 
 
 def _say(line: str) -> None:
@@ -120,7 +128,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE.npz",
         help="recorded scans with lidar and poses",
     )
-    write = commands.add_parser("write", help="write BENCHMARK.md and its plots")
+    write = commands.add_parser("write", help="write BENCHMARK.md, its plots and the figures of pages")
     write.add_argument("results", type=Path, nargs="?", default=_RESULTS, help="default: bench/results.json")
     write.add_argument("--check", action="store_true", help="write nothing; fail where they would change")
     write.add_argument("--root", type=Path, default=ROOT, help="where they lie; default: this repository")

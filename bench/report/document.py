@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable
 from typing import Any
 
@@ -61,12 +60,12 @@ def _head(results: Results) -> str:
     warning = (
         "**This was a quick run: its figures mean nothing.**" if results["quick"] else results.get("note", "")
     )
-    warning = f"\n\n{_filled(warning)}" if warning else ""
+    warning = f"\n\n{tables.wrapped(warning)}" if warning else ""
     return f"""# Benchmarks
 
 <!-- Do not edit: `python -m bench.report write` writes this file from bench/results.json. -->
 
-{_filled(measured)}
+{tables.wrapped(measured)}
 Times are of this machine, and one time may be off by a third.{warning}
 
 Beside this: [what each choice is worth](docs/levers.md), [what was tried and left out](docs/dead_ends.md),
@@ -82,22 +81,23 @@ def _surface(rows: list[Row], _part: dict[str, Any]) -> str:
     )
     if all(row["method"] != "3QFPI" for row in rows):
         text += " 3QFPI, which trains for more than a minute, is in the plot below only."
-    parts = ["## Surface", _filled(text)]
+    parts = ["## Surface", tables.wrapped(text)]
     for scene, own in tables.by_scene(rows).items():
         if any(row.get("f_score") is not None for row in own):
             parts += [f"### `{scene}`, {own[0]['returns']:,} returns", tables.surface(own)]
     return "\n\n".join([*parts, *_reasons(rows)])
 
 
-def _real(rows: list[Row], part: dict[str, Any]) -> str:
+def _real(rows: list[Row], _part: dict[str, Any]) -> str:
     ahead, drives = tables.octree_ahead(rows)
-    measured = f" They were measured before this run, {part['measured']}." if "measured" in part else ""
     if ahead == drives:
         verdict = f"On all {drives} drives the published octree, SHINE, is still ahead of this package"
     else:
         verdict = f"On {ahead} of {drives} drives the published octree, SHINE, is ahead of this package"
-    text = f"{verdict}. The figures are F-all, in %.{measured}"
-    return "\n\n".join(["## Surface from a real radar", _filled(text), tables.real(rows), *_reasons(rows)])
+    text = f"{verdict}. The figures are F-all, in %."
+    return "\n\n".join(
+        ["## Surface from a real radar", tables.wrapped(text), tables.real(rows), *_reasons(rows)]
+    )
 
 
 def _intensity(rows: list[Row], _part: dict[str, Any]) -> str:
@@ -105,7 +105,7 @@ def _intensity(rows: list[Row], _part: dict[str, Any]) -> str:
         "MAE, in dB. kNN answers with the intensities of the nearest returns, by settings chosen on the training scans. "
         "The floor is the error of the simulator's intensity without noise."
     )
-    return "\n\n".join(["## Intensity", _filled(text), tables.intensity(rows), *_reasons(rows)])
+    return "\n\n".join(["## Intensity", tables.wrapped(text), tables.intensity(rows), *_reasons(rows)])
 
 
 def _curve(rows: list[Row], _part: dict[str, Any]) -> str:
@@ -114,7 +114,7 @@ def _curve(rows: list[Row], _part: dict[str, Any]) -> str:
         "The error of the surface is what F-all lacks to 100 %."
     )
     picture = f"![Error of the surface and of the intensity over time]({ERROR_OVER_TIME})"
-    return "\n\n".join(["## Error over time", _filled(text), picture, *_reasons(rows)])
+    return "\n\n".join(["## Error over time", tables.wrapped(text), picture, *_reasons(rows)])
 
 
 def _growth(rows: list[Row], _part: dict[str, Any]) -> str:
@@ -122,14 +122,10 @@ def _growth(rows: list[Row], _part: dict[str, Any]) -> str:
     if not lines:
         return "\n\n".join(["## Growth", *_reasons(rows)])
     most = max(row["returns"] for row in lines)
-    largest = {row["intensities"]: row for row in lines if row["returns"] == most}
-    said = [
-        f"{row['wall_s']:.0f} s and {row['peak_mb'] / 1000:.1f} GB {'with' if both else 'without'} intensities"
-        for both, row in sorted(largest.items())
-    ]
-    text = f"Fits of a street of {lines[0]['size_m']:,.0f} m. {most:,} returns take {', '.join(said)}."
+    largest = tables.fits([row for row in lines if row["returns"] == most])
+    text = f"Fits of a street of {lines[0]['size_m']:,.0f} m. {most:,} returns take {largest}."
     return "\n\n".join(
-        ["## Growth", _filled(text), f"![Time and memory over returns]({GROWTH})", *_reasons(rows)]
+        ["## Growth", tables.wrapped(text), f"![Time and memory over returns]({GROWTH})", *_reasons(rows)]
     )
 
 
@@ -138,7 +134,7 @@ def _kernels(rows: list[Row], part: dict[str, Any]) -> str:
         return ""
     text = "Medians on two threads; training steps on one. Interpolation is at 262,144 points."
     left_out = [f"Left out: {'; '.join(part['skipped'])}."] if part.get("skipped") else []
-    return "\n\n".join(["## Kernels", _filled(text), table, *left_out])
+    return "\n\n".join(["## Kernels", tables.wrapped(text), table, *left_out])
 
 
 def _queries(rows: list[Row], _part: dict[str, Any]) -> str:
@@ -162,10 +158,6 @@ def _reasons(rows: list[Row]) -> list[str]:
             )
     lines = [f"- {', '.join(dict.fromkeys(names))}: {reason}" for reason, names in found.items()]
     return ["No result:\n\n" + "\n".join(lines)] if lines else []
-
-
-def _filled(text: str) -> str:
-    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def _missing(experiments: dict[str, Any]) -> str:

@@ -25,6 +25,7 @@ Values = dict[str, Any]
 # 3QFPI trains for more than a minute on each scene: `curve` has it on one, and `--long` on all.
 _PEERS = tuple(name for name in PEERS if name != "3QFPI")
 _SCENES = ("hugin", "oculii", "wall")
+REAL = "real"
 _SAMPLES = ("--samples", "1000000")
 _KERNELS = tuple(
     f"bench/{file}::{case}"
@@ -55,22 +56,6 @@ _ROW_KEYS = {
     ),
 }  # fmt: skip
 
-# Of the present default and the published octree, at commits before this run: the scans are not in the repository.
-_REAL_BEFORE: Values = {
-    "measured": "at commits up to b43865a",
-    "rows": [
-        {"scene": scene, "method": method, "f_score_all": value}
-        for scene, *values in (
-            ("r0144_0167", 0.333, 0.314),
-            ("r0009_0024", 0.324, 0.314),
-            ("r0057_0068", 0.382, 0.361),
-            ("r0133_0142", 0.350, 0.346),
-            ("r0309_0320", 0.424, 0.323),
-        )
-        for method, value in zip(("SHINE (octree)", "radarsdf"), values, strict=True)
-    ],
-}
-
 
 @dataclass(frozen=True)
 class Experiment:
@@ -80,7 +65,7 @@ class Experiment:
     minutes: float
     """On two cores, at its usual size; of the figures that were known when this was written."""
     words: tuple[str, ...]
-    """Of the command, after `python -m`; `{folder}` is where it writes."""
+    """Of the command, after `python -m`; `{folder}` is where it writes, and `{drives}` stands for recorded scans."""
     quick: tuple[str, ...]
     """The same to see that it runs."""
     long: tuple[str, ...]
@@ -113,8 +98,8 @@ def _paper(experiment: str, *words: str, peers: Sequence[str] = ()) -> tuple[str
 def _experiments() -> dict[str, Experiment]:
     fits = ("bench.growth", "fits", "--threads", "2", "--out", "{folder}")
     sizes = ("--sizes", "500", "--returns", "1e4", "1e5", "1e6", "1e7")
-    once, quick = ("--repetitions", "1"), ("wall", "--quick")
-    two = ("VDBFusion", "radarsdf")
+    once, thrice, quick = ("--repetitions", "1"), ("--repetitions", "3"), ("wall", "--quick")
+    two, three = ("VDBFusion", "radarsdf"), ("VDBFusion", "SHINE (octree)", "radarsdf")
     return {
         "surface": Experiment(
             "quality of the surface, beside the peers",
@@ -127,17 +112,17 @@ def _experiments() -> dict[str, Experiment]:
         ),
         "intensity": Experiment(
             "error of the intensity, beside the nearest neighbours",
-            1.5,
-            _paper("intensity", *_SCENES, "--base", "default", *once),
+            4,
+            _paper("intensity", *_SCENES, "{drives}", "--base", "default", *thrice),
             _paper("intensity", *quick, "--base", "default", *once),
-            _paper("intensity", *_SCENES, *once),
+            _paper("intensity", *_SCENES, "{drives}", *once),
             "intensity.json",
             _kept("intensity"),
         ),
         "curve": Experiment(
             "error over time",
             20,
-            _paper("curve", "hugin", *_SAMPLES, "--repetitions", "3"),
+            _paper("curve", "hugin", *_SAMPLES, *thrice),
             _paper("curve", *quick, *once, peers=two),
             _paper("curve", *_SCENES, *_SAMPLES, *once),
             "curve.json",
@@ -173,12 +158,20 @@ def _experiments() -> dict[str, Experiment]:
             "queries.json",
             lambda values: list(values["rows"]),
         ),
+        REAL: Experiment(
+            "quality of the surface of recorded drives",
+            1.5,
+            _paper("surface", "{drives}", *_SAMPLES, peers=three),
+            _paper("surface", "{drives}", "--quick", peers=two),
+            _paper("surface", "{drives}", *_SAMPLES),
+            "surface.json",
+            _kept("surface"),
+        ),
     }  # fmt: skip
 
 
 EXPERIMENTS = _experiments()
-REAL = "real"
-NAMES = (*EXPERIMENTS, REAL)
+NAMES = tuple(EXPERIMENTS)
 
 
 def run(name: str, *, size: str, real: Sequence[Path] = ()) -> Values:
@@ -191,16 +184,12 @@ def run(name: str, *, size: str, real: Sequence[Path] = ()) -> Values:
     size
         "quick", "long" or "usual".
     real
-        Recorded scans, for the experiment `real`. Where there are none, it gives what was measured before.
+        Recorded scans. Without them, `real` cannot run, and `intensity` has simulated scenes only.
     """
-    if name == REAL:
-        if not real:
-            return dict(_REAL_BEFORE)
-        files = (str(path.resolve()) for path in real)
-        words = _paper("surface", *files, *_SAMPLES, peers=("VDBFusion", "SHINE (octree)", "radarsdf"))
-        return _run(words, "surface.json", _kept("surface"))
     experiment = EXPERIMENTS[name]
     words = {"quick": experiment.quick, "long": experiment.long}.get(size, experiment.words)
+    drives = [str(path.resolve()) for path in real]
+    words = tuple(part for word in words for part in (drives if word == "{drives}" else [word]))
     return _run(words, experiment.file, experiment.rows)
 
 

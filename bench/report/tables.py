@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from statistics import fmean
 
@@ -18,7 +19,7 @@ _SURFACE: tuple[Column, ...] = (
     ("seconds", "time", 1, 1, False),
     ("peak_bytes", "memory", 1e-6, 0, False),
 )
-OURS, OCTREE = "radarsdf", "SHINE (octree)"
+OURS, OCTREE, KNN = "radarsdf", "SHINE (octree)", "kNN"
 
 # What, and the cases of pytest-benchmark that it compares: a word of the group, and words of ours and of the other.
 _STEPS = 100  # in each round of the bench of training steps
@@ -103,12 +104,21 @@ def kernels(cases: Sequence[Row]) -> str:
         if own is None:
             continue
         scale = 1000 / _STEPS if what.startswith("training step") else 1000
-        times = [_digits(scale * own), other, "–" if peer is None else _digits(scale * peer)]
+        times = [two_digits(scale * own), other, "–" if peer is None else two_digits(scale * peer)]
         lines.append([what, *times, "–" if peer is None else f"{peer / own:.1f}"])
     return (
         markdown(["what", "ours, ms", "compared with", "its time, ms", "its time / ours"], lines)
         if lines
         else ""
+    )
+
+
+def fits(rows: Sequence[Row]) -> str:
+    """Time and memory of fits of one size, without intensities first."""
+    return ", ".join(
+        f"{two_digits(row['wall_s'])} s and {row['peak_mb'] / 1000:.1f} GB "
+        f"{'with' if row['intensities'] else 'without'} intensities"
+        for row in sorted(rows, key=lambda row: bool(row["intensities"]))
     )
 
 
@@ -125,8 +135,13 @@ def _mean(values: Sequence[float]) -> str:
     return f"{fmean(values):.2f}" if values else "–"
 
 
-def _digits(value: float) -> str:
+def two_digits(value: float) -> str:
     """Two digits that mean something, as a time of one run has."""
     if value >= 10:
         return f"{value:.0f}"
     return f"{value:.1f}" if value >= 1 else f"{value:.2f}"
+
+
+def wrapped(text: str) -> str:
+    """A paragraph in lines as long as a page may have."""
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)

@@ -15,7 +15,7 @@ from bench.paper import __main__ as paper_command
 from bench.paper.report import ROOT
 from bench.peers.interface import Reconstruction
 from bench.report import __main__ as command
-from bench.report import experiments, results, tables
+from bench.report import experiments, pages, results
 from bench.report.document import WORD_LIMIT, document
 from bench.report.plots import PLOTS
 
@@ -73,8 +73,8 @@ def made_up():
         ],
         "queries": [{"what": "signed distances", "count": 22, "seconds": 0.33}],
         "real": [
-            {"scene": "drive", "method": "SHINE (octree)", "f_score_all": 0.4},
-            {"scene": "drive", "method": "radarsdf", "f_score_all": 0.3},
+            {"scene": "drive", "method": "SHINE (octree)", "f_score_all": 0.4, "completion_ratio": 0.6},
+            {"scene": "drive", "method": "radarsdf", "f_score_all": 0.3, "completion_ratio": 0.5},
         ],
     }
     made = {name: {"command": f"python -m nothing {name}", "rows": rows} for name, rows in parts.items()}
@@ -161,6 +161,70 @@ def test_the_same_results_give_the_same_files(written):
     check(root, path)
 
 
+BLOCK = "<!-- measured: {} -->\n{}<!-- end -->\n"
+
+
+def test_pages_get_the_figures_of_the_run(made_up, written):
+    root, path = written
+    page = root / "README.md"
+    page.write_text(
+        "# A page\n\n" + BLOCK.format("comparison", "It takes 1 s.\n") + "\n3 times\n", encoding="utf-8"
+    )
+    (root / "docs" / "a.md").write_text(BLOCK.format("growth", ""), encoding="utf-8")
+    (root / "docs" / "b.md").write_text("No figures.\n", encoding="utf-8")
+    with pytest.raises(SystemExit, match=r"the figures of README\.md are not those of"):
+        check(root, path)
+    command.main(["write", str(path), "--root", str(root)])
+    check(root, path)
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("# A page\n\n<!-- measured: comparison -->\n| scene `hugin`, simulated ")
+    assert text.endswith("<!-- end -->\n\n3 times\n")
+    assert "| **80.0 %** " in text
+    assert "| 4.0 s " in text
+    assert "commit feedc0ffee: `python -m nothing curve`" in text
+    assert "1 s." not in text
+    made_up["commit"] = "0ddba11"
+    path.write_text(json.dumps(made_up), encoding="utf-8")
+    with pytest.raises(SystemExit, match=r"run: python -m bench\.report write"):
+        check(root, path)
+
+
+def test_what_recorded_drives_say_follows_from_the_figures(made_up):
+    def said():
+        return " ".join(pages.measured(BLOCK.format("drives", ""), made_up).split())
+
+    assert (
+        "30.0 %, and those of the published octree (SHINE-Mapping) 40.0 %: radarsdf is ahead on 0 of 1."
+        in said()
+    )
+    assert "the lidar's surface on 1 of them" in said()
+    assert "nearest neighbours" not in said()  # hugin is no drive
+    made_up["experiments"]["intensity"]["rows"] += [
+        {"scene": "drive", "method": method, "mae": mae} for method, mae in (("kNN", 4.0), ("radarsdf", 3.0))
+    ]
+    assert "is 0.75 to 0.75 times that of the nearest neighbours" in said()
+    del made_up["experiments"]["real"]
+    assert "No recorded drive is in this run." in said()
+
+
+@pytest.mark.parametrize(
+    ("text", "changes", "message"),
+    [
+        (BLOCK.format("weather", ""), {}, "nothing is measured as weather"),
+        ("<!-- measured: growth -->\nand no end\n", {}, "has no <!-- end -->"),
+        (BLOCK.format("growth", ""), {"quick": True}, "mean nothing"),
+    ],
+)
+def test_pages_that_cannot_have_the_figures_are_refused(text, changes, message, made_up, tmp_path):
+    (tmp_path / "README.md").write_text(text, encoding="utf-8")
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(made_up | changes), encoding="utf-8")
+    with pytest.raises(SystemExit, match=message):
+        command.main(["write", str(path), "--root", str(tmp_path)])
+    assert {file.name for file in tmp_path.iterdir()} == {"README.md", "results.json"}
+    assert (tmp_path / "README.md").read_text(encoding="utf-8") == text
+
+
 def test_results_without_an_experiment_give_a_document(made_up, tmp_path):
     made_up["experiments"] = {}
     path = tmp_path / "results.json"
@@ -229,7 +293,7 @@ def test_only_some_experiments_join_the_file(made_up, tmp_path, monkeypatch):
 
     monkeypatch.setattr(command, "run", run)
     path = tmp_path / "new" / "results.json"
-    command.main(["run", "--out", str(path)])
+    command.main(["run", "--out", str(path), "--real", "a.npz"])
     assert [name for name, *_ in asked] == list(experiments.NAMES)
     before = results.read(path)
     command.main(
@@ -254,7 +318,7 @@ def test_a_failed_experiment_is_in_the_file_and_fails_the_command(made_up, tmp_p
     path = tmp_path / "results.json"
     with pytest.raises(SystemExit, match="failed: curve"):
         command.main(["run", "--out", str(path)])
-    assert list(results.read(path)["experiments"]) == list(experiments.NAMES)
+    assert list(results.read(path)["experiments"]) == [name for name in experiments.NAMES if name != "real"]
 
 
 def test_the_commit_is_that_of_the_files():
@@ -275,11 +339,19 @@ def test_a_command_that_fails_becomes_a_reason_without_folders():
     assert "rows" not in found
 
 
-def test_recorded_scans_are_those_of_before_where_none_are_given():
-    found = experiments.run("real", size="usual")
-    assert "before" not in found
-    assert tables.octree_ahead(found["rows"]) == (5, 5)
-    assert "command" not in found
+def test_recorded_scans_are_measured_by_this_run_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "results.json"
+    with pytest.raises(SystemExit, match="real needs recorded scans: --real"):
+        command.main(["run", "--out", str(path), "--only", "real"])
+    assert not path.exists()
+    monkeypatch.setattr(experiments, "_run", lambda words, *_: {"words": words})
+    drives = [tmp_path / "a.npz", tmp_path / "b.npz"]
+    words = experiments.run("real", size="usual", real=drives)["words"]
+    assert words[:4] == ("bench.paper", "surface", *map(str, drives))
+    words = experiments.run("intensity", size="usual", real=drives)["words"]
+    assert words[5:8] == (*map(str, drives), "--base")
+    words = experiments.run("intensity", size="usual")["words"]
+    assert words[4:6] == ("wall", "--base")
 
 
 def test_commands_are_ones_that_exist():
