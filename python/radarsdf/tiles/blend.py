@@ -176,7 +176,7 @@ class TileBlend:
 
         Weights depend on the borders between tiles alone, not on what a tile observed.
         """
-        for tile in self.plan.grid.counting(world) if len(world) else ():
+        for tile in self.plan.grid.counting(world):
             if not self.has(tile):
                 continue
             rows = self.plan.grid.within_half_a_halo(tile, world)

@@ -16,6 +16,7 @@ Tile = tuple[int, int]
 """Number of a tile along x and along y. Tile (0, 0) begins where the lattice of the world does."""
 
 _Floats = NDArray[np.float64]
+_MOST_TILES = 2**31  # to either side: far beyond what a float64 of metres tells apart
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,11 @@ class TileGrid:
     def counting(self, positions: _Floats) -> list[Tile]:
         """The tiles that count at any of the positions (N, 3), world, m, in ascending order."""
         found: set[Tile] = set()
+        # What is no place, or too far away for a number, is in no tile.
+        is_place = (np.abs(self._along(positions)) < _MOST_TILES * self.tile_m).all(axis=1)
+        positions = positions if is_place.all() else positions[is_place]
+        if len(positions) == 0:
+            return []
         for shift in itertools.product((-0.5, 0.5), repeat=2):
             tiles = self.tiles_of(positions[:, :2] + np.array(shift) * self.halo_m)
             # Neighbours in the list are mostly of one tile: what is left to sort is a thousandth.

@@ -171,7 +171,9 @@ class TiledMap(TileBlend):
             there = queries.to_local(
                 share.contents, torch.from_numpy(np.ascontiguousarray(sensors[share.rows]))
             )
-            return queries.intensity(share.contents, share.local, there).numpy().astype(np.float64)[:, None]
+            predicted = partial(queries.intensity, share.contents)
+            values = queries.where(there.isfinite().all(dim=1), share.local, there, function=predicted)
+            return values.numpy().astype(np.float64)[:, None]
 
         shares = self.known_shares(world, extrapolate=extrapolate)
         return answer(torch.from_numpy(averages(shares, len(world), of_tile)[:, 0]))

@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What was not observed has no answer, in every kind of map and for every kind of number."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
+
+SENSOR = np.array([0.0, 0.0, 1.0])
+SHORT = {"sdf_iterations": 3, "intensity_iterations": 3, "batch_size": 256, "intensity_batch_size": 256}
+CONFIGS = {
+    "quick": FitConfig.quick(training=SHORT),
+    "default": FitConfig(training=SHORT),
+    "paper": FitConfig.paper(training=SHORT),
+    "octree": FitConfig.paper(training=SHORT, encoding={"kind": "octree"}),
+}
+# In free space before the sensor, below the ground, far away, and no places at all.
+NOWHERE = np.array(
+    [
+        [2.0, 0.0, 1.0],
+        [2.0, 0.0, -40.0],
+        [1e7, 0.0, 0.0],
+        [0.0, -1e30, 0.0],
+        [1e30, 1e30, 1e30],
+        [0.0, 0.0, 1e30],
+        [np.nan, 0.0, 0.0],
+        [0.0, 0.0, np.nan],
+        [0.0, np.inf, 0.0],
+        [-np.inf, 0.0, 0.0],
+        [0.0, 0.0, -np.inf],
+        [np.nan, np.inf, 1e30],
+    ]
+)
+
+
+@pytest.fixture(scope="module", params=[*CONFIGS, "tiles"])
+def any_map(request, drive):
+    if request.param == "tiles":
+        return radarsdf.load(request.getfixturevalue("folder"))
+    return radarsdf.fit(drive, config=CONFIGS[request.param], progress=False)
+
+
+@pytest.fixture(scope="module")
+def returns(drive):
+    return np.concatenate([scan.world_points for scan in drive])[::50].astype(np.float64)
+
+
+def answers(any_map, x, sensor=SENSOR, **options):
+    like = (lambda a: torch.from_numpy(a).to(x.dtype)) if isinstance(x, torch.Tensor) else x.dtype.type
+    return {
+        "sdf": any_map.sdf(x, **options),
+        "gradient": any_map.gradient(x, **options),
+        "intensity": any_map.intensity(x, like(sensor), **options),
+        "uncertainty": any_map.uncertainty(x),
+        "confidence": any_map.confidence(x),
+        "observed": any_map.observed(x),
+    }
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_what_was_not_observed_is_not_a_number(any_map, kind, dtype):
+    found = answers(any_map, kind(NOWHERE.astype(dtype)))
+    for name, answer in found.items():
+        assert isinstance(answer, type(kind(NOWHERE)))
+        values = np.asarray(answer)
+        assert values.dtype == (np.bool_ if name == "observed" else dtype)
+        assert len(values) == len(NOWHERE)
+        if name == "observed":
+            assert not values.any()
+        elif name == "confidence":
+            assert (values == 0).all()
+        else:
+            assert np.isnan(values).all(), name
+
+
+def test_neighbours_of_what_is_no_place_keep_their_answers(any_map, returns):
+    alone = answers(any_map, returns)
+    assert alone["observed"].mean() > 0.9
+    mixed = answers(any_map, np.concatenate([NOWHERE[::2], returns, NOWHERE]))
+    for name, values in mixed.items():
+        np.testing.assert_allclose(
+            np.asarray(values, float)[len(NOWHERE[::2]) : -len(NOWHERE)],
+            np.asarray(alone[name], float),
+            rtol=1e-5,
+            atol=2e-4 if name == "intensity" else 2e-5,  # products of other heights may add in another order
+        )
+
+
+def test_what_was_observed_has_an_answer_and_only_that(any_map, returns):
+    x = (returns[:, None] + np.random.default_rng(0).normal(0, 1.0, (4, 3))).reshape(-1, 3)
+    found = answers(any_map, x)
+    assert 0.1 < found["observed"].mean() < 0.9
+    for name in ("sdf", "gradient", "intensity"):
+        known = np.isfinite(found[name]).reshape(len(x), -1).all(axis=1)
+        np.testing.assert_array_equal(known, found["observed"])
+
+
+def test_extrapolation_answers_at_all_places_near_tiles(any_map, returns):
+    x = np.concatenate([returns, returns + [0.0, 0.0, 30.0]])
+    found, known = answers(any_map, x, extrapolate=True), answers(any_map, x)
+    for name in ("sdf", "gradient", "intensity"):
+        assert np.isfinite(found[name]).all()
+        rows = known["observed"]
+        np.testing.assert_allclose(found[name][rows], known[name][rows], rtol=1e-5, atol=2e-4)
+    nowhere = answers(any_map, NOWHERE[~np.isfinite(NOWHERE).all(axis=1)], extrapolate=True)
+    for name in ("sdf", "gradient", "intensity"):
+        assert np.isnan(nowhere[name]).all()
+
+
+@pytest.mark.parametrize("extrapolate", [False, True])
+@pytest.mark.parametrize("wild", [np.nan, np.inf, -np.inf])
+def test_a_sensor_that_is_nowhere_measures_no_intensity(any_map, returns, wild, extrapolate):
+    for axis in range(3):
+        sensor = SENSOR.copy()
+        sensor[axis] = wild
+        assert np.isnan(any_map.intensity(returns[:5], sensor, extrapolate=extrapolate)).all()
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_no_positions_have_no_answers(any_map, kind):
+    for name, answer in answers(any_map, kind(np.zeros((0, 3), np.float32))).items():
+        assert tuple(answer.shape) == ((0, 3) if name == "gradient" else (0,))
