@@ -86,13 +86,13 @@ def fitted(changes: Changes, iterations: int) -> tuple[RadarMap, str]:
 
 
 def free_and_solid(radar_map: RadarMap) -> tuple[float, float]:
-    """Share of points 0.2 m in front of the walls that are free, and of points 0.2 m behind that are solid."""
+    """Share of points 0.2 m in front of the walls that are free, and of points 0.2 m behind that are solid, seen or not."""
     rng = np.random.default_rng(2)
     rays = rng.normal(size=(2000, 3))
     on_wall = rays * (np.array([4, 4, 1.5]) / np.abs(rays)).min(axis=1, keepdims=True)
     outward = np.where(np.isclose(np.abs(on_wall), [4, 4, 1.5]), np.sign(on_wall), 0.0)
-    free = float((radar_map.sdf(on_wall - 0.2 * outward) > 0).mean())
-    return free, float((radar_map.sdf(on_wall + 0.2 * outward) < 0).mean())
+    free = float((radar_map.sdf(on_wall - 0.2 * outward, extrapolate=True) > 0).mean())
+    return free, float((radar_map.sdf(on_wall + 0.2 * outward, extrapolate=True) < 0).mean())
 
 
 def run(iterations: int, longest: int) -> None:

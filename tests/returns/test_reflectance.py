@@ -153,5 +153,6 @@ def test_few_returns_have_no_planes_and_still_answer():
     radar_map = radarsdf.fit(
         points, np.stack([np.eye(4)] * 2), [[1.0, 2.0], [3.0]], config=config, progress=False
     )
-    answers = radar_map.intensity(np.array([[5.0, 0, 0], [9.0, 9, 9]]), [0.0, 0, 0])
+    places = np.array([[5.0, 0, 0], [9.0, 9, 9]])
+    answers = radar_map.intensity(places, [0.0, 0, 0], extrapolate=True)
     assert ((answers >= 1) & (answers <= 3)).all()
