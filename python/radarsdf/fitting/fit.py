@@ -90,8 +90,9 @@ def fit(
     >>> import radarsdf
     >>> scans = radarsdf.simulate.wall(frames=4)
     >>> radar_map = radarsdf.fit(scans.points, scans.poses)  # and scans.intensities, for radar_map.intensity(...)
-    >>> distance_m = radar_map.sdf(scans.poses[:, :3, 3])  # of the sensor's positions: all in free space
-    >>> bool((distance_m > 0).all())
+    >>> mesh = radar_map.mesh()
+    >>> distance_m = radar_map.sdf(mesh.vertices)  # and NaN where nothing was observed
+    >>> bool(abs(distance_m).max() < 0.2)
     True
     """
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
