@@ -8,6 +8,7 @@ The same examples on every run; `python -m bench.stress arguments --count 5000` 
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from types import SimpleNamespace
 
@@ -317,6 +318,11 @@ def test_queries_of_a_map(tiny_map, x, sensor, as_tensor):
         assert isinstance(result, torch.Tensor) == isinstance(x, torch.Tensor)
         assert tuple(result.shape) == (len(x), *shape)
         if query != "observed":
+            known = np.asarray(tiny_map.observed(x))
+            finite = np.isfinite(np.asarray(result)).reshape(len(x), math.prod(shape))
+            assert (finite.all(axis=1) == known).all()
+            assert (finite.any(axis=1) == known).all()
+            result = getattr(tiny_map, query)(x, extrapolate=True)
             near = np.abs(np.asarray(x, np.float64)) < 1e6
             assert np.isfinite(np.asarray(result)[near.all(axis=1)]).all()
     result = answer(tiny_map.intensity, x, sensor)

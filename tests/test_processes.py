@@ -23,29 +23,35 @@ from radarsdf import FitConfig
 QUICK = FitConfig(training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024})
 X = np.random.default_rng(0).uniform([8, -5, -1], [20, 5, 3], (30_000, 3))
 
+
+def everywhere(radar_map, x=X):
+    """Signed distances, also where nothing was observed: NaN would hide other bits."""
+    return radar_map.sdf(x, extrapolate=True)
+
+
 FORK = """
 import os, signal, sys, threading
 import numpy as np, torch, radarsdf
 from tests.conftest import ground_and_wall
-from tests.test_processes import QUICK, X
+from tests.test_processes import QUICK, X, everywhere
 torch.set_num_threads(2)
 scene = ground_and_wall()
 def fitted(threads=0):
     config = QUICK.override(num_threads=threads)
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
 radar_map = fitted()
-sdf, mesh, product = radar_map.sdf(X), radar_map.mesh(0.2), torch.ones(700, 700) @ torch.ones(700, 700)
+sdf, mesh, product = everywhere(radar_map), radar_map.mesh(0.2), torch.ones(700, 700) @ torch.ones(700, 700)
 """
 CHILD = """
 child = os.fork()
 if child == 0:
     signal.alarm(40)  # instead of waiting for ever
-    assert np.array_equal(radar_map.sdf(X), sdf)
+    assert np.array_equal(everywhere(radar_map), sdf)
     assert np.array_equal(radar_map.mesh(0.2).faces, mesh.faces)
     assert torch.equal(torch.ones(700, 700) @ torch.ones(700, 700), product)
     assert torch.get_num_threads() == 1
     again = fitted(threads=2)  # as many as the parent had: the same bits
-    assert np.array_equal(again.sdf(X), sdf)
+    assert np.array_equal(everywhere(again), sdf)
     os._exit(17)
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
 """
@@ -70,8 +76,8 @@ for _ in range(3):
     child = os.fork()
     if child == 0:
         signal.alarm(40)
-        assert np.array_equal(radar_map.sdf(X), sdf)
-        assert np.array_equal(fitted(threads=2).sdf(X), sdf)
+        assert np.array_equal(everywhere(radar_map), sdf)
+        assert np.array_equal(everywhere(fitted(threads=2)), sdf)
         os._exit(17)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
 for thread in threads:
@@ -82,7 +88,8 @@ assert torch.get_num_threads() == 2
 
 
 def answers(radar_map, x):
-    return radar_map.sdf(x), radar_map.confidence(x), radar_map.intensity(x, np.zeros(3))
+    intensities = radar_map.intensity(x, np.zeros(3), extrapolate=True)
+    return everywhere(radar_map, x), radar_map.confidence(x), intensities
 
 
 def test_a_map_goes_to_spawned_workers(radar_map):
@@ -97,7 +104,7 @@ def test_pickles_and_copies_are_the_same_map(radar_map):
     without = radarsdf.fit([X], np.eye(4)[None], config=QUICK, progress=False)
     for original in (radar_map, without):
         for other in (pickle.loads(pickle.dumps(original)), copy.deepcopy(original)):
-            np.testing.assert_array_equal(other.sdf(X), original.sdf(X))
+            np.testing.assert_array_equal(everywhere(other), everywhere(original))
             assert (other.config, other.report) == (original.config, original.report)
             assert other.has_intensity == original.has_intensity
             for name, column in dataclasses.asdict(original.evidence).items():
@@ -117,13 +124,18 @@ def test_a_pickle_holds_no_modules(radar_map):
 
 def test_queries_from_many_threads_give_the_bits_of_one(radar_map):
     threads_before = torch.get_num_threads()
-    expected = radar_map.sdf(X), radar_map.gradient(X), radar_map.mesh(0.2).vertices
     wrong = []
+
+    def found():
+        return (
+            everywhere(radar_map), radar_map.gradient(X, extrapolate=True), radar_map.mesh(0.2).vertices
+        )  # fmt: skip
+
+    expected = found()
 
     def work():
         for _ in range(3):
-            found = radar_map.sdf(X), radar_map.gradient(X), radar_map.mesh(0.2).vertices
-            wrong.extend([1 for a, b in zip(found, expected, strict=True) if not np.array_equal(a, b)])
+            wrong.extend([1 for a, b in zip(found(), expected, strict=True) if not np.array_equal(a, b)])
 
     threads = [threading.Thread(target=work) for _ in range(6)]
     for thread in threads:

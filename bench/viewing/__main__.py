@@ -68,6 +68,9 @@ def _plain(viewer: Viewer, seconds: float) -> dict[str, str]:
         mesh = client.wait_for(_is_mesh, before)
         received = client.received(before)
         updates = [m for m in received if m.changes(_CLOUD, "colors") and m.at_s <= ended_s]
+        if len(updates) < 2:
+            msg = f"{len(updates)} updates in {seconds:g} s: drag for longer (--seconds)"
+            raise SystemExit(msg)
         gaps_s = np.diff([m.at_s for m in updates])
         frames = {m.at_s: m.frame_bytes for m in received if m.at_s <= ended_s}
         return {

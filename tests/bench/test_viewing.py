@@ -13,7 +13,7 @@ from bench.viewing import __main__ as command
 
 def test_a_client_counts(tmp_path, monkeypatch):
     monkeypatch.setattr(command, "why_no_browser", lambda: "left out")
-    command.main(["--quick", "--seconds", "0.5", "--out", str(tmp_path)])
+    command.main(["--quick", "--seconds", "2", "--out", str(tmp_path)])
     text = (tmp_path / "viewing.md").read_text()
     rows = dict(line.split(" | ")[1:3] for line in text.splitlines() if line.startswith("| plain | "))
     assert (

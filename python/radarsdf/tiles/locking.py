@@ -28,9 +28,10 @@ if sys.platform == "win32":
         os.lseek(descriptor, 0, os.SEEK_SET)
 
 else:
-    import fcntl
 
     def _lock(descriptor: int) -> None:
+        import fcntl  # noqa: PLC0415 (a system without it can do all but plan tiles)
+
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
