@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.config import ReturnsConfig
-from radarsdf.products import normal_matrix, product
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
@@ -22,6 +21,7 @@ _SIGMAS2 = 6.0  # variances. A larger squared residual is an outlier
 _TRUNCATION = 1.05
 _ROUNDS = 10
 _FIRST_ANGLE_RAD = 0.01
+_MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
 
 
 @dataclass(frozen=True)
@@ -79,33 +79,49 @@ def sensor_noise(
     sigma2 = np.where(free, [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD], known) ** 2
     on_flat = surfels.cells.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
     size = len(rays) if some is None else len(some)
-    step = max(1, int(on_flat / len(rays) * size) // _RETURNS)
-    rows = np.arange(0, size, step) if some is None else some[::step]
+    tried = min(size, int(_RETURNS * len(rays) / max(on_flat, 1.0)))
+    rows = np.linspace(0, size - 1, tried).astype(np.int64)
+    rows = rows if some is None else some[rows]
     plane = surfels.flat_plane_of(surfels.cells.cell_of_ray[rows])
     rows, plane = rows[plane >= 0], plane[plane >= 0]
     if free.any() and len(rows) >= _MIN_RETURNS:
         normals = surfels.normals[plane]
         residual2 = np.einsum("ni,ni->n", rays.points[rows] - surfels.centres[plane], normals) ** 2
         shares = _shares(rays, rows, normals)
+        unexplained = residual2 - np.einsum("k,kn->n", sigma2[~free], shares[~free])
         least = np.array([0.025 * surfels.cell_size_m, 1e-3, 1e-3]) ** 2
         for _ in range(_ROUNDS):  # the weights are the variances of the round before
-            variance = product(shares, sigma2[:, None])[:, 0]
-            used = residual2 < _SIGMAS2 * variance
-            weighted = shares[used] / variance[used, None] ** 2
-            rest = residual2[used] - product(shares[used][:, ~free], sigma2[~free, None])[:, 0]
-            weighted = weighted[:, free]
-            normal = normal_matrix(weighted, shares[used][:, free])
-            solution = np.linalg.lstsq(normal, normal_matrix(weighted, rest[:, None])[:, 0], rcond=None)[0]
+            variance = np.einsum("k,kn->n", sigma2, shares)
+            weights = (residual2 < _SIGMAS2 * variance) / np.square(variance)
+            weighted = shares[free] * weights
+            normal = np.einsum("kn,ln->kl", weighted, shares[free])
+            solution = np.linalg.lstsq(normal, np.einsum("kn,n->k", weighted, unexplained), rcond=None)[0]
             sigma2[free] = _TRUNCATION * np.maximum(solution, least[free])
     return SensorNoise(*np.sqrt(sigma2).tolist())
 
 
 def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(M, 3) factors of the variances along the beam, in azimuth and in elevation, across planes."""
+    """(3, M) factors of the variances along the beam, in azimuth and in elevation, across planes.
+
+    A return straight above the sensor has no azimuth: its factors of the angles are 0.
+    """
     ranges2 = np.square(rays.ranges_m[rows].astype(np.float64))
-    azimuth, elevation = rays.cross_axes(rows)
-    squares = [
-        np.square(np.einsum("ni,ni->n", axis, normals))
-        for axis in (rays.directions[rows], azimuth, elevation)
-    ]
-    return np.stack([squares[0], squares[1] * ranges2, squares[2] * ranges2], 1)
+    up, normal = rays.up_of_scan[rays.scans[rows]].T, normals.T
+    along = rays.directions[rows].T.astype(np.float64)
+    azimuth = _cross(up, along)  # where it grows
+    azimuth /= np.maximum(np.sqrt(_dot(azimuth, azimuth)), _MIN_SINE)
+    elevation = _cross(along, azimuth)
+    shares = [np.square(_dot(axis, normal)) for axis in (along, azimuth, elevation)]
+    return np.stack([shares[0], shares[1] * ranges2, shares[2] * ranges2])
+
+
+# Vectors in columns (3, M): a row of three takes NumPy three times as long.
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    products: NDArray[np.float64] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return products
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])

@@ -30,7 +30,6 @@ from radarsdf.lattice import WorldLattice
 from radarsdf.products import turned
 
 _MISSING: Any = object()  # where there are fewer scans of one kind
-_MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
 
 
 @dataclass(frozen=True)
@@ -83,16 +82,6 @@ class Rays:
             intensities=None if self.intensities is None else chosen(self.intensities),
             scans=np.ascontiguousarray(chosen(self.scans)),
         )
-
-    def cross_axes(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Unit vectors (M, 3) in which azimuth and elevation of the returns in these `rows` (M,) grow, local frame.
-
-        A return straight above the sensor has no azimuth: there, both vectors are 0.
-        """
-        directions = self.directions[rows].astype(np.float64)
-        azimuth = np.cross(self.up_of_scan[self.scans[rows]], directions)
-        azimuth /= np.maximum(_lengths(azimuth), _MIN_SINE)[:, None]
-        return azimuth, np.cross(directions, azimuth)
 
     def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns, and for each the sensor position it was seen from: (N, 3) and (N, 3) float64, world, m."""
