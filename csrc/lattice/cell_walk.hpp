@@ -42,10 +42,10 @@ class CellWalk {
   bool inside() const { return inside_; }
   std::int32_t coordinate(int axis) const { return cell_[axis]; }
   std::uint64_t key() const { return key_; }
+  double leaves_m() const { return next_m_[nearest_axis()]; }  ///< where the line leaves the cell
 
   void next() {
-    int axis = next_m_[1] < next_m_[0] ? 1 : 0;
-    axis = next_m_[2] < next_m_[axis] ? 2 : axis;
+    const int axis = nearest_axis();
     inside_ = next_m_[axis] <= to_m_;
     cell_[axis] += step_[axis];
     key_ = morton_neighbour(key_, axis, step_[axis]);
@@ -53,6 +53,11 @@ class CellWalk {
   }
 
  private:
+  int nearest_axis() const {
+    const int axis = next_m_[1] < next_m_[0] ? 1 : 0;
+    return next_m_[2] < next_m_[axis] ? 2 : axis;
+  }
+
   void look_ahead(int axis) {
     next_m_[axis] = (cell_[axis] + (step_[axis] > 0 ? 1 : 0) - position_[axis]) * m_per_cell_[axis];
   }
