@@ -5,6 +5,7 @@
 // lattice depends on that face alone, so a longer piece of the same line goes through all the cells of a shorter one.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <limits>
@@ -17,6 +18,9 @@ namespace radarsdf {
 
 // Cells that point + t * direction is in for a t in [from_m, to_m]: for (CellWalk cell(...); cell.inside();
 // cell.next()). check_rays comes first.
+//
+// A step changes all three axes, two of them by nothing. To choose one by a branch or an index takes twice as long: the
+// next step waits for it.
 class CellWalk {
  public:
   // bias: of the keys, as kAxisBias is that of leaf cells.
@@ -24,47 +28,63 @@ class CellWalk {
            std::int32_t bias = kAxisBias)
       : to_m_(to_m) {
     for (int axis = 0; axis < 3; ++axis) {
-      position_[axis] = point[axis] / cell_size_m;
-      const double cells_per_m = direction[axis] / cell_size_m;
-      step_[axis] = cells_per_m >= 0 ? 1 : -1;
-      cell_[axis] = static_cast<std::int32_t>(std::floor(position_[axis] + from_m * cells_per_m));
-      m_per_cell_[axis] = cells_per_m != 0 ? 1 / cells_per_m : std::numeric_limits<double>::infinity();
-      look_ahead(axis);
+      const double position = point[axis] / cell_size_m, cells_per_m = direction[axis] / cell_size_m;
+      const std::int32_t step = cells_per_m >= 0 ? 1 : -1, ahead = step > 0 ? 1 : 0;
+      const double m_per_cell = cells_per_m != 0 ? 1 / cells_per_m : std::numeric_limits<double>::infinity();
+      std::int32_t cell = floor_to_int(position + from_m * cells_per_m);
       // Rounding may have put the beginning one cell too far back.
-      while (next_m_[axis] < from_m) {
-        cell_[axis] += step_[axis];
-        look_ahead(axis);
-      }
+      while ((cell + ahead - position) * m_per_cell < from_m) cell += step;
+      Axis& way = axes_[axis];
+      way = {position, m_per_cell, static_cast<double>(cell + ahead), static_cast<double>(step), 0, cell, step, 0, 0};
+      way.next_m = (way.face - position) * m_per_cell;
+      way.key = spread_bits(static_cast<std::uint32_t>(cell + bias)) << axis;
+      // With the bits of other axes set, a carry passes through them; without, a borrow does.
+      const std::uint64_t unit = std::uint64_t{1} << axis;
+      way.key_step = step > 0 ? ~key_bits(axis) + unit : std::uint64_t{0} - unit;
     }
-    key_ = lattice_key(cell_, bias);
   }
 
   bool inside() const { return inside_; }
-  std::int32_t coordinate(int axis) const { return cell_[axis]; }
-  std::uint64_t key() const { return key_; }
-  double leaves_m() const { return next_m_[nearest_axis()]; }  ///< where the line leaves the cell
+  std::int32_t coordinate(int axis) const { return axes_[axis].cell; }
+  std::uint64_t key() const { return axes_[0].key | axes_[1].key | axes_[2].key; }
+
+  // Where the line leaves the cell.
+  double leaves_m() const {
+    const double xy_m = std::min(axes_[0].next_m, axes_[1].next_m);
+    return std::min(xy_m, axes_[2].next_m);
+  }
 
   void next() {
-    const int axis = nearest_axis();
-    inside_ = next_m_[axis] <= to_m_;
-    cell_[axis] += step_[axis];
-    key_ = morton_neighbour(key_, axis, step_[axis]);
-    look_ahead(axis);
+    const bool y_before_x = axes_[1].next_m < axes_[0].next_m;
+    const double xy_m = y_before_x ? axes_[1].next_m : axes_[0].next_m;
+    const bool z = axes_[2].next_m < xy_m;
+    inside_ = (z ? axes_[2].next_m : xy_m) <= to_m_;
+    advance(0, !z && !y_before_x);
+    advance(1, !z && y_before_x);
+    advance(2, z);
   }
 
  private:
-  int nearest_axis() const {
-    const int axis = next_m_[1] < next_m_[0] ? 1 : 0;
-    return next_m_[2] < next_m_[axis] ? 2 : axis;
+  struct Axis {
+    double position, m_per_cell;  // of the point, in cells; negative where the coordinate falls
+    double face, face_step;       // that comes next, in cells
+    double next_m;                // where the line meets it
+    std::int32_t cell, cell_step;
+    std::uint64_t key, key_step;  // bits of this axis; what is added to them and beyond them
+  };
+
+  static constexpr std::uint64_t key_bits(int axis) { return std::uint64_t{0x1249249249249249} << axis; }
+
+  void advance(int axis, bool moves) {
+    Axis& way = axes_[axis];
+    way.face += moves ? way.face_step : 0.0;
+    way.next_m = (way.face - way.position) * way.m_per_cell;
+    way.cell += moves ? way.cell_step : 0;
+    way.key = (way.key + (moves ? way.key_step : 0)) & key_bits(axis);
   }
 
-  void look_ahead(int axis) {
-    next_m_[axis] = (cell_[axis] + (step_[axis] > 0 ? 1 : 0) - position_[axis]) * m_per_cell_[axis];
-  }
-
-  double to_m_, position_[3], m_per_cell_[3], next_m_[3];
-  std::int32_t cell_[3], step_[3];
-  std::uint64_t key_;
+  double to_m_;
+  Axis axes_[3];
   bool inside_ = true;
 };
 

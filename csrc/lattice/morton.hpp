@@ -14,6 +14,13 @@ constexpr int kAxisBits = 21;
 // shifting a biased coordinate is the floor division that finds the parent.
 constexpr std::int32_t kAxisBias = 1 << (kAxisBits - 1);
 
+// Without SSE4.1 (the baseline) std::floor is a library call.
+template <typename T>
+inline std::int32_t floor_to_int(T value) {
+  const auto truncated = static_cast<std::int32_t>(value);
+  return truncated - static_cast<std::int32_t>(value < static_cast<T>(truncated));
+}
+
 // Spreads the low 21 bits of v to every third bit.
 inline std::uint64_t spread_bits(std::uint64_t v) {
   v &= 0x1fffff;

@@ -211,13 +211,6 @@ std::vector<std::uint64_t> parents_of(const std::vector<std::uint64_t>& keys) {
   return parents;
 }
 
-// Without SSE4.1 (the baseline) std::floor is a library call.
-template <typename T>
-std::int32_t floor_to_int(T value) {
-  const auto truncated = static_cast<std::int32_t>(value);
-  return truncated - static_cast<std::int32_t>(value < static_cast<T>(truncated));
-}
-
 inline int count_eight_bits(std::uint32_t eight_bits) {
   std::uint32_t v = eight_bits - ((eight_bits >> 1) & 0x55u);
   v = (v & 0x33u) + ((v >> 2) & 0x33u);

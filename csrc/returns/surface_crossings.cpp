@@ -56,7 +56,8 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
       for (int axis = 0; axis < 3; ++axis) inside = inside && std::abs(points[3 * i + axis]) + range_m < limit_m;
       if (!inside || -range_m > last_m) continue;
       double begin_m = -range_m;
-      for (CellWalk cell(points + 3 * i, directions + 3 * i, -range_m, last_m, cell_size_m_); cell.inside(); cell.next()) {
+      for (CellWalk cell(points + 3 * i, directions + 3 * i, -range_m, last_m, cell_size_m_); cell.inside();
+           cell.next()) {
         const double end_m = cell.leaves_m();
         const std::int32_t row = rows.row(cell.key());
         if (row >= 0 && crosses(i, surfels_[static_cast<std::size_t>(row)], begin_m, end_m)) {
