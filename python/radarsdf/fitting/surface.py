@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.config import FitConfig
+from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -39,8 +40,10 @@ class SurfaceReturns:
         averages = config.training.start == "average"
         # Without an sdf stage, only the average uses the surface, and it takes distances to surfels anyway.
         onto_planes = config.returns.onto_planes and config.training.sdf_iterations != 0
-        means = MeanRays.of(rays, config.leaf_size_m, num_threads) if averages else None
-        surfels = Surfels.of(rays, config.leaf_size_m, num_threads)
+        leaves = ReturnCells.of(rays, config.leaf_size_m, num_threads) if averages else None
+        means = None if leaves is None else MeanRays.of(rays, leaves, num_threads)
+        surfels = Surfels.of(rays, config.leaf_size_m, num_threads, leaves)
+        del leaves  # frees memory: 4 bytes a return
         # An average counts cells, not returns, so it needs the noise of those: one return of each.
         noise = sensor_noise(surfels, rays, config.returns, None if means is None else means.first)
         kept = inside

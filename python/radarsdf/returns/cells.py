@@ -17,6 +17,9 @@ MAX_CELLS_FROM_ORIGIN = 1_000_000
 """Farthest cell along each axis. A Morton key has 21 bits for each axis."""
 
 _AXIS_BITS = 21  # of a key, interleaved with those of the other axes
+_QUARTER = np.uint64(
+    0b111 << (3 * (_AXIS_BITS - 2))
+)  # of the bits of a key: those that say in which quarter of the axes
 _COMPACTED = (
     (2, 0x10C30C30C30C30C3),
     (4, 0x100F00F00F00F00F),
@@ -59,6 +62,16 @@ class ReturnCells:
         blocks = CellBlocks(keys)
         rows = blocks.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
         return cls(keys, blocks, rows)
+
+    def merged(self) -> ReturnCells:
+        """The cells twice as large that hold the same returns: in a tenth of the time of looking for them again."""
+        halved = self.keys >> np.uint64(3)
+        # Coordinates count from -2²⁰, of these cells, too: half of that was shifted out.
+        quarters = halved & _QUARTER
+        keys = (halved ^ _QUARTER) | quarters << np.uint64(3)
+        first = np.diff(keys, prepend=keys[:1] + np.uint64(1)) != 0
+        row_of_cell = np.cumsum(first, dtype=np.int32) - np.int32(1)
+        return ReturnCells(keys[first], CellBlocks(keys[first]), row_of_cell[self.cell_of_ray])
 
     @cached_property
     def counts(self) -> NDArray[np.float64]:

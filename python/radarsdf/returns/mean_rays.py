@@ -40,9 +40,8 @@ class MeanRays:
     """(M,) range of the first return in each cell."""
 
     @classmethod
-    def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> MeanRays:
-        """The mean rays of cells of this size, m. `num_threads` 0: as many as OpenMP uses."""
-        cells = ReturnCells.of(rays, cell_size_m, num_threads)
+    def of(cls, rays: Rays, cells: ReturnCells, num_threads: int = 0) -> MeanRays:
+        """The mean rays of the `cells` that hold the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
         rows, moments = cells.cell_of_ray, cells.moments(rays, num_threads)
         first = np.zeros(len(cells.keys), np.int64)
         first[rows[::-1]] = np.arange(

@@ -42,10 +42,15 @@ class Surfels:
     plane."""
 
     @classmethod
-    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
-        """Surfels of the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
+    def of(
+        cls, rays: Rays, leaf_size_m: float, num_threads: int = 0, leaves: ReturnCells | None = None
+    ) -> Surfels:
+        """Surfels of the returns of `rays`. `num_threads` 0: as many as OpenMP uses.
+
+        `leaves` are the leaf cells that hold the returns, if they are known.
+        """
         cell_size_m = LEAVES_PER_SURFEL * leaf_size_m
-        cells = ReturnCells.of(rays, cell_size_m, num_threads)
+        cells = ReturnCells.of(rays, cell_size_m, num_threads) if leaves is None else leaves.merged()
         sums = cells.moments(rays, num_threads)
         support = cells.blocks.sum_round(cells.keys, cells.counts[:, None], NEIGHBOUR_WEIGHT, num_threads)[
             :, 0

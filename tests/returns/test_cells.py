@@ -1,0 +1,22 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The cells that hold returns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radarsdf.returns.cells import ReturnCells
+from radarsdf.returns.rays import prepare
+
+
+@pytest.mark.parametrize("size_m", [0.1, 0.2, 0.37])
+@pytest.mark.parametrize("extent_m", [1.0, 30.0, 9e4])
+def test_merged_cells_are_those_of_twice_the_size(size_m, extent_m):
+    points = np.random.default_rng(0).uniform(-extent_m, extent_m, (2000, 3))
+    rays = prepare([points], np.eye(4)[None])
+    merged, found = ReturnCells.of(rays, size_m).merged(), ReturnCells.of(rays, 2 * size_m)
+    np.testing.assert_array_equal(merged.keys, found.keys)
+    np.testing.assert_array_equal(merged.cell_of_ray, found.cell_of_ray)
+    np.testing.assert_array_equal(merged.blocks.rows(merged.keys), np.arange(len(found.keys)))
+    assert merged.counts.tolist() == found.counts.tolist()
