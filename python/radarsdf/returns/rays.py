@@ -134,13 +134,15 @@ def _checked(
         if len(scan) == 0:
             msg = f"scan {i} is empty: leave out the scan and its pose"
             raise ValueError(msg)
-        fine, values = (np.abs(scan) <= MAX_POSITION_M).all(axis=1), None
+        values = None
         if intensities is not None:
             values = real_array(given_values, f"intensities of scan {i}", np.float32)
             check_values_of_scan(values, scan, "intensities", i)
-            fine &= np.isfinite(values)
         num_returns += len(scan)
-        if not fine.all():
+        # A question for all, NaN among them: one for each return takes five times as long.
+        if not (np.abs(scan).max() <= MAX_POSITION_M and (values is None or np.isfinite(values).all())):
+            fine = (np.abs(scan) <= MAX_POSITION_M).all(axis=1)
+            fine &= True if values is None else np.isfinite(values)
             first_bad = first_bad if num_bad else i
             num_bad += len(fine) - int(fine.sum())
         if not num_bad:
@@ -247,9 +249,8 @@ def prepare(
         seen_from = positions[middle_scan(i, num_scans, accumulate_scans)]
         keep = _kept(scan, min_range_m, max_range_m)
         values = None if of_scan is None else of_scan[keep]
-        local = turned(scan if keep.all() else scan[keep], T_world_sensor[i, :3, :3]) + (
-            positions[i] - local_origin
-        )
+        local = turned(scan if keep.all() else scan[keep], T_world_sensor[i, :3, :3])
+        local += positions[i] - local_origin
         polar = _directions_and_ranges(local - (seen_from - local_origin))
         for column, part in zip(kept, (local.astype(np.float32), *polar, values), strict=True):
             if part is not None:
