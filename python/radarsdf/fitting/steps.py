@@ -159,7 +159,7 @@ def _initialise(field: Field, start: Start, config: FitConfig) -> None:
     """Sets the parameters that the training starts from. Raises Diverged if one is not finite."""
     start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
     # A sum is finite only if all that it adds up is. To ask each takes ten times as long.
-    if not all(np.isfinite(parameter.detach().numpy().sum()) for parameter in field.parameters()):
+    if not all(parameter.detach().sum().isfinite() for parameter in field.parameters()):
         msg = "what the training starts from is not finite: training.sigma_cells may be too small"
         raise Diverged(msg)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -85,13 +86,15 @@ def into_cells(contents: MapContents, points: Tensor, size_m: float | None = Non
     A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features. It is moved by
     a thousandth of `size_m`, by default of a leaf cell.
     """
-    size_m = contents.config.leaf_size_m if size_m is None else size_m
-    inside, step_m = occupied(contents, points), INWARD * size_m
-    place = points / contents.config.leaf_size_m
-    on_face = ((place - place.round()).abs() * contents.config.leaf_size_m <= step_m).any(dim=1)
-    left = torch.nonzero(~inside & on_face)[:, 0]
-    if len(left):
-        points, inside = points.clone(), inside.clone()
+    leaf_m = contents.config.leaf_size_m
+    step_m = INWARD * (leaf_m if size_m is None else size_m)
+    inside = occupied(contents, points)
+    left = torch.nonzero(~inside)[:, 0]
+    place = points[left] / leaf_m
+    left = left[((place - place.round()).abs() * leaf_m <= step_m).any(dim=1)]
+    if len(left) == 0:
+        return points, inside
+    points, inside = points.clone(), inside.clone()
     for shift in itertools.product((-step_m, step_m), repeat=3):
         moved = points[left] + torch.tensor(shift, dtype=torch.float32, device="cpu")
         found = occupied(contents, moved)
@@ -99,6 +102,26 @@ def into_cells(contents: MapContents, points: Tensor, size_m: float | None = Non
         inside[left[found]] = True
         left = left[~found]
     return points, inside
+
+
+def observed(contents: MapContents, points: Tensor) -> Tensor:
+    """(N,) bool, whether each point lies in an occupied leaf cell, or on its border."""
+    return into_cells(contents, points)[1]
+
+
+def answers_at(
+    contents: MapContents, function: Callable[..., Tensor], points: Tensor, *others: Tensor, extrapolate: bool
+) -> Tensor:
+    """function(contents, points, *others) where the points (N, 3) were observed and the others are finite. NaN elsewhere.
+
+    `extrapolate`: whether it is enough that the points are finite, too.
+    """
+    points, known = into_cells(contents, points)
+    if extrapolate:
+        known = points.isfinite().all(dim=1)
+    for other in others:
+        known = known & other.isfinite().all(dim=1)
+    return where(known, points, *others, function=partial(function, contents))
 
 
 @torch.inference_mode(mode=False)

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, overload
 
@@ -149,8 +149,9 @@ class RadarMap:
             If `x` does not have shape (N, 3).
         """
         points, answer = self._local(x)
-        distance = partial(queries.signed_distance, self._contents)
-        return answer(queries.where(*self._known(points, extrapolate), function=distance))
+        return answer(
+            queries.answers_at(self._contents, queries.signed_distance, points, extrapolate=extrapolate)
+        )
 
     @overload
     def gradient(self, x: Tensor, *, extrapolate: bool = False) -> Tensor: ...
@@ -163,8 +164,7 @@ class RadarMap:
         flat angle. It is NaN where that is, and `extrapolate` does the same.
         """
         points, answer = self._local(x)
-        gradient = partial(queries.gradient, self._contents)
-        return answer(queries.where(*self._known(points, extrapolate), function=gradient))
+        return answer(queries.answers_at(self._contents, queries.gradient, points, extrapolate=extrapolate))
 
     @overload
     def observed(self, x: Tensor) -> Tensor: ...
@@ -177,7 +177,7 @@ class RadarMap:
         :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN. A position that is not finite was not observed.
         """
         points, answer = self._local(x)
-        return answer(queries.into_cells(self._contents, points)[1])
+        return answer(queries.observed(self._contents, points))
 
     @overload
     def confidence(self, x: Tensor) -> Tensor: ...
@@ -272,10 +272,10 @@ class RadarMap:
             raise ValueError(msg)
         points, answer = self._local(x)
         sensors, _ = self._local(sensor_positions, rows=len(points))
-        known, points = self._known(points, extrapolate)
-        known = known & sensors.isfinite().all(dim=1)
-        intensity = partial(queries.intensity, self._contents)
-        return answer(queries.where(known, points, sensors, function=intensity))
+        positions = points, sensors
+        return answer(
+            queries.answers_at(self._contents, queries.intensity, *positions, extrapolate=extrapolate)
+        )
 
     def mesh(
         self,
@@ -411,11 +411,6 @@ class RadarMap:
         An old file is replaced only once the new one is complete. An OSError says why it cannot be written.
         """
         storage.save_contents(self._contents, path)
-
-    def _known(self, points: Tensor, extrapolate: bool) -> tuple[Tensor, Tensor]:
-        """Where to answer (N,) bool, and for which points (N, 3), local frame, m: those observed, or all finite ones."""
-        points, observed = queries.into_cells(self._contents, points)
-        return (points.isfinite().all(dim=1) if extrapolate else observed), points
 
     def _local(self, x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
         """`x` as (N, 3) float32, local frame, and a function that gives results the kind and precision of `x`.
