@@ -188,7 +188,7 @@ class Pass {
     for (std::int64_t i = 0; i < count; ++i) {
       // No return is expected from free space (3QFPI).
       const T label = i < part_.num_labelled ? part_.rays[i * part_.ray_stride + kRayIntensity] : T(0);
-      const T error = predicted[i] - label;
+      const T error = std::isnan(label) ? T(0) : predicted[i] - label;
       sum += static_cast<double>(std::abs(error));
       predicted[i] = error > 0 ? share : error < 0 ? -share : T(0);
     }

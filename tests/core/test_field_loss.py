@@ -116,6 +116,24 @@ def test_same_as_autograd(rays, changes, stage, dtype):
 
 @pytest.mark.usefixtures("default_dtype")
 @pytest.mark.parametrize("dtype", [torch.float64])
+@pytest.mark.parametrize("stage", ["joint", "intensity"])
+def test_a_label_that_is_nan_has_no_error(rays, stage, dtype):
+    batch = make_batch(rays, dtype)
+    whole = batch.gradients(CoreGradients, stage).losses["intensity"]
+    for every, share in ((3, 2 / 3), (1, 0)):
+        batch.batch.of_ray[::every, _core.RAY_INTENSITY] = np.nan
+        found, expected = (
+            batch.gradients(kind, stage, row_updates=False) for kind in (CoreGradients, AutogradGradients)
+        )
+        assert found.losses["intensity"] == pytest.approx(share * whole, rel=0.1)
+        assert found.losses == pytest.approx(expected.losses, rel=1e-12)
+        for a, b in zip(found.by_parameters, expected.by_parameters, strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+    assert expected.by_parameters[-1].abs().max() == 0
+
+
+@pytest.mark.usefixtures("default_dtype")
+@pytest.mark.parametrize("dtype", [torch.float64])
 @pytest.mark.parametrize("stage", ["sdf", "joint"])
 @pytest.mark.parametrize("kind", [CoreGradients, AutogradGradients])
 def test_the_touched_features_get_the_same_gradient(rays, kind, stage, dtype):
@@ -186,7 +204,7 @@ def test_not_a_number_is_passed_on(rays):
     made.batch.sdf_m[3] = float("nan")
     assert np.isnan(made.gradients(CoreGradients, "sdf").losses["sdf"])
     made.batch.sdf_m[3] = 0
-    made.batch.of_ray[2, 7] = float("nan")
+    made.batch.of_ray[2, _core.RAY_RANGE] = float("nan")
     losses = made.gradients(CoreGradients, "joint").losses
     assert np.isnan(losses["intensity"])
     assert np.isfinite(losses["sdf"])

@@ -27,5 +27,8 @@ def sdf_loss(logit: Tensor, sdf_m: Tensor, sigma_m: float) -> Tensor:
 
 
 def intensity_loss(predicted: Tensor, label: Tensor) -> Tensor:
-    """Mean absolute error of scaled intensities (B,). Outliers count less than in a squared error (3QFPI)."""
-    return functional.l1_loss(predicted, label)
+    """Mean absolute error of scaled intensities (B,). Outliers count less than in a squared error (3QFPI).
+
+    Where the label is NaN there is none, and no error.
+    """
+    return functional.l1_loss(predicted, torch.where(label.isnan(), predicted.detach(), label))
