@@ -24,8 +24,10 @@ class IntensityScale:
 
     @classmethod
     def of(cls, intensities: NDArray[np.float32] | None) -> IntensityScale | None:
-        """The range of `intensities` (N,), sensor units. None if there are none."""
-        return None if intensities is None else cls(float(intensities.min()), float(intensities.max()))
+        """The range of `intensities` (N,), sensor units, NaN where there is none. None if there are none at all."""
+        return (
+            None if intensities is None else cls(float(np.nanmin(intensities)), float(np.nanmax(intensities)))
+        )
 
     @classmethod
     def between(cls, intensity_range: ArrayLike) -> IntensityScale:
@@ -37,7 +39,7 @@ class IntensityScale:
         return cls(*ends.tolist())
 
     def to_unit(self, intensities: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Intensities (N,) from sensor units to [0, 1]. Those beyond the range are moved to its ends."""
+        """Intensities (N,) from sensor units to [0, 1]. Those beyond the range are moved to its ends, NaN stays."""
         unit = (intensities - np.float32(self.low)) / np.float32(self.high - self.low)
         clipped: NDArray[np.float32] = np.clip(unit, 0, 1).astype(np.float32)
         return clipped

@@ -50,7 +50,11 @@ class ClosedForm:
         self._returns: tuple[Rays, Surfels, NDArray[np.int32]] | None = None
         if rays.intensities is not None and config.closes_intensity:
             cells = surface.surfels.cells.cell_of_ray
-            self._returns = rays, surface.surfels, cells if inside is None else cells[inside]
+            cells = cells if inside is None else cells[inside]
+            known = rays.with_intensity
+            if known.any() and not known.all():  # a tile may have none: its returns then count as the lowest
+                rays, cells = rays.select(known), cells[known]
+            self._returns = rays, surface.surfels, cells
 
     def added(self, contents: MapContents, *, trained: bool) -> MapContents:
         """The contents of the map with intensities in closed form, if it is time for them."""
@@ -71,6 +75,7 @@ class ClosedForm:
             sensors = torch.from_numpy(points - directions * ranges_m[:, None])
             return scale.to_unit(queries.intensity(contents, torch.from_numpy(points), sensors).numpy())
 
-        unit, network = scale.to_unit(rays.intensities), ask if self._after_training else None
+        unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False)
+        network = ask if self._after_training else None
         leaf_size_m = contents.config.leaf_size_m
         return Residuals.of(rays, unit, surfels, leaf_size_m, self._num_threads, network, cell_of_ray)

@@ -44,7 +44,9 @@ def fit(
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
     intensities : iterable of F arrays, optional
-        (N_i,) each, sensor units. Without them the map has no intensity network.
+        (N_i,) each, sensor units. Without them the map has no intensity network. Those that cannot belong to the others,
+        such as -9999 in place of a measurement, are left out of the reflectance; the surface keeps their returns.
+        ``report["wild_intensities"]`` counts them.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each: speed of each return along its ray, m/s; NaN where it was not measured. With them, returns that
         move are left out; see ``config.returns.drop_movers``.
@@ -61,8 +63,8 @@ def fit(
         Origin of the map's local frame, world, m. By default the sensors' mean position, moved to the next corner of a
         block of ``config.lattice``: fits whose origins are such corners share their cells.
     intensity_range : (low, high), optional
-        Intensities that become 0 and 1 for the network, sensor units; those beyond are moved to its ends. By default the
-        lowest and the highest.
+        Intensities that become 0 and 1 for the network, sensor units; those beyond are moved to its ends, but for those that
+        are left out. By default the lowest and the highest of the others.
 
     Returns
     -------

@@ -104,6 +104,9 @@ def fit_rays(
                 "returns_used": len(kept),
                 "ghosts": len(learnt) - len(kept),
                 "movers": given.movers,
+                "wild_intensities": 0
+                if learnt.intensities is None
+                else len(learnt) - int(learnt.with_intensity.sum()),
                 "noise": dataclasses.asdict(noise),
             }
             # Of many returns, gigabytes that nobody needs any more: the training has its own copy of the rays.

@@ -38,6 +38,7 @@ class _Report(TypedDict, total=False):
     returns_used: _Count
     ghosts: _Count
     movers: _Count
+    wild_intensities: _Count
     noise: _Noise
     leaf_cells: _Count
     vertices: _Count

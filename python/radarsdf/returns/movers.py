@@ -115,7 +115,10 @@ def _checked(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> lis
 
 
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
-    """The returns that a fit with this configuration accepts, of a range and of what does not move, each seen from where its scan was taken."""
+    """The returns that a fit with this configuration accepts, of a range and of what does not move, each seen from where its scan was taken.
+
+    An intensity that cannot belong to the others of these scans is NaN.
+    """
     standing = Standing.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
     return prepare(
         standing.points,

@@ -28,6 +28,7 @@ from radarsdf.checks import (
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
 from radarsdf.products import turned
+from radarsdf.returns.plausible import Plausible
 
 _MISSING: Any = object()  # where there are fewer scans of one kind
 
@@ -48,7 +49,7 @@ class Rays:
     ranges_m: NDArray[np.float32]
     """(N,) distance of the return from the sensor."""
     intensities: NDArray[np.float32] | None
-    """(N,) sensor units. None if there are no intensities."""
+    """(N,) sensor units; NaN where it cannot belong to the others. None if there are no intensities."""
     scans: NDArray[np.int32]
     """(N,) scan of each return."""
     up_of_scan: NDArray[np.float64]
@@ -58,6 +59,13 @@ class Rays:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def with_intensity(self) -> NDArray[np.bool_]:
+        """Mask (N,) of the returns whose intensity is known and can belong to the others."""
+        if self.intensities is None:
+            return np.zeros(len(self), np.bool_)
+        return ~np.isnan(self.intensities)
 
     def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
         """The rays of a slice, a mask (N,) bool, or row numbers (M,), in that order."""
@@ -207,8 +215,9 @@ def prepare(
     lattice : WorldLattice, optional
         That default is moved to the next corner of a block of it, so that different scans share their cells.
     whole : bool
-        False: these are a part of the scans. None of their returns need be within the ranges, and all of their
-        intensities may be equal.
+        False: these are a part of the scans. None of their returns need be within the ranges, and their intensities are
+        as they are. Of whole scans, intensities that cannot belong to the others become NaN: see
+        :class:`~radarsdf.returns.plausible.Plausible`.
 
     Returns
     -------
@@ -261,16 +270,9 @@ def prepare(
         msg = f"none of {num_given} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
         raise ValueError(msg)
     intensity = None if intensities is None else _joined(kept[3])
-    if intensity is not None and whole and intensity.min() == intensity.max():
-        msg = f"all intensities are {intensity[0]}: leave them out if the sensor does not measure them"
-        raise ValueError(msg)
-    if (
-        intensity is not None
-        and len(intensity)
-        and float(intensity.max()) - float(intensity.min()) > float(np.finfo(np.float32).max)
-    ):
-        msg = f"intensities from {intensity.min()} to {intensity.max()} are too far apart for float32"
-        raise ValueError(msg)
+    if intensity is not None and whole:
+        intensity = Plausible.of(intensity).kept(intensity)
+        check_range(float(np.nanmin(intensity)), float(np.nanmax(intensity)))
     return Rays(
         origin=local_origin,
         points=_joined(kept[0]),
@@ -281,6 +283,16 @@ def prepare(
         up_of_scan=T_world_sensor[:, :3, 2].copy(),
         num_given=num_given,
     )
+
+
+def check_range(low: float, high: float) -> None:
+    """Raises a ValueError if intensities from `low` to `high`, sensor units, are all equal or too far apart for float32."""
+    if low == high:
+        msg = f"all intensities are {low}: leave them out if the sensor does not measure them"
+        raise ValueError(msg)
+    if high - low > float(np.finfo(np.float32).max):
+        msg = f"intensities from {low} to {high} are too far apart for float32"
+        raise ValueError(msg)
 
 
 def rays_from(

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import check_poses, number, real_array
 from radarsdf.io.sequence import Scans
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.plausible import Plausible
 from radarsdf.returns.rays import Rays
 
 # Of the returns: what lies beyond in azimuth, in elevation or in range is taken for a stray one.
@@ -133,7 +134,7 @@ class Sensor:
         points : sequence of F arrays, or Scans
             (N_i, 3) each: the returns of one scan, sensor frame, m. `Scans` bring their intensities.
         intensities : sequence of F arrays, optional
-            (N_i,) each, sensor units.
+            (N_i,) each, sensor units; NaN where there is none. Those that cannot belong to the others do not count.
         noise : SensorNoise, optional
             See :func:`radarsdf.returns.noise.sensor_noise`. Default: none.
         min_range_m, max_range_m : float
@@ -162,6 +163,7 @@ class Sensor:
         values = None
         if intensities is not None:
             values = np.concatenate([real_array(v, "intensities") for v in intensities])[rows]
+            values = Plausible.of(values).kept(values)
         return cls._of_returns(returns[rows], values, per_scan, noise)
 
     @classmethod
@@ -193,13 +195,14 @@ class Sensor:
         """Of returns (N, 3), sensor frame, m, with their intensities (N,), and the number of returns (F,) in each scan."""
         x, y, z = returns.T
         range_m = np.sqrt(x * x + y * y + z * z)
+        known = np.isfinite(range_m if values is None else values)
         return cls(
             azimuth_rad=_limits(np.arctan2(y, x)),
             elevation_rad=_limits(np.arcsin(np.clip(z / range_m, -1, 1))),
             range_m=_limits(range_m),
             returns_per_scan=float(np.median(per_scan[per_scan > 0])),
             noise=SensorNoise(0.0, 0.0, 0.0) if noise is None else noise,
-            thresholds=() if values is None else _thresholds(range_m, values),
+            thresholds=() if values is None else _thresholds(range_m[known], values[known]),
         )
 
 

@@ -78,7 +78,8 @@ class Plan:
     halo_m: _Length
     """What a tile knows beyond its edges, m."""
     intensity_range: Annotated[tuple[float, float], _FromList] | None
-    """Lowest and highest intensity, sensor units. None: there are none."""
+    """Lowest and highest intensity of those that can belong to the others, sensor units; a fit leaves out what is beyond.
+    None: there are none."""
     rough_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the returns that lie on no thin surface, of the largest tiles."""
     sensor: Sensor

@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import itertools
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +21,13 @@ from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.io.sequence import Scan
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.rays import Rays, middle_scan, prepare
+from radarsdf.returns.plausible import Intensities
+from radarsdf.returns.rays import Rays, check_range, middle_scan, prepare
 from radarsdf.returns.sensor import Sensor
 from radarsdf.threads import Workers
 from radarsdf.tiles.grid import Tile, TileGrid
 from radarsdf.tiles.plan import Plan, TilePlan
-from radarsdf.tiles.ray_files import RayFiles, read_rays, write_scans
+from radarsdf.tiles.ray_files import RayFiles, read_intensities, read_rays, write_scans
 
 _CHUNK_SCANS = 256  # in memory at a time
 _CHUNK_RETURNS = 500_000  # likewise: fewer scans of a dense sensor
@@ -65,7 +67,7 @@ class Planner:
         self._up: list[NDArray[np.float64]] = []
         self._samples: list[Scan] = []
         self._every = 1
-        self._range: tuple[float, float] | None = None
+        self._intensities = Intensities()
         self._with_intensities: bool | None = None
 
     def add(self, scans: list[Scan], first: int) -> None:
@@ -81,9 +83,7 @@ class Planner:
         if len(rays) == 0:
             return
         if rays.intensities is not None:
-            low, high = float(rays.intensities.min()), float(rays.intensities.max())
-            known = self._range or (low, high)
-            self._range = (min(known[0], low), max(known[1], high))
+            self._intensities.add(rays.intensities)
         points, sensors = rays.in_world()
         rays = dataclasses.replace(rays, scans=rays.scans + np.int32(first))
         pairs = list(self._grid.crossed(points, sensors))
@@ -168,9 +168,6 @@ class Planner:
         if not self._tiles:
             msg = "no return of any scan lies within the ranges"
             raise ValueError(msg)
-        if self._range is not None and self._range[0] == self._range[1]:
-            msg = f"all intensities are {self._range[0]}: leave them out if the sensor does not measure them"
-            raise ValueError(msg)
         positions = np.concatenate(self._positions)
         write_scans(self._folder, positions, np.concatenate(self._up))
         tiles = [
@@ -187,7 +184,7 @@ class Planner:
             config=self._config,
             tile_m=self._grid.tile_m,
             halo_m=self._grid.halo_m,
-            intensity_range=self._range,
+            intensity_range=self._intensity_range(),
             rough_share=0.0,
             sensor=self._sensor(SensorNoise(0.0, 0.0, 0.0)),
             scans=len(positions),
@@ -195,6 +192,21 @@ class Planner:
             tiles=tuple(tiles),
         )
         return self._looked_at(draft)
+
+    def _intensity_range(self) -> tuple[float, float] | None:
+        """The lowest and the highest intensity of those that can belong to the others. None: there are none."""
+        if not self._with_intensities:
+            return None
+        low, high, plausible = self._intensities.low, self._intensities.high, self._intensities.plausible()
+        if not plausible.holds(np.array([low, high])).all():
+            low, high = math.inf, -math.inf
+            for tile in self._tiles:
+                values = read_intensities(self._folder, tile)
+                values = values[plausible.holds(values)]
+                low = float(values.min(initial=low))
+                high = float(values.max(initial=high))
+        check_range(low, high)
+        return low, high
 
     def _looked_at(self, plan: Plan) -> Plan:
         """The plan with what the largest tiles tell of noise and roughness, and with the cost of each."""

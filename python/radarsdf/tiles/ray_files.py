@@ -13,6 +13,7 @@ from radarsdf._core import cell_keys
 from radarsdf.checks import MAX_POSITION_M
 from radarsdf.io.files import check_regular_file
 from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.plausible import Plausible
 from radarsdf.returns.rays import Rays, rays_from
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.plan import Plan, TilePlan, within
@@ -51,7 +52,7 @@ class RayFiles:
     def flush(self) -> None:
         """Writes what is held."""
         for tile, parts in self._buffers.items():
-            path = rays_path(self._folder, f"{tile[0]}_{tile[1]}")
+            path = _path(self._folder, tile)
             if tile not in self._begun:
                 path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("ab" if tile in self._begun else "wb") as file:
@@ -62,7 +63,7 @@ class RayFiles:
 
     def remove(self, tile: Tile) -> None:
         """Removes the file of a tile, and its folder if that is then empty."""
-        path = rays_path(self._folder, f"{tile[0]}_{tile[1]}")
+        path = _path(self._folder, tile)
         path.unlink(missing_ok=True)
         if not any(path.parent.iterdir()):
             path.parent.rmdir()
@@ -107,15 +108,19 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
     if not ((np.abs(points) <= MAX_POSITION_M).all() and (np.abs(of_scans) <= MAX_POSITION_M).all()):
         msg = f"{path} or {folder / _SCANS} holds something other than finite positions: make the plan again"
         raise ValueError(msg)
-    if plan.intensity_range is not None and not np.isfinite(rows["intensity"]).all():
-        msg = f"{path} holds an intensity that is not finite: make the plan again"
-        raise ValueError(msg)
+    intensities = None
+    if plan.intensity_range is not None:
+        values = rows["intensity"]
+        if not np.isfinite(values).all():
+            msg = f"{path} holds an intensity that is not finite: make the plan again"
+            raise ValueError(msg)
+        intensities = Plausible(*plan.intensity_range).kept(values)
     origin = plan.config.lattice.position(tile.origin_cells)
     rays = rays_from(
         points,
         (of_scans[:, :3] - origin)[scans],
         origin=origin,
-        intensities=None if plan.intensity_range is None else np.ascontiguousarray(rows["intensity"]),
+        intensities=intensities,
         scans=scans.astype(np.int32),
         up_of_scan=np.ascontiguousarray(of_scans[:, 3:]),
     )
@@ -137,6 +142,16 @@ def _table_of_scans(path: Path) -> NDArray[np.float64]:
     except (ValueError, EOFError) as error:
         msg = f"{path} is not a whole .npy file: {error}"
         raise ValueError(msg) from error
+
+
+def read_intensities(folder: Path, tile: Tile) -> NDArray[np.float32]:
+    """(N,) of the rays that cross a tile, as they were given, sensor units."""
+    intensities: NDArray[np.float32] = np.fromfile(_path(folder, tile), _RECORD)["intensity"]
+    return intensities
+
+
+def _path(folder: Path, tile: Tile) -> Path:
+    return rays_path(folder, f"{tile[0]}_{tile[1]}")
 
 
 def rays_path(folder: Path, name: str) -> Path:

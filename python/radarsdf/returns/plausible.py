@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Which intensities can belong to the others. A driver's sentinel, or garbage, would stretch the scale of all of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# An intensity is left out if it lies beyond a gap, and farther than the tail of the others reaches but by chance.
+_GAP = 3.0  # times as far from the median as any other. Tails have gaps, too
+_CHANCE = 1e-3  # that so many of a tail lie beyond
+_RARE = 0.03  # share of the returns. More are another kind of returns ...
+_FEW = 3  # ... unless they have no more different values than this: sentinels
+_FEWEST = 128  # returns; fewer do not tell what is usual
+_MOST = 1 << 15  # returns that tell it
+_THINNED = 7  # times fewer of more than these. Few sensors repeat anything after seven returns
+
+
+@dataclass(frozen=True)
+class Plausible:
+    """Limits of the intensities that can belong to the others, sensor units."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, intensities: NDArray[Any]) -> Plausible:
+        """The limits of intensities (N,), sensor units. NaN stands for none."""
+        known = Intensities()
+        known.add(intensities)
+        return known.plausible()
+
+    def holds(self, intensities: NDArray[Any]) -> NDArray[np.bool_]:
+        """Mask (N,) of the intensities within the limits. NaN is not."""
+        return (intensities >= np.float64(self.low)) & (intensities <= np.float64(self.high))
+
+    def kept(self, intensities: NDArray[Any]) -> NDArray[Any]:
+        """The intensities (N,); NaN in place of those beyond the limits."""
+        return np.where(self.holds(intensities), intensities, intensities.dtype.type(np.nan))
+
+
+class Intensities:
+    """Intensities that come a part at a time: some of them, the lowest and the highest."""
+
+    def __init__(self) -> None:
+        self._some: NDArray[Any] = np.zeros(0, np.float32)
+        self._every, self._count = 1, 0
+        self.low, self.high = math.inf, -math.inf
+
+    def add(self, intensities: NDArray[Any]) -> None:
+        """The next ones (N,), sensor units. NaN stands for none."""
+        none = np.isnan(intensities)
+        known = intensities[~none] if none.any() else intensities
+        if len(known) == 0:
+            return
+        self._some = np.concatenate([self._some, known[-self._count % self._every :: self._every]])
+        self._count += len(known)
+        while len(self._some) > _MOST:
+            self._some, self._every = self._some[::_THINNED], _THINNED * self._every
+        self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
+
+    def plausible(self) -> Plausible:
+        """The limits of all so far."""
+        if len(self._some) < _FEWEST:
+            return Plausible(-math.inf, math.inf)
+        values = self._some
+        if self._every > 1:
+            values = np.append(values, np.array([self.low, self.high], values.dtype))
+        median = np.partition(values, len(values) // 2)[len(values) // 2]
+        limit = _farthest(np.sort(np.abs(values - median)), self._count)
+        return Plausible(float(median) - limit, float(median) + limit)
+
+
+def _farthest(distances: NDArray[Any], count: int) -> float:
+    """How far from the median one of `count` intensities can be, by the distances (M,) of some, ascending."""
+    of_all = len(distances)
+    distances = distances[distances > 0]  # half of the returns may have the same intensity
+    gaps = np.flatnonzero(distances[1:] > _GAP * distances[:-1]) + 1
+    for first in gaps[gaps >= _FEWEST]:
+        usual, beyond = distances[:first], distances[first:]
+        different = 1 + np.count_nonzero(np.diff(beyond))
+        if len(beyond) > _RARE * of_all and different > _FEW:
+            continue
+        # n of a tail lie beyond with this chance, nearly, where so large a share is expected there (Poisson).
+        share = len(beyond) / (math.e * count) * _CHANCE ** (1 / len(beyond))
+        if beyond[0] > _reach(usual, share):
+            return _GAP * float(usual[-1])
+    return math.inf
+
+
+def _reach(distances: NDArray[Any], share: float) -> float:
+    """How far from the median such a `share` of the returns lies, by the distances (M,) of others, ascending.
+
+    An exponential tail grows by the same length with each quartering of the share, a heavy one by longer and longer ones. A
+    lighter one than exponential is taken for that: returns are of several kinds.
+    """
+    quarter, second, third = (float(distances[len(distances) * (4**k - 1) // 4**k]) for k in (1, 2, 3))
+    step, before = third - second, second - quarter
+    growth = max(step / before, 1.0) if before > 0 else 1.0
+    steps = max(-math.log(share, 4) - 3, 0.0)
+    length = max(step, quarter)
+    if growth == 1:
+        return third + length * steps
+    with np.errstate(over="ignore"):
+        return float(third + length * growth * (np.float64(growth) ** steps - 1) / (growth - 1))

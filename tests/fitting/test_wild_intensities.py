@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Intensities that cannot belong to the others: left out of the reflectance, but not of the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.map.storage import parts_of
+from radarsdf.tiles.plan import Plan
+
+SHORT = {"sdf_iterations": 20, "intensity_iterations": 40, "intensity_batch_size": 256}
+CONFIGS = {
+    "quick": FitConfig.quick(num_threads=1),
+    "default": FitConfig(num_threads=1, training={**SHORT, "batch_size": 512}),
+    "paper": FitConfig.paper(num_threads=1).override(training={**SHORT, "batch_size": 512}),
+}
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return radarsdf.simulate.wall(frames=4, seed=3)
+
+
+def struck(scans, value):
+    """The intensities, every hundredth of them replaced."""
+    whole = np.concatenate(scans.intensities)
+    whole[::100] = value
+    return np.split(whole, np.cumsum([len(scan) for scan in scans.points])[:-1])
+
+
+def tensors(radar_map):
+    return parts_of(radar_map._contents)[0]
+
+
+def errors(radar_map, scans):
+    """(N,) of all intensities."""
+    rays = radarsdf.returns.rays.prepare(scans.points, scans.poses, scans.intensities)
+    return np.abs(radar_map.intensity(*rays.in_world(), extrapolate=True) - rays.intensities)
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_their_values_do_not_matter(scans, config):
+    good, low, high = (
+        radarsdf.fit(scans.points, scans.poses, values, config=config, progress=False)
+        for values in (scans.intensities, struck(scans, -9999.0), struck(scans, 65535.0))
+    )
+    assert good.report["wild_intensities"] == 0
+    assert low.report["wild_intensities"] == -(-sum(map(len, scans.points)) // 100)
+    assert low.intensity_scale == good.intensity_scale
+    weakest = [np.transpose(radar_map.sensor.thresholds)[1] for radar_map in (low, good)]
+    np.testing.assert_allclose(*weakest, atol=2)
+    assert low.sensor == high.sensor
+    for name, tensor in tensors(low).items():
+        assert tensor.equal(tensors(high)[name]), name
+    # They are few: without them it is as good, also where they were.
+    assert errors(low, scans).mean() < 1.02 * errors(good, scans).mean()
+    assert errors(low, scans)[::100].mean() < 1.3 * errors(good, scans)[::100].mean()
+
+
+def test_the_surface_keeps_their_returns(scans):
+    config = CONFIGS["quick"]
+    good, low = (
+        radarsdf.fit(scans.points, scans.poses, values, config=config, progress=False)
+        for values in (scans.intensities, struck(scans, -9999.0))
+    )
+    assert low.report["returns_used"] == good.report["returns_used"]
+    for name, tensor in tensors(good).items():
+        if not name.startswith("reflectance."):
+            assert tensor.equal(tensors(low)[name]), name
+
+
+def test_a_given_range_does_not_bring_them_back(scans):
+    good, low = (
+        radarsdf.fit(
+            scans.points,
+            scans.poses,
+            values,
+            config=CONFIGS["quick"],
+            progress=False,
+            intensity_range=(70.0, 150.0),
+        )
+        for values in (scans.intensities, struck(scans, -9999.0))
+    )
+    assert low.report["wild_intensities"] > 0
+    assert errors(low, scans).mean() < 1.02 * errors(good, scans).mean()
+
+
+def test_all_tiles_leave_out_the_same(scans, tmp_path):
+    """The plan decides for all, also where a tile has no other intensities."""
+    whole = struck(scans, -9999.0)
+    far = scans.poses[0].copy()
+    far[0, 3] += 200
+    points, poses = [*scans.points, scans.points[0][:50]], np.concatenate([scans.poses, far[None]])
+    city = radarsdf.fit_tiles(
+        radarsdf.io.Scans(points, poses, [*whole, np.full(50, -9999.0)]),
+        tmp_path / "city",
+        tile_size=25.6,
+        halo=6.4,
+        config=CONFIGS["quick"],
+        progress=False,
+    )
+    assert city.missing == {}
+    plan = Plan.load(tmp_path / "city")
+    assert plan.intensity_range == (
+        min(v.min() for v in scans.intensities),
+        max(v.max() for v in scans.intensities),
+    )
+    alone = radarsdf.fit(scans.points, scans.poses, whole, config=CONFIGS["quick"], progress=False)
+    assert errors(city, scans).mean() < 1.1 * errors(alone, scans).mean()
+    assert np.isfinite(city.intensity(far[:3, 3] + [[5, 0, 0]], far[:3, 3], extrapolate=True)).all()
