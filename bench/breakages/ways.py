@@ -139,6 +139,19 @@ def _clipped(data: Data) -> Data:
     return _intensities(lambda values: np.minimum(values, highest))(data)
 
 
+def _replaced(share: float, low: float, high: float) -> Way:
+    """A `share` of the intensities, at least one of them, is somewhere from `low` to `high`."""
+
+    def broken(data: Data) -> Data:
+        whole = np.concatenate(data.intensities).astype(np.float64)
+        rng, count = np.random.default_rng(0), max(1, round(share * len(whole)))
+        whole[rng.choice(len(whole), count, replace=False)] = rng.uniform(low, high, count)
+        ends = np.cumsum([len(values) for values in data.intensities])
+        return dataclasses.replace(data, intensities=np.split(whole, ends[:-1]))
+
+    return broken
+
+
 def _below_ground(data: Data) -> Data:
     def mirrored(scan: FloatArray) -> FloatArray:
         lower = scan.copy()
@@ -202,6 +215,10 @@ WAYS: dict[str, tuple[str, Way]] = {
     "intensity in steps of 0.5": ("intensity_steps", _intensities(lambda v: np.round(2 * v) / 2)),
     "intensity clipped": ("intensity_clipped", _clipped),
     "intensity is RCS + 128": ("intensity_offset", _intensities(lambda v: np.round(v - np.median(v)) + 128)),
+    "intensity -9999 in 1 of 100 returns": ("intensity_sentinel", _replaced(0.01, -9999, -9999)),
+    "intensity 65535 in 1 of 5 returns": ("intensity_sentinel", _replaced(0.2, 65535, 65535)),
+    "one intensity of 1e9": ("intensity_wild", _replaced(0, 1e9, 1e9)),
+    "garbage in 1 of 100 intensities": ("intensity_wild", _replaced(0.01, -1e9, 1e9)),
     "Doppler as intensity": ("intensity_is_doppler", _doppler_as_intensity),
     "Doppler with the other sign": ("doppler_sign", with_other_sign),
     "sensor turned by 8 degrees": ("sensor_turned", _sensor_turned),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the intensities tell: whether they are measured at all, their steps, where they are clipped, an offset."""
+"""What the intensities tell: whether they are measured at all, what cannot belong to them, their steps, an offset, clipping."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ import numpy as np
 
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import FloatArray, Recording
+from radarsdf.returns.plausible import Plausible
 
 _SOME, _MANY = 0.005, 0.05  # share of the returns at the highest value
 _ABOVE_NEXT = 5.0  # times the share at each of the next values
 _FEW_VALUES = 1000  # different ones. More have no steps that matter
 _RCS_OFFSET = 128  # of radar cross sections in dBsm, to put them into a byte
 _LEAST_RETURNS = 100
+_NAMED = 3  # sentinels in a message
 
 
 def check_intensities(recording: Recording) -> list[Finding]:
     """Tells what is worth knowing of the intensities."""
     if recording.intensities is None:
         return []
-    scans = [np.asarray(recording.intensities[i], np.float64) for i in recording.some_scans()]
-    values = np.concatenate(scans)
-    finite = np.isfinite(values)
+    whole = np.concatenate(recording.intensities)  # one value in any scan can stretch the scale of all
+    finite = np.isfinite(whole)
     if not finite.all():
         return [
             Finding(
@@ -32,27 +33,70 @@ def check_intensities(recording: Recording) -> list[Finding]:
                 "Leave out these returns, or fit without intensities.",
             )
         ]
+    plausible = Plausible.of(whole)
+    wild = whole[~plausible.holds(whole)]
+    found = _wild(wild, whole, plausible) if len(wild) else []
+    scans = [np.asarray(recording.intensities[i], np.float64) for i in recording.some_scans()]
+    scans = [scan[plausible.holds(scan)] for scan in scans]
+    values = np.concatenate(scans)
+    if len(values) == 0:
+        return found
     if values.min() == values.max():
         return [
+            *found,
             Finding(
                 "intensity_constant",
                 "error",
                 f"All intensities are {values[0]:g}.",
                 "Pass another field, or fit without intensities: the sensor does not measure this one.",
-            )
+            ),
         ]
     larger = [scan for scan in scans if len(scan) > 1]
     constant = [scan.min() == scan.max() for scan in larger]
     if larger and np.mean(constant) > 0.5:
         return [
+            *found,
             Finding(
                 "intensity_constant_in_scans",
                 "warning",
                 f"In {np.mean(constant):.0%} of the scans all returns have the same intensity.",
                 "Look for a fault of the driver, or fit without intensities.",
-            )
+            ),
         ]
-    return _values(values) if len(values) >= _LEAST_RETURNS else []
+    return found + (_values(values) if len(values) >= _LEAST_RETURNS else [])
+
+
+def _wild(wild: FloatArray, whole: FloatArray, plausible: Plausible) -> list[Finding]:
+    """Findings about `wild` intensities, those of the `whole` that are not plausible."""
+    usual = whole[plausible.holds(whole)]
+    others = f"far from all others, which are {usual.min():g} to {usual.max():g}"
+    left_out = "A fit leaves them out of the reflectance, and keeps these returns in the surface."
+    levels, counts = np.unique(wild, return_counts=True)
+    repeated = np.flatnonzero(counts > 1)
+    found = []
+    if len(repeated):
+        most = repeated[np.argsort(-counts[repeated], kind="stable")]
+        named = ", ".join(f"{levels[i]:g}" for i in most[:_NAMED]) + ", …" * (len(most) > _NAMED)
+        count = int(counts[repeated].sum())
+        found.append(
+            Finding(
+                "intensity_sentinel",
+                "warning",
+                f"{count} of {len(whole)} intensities ({count / len(whole):.2g}) are {named}, {others}.",
+                f"Look up in the driver what {named} stands for: no measurement is likely. {left_out}",
+            )
+        )
+    if len(single := levels[counts == 1]):
+        farthest = single[np.argmax(np.abs(single - np.median(usual)))]
+        found.append(
+            Finding(
+                "intensity_wild",
+                "warning",
+                f"{len(single)} of {len(whole)} intensities are wild, such as {farthest:g}: {others}.",
+                f"Look for a fault of the driver or of the units: decibels have no such tails. {left_out}",
+            )
+        )
+    return found
 
 
 def _values(values: FloatArray) -> list[Finding]:
