@@ -60,6 +60,17 @@ def test_held_out_intensities(map_file, scans_file, capsys):
         assert "(3000 returns," in row(printed, name)  # of the scans 0 and 3
 
 
+def test_wild_held_out_intensities_are_counted_and_not_compared(map_file, scene, tmp_path, capsys):
+    intensities = [np.where(np.arange(len(scan)) % 100, scan, -9999) for scan in scene.intensities]
+    path = tmp_path / "scans.npz"
+    write_scans(path, Scans(scene.points, scene.poses, intensities))
+    assert call("eval", map_file, path, "--holdout", 3) == 0
+    printed = capsys.readouterr().out
+    assert "30 of 3000 held-out intensities cannot belong to the others" in printed
+    for name in ("held-out intensity error", "kNN      intensity error"):
+        assert "(2970 returns," in row(printed, name)
+
+
 def test_the_baseline_and_its_choice_see_the_training_scans_alone(map_file, scans_file, capsys, monkeypatch):
     given = []
     choose = KNNIntensity.chosen

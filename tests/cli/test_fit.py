@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import radarsdf
+from radarsdf.io import Scans, write_scans
 
 from .calls import FAST, call, files, refusal
 
@@ -35,6 +37,14 @@ def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     assert not radar_map.has_intensity
     assert radar_map.config == radarsdf.FitConfig.quick()
     assert radar_map.report["returns"] == 6 * 1500
+
+
+def test_wild_intensities_are_counted(scene, tmp_path, capsys):
+    intensities = [np.where(np.arange(len(scan)) % 100, scan, -9999) for scan in scene.intensities]
+    write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, intensities))
+    assert call("fit", tmp_path / "scans.npz", "-o", tmp_path / "map.safetensors", "--quick") == 0
+    assert "90 intensities cannot belong to the others, and are left out" in capsys.readouterr().out
+    assert radarsdf.load(tmp_path / "map.safetensors").report["wild_intensities"] == 90
 
 
 def test_what_was_held_out_is_to_be_evaluated(scans_file, tmp_path, capsys):

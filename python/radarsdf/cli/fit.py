@@ -151,6 +151,12 @@ def _say(
         scans=scans,
         **{name: report[name] for name in ("returns", "returns_used", "movers", "ghosts")},
     )
+    if wild := report["wild_intensities"]:
+        results.add(
+            f"{wild} intensities cannot belong to the others, and are left out of the reflectance: "
+            "radarsdf check names them",
+            wild_intensities=wild,
+        )
     for line in report["skipped"]:
         if "moves" in line:
             complain(f"radarsdf fit: warning: no returns were left out that move: {line.partition(': ')[2]}")

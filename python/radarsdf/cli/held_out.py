@@ -33,6 +33,13 @@ def add_intensity_errors(results: Results, radar_map: AnyMap, test: Scans, train
         return
     tested, known = (rays_as_measured(scans, radar_map.config) for scans in (test, train))
     given = len(tested)
+    tested, known = (rays.select(rays.with_intensity) for rays in (tested, known))
+    if len(tested) < given:
+        results.add(
+            f"{given - len(tested)} of {given} held-out intensities cannot belong to the others, and are not compared",
+            wild_intensities=given - len(tested),
+        )
+        given = len(tested)
     tested, found = predicted(radar_map, tested)
     if len(tested) < given:
         results.add(

@@ -33,6 +33,8 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]],
         return Section(anchor, title, [paragraph(f"Not compared with measurements. {why}")]), [], []
     radar_map, config = subject.radar_map, subject.radar_map.config
     rays = rays_as_measured(scans, config)
+    given = len(rays)
+    rays = rays.select(rays.with_intensity)
     total = len(rays)
     rays = rays.select(np.linspace(0, total - 1, min(total, _MOST_RETURNS)).astype(np.int64))
     chosen = len(rays)
@@ -45,6 +47,7 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]],
     others = {}
     if subject.held_out is not None and subject.scans is not None:
         known = rays_as_measured(subject.scans, config)
+        known = known.select(known.with_intensity)
         assert known.intensities is not None
         knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
         nearest = intensity_metrics(knn.predict(x, sensors), measured)
@@ -63,6 +66,8 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]],
     count = f"all {total:,}" if len(rays) == total else f"{len(rays):,} of the {total:,}"
     if chosen > len(rays):
         which += f"; {chosen - len(rays):,} more are in no tile"
+    if total < given:
+        which += f"; intensities of {given - total:,} more cannot belong to the others"
     honest = (
         ""
         if subject.held_out is not None

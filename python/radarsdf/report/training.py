@@ -27,6 +27,7 @@ _COUNTS = {
     "returns": "Returns",
     "ghosts": "of these false, and left out of the surface",
     "movers": "of these moving, and left out",
+    "wild_intensities": "of these with wild intensities, left out of the reflectance",
     "leaf_cells": "Leaf cells",
     "vertices": "Vertices of cells",
 }
