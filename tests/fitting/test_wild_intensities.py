@@ -111,3 +111,19 @@ def test_all_tiles_leave_out_the_same(scans, tmp_path):
     alone = radarsdf.fit(scans.points, scans.poses, whole, config=CONFIGS["quick"], progress=False)
     assert errors(city, scans).mean() < 1.1 * errors(alone, scans).mean()
     assert np.isfinite(city.intensity(far[:3, 3] + [[5, 0, 0]], far[:3, 3], extrapolate=True)).all()
+
+
+@pytest.mark.parametrize("config", [CONFIGS["quick"], CONFIGS["default"]], ids=["quick", "default"])
+def test_beyond_the_ranges_of_the_returns_an_intensity_is_that_at_their_end(scans, config):
+    radar_map = radarsdf.fit(scans.points, scans.poses, scans.intensities, config=config, progress=False)
+    points, sensors = radarsdf.returns.rays.prepare(scans.points, scans.poses).in_world()
+    rays = points - sensors
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    nearest, farthest = radar_map.sensor.range_m
+    for end, others in ((nearest, (0.1, 0.5)), (farthest, (2, 10, 1e4))):
+        expected = radar_map.intensity(points, points - end * unit, extrapolate=True)
+        for times in others:
+            found = radar_map.intensity(points, points - times * end * unit, extrapolate=True)
+            assert (
+                np.mean(np.abs(found - expected) < 0.1) > 0.95
+            )  # rounded directions are in other cells, a few

@@ -227,6 +227,8 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
         positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
         ranges_m = rays.norm(dim=1)
         directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
+        # How the intensity goes on beyond the ranges of the returns, nothing tells. A regression would take it to an end.
+        ranges_m = ranges_m.clamp(*contents.sensor.range_m)
         closed, share = contents.reflectance, 1.0
         unit = torch.zeros_like(ranges_m)
         if closed is not None:

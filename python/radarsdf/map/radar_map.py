@@ -246,6 +246,8 @@ class RadarMap:
     def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
         """Predicts the intensity of the return that a sensor gets from each point.
 
+        From closer or farther than the returns of the fit, it is that at the end of their ranges.
+
         Parameters
         ----------
         x : (N, 3) array or tensor
