@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a fit will meet: returns below the ground, the noise of the sensor, memory and time."""
+"""What a fit will meet: returns below the ground, the noise of sensor and poses, memory and time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from radarsdf.budget.estimate import estimate_rays
 from radarsdf.budget.extent import check_extent
+from radarsdf.checking.common_surfaces import check_poses_by_noise
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import Recording
 from radarsdf.config import FitConfig
@@ -67,6 +68,7 @@ def check_fit(recording: Recording, config: FitConfig) -> list[Finding]:
     surfels = Surfels.of(rays, config.leaf_size_m)
     noise = sensor_noise(surfels, rays, config.returns)
     return [
+        *check_poses_by_noise(rays, surfels, noise),
         Finding(
             "noise",
             "note",

@@ -103,7 +103,11 @@ def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort)
         return found  # nothing below can be computed
     found += check_intensities(recording)
     found += trajectory.check_duplicates(recording)
-    wrong = frames.check_frames(recording, effort) or trajectory.check_lengths(recording)
+    wrong = (
+        frames.check_still(recording, effort)
+        or frames.check_frames(recording, effort)
+        or trajectory.check_lengths(recording)
+    )
     if not wrong:  # else the scans do not agree, whatever the clock
         wrong = trajectory.check_jumps(recording, effort)
         wrong += check_doppler(recording)

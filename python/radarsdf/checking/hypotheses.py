@@ -20,6 +20,8 @@ _AXES = "xyz"
 _UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}
 # Of radar axes (x forward, y left, z up) in a camera frame (x right, y down, z forward).
 _CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+_TURNS_DEG = (5, 10, 15, 20, 25, 30, 35, 40, 45)  # of a sensor on its vehicle, in yaw; in pitch up to 20
+_MAX_PITCH_DEG = 20
 _FAST_RAD = np.radians(
     3
 )  # a sensor that turns more between scans may have poses of degrees taken for radians
@@ -90,7 +92,45 @@ def hypotheses(
         )
         for what, T in _angles(T_world_sensor)
     ]
+    found += _quaternions(T_world_sensor, pairs)
+    found += _turned(relative(T_world_sensor, pairs))
     return found
+
+
+def standing_still(guesses: list[Hypothesis]) -> int:
+    """Number of the hypothesis under which the sensor does not move between scans: points in the world frame."""
+    return next(k for k, guess in enumerate(guesses) if guess.finding == "points_in_world_frame")
+
+
+def _quaternions(T_world_sensor: FloatArray, pairs: NDArray[np.int64]) -> Iterator[Hypothesis]:
+    """Quaternions whose real part comes first taken for ones where it comes last, and the other way round."""
+    read = Rotation.from_matrix(T_world_sensor[:, :3, :3]).as_quat()
+    for shift, order, other in ((-1, "w x y z", "x y z w"), (1, "x y z w", "w x y z")):
+        poses = T_world_sensor.copy()
+        poses[:, :3, :3] = Rotation.from_quat(np.roll(read, shift, axis=1)).as_matrix()
+        yield Hypothesis(
+            "quaternion_order",
+            f"the quaternions of the poses are {order}, and were read as {other}",
+            f"Make the rotations of the poses anew, from quaternions in the order {order}.",
+            relative(poses, pairs),
+        )
+
+
+def _turned(motions: FloatArray) -> Iterator[Hypothesis]:
+    """The poses are those of a vehicle on which the sensor looks to the side, or up or down."""
+    for axis, name, turns in (
+        ("z", "yaw", _TURNS_DEG),
+        ("y", "pitch", [turn for turn in _TURNS_DEG if turn <= _MAX_PITCH_DEG]),
+    ):
+        for degrees in (sign * turn for turn in turns for sign in (1, -1)):
+            T_vehicle_sensor = np.eye(4)
+            T_vehicle_sensor[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+            yield Hypothesis(
+                "sensor_turned",
+                f"the sensor is turned by {degrees} degrees of {name} on what the poses are of",
+                "Pass poses of the sensor: poses @ T_vehicle_sensor, by its calibration.",
+                T_vehicle_sensor.T @ motions @ T_vehicle_sensor,
+            )
 
 
 def _signed_permutations() -> Iterator[FloatArray]:

@@ -279,6 +279,8 @@ def _agree_without(
     scans = [i for i in range(jump - _ROUND + 1, jump + _ROUND + 1) if 0 <= i < len(poses)]
     scans = [i for i in scans if len(recording.points[i]) >= MIN_RETURNS]
     all_pairs = [(i, j) for i in scans for j in scans if i < j]
+    if not all_pairs:
+        return False
     beside = [(i, j) for i, j in all_pairs if not any(i <= k < j for k in suspects)]
     across = [(i, j) for i, j in all_pairs if i <= jump < j]
     # Either all is displaced from here on, or one pose is, and the step after takes it back.

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,6 +99,16 @@ def sensor_noise(
             solution = np.linalg.lstsq(normal, np.einsum("kn,n->k", weighted, unexplained), rcond=None)[0]
             sigma2[free] = _TRUNCATION * np.maximum(solution, least[free])
     return SensorNoise(*np.sqrt(sigma2).tolist())
+
+
+def variances_across(
+    rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64], noise: SensorNoise
+) -> NDArray[np.float64]:
+    """(M,) variances of the returns in these `rows` (M,) across planes with `normals` (M, 3), m²."""
+    variances: NDArray[np.float64] = np.einsum(
+        "k,kn->n", np.square(dataclasses.astuple(noise)), _shares(rays, rows, normals)
+    )
+    return variances
 
 
 def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
