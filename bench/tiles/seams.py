@@ -72,10 +72,9 @@ def _row(
         "F of one fit": f"{100 * scores[0]['f_score_all']:.2f}",
         "F of tiles": f"{100 * scores[1]['f_score_all']:.2f}",
     }
-    for what, (tiles, single, elsewhere) in steps.items():
-        row[f"step of {what}: tiles, one fit, tiles elsewhere"] = (
-            f"{tiles:.2g}, {single:.2g}, {elsewhere:.2g}"
-        )
+    for what, sizes in steps.items():
+        for of_map, (most, largest) in zip(("tiles", "one fit", "tiles elsewhere"), sizes, strict=True):
+            row[f"step of {what}: {of_map}, 99 % and largest"] = f"{most:.2g}, {largest:.2g}"
     row["from one fit, border, median, 95 %, m"] = _two(distance_m[near])
     row["elsewhere  "] = _two(distance_m[~near])
     on_borders, inside = _open_edges(city, meshes[1])
@@ -85,7 +84,7 @@ def _row(
 
 
 def _two(values: _Floats) -> str:
-    return ", ".join(f"{value:.3f}" for value in np.quantile(values, [0.5, 0.95]))
+    return ", ".join(f"{value:.3f}" for value in np.nanquantile(values, [0.5, 0.95]))
 
 
 def _to_border(city: TiledMap, points: _Floats) -> _Floats:
@@ -95,11 +94,11 @@ def _to_border(city: TiledMap, points: _Floats) -> _Floats:
     return nearest
 
 
-def _steps(city: TiledMap, one: RadarMap, vertices: _Floats) -> dict[str, tuple[float, ...]]:
-    """The 99 % quantiles of the steps of answers: of the tiles and of the single fit across borders, and of the tiles
-    across planes in the middle of tiles.
+def _steps(city: TiledMap, one: RadarMap, vertices: _Floats) -> dict[str, tuple[tuple[float, float], ...]]:
+    """The 99 % quantile and the largest of the steps of answers: of the tiles and of the single fit across borders, and of
+    the tiles across planes in the middle of tiles.
     """
-    found: dict[str, tuple[float, ...]] = {}
+    found: dict[str, tuple[tuple[float, float], ...]] = {}
     sensor = city.config.lattice.position(city.tiles[0].origin_cells)
     places = [_sides(city, vertices, shift_m) for shift_m in (0.0, city.plan.tile_m / 2)]
     for what in ("sdf, m", "intensity, dB"):
@@ -109,7 +108,8 @@ def _steps(city: TiledMap, one: RadarMap, vertices: _Floats) -> dict[str, tuple[
                 map_.sdf(at) if what == "sdf, m" else map_.intensity(at, sensor)
                 for at in (points - side, points + side)
             )
-            steps.append(float(np.quantile(np.abs(here - there), 0.99)))
+            step = np.abs(here - there)
+            steps.append((float(np.nanquantile(step, 0.99)), float(np.nanmax(step))))
         found[what] = tuple(steps)
     return found
 
