@@ -34,10 +34,12 @@ def main(folder: Path) -> None:
     radar_map = radarsdf.fit(points, poses, intensities)
     print(radar_map)
 
-    at = poses[:1, :3, 3] + [[0.0, 0.0, -1.0]]  # a metre below the sensor of the first scan, world, m
-    print(f"signed distance {radar_map.sdf(at)[0]:.2f} m, positive in free space")
-
     mesh = radar_map.mesh(voxel_size=0.2, viewpoint=poses[0, :3, 3])
+    at = np.stack([mesh.vertices[0] + 0.1 * mesh.vertex_normals[0], poses[0, :3, 3]])  # world, m
+    near, at_sensor = radar_map.sdf(at)
+    print(f"signed distance {near:.2f} m before the surface, positive in free space")
+    print(f"{at_sensor} m at the sensor: no return is near")
+
     dB = mesh.vertex_attributes["intensity"]
     print(f"{len(mesh.faces)} triangles; intensities from the first pose {dB.min():.0f} to {dB.max():.0f} dB")
     radarsdf.io.write_mesh(folder / "mesh.ply", mesh)

@@ -26,9 +26,10 @@ def main(folder: Path) -> None:
     city = radarsdf.fit_tiles(scans, folder / "city", tile_size=32, config=config, progress=False)
     print(f"{len(city.missing)} tiles are missing")
 
-    # One map answers: here, how far each sensor position is from what the nearest tiles know.
-    distance_m = city.sdf(street.poses[:, :3, 3])
-    print(f"{np.isfinite(distance_m).sum()} of {len(distance_m)} positions are in a tile")
+    # One map answers, on both sides of a border: here, how far the returns are from the surface.
+    distance_m = np.abs(city.sdf(street.world_points()))  # NaN where no tile observed a point
+    print(f"{np.isfinite(distance_m).mean():.0%} of the returns are where a tile knows the surface,")
+    print(f"half of these within {np.nanmedian(distance_m):.3f} m of it")
     vertices, triangles = city.export(folder / "city.ply", 0.2, progress=False)
     print(f"{vertices} vertices and {triangles} triangles")
 

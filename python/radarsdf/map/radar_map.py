@@ -161,7 +161,7 @@ class RadarMap:
         """Gradient of :meth:`sdf` at x (N, 3), world, m: (N, 3), towards free space.
 
         Its length is about 1 where rays met the surface at a right angle, and more where they met it at a
-        flat angle. It is NaN where that is, and `extrapolate` does the same.
+        flat angle. It is NaN where :meth:`sdf` is, and `extrapolate` does the same.
         """
         points, answer = self._local(x)
         return answer(queries.answers_at(self._contents, queries.gradient, points, extrapolate=extrapolate))
@@ -194,9 +194,8 @@ class RadarMap:
         Returns
         -------
         (N,) array or tensor
-            Probability that a true surface is within the edge of a leaf cell, in [0, 1]. 0 where there are no returns in the cells
-            round `x`, and where it is not finite.
-            A logistic function of how precisely the returns agree (:meth:`uncertainty` without its floor), of
+            Probability that a true surface is within the edge of a leaf cell, in [0, 1]. 0 where there are no
+            returns in the cells round `x`, and where it is not finite. It is a logistic function of how precisely the returns agree (:meth:`uncertainty` without its floor), of
             the share of scans with returns there among those that looked there, and of the share of the map's
             returns that lie on no thin surface; at most the share of a normal distribution of that error within a
             leaf cell's edge. It was fitted to simulated scenes and to three real drives.
