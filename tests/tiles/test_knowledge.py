@@ -38,7 +38,49 @@ def points_on_border(drive):
     return points[np.abs(points[:, 1] - np.round(points[:, 1] / TILE_M) * TILE_M) < 1.0][:200]
 
 
-def test_answers_have_no_step_where_one_tile_stops_knowing(disputed, points_on_border):
+@pytest.fixture
+def quarrelling(city, points_on_border, monkeypatch):
+    """A city of which each tile knows nothing in some cells more than a cell from borders, and says other distances."""
+    leaf_m = city.config.leaf_size_m
+    counting = [tile for tile in city.plan.grid.counting(points_on_border) if city.has(tile)]
+    for number, tile in enumerate(counting):
+        contents = city.contents_of(tile)
+        field, occupied = contents.field, contents.field.cells.occupied
+        shift_m = number * OFFSET_M
+        distance = field.signed_distance
+
+        def knows(p, occupied=occupied, number=number, contents=contents):
+            cells = torch.floor(p * np.float32(1 / leaf_m)).double()
+            y = (cells[:, 1] + 0.5) * leaf_m + contents.origin[1]
+            near_border = (y - torch.round(y / TILE_M) * TILE_M).abs() < 1.1 * leaf_m
+            lacks = (cells @ torch.tensor([3.0, 5.0, 7.0], dtype=torch.float64)) % 5 == number
+            return occupied(p) & ~(lacks & ~near_border)
+
+        monkeypatch.setattr(contents.field.cells, "occupied", knows)
+        monkeypatch.setattr(field, "signed_distance", lambda p, d=distance, shift_m=shift_m: d(p) + shift_m)
+    return city
+
+
+def test_the_tile_of_a_cell_says_whether_it_was_observed(quarrelling, points_on_border):
+    x = np.repeat(points_on_border, 20, axis=0).astype(np.float64)
+    x += np.random.default_rng(0).normal(0, 0.3, x.shape)
+    owners = quarrelling.plan.grid.tiles_of(x)
+    expected = np.zeros(len(x), bool)
+    disputed = 0
+    for share in quarrelling.shares(x):
+        observed = queries.occupied(share.contents, share.local).numpy()
+        own = (owners[share.rows] == share.tile).all(axis=1)
+        expected[share.rows[own]] = observed[own]
+    for share in quarrelling.shares(x):
+        disputed += (queries.occupied(share.contents, share.local).numpy() != expected[share.rows]).sum()
+    assert disputed > 100
+    # But for points on the border of an observed cell.
+    assert (quarrelling.observed(x) != expected).mean() < 0.005
+
+
+@pytest.mark.parametrize("kind", ["disputed", "quarrelling"])
+def test_answers_have_no_step_where_one_tile_stops_knowing(kind, points_on_border, request):
+    disputed = request.getfixturevalue(kind)
     rng = np.random.default_rng(0)
     ways = rng.normal(size=points_on_border.shape)
     ways *= STEP_M / np.linalg.norm(ways, axis=1, keepdims=True)
@@ -77,6 +119,11 @@ def test_what_one_tile_alone_knows_is_its_answer(disputed, points_on_border):
     assert (tiles == 2).sum() > 10
 
 
+def everywhere(cells):
+    """Other tiles have observed all cells."""
+    return np.ones(len(cells), bool)
+
+
 def test_knowledge_is_the_distance_to_what_is_not_observed(city):
     tile = city.tiles[0].tile
     contents = city.contents_of(tile)
@@ -85,7 +132,7 @@ def test_knowledge_is_the_distance_to_what_is_not_observed(city):
     points = torch.from_numpy(
         (cells + np.random.default_rng(0).uniform(0.05, 0.95, cells.shape)).astype(np.float32) * leaf_m
     )
-    known, slopes = knowledge(contents, points)
+    known, slopes = knowledge(contents, points, everywhere)
     assert (known > 0).all()
     # Nothing nearer than that is unobserved, and something just beyond it is.
     ways = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -102,8 +149,9 @@ def test_knowledge_is_the_distance_to_what_is_not_observed(city):
     for axis in range(3):
         way = torch.zeros(3)
         way[axis] = step
-        difference = (knowledge(contents, points + way)[0] - knowledge(contents, points - way)[0]) / (
-            2 * step
-        )
+        difference = (
+            knowledge(contents, points + way, everywhere)[0]
+            - knowledge(contents, points - way, everywhere)[0]
+        ) / (2 * step)
         assert np.quantile(np.abs(difference - slopes[:, axis]), 0.95) < 1e-2
-    assert knowledge(contents, torch.tensor([[0.0, 0.0, 1e4]]))[0] == 0
+    assert knowledge(contents, torch.tensor([[0.0, 0.0, 1e4]]), everywhere)[0] == 0

@@ -80,15 +80,20 @@ def occupied(contents: MapContents, points: Tensor) -> Tensor:
 
 
 @torch.inference_mode(mode=False)
-def into_cells(contents: MapContents, points: Tensor, size_m: float | None = None) -> tuple[Tensor, Tensor]:
+def into_cells(
+    contents: MapContents,
+    points: Tensor,
+    size_m: float | None = None,
+    among: Callable[[MapContents, Tensor], Tensor] = occupied,
+) -> tuple[Tensor, Tensor]:
     """Points, of which those on the border of the occupied leaf cells are moved a little into one, and which are inside.
 
     A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features. It is moved by
-    a thousandth of `size_m`, by default of a leaf cell.
+    a thousandth of `size_m`, by default of a leaf cell. `among`: which points are in a cell that counts.
     """
     leaf_m = contents.config.leaf_size_m
     step_m = INWARD * (leaf_m if size_m is None else size_m)
-    inside = occupied(contents, points)
+    inside = among(contents, points)
     left = torch.nonzero(~inside)[:, 0]
     place = points[left] / leaf_m
     left = left[((place - place.round()).abs() * leaf_m <= step_m).any(dim=1)]
@@ -97,7 +102,7 @@ def into_cells(contents: MapContents, points: Tensor, size_m: float | None = Non
     points, inside = points.clone(), inside.clone()
     for shift in itertools.product((-step_m, step_m), repeat=3):
         moved = points[left] + torch.tensor(shift, dtype=torch.float32, device="cpu")
-        found = occupied(contents, moved)
+        found = among(contents, moved)
         points[left[found]] = moved[found]
         inside[left[found]] = True
         left = left[~found]

@@ -7,7 +7,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from radarsdf.map.contents import MapContents
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.grid import Tile
-from radarsdf.tiles.knowledge import knowledge
+from radarsdf.tiles.knowledge import cells_of, holds, knowledge
 from radarsdf.tiles.plan import Plan, TilePlan, failure_of, map_path
 from radarsdf.tiles.tile_fit import contents_of_tile, is_done
 
@@ -37,6 +37,7 @@ _OF_FEATURES = 2.4  # bytes in memory for each of the features: measured; tables
 class Share(NamedTuple):
     """What one tile adds to answers at some of N positions."""
 
+    tile: Tile
     contents: MapContents
     """The map of the tile."""
     rows: NDArray[np.int64]
@@ -51,6 +52,7 @@ class Share(NamedTuple):
     def select(self, chosen: NDArray[np.bool_]) -> Share:
         """The share at some (M,) of its positions."""
         return Share(
+            self.tile,
             self.contents,
             self.rows[chosen],
             self.weights[chosen],
@@ -184,26 +186,55 @@ class TileBlend:
             if len(rows):
                 contents = self.contents_of(tile)
                 local = queries.to_local(contents, torch.from_numpy(world[rows]))
-                yield Share(contents, rows, weights, np.pad(slopes, ((0, 0), (0, 1))), local)
+                yield Share(tile, contents, rows, weights, np.pad(slopes, ((0, 0), (0, 1))), local)
 
     def seen(self, world: _Floats) -> NDArray[np.bool_]:
-        """(N,) whether a tile that counts at positions (N, 3), world, m, observed them."""
+        """(N,) whether positions (N, 3), world, m, are in observed leaf cells, or on their border."""
         found = np.zeros(len(world), bool)
         for share in self.shares(world):
-            found[share.rows] |= queries.into_cells(share.contents, share.local)[1].numpy()
+            found[share.rows] |= self._into_cells(share)[1].numpy()
+        return found
+
+    def _into_cells(self, share: Share) -> tuple[Tensor, Tensor]:
+        """The local positions of a share, those on borders of observed cells moved into one, and which are inside."""
+
+        def among(contents: MapContents, points: Tensor) -> Tensor:
+            inside = queries.occupied(contents, points)
+            cells = cells_of(contents, points[inside])
+            inside[inside.clone()] = torch.from_numpy(self._observed(share.tile, cells))
+            return inside
+
+        return queries.into_cells(share.contents, share.local, among=among)
+
+    def _observed(self, asking: Tile, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(K,) whether leaf cells (K, 3) from the origin of the tile that is `asking` were observed.
+
+        The tile that a cell lies in decides, because tiles disagree: which returns are ghosts depends on surfaces before
+        them, of which a neighbour may have few returns. Of a tile that is not done, all may have been observed.
+        """
+        cells = cells + self.plan.origin_cells(asking)
+        owners = cells[:, :2] // self.plan.tile_cells
+        found = np.ones(len(cells), bool)
+        left = np.ones(len(cells), bool)
+        while left.any():
+            owner = tuple(owners[left.argmax()].tolist())
+            rows = (owners == owner).all(axis=1)
+            left &= ~rows
+            if self.has(owner):
+                found[rows] = holds(self.contents_of(owner), cells[rows] - self.plan.origin_cells(owner))
         return found
 
     def known_shares(self, world: _Floats, *, extrapolate: bool = False) -> Iterator[Share]:
-        """The :meth:`shares` of the tiles that observed a position: weights fall to zero where a tile stops knowing.
+        """The :meth:`shares` at observed positions: weights fall to zero where a tile stops knowing what others know.
 
-        `extrapolate`: where no tile observed a position, all of them count.
+        `extrapolate`: where a position was not observed, all of them count.
         """
         alone = np.zeros(len(world), bool)
         if extrapolate:
             alone = np.isfinite(world).all(axis=1) & ~self.seen(world)
         for share in self.shares(world):
-            local, _ = queries.into_cells(share.contents, share.local)
-            known, slopes = knowledge(share.contents, local)
+            local, _ = self._into_cells(share)
+            known, slopes = knowledge(share.contents, local, partial(self._observed, share.tile))
             known[alone[share.rows]] = 1.0
             weights = share.weights * known
             slopes = share.slopes * known[:, None] + slopes * share.weights[:, None]
