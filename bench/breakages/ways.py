@@ -84,6 +84,52 @@ def _rad_for_degrees(poses: FloatArray) -> FloatArray:
     return broken
 
 
+def _of_vehicle(axis: str, degrees: float) -> Way:
+    """The poses of a vehicle on which the sensor is turned."""
+    T_sensor_vehicle = np.eye(4)
+    T_sensor_vehicle[:3, :3] = Rotation.from_euler(axis, -degrees, degrees=True).as_matrix()
+    return _poses(lambda T: T @ T_sensor_vehicle)
+
+
+def _quaternions_rolled(poses: FloatArray) -> FloatArray:
+    """Quaternions w x y z, read as x y z w."""
+    broken, quaternions = poses.copy(), Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    broken[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, 1, axis=1)).as_matrix()
+    return broken
+
+
+def _drifted(way_m: float, degrees: float) -> Way:
+    """The position moves off to the side and the heading to the left, at an even rate."""
+
+    def drifted(poses: FloatArray) -> FloatArray:
+        broken, share = poses.copy(), np.linspace(0, 1, len(poses))
+        turns = Rotation.from_euler("z", degrees * share[:, None], degrees=True).as_matrix()
+        broken[:, :3, :3] = turns @ poses[:, :3, :3]
+        moved = np.einsum("nij,nj->ni", turns, poses[:, :3, 3] - poses[0, :3, 3])
+        broken[:, :3, 3] = moved + poses[0, :3, 3] + way_m * share[:, None] * poses[0, :3, 1]
+        return broken
+
+    return _poses(drifted)
+
+
+def _there_and_back(data: Data) -> Data:
+    """The same way again, backwards, with poses that are off by 0.4 m in the end."""
+    rng = np.random.default_rng(0)
+
+    def again(arrays: list[NDArray[Any]], sigma: float = 0.0) -> list[NDArray[Any]]:
+        return [*arrays, *(a + rng.normal(0, sigma, a.shape) for a in reversed(arrays))]
+
+    both = dataclasses.replace(
+        data,
+        points=again(data.points, 1e-3),
+        poses=np.concatenate([data.poses, data.poses[::-1]]),
+        intensities=again(data.intensities),
+        doppler_mps=None,
+        times_s=None,
+    )
+    return _drifted(0.4, 0.0)(both)
+
+
 def _turned(poses: FloatArray) -> FloatArray:
     """The drive turns by 25 degrees on the spot, halfway."""
     broken, middle = poses.copy(), len(poses) // 2
@@ -198,6 +244,19 @@ WAYS: dict[str, tuple[str, Way]] = {
     "points mirrored": ("mirrored", _points(lambda p: p * [1, -1, 1])),
     "positions mirrored": ("mirrored", _positions(lambda t: t * [1, -1, 1])),
     "poses left-handed": ("mirrored", _poses(lambda T: T @ np.diag([1.0, -1, 1, 1]))),
+    "all poses equal": ("poses_stand_still", _poses(lambda T: np.repeat(T[:1], len(T), axis=0))),
+    "all positions 0": ("poses_stand_still", _positions(np.zeros_like)),
+    "quaternions w x y z read as x y z w": ("quaternion_order", _poses(_quaternions_rolled)),
+    **{
+        f"poses of a vehicle, sensor turned by {degrees} degrees of yaw": (
+            "sensor_turned",
+            _of_vehicle("z", degrees),
+        )
+        for degrees in (10, 20, 30, 45)
+    },
+    "poses of a vehicle, sensor turned by 15 degrees of pitch": ("sensor_turned", _of_vehicle("y", 15)),
+    "drift of 1.5 m and 6 degrees": ("poses_disagree", _drifted(1.5, 6.0)),
+    "there and back, drift of 0.4 m": ("poses_disagree", _there_and_back),
     "4 m to the side from halfway": ("pose_jumps", _poses(_moved_on)),
     "one pose 4 m to the side": ("pose_jumps", _poses(_one_off)),
     "25 degrees to the side from halfway": ("pose_jumps", _poses(_turned)),
@@ -226,5 +285,5 @@ WAYS: dict[str, tuple[str, Way]] = {
 }
 """What is broken, and the name of its finding and how to break it."""
 
-NEED_DOPPLER = {"intensity_is_doppler", "doppler_sign", "sensor_turned"}
-"""Findings that need Doppler."""
+NEED_DOPPLER = {"Doppler as intensity", "Doppler with the other sign", "sensor turned by 8 degrees"}
+"""Ways of which nothing is found without Doppler."""

@@ -68,8 +68,7 @@ def _head(results: Results) -> str:
 {tables.wrapped(measured)}
 Times are of this machine, and one time may be off by a third.{warning}
 
-Beside this: [what each choice is worth](docs/levers.md), [what was tried and left out](docs/dead_ends.md),
-[the peers, and how to measure](bench/README.md).
+Beside this: [the defaults](docs/defaults.md), [what failed](bench/history/failed.md), [the peers](bench/README.md).
 
 {words}"""
 
@@ -110,7 +109,7 @@ def _intensity(rows: list[Row], _part: dict[str, Any]) -> str:
 
 def _curve(rows: list[Row], _part: dict[str, Any]) -> str:
     text = (
-        "Each point is one fit. A line is one method that trains for 1/16 to 4 times its usual number of iterations. "
+        "A line is one method that trains for 1/16 to 4 times its usual number of iterations. "
         "The error of the surface is what F-all lacks to 100 %."
     )
     picture = f"![Error of the surface and of the intensity over time]({ERROR_OVER_TIME})"

@@ -4,7 +4,7 @@
 
 "3QFP" (ICRA 2024) and "3QFPI" (Neural Surface and Reflectance Modelling from 3D Radar Data) are the papers
 and their published settings for radar. "Measured" means measured on simulated and real scans;
-``docs/levers.md`` has the figures. Lengths that end in ``_cells`` are in leaf cells: for another scale of
+``bench/history/surface.md`` has the figures. Lengths that end in ``_cells`` are in leaf cells: for another scale of
 scene, only `leaf_size_m` has to change.
 """
 

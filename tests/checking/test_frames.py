@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking.check import check_cheaply
+from scipy.spatial.transform import Rotation
 
 from tests.conftest import recorded_scans
 
@@ -24,7 +25,22 @@ def in_world(points, poses):
     return [scan @ pose[:3, :3].T + pose[:3, 3] for scan, pose in zip(points, poses, strict=True)]
 
 
+def of_vehicle(poses, axis, degrees):
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler(axis, -degrees, degrees=True).as_matrix()
+    return poses @ turn
+
+
+def with_rolled_quaternions(poses):
+    rolled = poses.copy()
+    quaternions = np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1)
+    rolled[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    return rolled
+
+
 BREAKAGES = {
+    "quaternion_order": lambda points, poses: (points, with_rolled_quaternions(poses)),
+    "sensor_turned": lambda points, poses: (points, of_vehicle(poses, "z", 20)),
     "points_in_world_frame": lambda points, poses: (in_world(points, poses), poses),
     "poses_inverted": lambda points, poses: (points, np.linalg.inv(poses)),
     "camera_frame": lambda points, poses: ([p @ _CAMERA_OF_RADAR.T for p in points], poses),
@@ -55,6 +71,61 @@ def test_good_data_have_no_finding(good):
 def test_a_breakage_is_named(good, finding):
     found = radarsdf.check(*BREAKAGES[finding](*good))
     assert (found[0].name, found[0].severity) == (finding, "error")
+
+
+@pytest.mark.parametrize(
+    ("axis", "degrees", "words"), [("z", -45, "-45 degrees of yaw"), ("y", 15, "15 degrees of pitch")]
+)
+def test_how_far_a_sensor_is_turned_is_said(good, axis, degrees, words):
+    points, poses = good
+    found = radarsdf.check(points, of_vehicle(poses, axis, degrees))
+    assert found[0].name == "sensor_turned"
+    assert words in found[0].evidence
+
+
+@pytest.mark.parametrize("how", ["equal", "zero"])
+def test_positions_that_stay_while_the_scans_change_are_named(good, how):
+    points, poses = good
+    held = np.repeat(poses[:1], len(poses), axis=0) if how == "equal" else with_positions(poses, 0)
+    found = radarsdf.check(points, held)
+    told = len(points) >= 24  # so many scans tell that the sensor moved
+    assert (found[0].name, found[0].severity) == ("poses_stand_still", "error" if told else "warning")
+
+
+def room_of(poses, rng, returns=250, noise_m=0.1):
+    """Scans of a room of 12 m x 9 m x 5 m, by a sensor that looks 60 degrees to both sides."""
+    scans = []
+    for pose in poses:
+        azimuth, elevation = rng.uniform(-1.0, 1.0, returns), rng.uniform(-0.3, 0.3, returns)
+        rays = np.stack(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1
+        )
+        world = rays @ pose[:3, :3].T
+        walls_m = (np.where(world > 0, [8, 4, 3], [-4, -5, -2]) - pose[:3, 3]) / world
+        scans.append(rays * (walls_m.min(axis=1, keepdims=True) + rng.normal(0, noise_m, (returns, 1))))
+    return scans
+
+
+@pytest.mark.parametrize("scans", [6, 24])
+def test_a_sensor_that_stands_still_is_no_error(scans):
+    poses = np.repeat(np.eye(4)[None], scans, axis=0)
+    found = radarsdf.check(room_of(poses, np.random.default_rng(0)), poses)
+    assert worse_than_notes(found) == ["poses_stand_still"]
+    assert found[0].severity == "warning"
+
+
+@pytest.mark.parametrize("scans", [10, 40])
+def test_a_slow_sensor_has_no_finding(scans):
+    poses = np.repeat(np.eye(4)[None], scans, axis=0)
+    poses[:, 0, 3] = 0.02 * np.arange(scans)
+    assert worse_than_notes(radarsdf.check(room_of(poses, np.random.default_rng(0)), poses)) == []
+
+
+@pytest.mark.parametrize(("frames", "seed"), [(6, 2), (4, 1), (5, 3), (8, 1)])
+def test_few_sparse_scans_have_no_finding(frames, seed):
+    scans = radarsdf.simulate.oculii(frames=frames, seed=seed)
+    assert worse_than_notes(radarsdf.check(scans.points, scans.poses)) == []
+    assert worse_than_notes(check_cheaply(scans.points, scans.poses)) == []
 
 
 def test_far_from_the_origin_nothing_changes(good):

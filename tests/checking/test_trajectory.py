@@ -98,3 +98,13 @@ def test_shapes_that_do_not_fit_are_refused(good):
         radarsdf.check(points, poses[1:])
     with pytest.raises(ValueError, match="intensities of scan 0 must have shape"):
         radarsdf.check(points, poses, [p[:, :2] for p in points])
+
+
+@pytest.mark.parametrize("returns", [1, 3, 5])
+def test_a_jump_among_scans_of_few_returns_is_no_crash(good, returns):
+    points, poses = good
+    poses = poses.copy()
+    poses[30:, :3, 3] += poses[30, :3, 1] * 40
+    few = [scan[:returns] if 20 <= i < 42 else scan for i, scan in enumerate(points)]
+    assert "fit_refuses" not in names(radarsdf.check(few, poses))
+    assert names(radarsdf.check([scan[:returns] for scan in points], poses)) in ([], ["pose_jumps"])

@@ -14,15 +14,11 @@ from bench.report import pages, results
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "bench" / "results.json"
-# Of the commits that they name: what a choice is worth, and what failed. The other two say what data are like.
-OTHERS = {"dead_ends", "checks", "simulation"}
+# The first is of the commits that bench/history names. The other two say what data are like.
+OTHERS = {"defaults", "checks", "simulation"}
 PAGES = [
     ROOT / "README.md",
-    *(
-        page
-        for page in sorted((ROOT / "docs").glob("*.md"))
-        if not page.stem.startswith("levers") and page.stem not in OTHERS
-    ),
+    *(page for page in sorted((ROOT / "docs").glob("*.md")) if page.stem not in OTHERS),
 ]
 FIGURE = re.compile(
     r"\d\s?(s|ms|min|minutes|seconds|dB|%)(?!\w)|F-score\D{0,20}\d\d|commit [0-9a-f]{7}", re.ASCII

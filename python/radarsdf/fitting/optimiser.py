@@ -103,7 +103,7 @@ class Soap(Optimiser):
 
     Adam scales each number of a gradient by itself, although the inputs of a layer depend on each other. SOAP does so
     in a basis in which they hardly do. Measured: a network learns as much in a quarter to a half of Adam's steps
-    (``docs/levers_time.md``).
+    (``bench/history/time.md``).
     """
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
@@ -155,7 +155,7 @@ class RowAdam:
 
     The mean and mean square of an untouched row decay as with a gradient of zero, but the row does not
     change. Adam would go on to move it along its last gradient, by up to thirty times the learning rate.
-    Measured: the surface is as good without that (``docs/levers_time.md``).
+    Measured: the surface is as good without that (``bench/history/time.md``).
 
     Attributes
     ----------

@@ -11,7 +11,7 @@ from radarsdf._core import CellBlocks, bridge_cells
 from radarsdf.config import BLOCK_CELLS
 from radarsdf.returns.support import support_at
 
-# Measured on simulated and real scans; see docs/levers.md.
+# Measured on simulated and real scans; see bench/history/surface.md.
 # Share of the median support of the block. Returns with less are too often false to tell where a surface goes on.
 _MIN_SUPPORT = 0.5
 # Mean support of the two ends of a bridge, at most. A surface crosses about nine of the 27 cells. With one

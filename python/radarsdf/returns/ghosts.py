@@ -18,7 +18,7 @@ from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import NEIGHBOUR_WEIGHT, Surfels
 
-# Measured on simulated and real scans; see docs/levers.md.
+# Measured on simulated and real scans; see bench/history/surface.md.
 # A ghost is farther behind the surface than these two together, since noise puts returns of the surface
 # itself behind it.
 _MARGIN = 0.25  # cells of surfels

@@ -13,7 +13,7 @@ from radarsdf._core import principal_axes
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import Rays
 
-# Measured on simulated and real scans; see docs/levers.md.
+# Measured on simulated and real scans; see bench/history/surface.md.
 LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m with leaf cells of 0.2 m
 # Weight of a cell that shares a face. One that shares an edge has its square, a corner its cube.
 NEIGHBOUR_WEIGHT = 0.7
