@@ -8,7 +8,7 @@ from concurrent.futures import Future
 
 import pytest
 
-pytest.importorskip("distributed", reason="the extra cluster is not installed")
+distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
 import radarsdf
 from radarsdf.tiles.cluster import cluster_executor
@@ -22,6 +22,8 @@ from .conftest import CONFIG, TILE_M
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     with cluster_in(tmp_path_factory.mktemp("cluster") / "first") as found:
+        with distributed.Client(found.address) as client:  # its workers come a moment later
+            client.wait_for_workers(1, timeout=60)
         yield found
 
 
