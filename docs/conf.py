@@ -40,7 +40,7 @@ NumpyDocstring._consume_inline_attribute = lambda self: ("", self._dedent(self._
 DOCS = Path(__file__).parent
 # A page that begins so has the text of another file, and then its own. The second line is for readers on GitHub.
 _WHOLE = re.compile(r"<!-- the text of (\S+) -->\n\n.*\n")
-_LINK = re.compile(r"(\]\()([^)#\s:]+)(#[^)\s]*)?(\))")
+_LINK = re.compile(r"\[([^][]*)\]\(([^)#\s:]+)(#[^)\s]*)?\)")
 
 
 def _whole_files() -> dict[Path, Path]:
@@ -53,7 +53,7 @@ def _whole_files() -> dict[Path, Path]:
 
 
 def _read(_: Sphinx, name: str, source: list[str]) -> None:
-    """Put in the text of another file, and let links to such files lead to their pages."""
+    """Put in the text of another file, and let links to such files lead to their pages. Files without one are named."""
     pages, page = _whole_files(), DOCS / f"{name}.md"
     file, text = page, source[0]
     if match := _WHOLE.match(text):
@@ -62,8 +62,10 @@ def _read(_: Sphinx, name: str, source: list[str]) -> None:
 
     def there(link: re.Match[str]) -> str:
         target = (file.parent / link[2]).resolve()
-        relative = os.path.relpath(pages.get(target, target), page.parent)
-        return f"{link[1]}{Path(relative).as_posix()}{link[3] or ''}{link[4]}"
+        target = pages.get(target, target)
+        if target.is_file() and not target.is_relative_to(DOCS):
+            return f"{link[1]} (`{target.relative_to(DOCS.parent).as_posix()}`)"
+        return f"[{link[1]}]({Path(os.path.relpath(target, page.parent)).as_posix()}{link[3] or ''})"
 
     source[0] = _LINK.sub(there, text)
 
