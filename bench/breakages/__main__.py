@@ -24,7 +24,8 @@ SCENES = (
     ("astyx", 20),
     ("astyx", 8),
 )
-_STEP_S = 0.1
+_STEP_S = 0.1  # between scans, or more
+_FASTEST_MPS = 55.0
 _NAMED, _UNTRIED = "named", "–"
 _GOOD = {name: (range(1, 8), (3, 5, 8, 15, 40)) for name in ("hugin", "oculii", "wall", "astyx")}
 """Seeds and numbers of scans of good recordings."""
@@ -34,7 +35,8 @@ def simulated(name: str, frames: int, seed: int = 0) -> Data:
     """A simulated scene, with Doppler of its poses and a tenth of the returns moving at 3 m/s."""
     scans = getattr(radarsdf.simulate, name)(seed=seed, frames=frames)
     rng = np.random.default_rng(seed)
-    times_s = _STEP_S * np.arange(frames, dtype=np.float64)
+    step_m = np.median(np.linalg.norm(np.diff(scans.poses[:, :3, 3], axis=0), axis=1))
+    times_s = max(_STEP_S, step_m / _FASTEST_MPS) * np.arange(frames, dtype=np.float64)
     doppler = []
     for scan, velocity_mps in zip(scans.points, velocity_of_poses(scans.poses, times_s), strict=True):
         away = scan / np.linalg.norm(scan, axis=1, keepdims=True)
