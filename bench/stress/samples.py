@@ -17,6 +17,7 @@ import radarsdf
 import torch
 import trimesh
 from radarsdf import FitConfig
+from radarsdf.budget.schedule import Schedule
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
@@ -69,7 +70,11 @@ def training() -> Training:
     keys = near_leaf_keys(rays, config, 1)
     field = Field(keys, config, with_intensity=True, num_threads=1)
     field.initialise(torch.Generator().manual_seed(0))
-    return Training(field, rays, rays, scale, config, Workers(1))
+    count = len(rays)
+    schedule = Schedule.of(
+        config, surface_returns=count, returns=count, vertices=field.cells.table.num_rows, with_intensity=True
+    )
+    return Training(field, rays, rays, scale, schedule, config, Workers(1))
 
 
 @functools.cache

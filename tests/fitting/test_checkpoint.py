@@ -223,8 +223,8 @@ class TestOtherFiles:
             ("done", torch.tensor([1.0, 0.0])),
             ("field.cells.features", torch.zeros(3, 8)),
             ("field.cells.features", None),
-            ("draws.surface.next", torch.tensor(2**40)),
-            ("draws.surface.next", torch.tensor(-7)),
+            ("draws.next", torch.tensor(2**40)),
+            ("draws.next", torch.tensor(-7)),
             ("rows.step_count", torch.tensor(-1)),
             ("backend.generator", torch.full((5056,), 255, dtype=torch.uint8)),
             ("backend.generator", torch.zeros(5, dtype=torch.uint8)),
@@ -285,7 +285,7 @@ def test_the_state_is_all_there_is(scene):
         "optimiser.intensity.memory",
         "optimiser.intensity.adam.mean",
         "backend.generator",
-        "draws.returns.next",
+        "draws.next",
     ):
         names = [k for k in first if k.startswith(part)]
         assert names

@@ -9,7 +9,7 @@ import json
 import time
 import warnings
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from safetensors import SafetensorError
 from safetensors.torch import save as to_bytes
@@ -23,14 +23,21 @@ from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors
 from radarsdf.returns.rays import Rays
 
-if TYPE_CHECKING:
-    from radarsdf.fitting.training import Training
-
 FORMAT = "radarsdf.checkpoint"
 _EVERY_S = 30.0  # seconds between two files, at least
 _NONE = object()  # where one of two configurations lacks a setting
 _SHARE = 0.02  # largest share of the time that is spent on writing
 _SETTINGS_NOT_COMPARED = ("num_threads", "max_memory_bytes")  # none of them changes the result
+
+
+class Resumable(Protocol):
+    """What can go on from a state: a training."""
+
+    def state(self) -> dict[str, Tensor]:
+        """All that the rest depends on."""
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restores what :meth:`state` of the same fit gave. Raises an exception if it is impossible."""
 
 
 class Checkpoint:
@@ -87,7 +94,7 @@ class Checkpoint:
         now_s = time.monotonic()
         self._next_s = now_s + max(_EVERY_S, (now_s - started_s) / _SHARE)
 
-    def resume(self, training: Training) -> None:
+    def resume(self, training: Resumable) -> None:
         """Sets a training to the state in the file. Does nothing if there is no file.
 
         Raises

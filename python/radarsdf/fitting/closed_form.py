@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,63 +20,45 @@ from radarsdf.returns.reflectance import Float32, Reflectance, Residuals
 from radarsdf.returns.surfels import Surfels
 
 
+@dataclass(frozen=True)
 class ClosedForm:
-    """Adds intensities in closed form to a map: before the training, or after it if they are what a network leaves.
+    """What intensities in closed form are found from."""
 
-    Parameters
-    ----------
-    rays : Rays
-        N returns that the map is learnt from, with ghosts. They are let go before the means of cells are found: of ten
-        million, they and what is made of them take half a gigabyte.
-    inside : (N',) bool, optional
-        Those of the returns of `surface` that `rays` are. None: all.
-    surface : SurfaceReturns
-        With their surfels.
-    config : FitConfig
-        Of the fit.
-    num_threads : int
-        Threads of the fit.
-    """
+    rays: Rays
+    """N returns that the map is learnt from, with ghosts. All have intensities, or none has."""
+    surfels: Surfels
+    """Of all returns."""
+    cell_of_ray: NDArray[np.int32]
+    """(N,) cells of the surfels."""
 
-    def __init__(
-        self,
-        rays: Rays,
-        inside: NDArray[np.bool_] | None,
-        surface: SurfaceReturns,
-        config: FitConfig,
-        num_threads: int,
-    ) -> None:
-        self._after_training = config.trains_intensity
-        self._num_threads = num_threads
-        self._returns: tuple[Rays, Surfels, NDArray[np.int32]] | None = None
-        if rays.intensities is not None and config.closes_intensity:
-            cells = surface.surfels.cells.cell_of_ray
-            cells = cells if inside is None else cells[inside]
-            known = rays.with_intensity
-            if known.any() and not known.all():  # a tile may have none: its returns then count as the lowest
-                rays, cells = rays.select(known), cells[known]
-            self._returns = rays, surface.surfels, cells
+    @classmethod
+    def of(
+        cls, rays: Rays, inside: NDArray[np.bool_] | None, surface: SurfaceReturns, config: FitConfig
+    ) -> ClosedForm | None:
+        """Of `rays`, those of the returns of `surface` that are `inside`, (N',). None: none are asked for or given."""
+        if rays.intensities is None or not config.closes_intensity:
+            return None
+        cells = surface.surfels.cells.cell_of_ray
+        cells = cells if inside is None else cells[inside]
+        known = rays.with_intensity
+        if known.any() and not known.all():  # a tile may have none: its returns then count as the lowest
+            rays, cells = rays.select(known), cells[known]
+        return cls(rays, surface.surfels, cells)
 
-    def added(self, contents: MapContents, *, trained: bool) -> MapContents:
-        """The contents of the map with intensities in closed form, if it is time for them."""
-        if self._returns is None or trained != self._after_training:
-            return contents
-        residuals = self._residuals(contents, *self._returns)
-        self._returns = None
-        return dataclasses.replace(contents, reflectance=Reflectance.of(residuals, self._num_threads))
-
-    def _residuals(
-        self, contents: MapContents, rays: Rays, surfels: Surfels, cell_of_ray: NDArray[np.int32]
-    ) -> Residuals:
+    def added_to(self, contents: MapContents, num_threads: int) -> MapContents:
+        """The contents of a map with intensities in closed form: all of them, or what its network leaves."""
         scale = contents.intensity_scale
         assert scale is not None
-        assert rays.intensities is not None
+        assert self.rays.intensities is not None
 
         def ask(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
             sensors = torch.from_numpy(points - directions * ranges_m[:, None])
             return scale.to_unit(queries.intensity(contents, torch.from_numpy(points), sensors).numpy())
 
-        unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False)
-        network = ask if self._after_training else None
+        unit = np.nan_to_num(scale.to_unit(self.rays.intensities), copy=False)
+        network = ask if contents.config.trains_intensity else None
         leaf_size_m = contents.config.leaf_size_m
-        return Residuals.of(rays, unit, surfels, leaf_size_m, self._num_threads, network, cell_of_ray)
+        residuals = Residuals.of(
+            self.rays, unit, self.surfels, leaf_size_m, num_threads, network, self.cell_of_ray
+        )
+        return dataclasses.replace(contents, reflectance=Reflectance.of(residuals, num_threads))

@@ -12,13 +12,11 @@ from numpy.typing import ArrayLike
 from radarsdf.checks import instance
 from radarsdf.config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
-from radarsdf.fitting.steps import Clock, FitInput, fit_rays
-from radarsdf.fitting.stopping import Interrupted
+from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.sequence import Scans
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.sensor import Sensor
 
 
 def fit(
@@ -98,20 +96,17 @@ def fit(
     True
     """
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    clock = Clock()
-    try:
-        points, poses, intensities, doppler_mps = _given(points, poses, intensities, doppler_mps)
-        standing = Standing.of(points, intensities, doppler_mps, config.returns)
-        rays = prepare(standing.points, poses, standing.intensities, origin=origin, **config.preparation)
+
+    def read() -> FitInput:
+        scans, poses_, intensities_, doppler_mps_ = _given(points, poses, intensities, doppler_mps)
+        standing = Standing.of(scans, intensities_, doppler_mps_, config.returns)
+        rays = prepare(standing.points, poses_, standing.intensities, origin=origin, **config.preparation)
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
             scale = IntensityScale.between(intensity_range)
-        given = FitInput(rays, scale, lambda rays, noise: Sensor.of_rays(rays, poses, noise))
-        given.movers, given.why_no_movers = standing.movers, standing.why_none
-        del rays  # the fit lets go of them when it has no more use for them
-    except KeyboardInterrupt as interruption:
-        raise Interrupted(None) from interruption
-    return fit_rays(given, config, progress=progress, checkpoint=checkpoint, clock=clock)
+        return FitInput(rays, scale, poses_, standing.movers, standing.why_none)
+
+    return fit_rays(read, config, progress=progress, checkpoint=checkpoint)
 
 
 def _given(

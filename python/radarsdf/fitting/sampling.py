@@ -144,22 +144,12 @@ class RaySampler:
         self._layouts: dict[int, _Layout] = {}
 
     def state(self) -> dict[str, Tensor]:
-        """The order of the rays, as a state of the generator, and the position in it."""
-        if len(self._order) == 0:
-            return self.state_at_start(self._generator)
-        following = torch.tensor(self._next, dtype=torch.int64, device="cpu")
-        return {"order_from": self._order_from, "next": following}
-
-    @staticmethod
-    def state_at_start(generator: torch.Generator) -> dict[str, Tensor]:
-        """:meth:`state` of a sampler that has drawn nothing."""
-        following = torch.tensor(-1, dtype=torch.int64, device="cpu")
-        return {"order_from": torch.zeros_like(generator.get_state()), "next": following}
-
-    @staticmethod
-    def has_begun(state: dict[str, Tensor]) -> bool:
-        """Whether a sampler with this :meth:`state` has drawn."""
-        return int(state["next"]) >= 0
+        """The order of the rays, as a state of the generator, and the position in it: -1 before the first batch."""
+        following = self._next if len(self._order) else -1
+        return {
+            "order_from": self._order_from,
+            "next": torch.tensor(following, dtype=torch.int64, device="cpu"),
+        }
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restores what :meth:`state` of a sampler of the same rays gave. Changes the generator's state."""
@@ -167,7 +157,7 @@ class RaySampler:
         if not -1 <= following <= len(self._rays):
             msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"
             raise ValueError(msg)
-        if self.has_begun(state):
+        if following >= 0:
             self._generator.set_state(state["order_from"])
             self._draw_order()
             self._next = following

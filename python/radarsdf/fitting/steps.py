@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.budget.estimate import check_fit
 from radarsdf.budget.extent import check_extent
+from radarsdf.budget.schedule import Schedule
 from radarsdf.config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
@@ -31,22 +32,21 @@ from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
-from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sensor import Sensor
 from radarsdf.threads import Workers
 
 
-@dataclass
+@dataclass(frozen=True)
 class FitInput:
     """What a fit starts from."""
 
-    rays: Rays | None
-    """All rays, scan by scan. A fit takes them away, so that they are in memory no longer than it needs them."""
+    rays: Rays
+    """All rays, scan by scan."""
     scale: IntensityScale | None
     """Of their intensities."""
-    sensor_of: Callable[[Rays, SensorNoise], Sensor]
-    """The radar, once its noise is known."""
+    poses: ArrayLike | None = None
+    """(F, 4, 4) T_world_sensor of the scans. Only asked if there is no `sensor`."""
     movers: int = 0
     """Number of returns that were left out because they move."""
     why_no_movers: str | None = None
@@ -56,97 +56,166 @@ class FitInput:
     all."""
     rough_share: float | None = None
     """Share of the returns that lie on no thin surface. None: of these returns."""
+    sensor: Sensor | None = None
+    """The radar. None: as these rays and poses show it."""
 
 
 def fit_rays(
-    given: FitInput,
+    read: Callable[[], FitInput],
     config: FitConfig,
     *,
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
-    clock: Clock | None = None,
 ) -> RadarMap:
-    """Fits a map. See :func:`radarsdf.fit`, also for errors; `clock` has counted the time since the beginning."""
-    clock = Clock() if clock is None else clock
-    rays, inside, given.rays = given.rays, given.inside, None
-    assert rays is not None
-    radar_map = None
+    """Fits a map to what `read` gives. See :func:`radarsdf.fit`, also for errors.
+
+    `read` is called here, so that nobody else holds the rays: they are let go before the training.
+    """
+    clock = Clock()
     try:
-        check_extent(rays, config)
-        check_fit(rays, config, inside)
-        saved = None if checkpoint is None else Checkpoint(checkpoint, rays, given.scale, config)
-        clock.lap("prepare_s")
         # A map that is made in inference mode could not give gradients later.
         with torch.inference_mode(mode=False), Workers(config.num_threads) as workers:
-            surface = SurfaceReturns.of(rays, config, workers.num_threads, inside)
-            learnt = rays if inside is None else rays.select(inside)
-            clock.lap("ghosts_s")
-            start = STARTS[config.training.start](surface, config, workers.num_threads)
-            returns = start.returns_of_cells()
-            field = _open_cells(start.leaf_keys(), returns, learnt, config, workers.num_threads)
-            clock.lap("occupied_cells_s")
-            _initialise(field, start, config)
-            evidence = Evidence.of(
-                returns,
-                rays,
-                field.cells.table.leaf_keys(),
-                config.leaf_size_m,
-                workers.num_threads,
-            )
-            clock.lap("start_s")
-            rough_share = surface.surfels.rough_share() if given.rough_share is None else given.rough_share
-            noise, kept, origin, scale = surface.noise, surface.rays, rays.origin, given.scale
-            sensor = given.sensor_of(rays, noise)
-            closed_form = ClosedForm(learnt, inside, surface, config, workers.num_threads)
-            counts = {
-                "scans": len(rays.up_of_scan),
-                "returns": rays.num_given + given.movers,
-                "returns_used": len(kept),
-                "ghosts": len(learnt) - len(kept),
-                "movers": given.movers,
-                "wild_intensities": 0
-                if learnt.intensities is None
-                else len(learnt) - int(learnt.with_intensity.sum()),
-                "noise": dataclasses.asdict(noise),
-            }
-            # Of many returns, gigabytes that nobody needs any more: the training has its own copy of the rays.
-            del surface, start, returns, rays
-            training = Training(
-                field, kept, learnt, scale if config.trains_intensity else None, config, workers
-            )
-            del learnt, kept
-            history = training.history
-            if saved is not None:
-                saved.resume(training)
-            # The map is made before the training, which changes its field: Interrupted and Diverged can hand
-            # it over.
-            contents = MapContents(
-                field=field,
-                origin=origin,
-                intensity_scale=scale,
-                reflectance=None,
-                config=config,
-                evidence=evidence,
-                rough_share=rough_share,
-                sensor=sensor,
-                report=counts | _report(config, field, training, counts, given, workers.num_threads),
-            )
-            contents = closed_form.added(contents, trained=False)
-            radar_map = RadarMap(contents)
-            training.run(progress, saved)
-            del training  # its copy of the rays takes 32 bytes a return
-            radar_map = RadarMap(closed_form.added(contents, trained=True))
+            trained = _train(read, config, progress, checkpoint, clock, workers)
+            contents = trained.contents
+            if trained.closed_form is not None:
+                contents = trained.closed_form.added_to(contents, workers.num_threads)
     except KeyboardInterrupt as interruption:
-        raise Interrupted(radar_map) from interruption
-    except Diverged as error:
-        error.radar_map = radar_map
-        raise
-    finally:
-        if radar_map is not None:
-            clock.lap("training_s")
-            radar_map.report.update(clock.laps, loss_history=history.to_report())
-            radar_map.field.requires_grad_(False)
+        raise Interrupted(None) from interruption
+    clock.lap("training_s")
+    contents.report.update(clock.laps)
+    contents.field.requires_grad_(False)
+    radar_map = RadarMap(contents)
+    if isinstance(trained.stop, Diverged):
+        trained.stop.radar_map = radar_map
+        raise trained.stop
+    if trained.stop is not None:
+        raise Interrupted(radar_map) from trained.stop
     return radar_map
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is known without training, and what the training learns the rest from."""
+
+    contents: MapContents
+    """The map, with the field that the training starts from."""
+    closed_form: ClosedForm | None
+    """What intensities in closed form are found from."""
+    surface: Rays
+    """Returns that the surface is learnt from."""
+    returns: Rays
+    """Returns that intensities are learnt from: ghosts too."""
+    schedule: Schedule
+    """Of the training."""
+    checkpoint: Checkpoint | None
+    """Of the training."""
+
+
+@dataclass(frozen=True)
+class _Trained:
+    """What is left of a training."""
+
+    contents: MapContents
+    """The map, but for intensities in closed form."""
+    closed_form: ClosedForm | None
+    """What they are found from."""
+    stop: KeyboardInterrupt | Diverged | None
+    """Why it ended early."""
+
+
+def _train(
+    read: Callable[[], FitInput],
+    config: FitConfig,
+    progress: bool | None,
+    checkpoint: str | PathLike[str] | None,
+    clock: Clock,
+    workers: Workers,
+) -> _Trained:
+    """All but intensities in closed form. The training has a copy of its rays, 32 bytes a return, which is let go here."""
+    contents, closed_form, training, saved = _begin(read, config, checkpoint, clock, workers)
+    stop: KeyboardInterrupt | Diverged | None = None
+    try:
+        training.run(progress, saved)
+    except (KeyboardInterrupt, Diverged) as early:
+        stop = early
+    contents.report.update(training.report())
+    return _Trained(contents, closed_form, stop)
+
+
+def _begin(
+    read: Callable[[], FitInput],
+    config: FitConfig,
+    checkpoint: str | PathLike[str] | None,
+    clock: Clock,
+    workers: Workers,
+) -> tuple[MapContents, ClosedForm | None, Training, Checkpoint | None]:
+    """All before the first iteration. The rays that the training has a copy of are let go here."""
+    known = _learn_directly(read, config, checkpoint, clock, workers.num_threads)
+    training = Training(
+        known.contents.field,
+        known.surface,
+        known.returns,
+        known.contents.intensity_scale if config.trains_intensity else None,
+        known.schedule,
+        config,
+        workers,
+    )
+    if known.checkpoint is not None:
+        known.checkpoint.resume(training)
+    return known.contents, known.closed_form, training, known.checkpoint
+
+
+def _learn_directly(
+    read: Callable[[], FitInput],
+    config: FitConfig,
+    checkpoint: str | PathLike[str] | None,
+    clock: Clock,
+    num_threads: int,
+) -> _Known:
+    """What the returns tell without training: noise, ghosts, cells, the field at first, evidence, and the radar."""
+    given = read()
+    rays, inside, scale = given.rays, given.inside, given.scale
+    check_extent(rays, config)
+    check_fit(rays, config, inside)
+    saved = None if checkpoint is None else Checkpoint(checkpoint, rays, scale, config)
+    clock.lap("prepare_s")
+    surface = SurfaceReturns.of(rays, config, num_threads, inside)
+    learnt = rays if inside is None else rays.select(inside)
+    clock.lap("ghosts_s")
+    start = STARTS[config.training.start](surface, config, num_threads)
+    returns = start.returns_of_cells()
+    field = _open_cells(start.leaf_keys(), returns, learnt, config, num_threads)
+    leaf_keys = field.cells.table.leaf_keys()
+    clock.lap("occupied_cells_s")
+    _initialise(field, start, config)
+    evidence = Evidence.of(returns, rays, leaf_keys, config.leaf_size_m, num_threads)
+    clock.lap("start_s")
+    schedule = Schedule.of(
+        config,
+        surface_returns=len(surface.rays),
+        returns=len(learnt),
+        vertices=field.cells.table.num_rows,
+        with_intensity=scale is not None and config.trains_intensity,
+    )
+    sensor, rough_share = given.sensor, given.rough_share
+    if sensor is None:
+        assert given.poses is not None
+        sensor = Sensor.of_rays(rays, given.poses, surface.noise)
+    if rough_share is None:
+        rough_share = surface.surfels.rough_share()
+    contents = MapContents(
+        field=field,
+        origin=rays.origin,
+        intensity_scale=scale,
+        reflectance=None,
+        config=config,
+        evidence=evidence,
+        rough_share=rough_share,
+        sensor=sensor,
+        report=_report(given, learnt, surface, field, schedule, config, num_threads),
+    )
+    closed_form = ClosedForm.of(learnt, inside, surface, config)
+    return _Known(contents, closed_form, surface.rays, learnt, schedule, saved)
 
 
 def _open_cells(
@@ -168,32 +237,39 @@ def _initialise(field: Field, start: Start, config: FitConfig) -> None:
 
 
 def _report(
-    config: FitConfig,
-    field: Field,
-    training: Training,
-    counts: dict[str, Any],
     given: FitInput,
-    threads: int,
+    learnt: Rays,
+    surface: SurfaceReturns,
+    field: Field,
+    schedule: Schedule,
+    config: FitConfig,
+    num_threads: int,
 ) -> dict[str, Any]:
-    """What the map's report says of cells and training. The training goes on to fill what counts it."""
+    """What the map's report says before the training."""
+    cells = field.cells.table
     skipped = skipped_parts(
         config,
-        training.schedule,
-        returns=counts["returns_used"] + counts["ghosts"],
-        cells=len(field.cells.table.leaf_keys()),
-        rows=field.cells.table.num_rows,
+        schedule,
+        returns=len(learnt),
+        cells=len(cells.leaf_keys()),
+        rows=cells.num_rows,
         with_intensity=field.intensity_network is not None,
-        threads=threads,
+        threads=num_threads,
         closed_form=given.scale is not None and not config.trains_intensity,
     )
     if given.why_no_movers is not None:
         skipped.insert(0, Skipped(f"leaving out what moves: {given.why_no_movers}", None))
+    wild = 0 if learnt.intensities is None else len(learnt) - int(learnt.with_intensity.sum())
     return {
-        "leaf_cells": len(field.cells.table.leaf_keys()),
-        "vertices": field.cells.table.num_rows,
-        "iterations": training.iterations,
-        "iterations_done": training.iterations_done,
-        "losses": training.losses,
+        "scans": len(given.rays.up_of_scan),
+        "returns": given.rays.num_given + given.movers,
+        "returns_used": len(surface.rays),
+        "ghosts": len(learnt) - len(surface.rays),
+        "movers": given.movers,
+        "wild_intensities": wild,
+        "noise": dataclasses.asdict(surface.noise),
+        "leaf_cells": len(cells.leaf_keys()),
+        "vertices": cells.num_rows,
         "skipped": [part.words for part in skipped],
         "skipped_s": [part.seconds for part in skipped],
     }

@@ -38,85 +38,42 @@ _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would
 
 
 class _Draws:
-    """Draws the batches of both stages."""
+    """Draws the batches of both stages: first from the `surface`, then from all `returns` if those are others.
+
+    Ghosts are not part of the surface, but the sensor will see them again, so their intensities are learnt. A sampler has
+    its own copy of the rays: there is one at a time.
+    """
 
     def __init__(
         self,
         surface: Rays,
-        returns: Rays,
-        scale: IntensityScale | None,
-        config: FitConfig,
-        schedule: Schedule,
-        num_parts: Callable[[int], int],
-        num_threads: int,
+        returns: Rays | None,
+        sampler: Callable[[Rays, torch.Generator], RaySampler],
+        generator: torch.Generator,
     ) -> None:
-        self._config = config
-        self._schedule = schedule
-        self._num_parts = num_parts
-        self._generator = torch.Generator("cpu").manual_seed(config.seed * _GENERATORS)
+        self._generator = generator
+        self._returns = returns
+        """None: those of the surface, or all already."""
+        self._make = sampler
+        self.sampler = sampler(surface, generator)
 
-        def sampler(rays: Rays) -> RaySampler:
-            unit = None
-            if scale is not None and rays.intensities is not None:
-                unit = torch.from_numpy(scale.to_unit(rays.intensities))
-            return RaySampler(
-                rays,
-                config,
-                schedule.batch_size,
-                self._generator,
-                schedule.neighbours,
-                unit,
-                num_threads,
-            )
-
-        self._sampler = sampler(surface)
-        self._left: dict[str, Tensor] | None = None
-        """State of the surface's sampler, once that of the returns has taken its place."""
-        # Ghosts are not part of the surface, but the sensor will see them again, so their intensities are
-        # learnt. Each sampler has its own copy of the rays: there is one at a time.
-        self._sampler_of_returns: Callable[[], RaySampler] | None = None
-        if returns is not surface and scale is not None:
-            self._sampler_of_returns = functools.partial(sampler, returns)
+    def turn_to_returns(self) -> None:
+        """Draw from all returns from now on."""
+        if self._returns is not None:
+            del self.sampler
+            self.sampler, self._returns = self._make(self._returns, self._generator), None
 
     def state(self) -> dict[str, Tensor]:
         """All that the next batches depend on."""
-        states = {"surface": self._sampler.state()}
-        if self._left is not None:
-            states = {"surface": self._left, "returns": states["surface"]}
-        elif self._sampler_of_returns is not None:
-            states["returns"] = RaySampler.state_at_start(self._generator)
-        state = {f"{name}.{k}": v for name, own in states.items() for k, v in own.items()}
-        return state | {"generator": self._generator.get_state()}
+        turned = torch.tensor(self._returns is None, dtype=torch.int64, device="cpu")
+        return self.sampler.state() | {"turned": turned, "generator": self._generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        returns = _part(state, "returns")
-        if returns and RaySampler.has_begun(returns):
-            self._turn_to_returns()
-            self._left = _part(state, "surface")
-            self._sampler.restore(returns)
-        else:
-            self._sampler.restore(_part(state, "surface"))
+        """Restore what :meth:`state` of the same fit gave."""
+        if state["turned"]:
+            self.turn_to_returns()
+        self.sampler.restore(state)
         self._generator.set_state(state["generator"])  # last, because the sampler changes it
-
-    def _turn_to_returns(self) -> None:
-        """Draws from the returns from now on, ghosts included."""
-        if self._sampler_of_returns is None:
-            return
-        self._left = self._sampler.state()
-        del self._sampler
-        self._sampler, self._sampler_of_returns = self._sampler_of_returns(), None
-
-    def of_surface(self) -> Batch:
-        """A batch of the sdf stage."""
-        return self._sampler.batch(self._num_parts(self._schedule.batch_size))
-
-    def of_returns(self) -> Batch:
-        """A batch of the intensity stage, after the last one of the sdf stage."""
-        self._turn_to_returns()
-        if self._config.training.intensity_in_free_space:
-            return self._sampler.batch(self._num_parts(self._schedule.batch_size))
-        count = self._schedule.intensity_batch_size
-        return self._sampler.spread(count, self._num_parts(count))
 
 
 @dataclass(frozen=True)
@@ -164,26 +121,29 @@ class Training:
         surface: Rays,
         returns: Rays,
         scale: IntensityScale | None,
+        schedule: Schedule,
         config: FitConfig,
         workers: Workers,
     ) -> None:
         self._field = field
+        self._schedule = schedule
         self._config = config
         self._workers = workers
-        schedule = Schedule.of(
-            config,
-            surface_returns=len(surface),
-            returns=len(returns),
-            vertices=field.cells.table.num_rows,
-            with_intensity=scale is not None,
-        )
-        self.schedule = schedule
         self.iterations = schedule.iterations
-        self._draws: _Draws | None = None  # not made without iterations, because it sorts the returns
         self._backend = _backend(field, config, schedule, workers)
+        self._draws: _Draws | None = None  # not made without iterations, because it sorts the returns
         if any(self.iterations.values()):
-            num_parts, num_threads = self._backend.num_parts, workers.num_threads
-            self._draws = _Draws(surface, returns, scale, config, schedule, num_parts, num_threads)
+
+            def sampler(rays: Rays, generator: torch.Generator) -> RaySampler:
+                unit = None
+                if scale is not None and rays.intensities is not None:
+                    unit = torch.from_numpy(scale.to_unit(rays.intensities))
+                size, neighbours = schedule.batch_size, schedule.neighbours
+                return RaySampler(rays, config, size, generator, neighbours, unit, workers.num_threads)
+
+            others = None if returns is surface or scale is None else returns
+            generator = torch.Generator("cpu").manual_seed(config.seed * _GENERATORS)
+            self._draws = _Draws(surface, others, sampler, generator)
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         self.history = LossHistory(self.iterations)
@@ -240,6 +200,15 @@ class Training:
             self._draws.restore(_part(state, "draws"))
         self._backend.restore(_part(state, "backend"))
 
+    def report(self) -> dict[str, Any]:
+        """What the map's report says of the training."""
+        return {
+            "iterations": self.iterations,
+            "iterations_done": self.iterations_done,
+            "losses": self.losses,
+            "loss_history": self.history.to_report(),
+        }
+
     def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
         """Runs all iterations that are left.
 
@@ -278,8 +247,6 @@ class Training:
     def _stages(self) -> list[_Stage]:
         """The sdf stage, then the intensity stage, as far as they have iterations."""
         stages: list[_Stage] = []
-        if self._draws is None:
-            return stages
         sdf_iterations, intensity_iterations = self.iterations["sdf"], self.iterations["intensity"]
         of_surface = [o for name, o in self._optimisers.items() if name != "intensity"]
         of_intensity = [o for name, o in self._optimisers.items() if name == "intensity"]
@@ -293,7 +260,7 @@ class Training:
                     counts=("sdf", "intensity") if joint else ("sdf",),
                     optimisers=of_surface + of_intensity if joint else of_surface,
                     rows=self._rows,
-                    draw=self._draws.of_surface,
+                    draw=self._batch,
                     gradients_of=self._backend.joint if joint else self._backend.sdf,
                 )
             )
@@ -306,11 +273,25 @@ class Training:
                     counts=("intensity",),
                     optimisers=of_intensity,
                     rows=None,
-                    draw=self._draws.of_returns,
+                    draw=self._labelled_batch,
                     gradients_of=self._backend.intensity,
                 )
             )
         return stages
+
+    def _batch(self) -> Batch:
+        """A batch of the sdf stage."""
+        assert self._draws is not None
+        return self._draws.sampler.batch(self._backend.num_parts(self._schedule.batch_size))
+
+    def _labelled_batch(self) -> Batch:
+        """A batch of the intensity stage, after the last one of the sdf stage."""
+        assert self._draws is not None
+        self._draws.turn_to_returns()
+        if self._config.training.intensity_in_free_space:
+            return self._batch()
+        count = self._schedule.intensity_batch_size
+        return self._draws.sampler.spread(count, self._backend.num_parts(count))
 
     def _done(self, stage: _Stage) -> int:
         """Iterations of this stage that are done, without joint ones of an earlier stage."""

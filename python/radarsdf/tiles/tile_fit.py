@@ -59,16 +59,11 @@ def fit_tile(folder: str, name: str, run: str = "") -> str:
 
 
 def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
-    rays, inside = read_rays(root, plan, tile)
-    given = FitInput(
-        rays=rays,
-        scale=plan.scale,
-        sensor_of=lambda *_: plan.sensor,
-        inside=inside,
-        rough_share=plan.rough_share,
-    )
-    del rays  # the fit lets go of them when it has no more use for them
-    radar_map = fit_rays(given, plan.config, progress=False)
+    def read() -> FitInput:
+        rays, inside = read_rays(root, plan, tile)
+        return FitInput(rays, plan.scale, inside=inside, rough_share=plan.rough_share, sensor=plan.sensor)
+
+    radar_map = fit_rays(read, plan.config, progress=False)
     radar_map.report["plan"] = plan.digest
     radar_map.save(map_path(root, tile))
 
