@@ -16,7 +16,7 @@ import pytest
 import radarsdf
 import trimesh
 from radarsdf import FitConfig
-from radarsdf.io.scans import Scans, write_scans
+from radarsdf.io.npz import Scans, write_scans
 
 SOURCES = str(Path(radarsdf.__file__).parents[1])  # the commands run in another folder
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX")

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from radarsdf.evaluation import holdout
-from radarsdf.io.folders import is_posed_folder, read_posed_folder
-from radarsdf.io.scans import Scans, read_scans
-from radarsdf.io.snail_radar import is_snail_radar, read_snail_radar
+from radarsdf.io.datasets.folders import is_posed_folder, read_posed_folder
+from radarsdf.io.datasets.snail_radar import is_snail_radar, read_snail_radar
+from radarsdf.io.npz import Scans, read_scans
 from radarsdf.returns.rays import prepare
 from radarsdf.simulate import SCENES, Simulation
 from scipy.spatial import cKDTree
@@ -116,10 +116,10 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
         One of
 
         - the name of a simulated scene in `radarsdf.simulate.SCENES`;
-        - an ``.npz`` file for :func:`radarsdf.io.scans.read_scans`. Only lidar points within 1 m of a return that is
+        - an ``.npz`` file for :func:`radarsdf.io.npz.read_scans`. Only lidar points within 1 m of a return that is
           2.5 to 60 m from its sensor are ground truth;
-        - a folder for :func:`radarsdf.io.folders.read_posed_folder`, such as a recording of Viking Hill;
-        - a sequence of SNAIL-Radar for :func:`radarsdf.io.snail_radar.read_snail_radar`.
+        - a folder for :func:`radarsdf.io.datasets.folders.read_posed_folder`, such as a recording of Viking Hill;
+        - a sequence of SNAIL-Radar for :func:`radarsdf.io.datasets.snail_radar.read_snail_radar`.
 
         All lidar points of a folder are ground truth. Use `box` to select a part.
     frames : int, optional

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import radarsdf
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.io.folders import read_posed_folder
+from radarsdf.io.clouds.pcd import read_pcd
+from radarsdf.io.datasets.folders import read_posed_folder
 from radarsdf.io.ground_truth import read_ground_truth
 from radarsdf.io.meshes import read_mesh
-from radarsdf.io.pcd import read_pcd
-from radarsdf.io.scans import read_scans
-from radarsdf.io.trajectory import read_trajectory
+from radarsdf.io.npz import read_scans
+from radarsdf.io.poses.trajectory import read_trajectory
 from tqdm import tqdm
 
 from bench.paper.report import markdown

@@ -17,8 +17,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from radarsdf.io import read
-from radarsdf.io.poses import read_poses
-from radarsdf.io.sequence import Notes
+from radarsdf.io.poses.reading import read_poses
+from radarsdf.io.scans import Notes
 
 from bench.reading.bag_writing import BagWriter
 

@@ -14,7 +14,7 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.budget import estimate as budget
 from radarsdf.cli import main
-from radarsdf.io.scans import Scans, write_scans
+from radarsdf.io.npz import Scans, write_scans
 from radarsdf.returns.rays import prepare
 
 from bench.growth.street import street

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.io.scans import Scans, write_scans
+from radarsdf.io.npz import Scans, write_scans
 
 from .calls import FAST, call
 

@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.io.scans import Scans, write_scans
+from radarsdf.io.npz import Scans, write_scans
 
 from .calls import FAST, call, refusal
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 import trimesh
-from radarsdf.io.scans import Scans, read_scans, write_scans
+from radarsdf.io.npz import Scans, read_scans, write_scans
 
 from .calls import call, refusal, values
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf.evaluation import KNNIntensity
-from radarsdf.io.cloud_writers import write_cloud
+from radarsdf.io.clouds.writing import write_cloud
 from radarsdf.io.ground_truth import read_ground_truth
-from radarsdf.io.scans import Scans, read_scans, write_scans
+from radarsdf.io.npz import Scans, read_scans, write_scans
 
 from .calls import call, refusal, values
 

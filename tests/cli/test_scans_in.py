@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.io.scans import read_scans
+from radarsdf.io.npz import read_scans
 from scipy.spatial.transform import Rotation
 
 from .calls import FAST, call, refusal

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 import trimesh
-from radarsdf.io.scans import read_scans
+from radarsdf.io.npz import read_scans
 
 from .calls import call, refusal, values
 

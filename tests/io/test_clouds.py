@@ -12,9 +12,9 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read, read_points
-from radarsdf.io.clouds import read_columns
-from radarsdf.io.lzf import unpack_lzf
-from radarsdf.io.pcd import read_pcd
+from radarsdf.io.clouds.lzf import unpack_lzf
+from radarsdf.io.clouds.pcd import read_pcd
+from radarsdf.io.clouds.reading import read_columns
 
 from .test_folders import write_pcd
 

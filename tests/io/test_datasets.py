@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.datasets import DATASETS, find
-from radarsdf.io.snail_radar import read_snail_radar
+from radarsdf.io.datasets.published import DATASETS, find
+from radarsdf.io.datasets.snail_radar import read_snail_radar
 from scipy.spatial.transform import Rotation
 
 from ..conftest import pose

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.fields import DIALECTS, Fields
+from radarsdf.io.clouds.fields import DIALECTS, Fields
 
 from .test_folders import write_pcd
 

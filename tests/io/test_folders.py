@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
-from radarsdf.io.folders import read_posed_folder
-from radarsdf.io.pcd import read_pcd
-from radarsdf.io.snail_radar import read_snail_radar
+from radarsdf.io.clouds.pcd import read_pcd
+from radarsdf.io.datasets.folders import read_posed_folder
+from radarsdf.io.datasets.snail_radar import read_snail_radar
 
 from bench.paper.scenes import load_scene
 

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
-from radarsdf.io.scans import read_scans
+from radarsdf.io.npz import read_scans
 
 from bench.stress import files, samples
 from bench.stress.mutations import boundaries

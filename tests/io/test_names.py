@@ -12,10 +12,10 @@ import pytest
 import radarsdf
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.io import read
-from radarsdf.io.cloud_writers import write_cloud
+from radarsdf.io.clouds.writing import write_cloud
 from radarsdf.io.files import in_utf8
 from radarsdf.io.meshes import read_mesh
-from radarsdf.io.sequence import Scans
+from radarsdf.io.scans import Scans
 
 from bench.stress import readers, samples
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from radarsdf.io.poses import TransformChain, poses_of, read_poses
-from radarsdf.io.sequence import Notes
-from radarsdf.io.trajectory import Trajectory
+from radarsdf.io.poses.reading import TransformChain, poses_of, read_poses
+from radarsdf.io.poses.trajectory import Trajectory
+from radarsdf.io.scans import Notes
 from scipy.spatial.transform import Rotation
 
 from ..conftest import pose

@@ -10,7 +10,7 @@ import radarsdf
 import trimesh
 from radarsdf import FitConfig
 from radarsdf.evaluation import KNNIntensity, holdout, intensity_metrics, surface_metrics
-from radarsdf.io.scans import read_scans
+from radarsdf.io.npz import read_scans
 from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 

@@ -16,7 +16,7 @@ from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
 from radarsdf.checks import instance
 from radarsdf.config import FitConfig
-from radarsdf.io.sequence import Scans
+from radarsdf.io.scans import Scans
 
 
 def check(

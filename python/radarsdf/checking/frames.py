@@ -14,7 +14,7 @@ from radarsdf.checking.agreement import LAGS, MIN_RETURNS, Agreement, Comparison
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.hypotheses import Hypothesis, hypotheses, standing_still
 from radarsdf.checking.recording import FloatArray, Recording
-from radarsdf.io.trajectory import Trajectory
+from radarsdf.io.poses.trajectory import Trajectory
 
 # A hypothesis is right if the scans agree better by this: of the mean logarithm of distances, and of its standard
 # error. Of a hundred wrong ones, with good data of twelve simulated scenes and six real drives, none reached a gain

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from radarsdf import Finding, FitConfig
-    from radarsdf.io.sequence import Scans
+    from radarsdf.io.scans import Scans
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from radarsdf.cli.results import Results, counted
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
 
 if TYPE_CHECKING:
-    from radarsdf.io.sequence import Scans
+    from radarsdf.io.scans import Scans
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,10 +55,10 @@ def _convert_mesh(options: argparse.Namespace, results: Results) -> None:
 
 
 def _convert_scans(options: argparse.Namespace, results: Results) -> None:
-    from radarsdf.io.cloud_writers import check_cloud_path, write_cloud
-    from radarsdf.io.clouds import CLOUD_SUFFIXES
+    from radarsdf.io.clouds.reading import CLOUD_SUFFIXES
+    from radarsdf.io.clouds.writing import check_cloud_path, write_cloud
+    from radarsdf.io.npz import write_scans
     from radarsdf.io.origin import origin_path
-    from radarsdf.io.scans import write_scans
 
     suffix = options.out.suffix.lower()
     if suffix != ".npz":

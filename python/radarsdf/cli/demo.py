@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from radarsdf import RadarMap
-    from radarsdf.io.scans import Scans
+    from radarsdf.io.npz import Scans
 
 SCENES = ("hugin", "oculii", "wall", "astyx")
 """The names in `radarsdf.simulate.SCENES`, which is not imported for a help text."""
@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.evaluation import holdout
     from radarsdf.io.files import check_outputs
     from radarsdf.io.meshes import write_mesh
-    from radarsdf.io.scans import Scans, write_scans
+    from radarsdf.io.npz import Scans, write_scans
     from radarsdf.render.picture import save_picture
 
     options.out.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from radarsdf.cli.results import Results
 from radarsdf.cli.scans_in import SCANS, add_poses, scans_of
 
 if TYPE_CHECKING:
-    from radarsdf.io.sequence import Scans
+    from radarsdf.io.scans import Scans
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,8 +84,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _scans(options: argparse.Namespace) -> Scans | None:
     """The scans, if the truth is not a file of points or a surface."""
-    from radarsdf.io.bags import is_bag
-    from radarsdf.io.scans import holds_scans
+    from radarsdf.io.bags.reading import is_bag
+    from radarsdf.io.npz import holds_scans
 
     path = options.scans
     if path.is_dir() or is_bag(path) or options.poses is not None:

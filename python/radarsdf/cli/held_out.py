@@ -12,7 +12,7 @@ from radarsdf.tiles.any_map import AnyMap, predicted
 
 if TYPE_CHECKING:
     from radarsdf.cli.results import Results
-    from radarsdf.io.scans import Scans
+    from radarsdf.io.npz import Scans
 
 
 def add_intensity_errors(results: Results, radar_map: AnyMap, test: Scans, train: Scans) -> None:

@@ -59,9 +59,9 @@ def run(options: argparse.Namespace) -> None:
     import numpy as np
 
     from radarsdf.budget.estimate import check_views
-    from radarsdf.io.cloud_writers import write_cloud
+    from radarsdf.io.clouds.writing import write_cloud
     from radarsdf.io.files import check_outputs
-    from radarsdf.io.scans import write_scans
+    from radarsdf.io.npz import write_scans
     from radarsdf.map.views import scans_of
     from radarsdf.render.view_picture import save_view_picture
 
@@ -146,9 +146,9 @@ def _rotation(quaternion: list[float]) -> Any:
 
 
 def _poses_of_file(path: Path) -> NDArray[np.float64]:
-    from radarsdf.io.poses import read_poses
-    from radarsdf.io.sequence import Notes
-    from radarsdf.io.trajectory import Trajectory
+    from radarsdf.io.poses.reading import read_poses
+    from radarsdf.io.poses.trajectory import Trajectory
+    from radarsdf.io.scans import Notes
 
     found = read_poses(path, Notes(str(path)))
     if isinstance(found, Trajectory):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from radarsdf.io.sequence import Scans
+    from radarsdf.io.scans import Scans
 
 
 SCANS = ".npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"
@@ -61,8 +61,8 @@ def inputs_of(options: argparse.Namespace) -> list[Path]:
 
 def scans_of(options: argparse.Namespace) -> Scans:
     """The scans of the command. What was assumed or left out is said on standard error."""
+    from radarsdf.io.poses.trajectory import read_table
     from radarsdf.io.read import read
-    from radarsdf.io.trajectory import read_table
 
     extrinsic = None
     if options.extrinsic is not None:

@@ -13,7 +13,7 @@ from radarsdf.checks import instance
 from radarsdf.config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.steps import FitInput, fit_rays
-from radarsdf.io.sequence import Scans
+from radarsdf.io.scans import Scans
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import prepare

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: MIT
 """Reads and writes files of scans, poses, point clouds and meshes. Imports only `checks`, `interrupts` and `_core` of this package."""
 
-from radarsdf.io.cloud_writers import write_cloud
-from radarsdf.io.clouds import read_points
+from radarsdf.io.clouds.reading import read_points
+from radarsdf.io.clouds.writing import write_cloud
 from radarsdf.io.meshes import read_mesh, write_mesh
+from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.io.read import read
-from radarsdf.io.scans import read_scans, write_scans
-from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.scans import Scan, Scans
 
 __all__ = [
     "Scan",

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import positions
-from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
 from radarsdf.io.meshes import MESH_SUFFIXES, holds_mesh, read_mesh
-from radarsdf.io.scans import arrays_of
+from radarsdf.io.npz import arrays_of
 
 _ARRAYS = ("lidar_points", "points", "xyz", "arr_0")  # of which the first that a file has counts
 _SAMPLES = 1_000_000  # on a surface: a triangle of a building may be 20 m long

@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import path_of, positions, positive
-from radarsdf.io import bags, datasets
-from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
-from radarsdf.io.folders import base_T_radar, lidar_map
-from radarsdf.io.poses import POSE_FILES, extrinsic_of, poses_of
-from radarsdf.io.scans import read_scans
-from radarsdf.io.sequence import Notes, Scan, Scans
+from radarsdf.io.bags.reading import bags_in, is_bag, read_bags
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
+from radarsdf.io.datasets import published
+from radarsdf.io.datasets.folders import base_T_radar, lidar_map
+from radarsdf.io.npz import read_scans
+from radarsdf.io.poses.reading import POSE_FILES, extrinsic_of, poses_of
+from radarsdf.io.poses.trajectory import MAX_GAP_S
+from radarsdf.io.scans import Notes, Scan, Scans
 from radarsdf.io.sources import (
     NOT_FINITE,
     Request,
@@ -29,7 +31,6 @@ from radarsdf.io.sources import (
     posed,
     scan_poses,
 )
-from radarsdf.io.trajectory import MAX_GAP_S
 
 _STAMPS = (None, "header", "record")
 _CALIBRATIONS = ("calib.txt", "calibration.txt")
@@ -63,11 +64,11 @@ def read(
         - a folder with a file a scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
           file. Files are read in natural order, or in the order of the times in their names. Ground truth is
           ``lidar.pcd`` or ``lidar.ply`` in the folder;
-        - a folder of a data set that :mod:`radarsdf.io.datasets` knows by its shape;
+        - a folder of a data set that :mod:`radarsdf.io.datasets.published` knows by its shape;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
-        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.read_poses`: TUM, KITTI, 4 x 4 matrices. By
-        default what the data set says; in a folder, a file of `radarsdf.io.poses.POSE_FILES`; in a bag, `pose_topic`.
+        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices. By
+        default what the data set says; in a folder, a file of `radarsdf.io.poses.reading.POSE_FILES`; in a bag, `pose_topic`.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
     topic, pose_topic : str, optional
@@ -78,8 +79,8 @@ def read(
         In a bag, the time of a scan: of its header, or when it was recorded. By default of the header, unless its stamps
         are zero or stand still.
     fields : mapping, optional
-        Field of the file by role, if the table of :mod:`radarsdf.io.fields` is wrong: ``{"intensity": "Power"}``. Numbers
-        mean columns, None leaves a role out. Roles are those of `radarsdf.io.fields.ROLES`.
+        Field of the file by role, if the table of :mod:`radarsdf.io.clouds.fields` is wrong: ``{"intensity": "Power"}``. Numbers
+        mean columns, None leaves a role out. Roles are those of `radarsdf.io.clouds.fields.ROLES`.
     columns : int or sequence of str, optional
         Of files without names of columns: how many a point has, or their names.
     max_gap_s : float
@@ -134,7 +135,7 @@ def read(
         paths = [path_of(part, "path") for part in (path if isinstance(path, Iterable) else [path])]
         for part in paths:
             _check_exists(part)
-        found = bags.read_bags(paths, request, truth)
+        found = read_bags(paths, request, truth)
     else:
         found = _read(Path(path), request, truth)
     if truth is not None:
@@ -144,18 +145,18 @@ def read(
 
 def _read(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
     _check_exists(path)
-    if bags.is_bag(path):
-        return bags.read_bags([path], request, truth)
+    if is_bag(path):
+        return read_bags([path], request, truth)
     if path.is_dir():
-        dataset = datasets.find(path)
+        dataset = published.find(path)
         if dataset is not None:
             return dataset.read(path, request, truth)
-        if found := bags.bags_in(path):
+        if found := bags_in(path):
             beside = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
             if request.poses is None and request.pose_topic is None and beside is not None:
                 request.notes.add(f"poses: of {beside.name}")
                 request = dataclasses.replace(request, poses=beside)
-            return bags.read_bags(found, request, truth)
+            return read_bags(found, request, truth)
         return _folder(path, request, truth)
     if path.suffix.lower() == ".npz":
         return _npz(path, request, truth)

@@ -1,189 +1,295 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans in ``.npz`` files. The classes of scans are in `sequence`."""
+"""Scans with poses: one after another from files of any size, or all in memory."""
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Iterable
-from os import PathLike
-from pathlib import Path
-from typing import Any
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import instance, path_of
-from radarsdf.io.files import check_regular_file, write_whole
-from radarsdf.io.sequence import Scan, Scans
-from radarsdf.io.unpacking import check_unpacked
+from radarsdf.checks import one_for_each_scan
 
-__all__ = ["Scan", "Scans", "read_scans", "write_scans"]
+_LOG = logging.getLogger("radarsdf.io")
 
-_ARRAYS = (
-    "points",
-    "frame",
-    "poses",
-    "intensity",
-    "static",
-    "lidar_points",
-    "doppler",
-    "times",
-    "sigma",
-    "simulated",
-)
+TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
+"""Where ground truth comes from: the lidar of a recording, a simulator, or the user."""
 
 
-def read_scans(path: str | PathLike[str]) -> Scans:
-    """Reads scans from a file.
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One scan of N returns, with its pose."""
 
-    Parameters
-    ----------
-    path : path-like
-        An ``.npz`` file with these arrays:
+    points: NDArray[Any]
+    """(N, 3) sensor frame, m."""
+    T_world_sensor: NDArray[np.float64]
+    """(4, 4) m."""
+    intensities: NDArray[Any] | None = None
+    """(N,) sensor units. None if the sensor does not measure them."""
+    doppler_mps: NDArray[Any] | None = None
+    """(N,) radial velocity as the sensor gives it, m/s; most give negative values for what comes nearer. NaN where it
+    was not measured."""
+    time_s: float | None = None
+    """When the scan was taken, s, by the clock of the file."""
+    sigma: NDArray[Any] | None = None
+    """(N, 3) the sensor's own standard deviations of range, azimuth and elevation of each return: m, rad, rad."""
 
-        - ``points`` (N, 3): returns, sensor frame, m;
-        - ``poses`` (F, 4, 4): T_world_sensor, m;
-        - ``frame`` (N,): row of ``poses`` for each return;
-        - ``intensity`` (N,), optional: sensor units;
-        - ``static`` (N,) bool, optional: only returns with True are used;
-        - ``lidar_points`` (M, 3), optional: ground truth, world frame, m;
-        - ``simulated``, optional: not 0 if the ground truth is that of a simulator;
-        - ``doppler`` (N,), optional: m/s;
-        - ``times`` (F,), optional: when each scan was taken, s;
-        - ``sigma`` (N, 3), optional: the sensor's own deviations of range, azimuth and elevation, m, rad, rad.
+    def __len__(self) -> int:
+        """Number of returns."""
+        return len(self.points)
 
-    Returns
-    -------
-    Scans
-        One scan for each row of ``poses`` with at least one return.
-
-    Raises
-    ------
-    ValueError
-        If the file has another format, or its arrays do not fit together.
-    OSError
-        If the file cannot be read.
-    """
-    if path_of(path, "path").suffix != ".npz":
-        msg = f"{path} is not an .npz file: only .npz files of scans can be read"
-        raise ValueError(msg)
-    arrays = arrays_of(path, _ARRAYS)
-    if missing := sorted({"points", "frame", "poses"} - set(arrays)):
-        msg = f"{path} lacks the arrays {', '.join(missing)}"
-        raise ValueError(msg)
-    points, frame, poses = arrays["points"], arrays["frame"], arrays["poses"]
-    count, num_poses = points.shape[:1], poses.shape[:1]
-    for name, shape in {
-        "points": (*count, 3), "poses": (*num_poses, 4, 4), "frame": count, "intensity": count, "static": count,
-        "doppler": count, "times": num_poses, "sigma": (*count, 3),
-    }.items():  # fmt: skip
-        if name in arrays and arrays[name].shape != shape:
-            msg = f"{path}: {name} must have shape {shape}, not {arrays[name].shape}"
-            raise ValueError(msg)
-    truth = arrays.get("lidar_points", points)
-    if truth.ndim != 2 or truth.shape[1] != 3:
-        msg = f"{path}: lidar_points must have shape (M, 3), not {truth.shape}"
-        raise ValueError(msg)
-    for name, array in arrays.items():
-        if array.dtype.kind not in ("biuf" if name == "static" else "iuf"):
-            msg = f"{path}: {name} must be real numbers, not {array.dtype}"
-            raise ValueError(msg)
-    if (frame != np.floor(frame)).any():
-        msg = f"{path}: frame must hold row numbers of poses"
-        raise ValueError(msg)
-    if len(frame) and not 0 <= frame.min() <= frame.max() < len(poses):
-        msg = f"{path}: frame must lie in [0, {len(poses)})"
-        raise ValueError(msg)
-    used = arrays.get("static", np.ones(len(frame), bool)).astype(bool)
-    frame = frame.astype(np.int64)
-    order = np.flatnonzero(used)
-    order = order[np.argsort(frame[order], kind="stable")]
-    frames, first = np.unique(frame[order], return_index=True)
-    rows = np.split(order, first)[1:]  # the part before the first scan is empty
-    per_return = {
-        name: [arrays[name][r] for r in rows] if name in arrays else None
-        for name in ("intensity", "doppler", "sigma")
-    }
-    return Scans(
-        points=[points[r] for r in rows],
-        poses=poses[frames].astype(np.float64),
-        intensities=per_return["intensity"],
-        ground_truth=arrays.get("lidar_points"),
-        doppler_mps=per_return["doppler"],
-        times_s=arrays["times"][frames].astype(np.float64) if "times" in arrays else None,
-        sigmas=per_return["sigma"],
-        truth_kind="simulated" if "simulated" in arrays and arrays["simulated"].any() else "lidar",
-    )
+    @property
+    def world_points(self) -> NDArray[np.float64]:
+        """(N, 3) float64, world frame, m."""
+        R, t = self.T_world_sensor[:3, :3], self.T_world_sensor[:3, 3]
+        world: NDArray[np.float64] = np.asarray(self.points, np.float64) @ R.T + t
+        return world
 
 
-def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """The arrays of an ``.npz`` file that have these names, in this order. Raises as :func:`read_scans`."""
-    check_regular_file(path)
-    try:
-        return _arrays(Path(path), names)
-    except zipfile.BadZipFile as error:
-        msg = f"{path} is not a whole .npz file: it is cut off, damaged, or of another kind"
-        raise ValueError(msg) from error
-    except Exception as error:  # damaged files raise exceptions of many kinds, among them OSError
-        msg = f"{path} is not a whole .npz file: {error}"
-        raise ValueError(msg) from error
-
-
-def holds_scans(path: str | PathLike[str]) -> bool:
-    """Whether an ``.npz`` file has poses. Raises as :func:`read_scans`."""
-    return bool(arrays_of(path, ["poses"]))
-
-
-def _arrays(path: Path, wanted: Iterable[str]) -> dict[str, NDArray[Any]]:
-    with zipfile.ZipFile(path) as file:
-        names = file.namelist()
-        members = {name: file.getinfo(f"{name}.npy") for name in wanted if f"{name}.npy" in names}
-        unpacked = sum(member.file_size for member in members.values())
-        check_unpacked(unpacked, path.stat().st_size, "its arrays")
-        arrays = {}
-        for name, member in members.items():
-            with file.open(member) as stream:
-                arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
-        return arrays
-
-
-def write_scans(path: str | PathLike[str], scans: Scans) -> None:
-    """Writes scans as the ``.npz`` file that :func:`read_scans` reads, whole or not at all.
+class Notes:
+    """Sentences on what was assumed or left out. Each is logged once, as a warning of the logger ``radarsdf.io``.
 
     Parameters
     ----------
-    path : path-like
-        Where the file goes. ``.npz`` is appended where it is missing.
-    scans : Scans
-        At least one scan. What is None of it, the file lacks.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
+    about : str
+        What is read, for errors.
     """
-    instance(scans, Scans, "scans")
-    arrays: dict[str, NDArray[Any]] = {
-        "points": np.concatenate(scans.points),
-        "frame": np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points]),
-        "poses": scans.poses,
-    }
-    for name, values in (
-        ("intensity", scans.intensities), ("doppler", scans.doppler_mps), ("sigma", scans.sigmas)
-    ):  # fmt: skip
-        if values is not None:
-            arrays[name] = np.concatenate(values)
-    if scans.times_s is not None:
-        arrays["times"] = scans.times_s
-    if scans.ground_truth is not None:
-        arrays["lidar_points"] = scans.ground_truth
-        if scans.truth_kind == "simulated":
-            arrays["simulated"] = np.array(1, np.uint8)
-    file = io.BytesIO()
-    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-    target = path_of(path, "path")
-    write_whole(
-        target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz"), file.getvalue()
-    )
+
+    def __init__(self, about: str = "the scans") -> None:
+        self.about = about
+        self.lines: list[str] = []
+        self._counts: dict[str, int] = {}
+
+    def add(self, line: str) -> None:
+        """Keep a sentence, and log it if it is new."""
+        if line not in self.lines:
+            self.lines.append(line)
+            _LOG.warning(line)
+
+    def start_counts(self) -> None:
+        """Forget the counts: the files are read again."""
+        self._counts = {}
+
+    def count(self, what: str, number: int) -> None:
+        """Add to the count of what was left out."""
+        if number:
+            self._counts[what] = self._counts.get(what, 0) + number
+
+    def counted(self) -> None:
+        """Turn the counts into sentences, in the end of a pass through the files."""
+        for what, number in self._counts.items():
+            self.add(f"{number} {what}")
+
+
+class Scans:
+    """F scans with poses, and lidar points as ground truth where there are any.
+
+    Iterating gives one :class:`Scan` after another, as often as wanted. Scans of :func:`radarsdf.io.read` are read from
+    their files while they are iterated, so that memory is bounded by a scan; `points`, `intensities`, `doppler_mps` and
+    `sigmas` read all of them and keep them. `poses`, `times_s` and ``len()`` read the files once, if nobody did so
+    before, and keep no points.
+
+    Parameters
+    ----------
+    points : sequence of F arrays
+        (N_i, 3) each, sensor frame, m.
+    poses : (F, 4, 4) ndarray
+        T_world_sensor, m.
+    intensities : sequence of F arrays, optional
+        (N_i,) each, sensor units. None if the sensor does not measure them.
+    ground_truth : (M, 3) ndarray, optional
+        Lidar points, world frame, m.
+    doppler_mps, sigmas : sequence of F arrays, optional
+        As `Scan.doppler_mps` and `Scan.sigma`.
+    times_s : (F,) ndarray, optional
+        When the scans were taken, s.
+    truth_kind : {"lidar", "simulated", "given"}
+        Where the ground truth comes from.
+    """
+
+    def __init__(
+        self,
+        points: Sequence[NDArray[Any]],
+        poses: NDArray[np.float64],
+        intensities: Sequence[NDArray[Any]] | None = None,
+        ground_truth: NDArray[Any] | None = None,
+        *,
+        doppler_mps: Sequence[NDArray[Any]] | None = None,
+        times_s: NDArray[np.float64] | None = None,
+        sigmas: Sequence[NDArray[Any]] | None = None,
+        truth_kind: TruthKind = "lidar",
+    ) -> None:
+        self._source: Callable[[], Iterator[Scan]] | None = None
+        self._notes = Notes()
+        self._points: list[NDArray[Any]] | None = list(one_for_each_scan(points, "points"))
+        self._poses: NDArray[np.float64] | None = poses
+        self._intensities = _listed(intensities, "intensities")
+        self._doppler_mps = _listed(doppler_mps, "doppler_mps")
+        self._sigmas = _listed(sigmas, "sigmas")
+        self._times_s = times_s
+        self._ground_truth: Callable[[], NDArray[Any] | None] = lambda: ground_truth
+        self._truth_known = False
+        self.truth_kind: TruthKind = truth_kind
+        """Where the ground truth comes from."""
+        self._truth: NDArray[Any] | None = None
+
+    @classmethod
+    def of_source(
+        cls,
+        source: Callable[[], Iterator[Scan]],
+        notes: Notes,
+        ground_truth: Callable[[], NDArray[Any] | None] = lambda: None,
+    ) -> Scans:
+        """Scans that are read while they are iterated.
+
+        Parameters
+        ----------
+        source : callable
+            Gives a new iterator over the scans, which have at least one return each.
+        notes : Notes
+            What the source says of its files.
+        ground_truth : callable
+            Reads the ground truth, when it is asked for.
+        """
+        scans = cls([], np.zeros((0, 4, 4)))
+        scans._source = source
+        scans._notes = notes
+        scans._points = scans._poses = None
+        scans._ground_truth = ground_truth
+        return scans
+
+    def __iter__(self) -> Iterator[Scan]:
+        """One scan after another."""
+        if self._points is None:
+            return self._read()
+        return (self._scan(i) for i in range(len(self._points)))
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self.poses)
+
+    def __repr__(self) -> str:
+        """What is known without reading files."""
+        known = f"{len(self._poses)} scans" if self._poses is not None else "scans that are not yet read"
+        return f"<Scans: {known}>"
+
+    @property
+    def points(self) -> list[NDArray[Any]]:
+        """F arrays (N_i, 3), sensor frame, m."""
+        self._load()
+        assert self._points is not None
+        return self._points
+
+    @property
+    def poses(self) -> NDArray[np.float64]:
+        """(F, 4, 4) T_world_sensor, m."""
+        if self._poses is None:
+            for _ in self._read():  # which keeps the poses in its end
+                pass
+        assert self._poses is not None
+        return self._poses
+
+    @property
+    def intensities(self) -> list[NDArray[Any]] | None:
+        """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
+        self._load()
+        return self._intensities
+
+    @property
+    def doppler_mps(self) -> list[NDArray[Any]] | None:
+        """F arrays (N_i,), m/s: see `Scan.doppler_mps`. None if there is none."""
+        self._load()
+        return self._doppler_mps
+
+    @property
+    def sigmas(self) -> list[NDArray[Any]] | None:
+        """F arrays (N_i, 3), m, rad, rad: see `Scan.sigma`. None if there are none."""
+        self._load()
+        return self._sigmas
+
+    @property
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(F,) when the scans were taken, s. None if that is not known."""
+        _ = self.poses
+        return self._times_s
+
+    @property
+    def ground_truth(self) -> NDArray[Any] | None:
+        """(M, 3) lidar points, world frame, m. None if there are none."""
+        if not self._truth_known:
+            self._truth, self._truth_known = self._ground_truth(), True
+        return self._truth
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on what was assumed, and after the files were read, on what was left out."""
+        return list(self._notes.lines)
+
+    def select(self, frames: NDArray[np.int64]) -> Scans:
+        """The scans with the numbers `frames`, (K,), in this order. All scans are read."""
+
+        def chosen(arrays: list[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
+            return None if arrays is None else [arrays[i] for i in frames]
+
+        return Scans(
+            [self.points[i] for i in frames],
+            self.poses[frames],
+            chosen(self.intensities),
+            self.ground_truth,
+            doppler_mps=chosen(self.doppler_mps),
+            times_s=None if self.times_s is None else self.times_s[frames],
+            sigmas=chosen(self.sigmas),
+            truth_kind=self.truth_kind,
+        )
+
+    def _scan(self, i: int) -> Scan:
+        assert self._points is not None
+        return Scan(
+            self._points[i],
+            self.poses[i],
+            None if self._intensities is None else self._intensities[i],
+            None if self._doppler_mps is None else self._doppler_mps[i],
+            None if self._times_s is None else float(self._times_s[i]),
+            None if self._sigmas is None else self._sigmas[i],
+        )
+
+    def _read(self) -> Iterator[Scan]:
+        """Reads the files, and keeps what is small once they are read to the end."""
+        assert self._source is not None
+        poses: list[NDArray[np.float64]] = []
+        times_s: list[float | None] = []
+        self._notes.start_counts()
+        for scan in self._source():
+            poses.append(scan.T_world_sensor)
+            times_s.append(scan.time_s)
+            yield scan
+        self._notes.counted()
+        if not poses:
+            why = "".join(f"; {line}" for line in self._notes.lines)
+            msg = f"{self._notes.about}: there is no scan with a return and a pose{why}"
+            raise ValueError(msg)
+        self._poses = np.stack(poses)
+        self._times_s = None if None in times_s else np.array(times_s, np.float64)
+
+    def _load(self) -> None:
+        """Reads all scans, and keeps them."""
+        if self._points is not None:
+            return
+        scans = list(self._read())
+        self._intensities = _all_or_none([scan.intensities for scan in scans])
+        self._doppler_mps = _all_or_none([scan.doppler_mps for scan in scans])
+        self._sigmas = _all_or_none([scan.sigma for scan in scans])
+        self._points = [scan.points for scan in scans]
+
+
+def _listed(arrays: Sequence[NDArray[Any]] | None, name: str) -> list[NDArray[Any]] | None:
+    return None if arrays is None else list(one_for_each_scan(arrays, name))
+
+
+def _all_or_none(arrays: list[NDArray[Any] | None]) -> list[NDArray[Any]] | None:
+    given = [array for array in arrays if array is not None]
+    return given if given and len(given) == len(arrays) else None

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_columns
-from radarsdf.io.fields import Fields
-from radarsdf.io.poses import POSE_FILES, ScanPoses, StampedPoses
-from radarsdf.io.sequence import Notes, Scan
+from radarsdf.io.clouds.fields import Fields
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_columns
+from radarsdf.io.poses.reading import POSE_FILES, ScanPoses, StampedPoses
+from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, in_seconds
+from radarsdf.io.scans import Notes, Scan
 from radarsdf.io.text import number_rows
-from radarsdf.io.trajectory import MAX_GAP_S, Trajectory, in_seconds
 
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
 """Names of files with a time, s, for each scan, one a line."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf._core import cell_keys
 from radarsdf.budget.estimate import check_views
 from radarsdf.checks import check_poses, flag, instance, number, real_array, whole_number
-from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.scans import Scan, Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.traced_surface import TracedSurface

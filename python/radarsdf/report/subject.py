@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.checking.finding import Finding
-from radarsdf.io.sequence import Scans, TruthKind
+from radarsdf.io.scans import Scans, TruthKind
 from radarsdf.tiles.any_map import AnyMap
 from radarsdf.view.thinning import thinned
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import check_values_of_scans, one_for_each_scan, real_array
 from radarsdf.config import FitConfig, ReturnsConfig
-from radarsdf.io.sequence import Scans
+from radarsdf.io.scans import Scans
 from radarsdf.returns.doppler import MIN_RETURNS, sensor_velocities
 from radarsdf.returns.rays import Rays, check_scans, prepare
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import check_poses, number, real_array
-from radarsdf.io.sequence import Scans
+from radarsdf.io.scans import Scans
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.plausible import Plausible
 from radarsdf.returns.rays import Rays

@@ -20,7 +20,7 @@ from radarsdf.checks import instance, one_for_each_scan, path_of, positive
 from radarsdf.config import FitConfig
 from radarsdf.io.files import write_whole
 from radarsdf.io.read import read
-from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.scans import Scan, Scans
 from radarsdf.tiles.grid import TileGrid
 from radarsdf.tiles.locking import LOCK, only_planner
 from radarsdf.tiles.plan import PLAN, Plan, failure_path

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.io.files import write_whole
-from radarsdf.io.scans import arrays_of
+from radarsdf.io.npz import arrays_of
 from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import renumbered

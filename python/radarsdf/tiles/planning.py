@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from radarsdf.budget.estimate import estimate_rays
 from radarsdf.config import FitConfig
 from radarsdf.fitting.surface import SurfaceReturns
-from radarsdf.io.sequence import Scan
+from radarsdf.io.scans import Scan
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.plausible import Intensities

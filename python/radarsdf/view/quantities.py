@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.scans import Scan, Scans
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.any_map import AnyMap

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.io.sequence import Scans
+from radarsdf.io.scans import Scans
 from radarsdf.tiles.any_map import AnyMap
 from radarsdf.view.canvas import SurfaceCanvas
 from radarsdf.view.controls import Controls

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.scans import Scan, Scans
 from radarsdf.tiles.any_map import AnyMap
 
 ALL_RETURNS = 200_000

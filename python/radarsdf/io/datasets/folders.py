@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import check_poses
 from radarsdf.interrupts import whole_import
-from radarsdf.io.pcd import read_pcd
-from radarsdf.io.sequence import Scans
-from radarsdf.io.trajectory import MAX_GAP_S, Trajectory, read_table, read_trajectory
+from radarsdf.io.clouds.pcd import read_pcd
+from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, read_table, read_trajectory
+from radarsdf.io.scans import Scans
 
 INTENSITY_FIELDS = ("power", "Power", "intensity", "rcs")
 """Names of the intensity in PCD files, of which the first that is present counts. Hugin: power; Oculii: Power."""

@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check_poses
-from radarsdf.io.bag_files import bags_in
-from radarsdf.io.bags import read_bags
-from radarsdf.io.clouds import read_columns
-from radarsdf.io.folders import base_T_radar
-from radarsdf.io.poses import ScanPoses, poses_of, read_calibration, trajectory_of
-from radarsdf.io.sequence import Scans
-from radarsdf.io.snail_radar import SnailRadar, is_snail_radar
+from radarsdf.io.bags.files import bags_in
+from radarsdf.io.bags.reading import read_bags
+from radarsdf.io.clouds.reading import read_columns
+from radarsdf.io.datasets.folders import base_T_radar
+from radarsdf.io.datasets.snail_radar import SnailRadar, is_snail_radar
+from radarsdf.io.poses.reading import ScanPoses, poses_of, read_calibration, trajectory_of
+from radarsdf.io.poses.trajectory import read_table
+from radarsdf.io.scans import Scans
 from radarsdf.io.sources import RawScan, Request, files_source, natural, posed, scan_poses
 from radarsdf.io.text import read_text
-from radarsdf.io.trajectory import read_table
 
 Truth = Callable[[], NDArray[np.float64] | None] | None
 
@@ -239,7 +239,7 @@ class VikingHill:
 
 
 class Snail:
-    """A sequence of SNAIL-Radar, or one radar of it; see :func:`radarsdf.io.snail_radar.read_snail_radar`.
+    """A sequence of SNAIL-Radar, or one radar of it; see :func:`radarsdf.io.datasets.snail_radar.read_snail_radar`.
 
     ``data3`` means its Oculii Eagle, ``data3/ars548/points`` its Continental ARS548.
     """

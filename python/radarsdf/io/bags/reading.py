@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.bag_files import Message, Topic, bags_in, is_bag, messages_of, topics_of
-from radarsdf.io.bag_poses import poses_in_bags
-from radarsdf.io.clouds import Columns
-from radarsdf.io.messages import CLOUD_TYPES, POINT_A_MESSAGE, CloudMessage, read_cloud
-from radarsdf.io.poses import ScanPoses, poses_of
-from radarsdf.io.sequence import Scans
+from radarsdf.io.bags.files import Message, Topic, bags_in, is_bag, messages_of, topics_of
+from radarsdf.io.bags.messages import CLOUD_TYPES, POINT_A_MESSAGE, CloudMessage, read_cloud
+from radarsdf.io.bags.poses import poses_in_bags
+from radarsdf.io.clouds.reading import Columns
+from radarsdf.io.poses.reading import ScanPoses, poses_of
+from radarsdf.io.scans import Scans
 from radarsdf.io.sources import RawScan, Request, posed, scan_poses
 
 __all__ = ["bags_in", "is_bag", "read_bags"]

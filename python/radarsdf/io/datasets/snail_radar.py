@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf._core import cell_keys
-from radarsdf.io.folders import lidar_map, read_stamped_scans, read_transform, stamped_files, xyz_of
-from radarsdf.io.pcd import read_pcd
-from radarsdf.io.sequence import Scans
-from radarsdf.io.trajectory import MAX_GAP_S, Trajectory, read_trajectory
+from radarsdf.io.clouds.pcd import read_pcd
+from radarsdf.io.datasets.folders import lidar_map, read_stamped_scans, read_transform, stamped_files, xyz_of
+from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, read_trajectory
+from radarsdf.io.scans import Scans
 
 RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")
 """Folders of clouds in a sequence: of the Oculii Eagle, and of the Continental ARS548. The first that is there counts."""
@@ -98,21 +98,21 @@ def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
     ----------
     folder : Path
         A folder as above: the Oculii is read, or the ARS548 if it is the only one. Or the folder of one radar in it, such
-        as ``ars548/points``. The same returns and scans are left out as by :func:`radarsdf.io.folders.read_posed_folder`.
+        as ``ars548/points``. The same returns and scans are left out as by :func:`radarsdf.io.datasets.folders.read_posed_folder`.
     frames : int, optional
         Number of scans to read, from the first. Default: all. Lidar scans are read from the first to the last of them.
 
     Returns
     -------
     Scans
-        As of :func:`radarsdf.io.folders.read_posed_folder`, with UTM zone 50R as the world frame. The ground truth holds
+        As of :func:`radarsdf.io.datasets.folders.read_posed_folder`, with UTM zone 50R as the world frame. The ground truth holds
         lidar points with a range of 1 to 60 m, at most one in each cell of 5 cm. Each is moved with the pose at its own
         time, or at the time of its scan if the file has no field ``timestamp``.
 
     Raises
     ------
     ValueError, OSError
-        As :func:`radarsdf.io.folders.read_posed_folder`.
+        As :func:`radarsdf.io.datasets.folders.read_posed_folder`.
     """
     snail = SnailRadar.of(folder)
     scans, times_s = read_stamped_scans(snail.clouds, snail.trajectory, snail.T_base_radar, frames)

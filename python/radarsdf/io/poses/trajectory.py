@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from radarsdf.io.sequence import Notes
+from radarsdf.io.scans import Notes
 from radarsdf.io.text import number_rows
 
 MAX_GAP_S = 0.5

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check_poses, real_array
 from radarsdf.io.files import check_regular_file
-from radarsdf.io.sequence import Notes
+from radarsdf.io.poses.trajectory import Trajectory, in_seconds, trajectory_of_table
+from radarsdf.io.scans import Notes
 from radarsdf.io.text import number_rows, read_text
-from radarsdf.io.trajectory import Trajectory, in_seconds, trajectory_of_table
 
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 """Names of files of poses that are found beside scans."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.lzf import unpack_lzf
+from radarsdf.io.clouds.lzf import unpack_lzf
 
 _TYPES = {f"{kind}{size}" for kind, sizes in {"F": "48", "I": "1248", "U": "1248"}.items() for size in sizes}
 _MAX_HEADER_LINES = 64  # a header has eleven

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from radarsdf.checks import path_of
+from radarsdf.io.clouds.las import las_writer
 from radarsdf.io.files import whole_file
-from radarsdf.io.las import las_writer
 from radarsdf.io.origin import origin_for, write_origin
 from radarsdf.io.records import ply_header, records
-from radarsdf.io.sequence import Scan, Scans
+from radarsdf.io.scans import Scan, Scans
 from radarsdf.progress import hides_bar
 
 CLOUD_OUT_SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".npy", ".csv")

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.io.bag_files import Message, Topic, messages_of, topics_of
-from radarsdf.io.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage, read_pose_messages
-from radarsdf.io.poses import StampedPoses, TransformChain, trajectory_of
+from radarsdf.io.bags.files import Message, Topic, messages_of, topics_of
+from radarsdf.io.bags.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage, read_pose_messages
+from radarsdf.io.poses.reading import StampedPoses, TransformChain, trajectory_of
+from radarsdf.io.poses.trajectory import Trajectory
 from radarsdf.io.sources import Request
-from radarsdf.io.trajectory import Trajectory
 
 _STATIC = "static"  # in the name of a topic whose transforms hold for all times: /tf_static
 _SAME = 1e-9  # a transform that changes by no more is constant, though it is published again and again

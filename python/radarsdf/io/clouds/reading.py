@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.interrupts import whole_import
-from radarsdf.io.fields import COLUMNS, Fields
+from radarsdf.io.clouds.fields import COLUMNS, Fields
+from radarsdf.io.clouds.las import INTENSITY as RADAR_INTENSITY
+from radarsdf.io.clouds.laz import check_las_points, check_las_records
+from radarsdf.io.clouds.pcd import read_pcd
 from radarsdf.io.files import are_numbers, check_regular_file
-from radarsdf.io.las import INTENSITY as RADAR_INTENSITY
-from radarsdf.io.laz import check_las_points, check_las_records
 from radarsdf.io.origin import origin_of
-from radarsdf.io.pcd import read_pcd
 from radarsdf.io.text import COMMENTS, check_header, read_text, with_points, without_comment
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
