@@ -116,3 +116,13 @@ def test_pickles_and_words(city, points):
     copy = pickle.loads(pickle.dumps(city))
     np.testing.assert_array_equal(copy.sdf(points[:100]), city.sdf(points[:100]))
     assert repr(city) == "TiledMap(surface and reflectance, 4 of 4 tiles of 12.8 m)"
+
+
+def test_a_copy_is_the_same_map(city, points, tmp_path):
+    city.save(tmp_path / "copy")
+    copy = radarsdf.load(tmp_path / "copy")
+    np.testing.assert_array_equal(copy.sdf(points), city.sdf(points))
+    np.testing.assert_array_equal(copy.intensity(points, [0, 0, 1]), city.intensity(points, [0, 0, 1]))
+    assert copy.report == city.report
+    with pytest.raises(FileExistsError):
+        city.save(tmp_path / "copy")

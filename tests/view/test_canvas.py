@@ -13,7 +13,7 @@ from radarsdf.view import canvas as module
 from radarsdf.view.canvas import SurfaceCanvas
 from radarsdf.view.painter import Wish
 from radarsdf.view.quantities import quantities_of
-from radarsdf.view.surface import Surface
+from radarsdf.view.surface import ShownSurface
 
 SEES_ALL = Wish((0.0, 0.0, 1.5), max_uncertainty_m=9.0, min_confidence=0.0, quantity="intensity")
 MOVING = replace(SEES_ALL, coarse=True, sensor=(3.0, 0.0, 1.5))
@@ -50,7 +50,7 @@ def page(sharp_map, monkeypatch):
     """A scene, its canvas, and what is seen each time that the canvas waits for the page."""
     scene, waits = Scene(), []
     monkeypatch.setattr(module, "wait_until_drawn", lambda *_: waits.append(scene.seen()))
-    surface = Surface.of(sharp_map, 0.4, max_vertices=100_000, progress=False)
+    surface = ShownSurface.of(sharp_map, 0.4, max_vertices=100_000, progress=False)
     quantities = quantities_of(sharp_map, surface, None, SEES_ALL.sensor)
     shown = []
     return scene, SurfaceCanvas(scene, sharp_map, surface, quantities, None, shown.append), waits, shown

@@ -12,7 +12,7 @@ from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import glb
 from radarsdf.view.light import shaded
 from radarsdf.view.picking import first_hit
-from radarsdf.view.surface import Surface
+from radarsdf.view.surface import ShownSurface
 from radarsdf.view.thinning import spread_evenly, thinned
 from scipy.spatial import cKDTree
 
@@ -21,10 +21,10 @@ TWO = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
 
 
 def test_a_surface_has_no_more_vertices_than_allowed(sharp_map):
-    full = Surface.of(sharp_map, 0.1, max_vertices=10**9, progress=False)
+    full = ShownSurface.of(sharp_map, 0.1, max_vertices=10**9, progress=False)
     assert full.spacing_m == 0.1
     most = len(full.vertices) // 3
-    thin = Surface.of(sharp_map, 0.1, max_vertices=most, progress=False)
+    thin = ShownSurface.of(sharp_map, 0.1, max_vertices=most, progress=False)
     assert most / 2 < len(thin.vertices) <= most
     assert thin.spacing_m > 0.1
     np.testing.assert_allclose(np.ptp(thin.vertices, axis=0), np.ptp(full.vertices, axis=0), atol=0.5)
@@ -50,11 +50,11 @@ def test_a_thinned_mesh_is_the_same_surface_with_the_same_attributes(sharp_map):
 
 def test_a_map_without_a_surface_here(sharp_map):
     with pytest.raises(ValueError, match="no surface here"):
-        Surface.of(sharp_map, 0.2, max_vertices=1000, box=[[90, 90, 90], [91, 91, 91]], progress=False)
+        ShownSurface.of(sharp_map, 0.2, max_vertices=1000, box=[[90, 90, 90], [91, 91, 91]], progress=False)
 
 
 def test_limits_leave_out_vertices_and_their_triangles():
-    surface = Surface(
+    surface = ShownSurface(
         SQUARE, TWO, np.array([0.1, 0.1, 0.1, 0.4], np.float32), np.array([0.5, 1, 1, 1], np.float32),
         np.ones(4, np.float32), 1.0,
     )  # fmt: skip

@@ -339,6 +339,8 @@ def test_a_map_far_away_without_intensities():
 
 
 def test_a_port_that_is_taken_is_said_before_the_work(viewer, sharp_map, monkeypatch):
-    monkeypatch.setattr("radarsdf.view.surface.Surface.of", lambda *_, **__: pytest.fail("work was done"))
+    monkeypatch.setattr(
+        "radarsdf.view.surface.ShownSurface.of", lambda *_, **__: pytest.fail("work was done")
+    )
     with pytest.raises(OSError, match="in use"):
         Viewer(sharp_map, port=viewer.port)

@@ -7,15 +7,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
+from radarsdf.map.map import Map
 from radarsdf.returns.movers import rays_as_measured
-from radarsdf.tiles.any_map import AnyMap, predicted
+from radarsdf.tiles.any_map import predicted
 
 if TYPE_CHECKING:
     from radarsdf.cli.results import Results
     from radarsdf.io.npz import Scans
 
 
-def add_intensity_errors(results: Results, radar_map: AnyMap, test: Scans, train: Scans) -> None:
+def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: Scans) -> None:
     """Add the errors of a map, and of a kNN baseline that is as good as these scans allow; nothing if map or scans have no intensities.
 
     Parameters

@@ -13,7 +13,7 @@ from radarsdf.cli.options import add_json
 from radarsdf.cli.results import Results
 
 if TYPE_CHECKING:
-    from radarsdf.tiles.any_map import AnyMap
+    from radarsdf.map.map import Map
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     results.end()
 
 
-def _add_map(results: Results, radar_map: AnyMap) -> None:
+def _add_map(results: Results, radar_map: Map) -> None:
     scale, sensor = radar_map.intensity_scale, radar_map.sensor
     limits = None if scale is None else (scale.low, scale.high)
     cells, edge_m, size = radar_map.num_cells, radar_map.config.leaf_size_m, radar_map.file_bytes

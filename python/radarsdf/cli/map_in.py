@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from radarsdf.cli.saying import complain
 
 if TYPE_CHECKING:
-    from radarsdf.tiles.any_map import AnyMap
+    from radarsdf.map.map import Map
 
 MAP_SUFFIX = ".safetensors"
 """By which the file of a map is known from a mesh."""
@@ -28,7 +28,7 @@ def is_map(path: Path) -> bool:
     return path.is_dir() or path.suffix == MAP_SUFFIX
 
 
-def load_map(path: Path) -> AnyMap:
+def load_map(path: Path) -> Map:
     """Read a map. Tiles that are missing are said on standard error."""
     from radarsdf.tiles.any_map import lacking, load
 

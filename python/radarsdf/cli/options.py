@@ -138,7 +138,7 @@ def add_surface(parser: argparse.ArgumentParser) -> None:
 
 
 def limits_of(options: argparse.Namespace) -> dict[str, Any]:
-    """What a mesh leaves out, as arguments of ``RadarMap.mesh``."""
+    """What a mesh leaves out, as arguments of ``Map.mesh``."""
     return {
         "min_confidence": options.min_confidence,
         "max_uncertainty": options.max_uncertainty,

@@ -77,7 +77,9 @@ def fit_rays(
         with torch.inference_mode(mode=False), Workers(config.num_threads) as workers:
             trained = _train(read, config, progress, checkpoint, clock, workers)
             contents = trained.contents
-            if trained.closed_form is not None:
+            # What a network that diverged leaves of the intensities can be anything.
+            diverged = isinstance(trained.stop, Diverged) and config.trains_intensity
+            if trained.closed_form is not None and not diverged:
                 contents = trained.closed_form.added_to(contents, workers.num_threads)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption

@@ -34,9 +34,9 @@ class Surface:
     evidence: queries.EvidenceAt
     """Of each vertex."""
     confidence: NDArray[np.float32]
-    """(V,) see :meth:`RadarMap.confidence`."""
+    """(V,) see :meth:`Map.confidence`."""
     uncertainty_m: NDArray[np.float32]
-    """(V,) see :meth:`RadarMap.uncertainty`."""
+    """(V,) see :meth:`Map.uncertainty`."""
     cells_searched: int
     """Number of leaf cells in which the surface can be."""
 
@@ -75,7 +75,7 @@ class Surface:
         min_detection_rate: float,
         min_component_triangles: int,
     ) -> NDArray[np.bool_]:
-        """Which of the faces a mesh keeps, (F,). The arguments are those of :meth:`RadarMap.mesh`."""
+        """Which of the faces a mesh keeps, (F,). The arguments are those of :meth:`Map.mesh`."""
         good = (self.confidence >= min_confidence) & queries.answers(
             self.evidence, min_detection_rate
         ).numpy()
@@ -100,7 +100,7 @@ def extract_mesh(
     min_component_triangles: int,
     progress: bool | None,
 ) -> trimesh.Trimesh:
-    """See :meth:`RadarMap.mesh`."""
+    """See :meth:`Map.mesh`."""
     limits = check_limits(contents, min_confidence, max_uncertainty, min_detection_rate)
     whole_number(min_component_triangles, "min_component_triangles", 0)
     voxel_size = positive(voxel_size, "voxel_size")
@@ -130,7 +130,7 @@ def extract_mesh(
 def check_limits(
     contents: MapContents, min_confidence: float, max_uncertainty: float | None, min_detection_rate: float
 ) -> tuple[float, float, float]:
-    """These arguments of :meth:`RadarMap.mesh` as numbers. Raises a ValueError if they are out of range."""
+    """These arguments of :meth:`Map.mesh` as numbers. Raises a ValueError if they are out of range."""
     min_confidence = number(min_confidence, "min_confidence")
     if not 0 <= min_confidence <= 1:
         msg = f"min_confidence must be in [0, 1], not {min_confidence}"

@@ -137,7 +137,7 @@ def view_from(
     noise: bool = False,
     seed: Any = 0,
 ) -> View:
-    """See :meth:`RadarMap.render`."""
+    """See :meth:`Map.render`."""
     pose = real_array(T_world_sensor, "T_world_sensor")
     if pose.shape != (4, 4):
         msg = f"T_world_sensor must have shape (4, 4), not {pose.shape}"

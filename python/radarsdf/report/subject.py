@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf.checking.finding import Finding
 from radarsdf.io.scans import Scans, TruthKind
-from radarsdf.tiles.any_map import AnyMap
+from radarsdf.map.map import Map
 from radarsdf.view.thinning import thinned
 
 MOST_VERTICES = 160_000
@@ -26,7 +26,7 @@ MOST_VERTICES = 160_000
 class Subject:
     """A map, and what is known besides it."""
 
-    radar_map: AnyMap
+    radar_map: Map
     name: str
     """Of the map, for the heading."""
     scans: Scans | None = None
@@ -40,9 +40,9 @@ class Subject:
     box: ArrayLike | None = None
     """(2, 3) the part of the world that counts, m. None: all."""
     progress: bool | None = None
-    """As for :meth:`RadarMap.mesh`."""
+    """As for :meth:`Map.mesh`."""
     limits: Mapping[str, Any] = field(default_factory=dict)
-    """What the mesh leaves out, such as `min_confidence`: as :meth:`RadarMap.mesh`."""
+    """What the mesh leaves out, such as `min_confidence`: as :meth:`Map.mesh`."""
 
     @property
     def viewpoint(self) -> NDArray[np.float64]:

@@ -44,7 +44,7 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
     ImportError
         If matplotlib or viser is missing.
     ValueError
-        As :meth:`RadarMap.mesh`.
+        As :meth:`Map.mesh`.
     MemoryError
         If the voxels of the mesh need too much memory.
     OSError

@@ -5,23 +5,19 @@
 from __future__ import annotations
 
 from os import PathLike
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
-from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.map import Map
 from radarsdf.map.radar_map import load as load_file
 from radarsdf.returns.rays import Rays
 from radarsdf.tiles.tiled_map import TiledMap
 
-AnyMap: TypeAlias = RadarMap | TiledMap
-"""Both answer the same questions."""
 
-
-def load(path: str | PathLike[str]) -> AnyMap:
-    """Reads a map: a file of :meth:`RadarMap.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
+def load(path: str | PathLike[str]) -> Map:
+    """Reads a map: a file of :meth:`Map.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
 
     Parameters
     ----------
@@ -44,14 +40,14 @@ def load(path: str | PathLike[str]) -> AnyMap:
     return TiledMap(path) if path.is_dir() else load_file(path)
 
 
-def lacking(radar_map: AnyMap) -> str:
+def lacking(radar_map: Map) -> str:
     """How many tiles a map lacks, in words; empty if none."""
     if not isinstance(radar_map, TiledMap) or not (missing := radar_map.missing):
         return ""
     return f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
 
 
-def predicted(radar_map: AnyMap, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
+def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
     """The intensities (N,) that a map predicts for rays, sensor units, and these rays: those in no tile are left out."""
     found = np.asarray(radar_map.intensity(*rays.in_world(), extrapolate=True), np.float64)
     known = np.isfinite(found)

@@ -122,11 +122,6 @@ class TileBlend:
         return self.plan.scale
 
     @property
-    def has_intensity(self) -> bool:
-        """Whether intensities were given to the fit."""
-        return self.plan.intensity_range is not None
-
-    @property
     def sensor(self) -> Sensor:
         """The radar, as the scans of the fit show it."""
         return self.plan.sensor
@@ -201,12 +196,12 @@ class TileBlend:
         def among(contents: MapContents, points: Tensor) -> Tensor:
             inside = queries.occupied(contents, points)
             cells = cells_of(contents, points[inside])
-            inside[inside.clone()] = torch.from_numpy(self._observed(share.tile, cells))
+            inside[inside.clone()] = torch.from_numpy(self._owners_observed(share.tile, cells))
             return inside
 
         return queries.into_cells(share.contents, share.local, among=among)
 
-    def _observed(self, asking: Tile, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _owners_observed(self, asking: Tile, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(K,) whether leaf cells (K, 3) from the origin of the tile that is `asking` were observed.
 
         The tile that a cell lies in decides, because tiles disagree: which returns are ghosts depends on surfaces before
@@ -234,7 +229,7 @@ class TileBlend:
             alone = np.isfinite(world).all(axis=1) & ~self.seen(world)
         for share in self.shares(world):
             local, _ = self._into_cells(share)
-            known, slopes = knowledge(share.contents, local, partial(self._observed, share.tile))
+            known, slopes = knowledge(share.contents, local, partial(self._owners_observed, share.tile))
             known[alone[share.rows]] = 1.0
             weights = share.weights * known
             slopes = share.slopes * known[:, None] + slopes * share.weights[:, None]

@@ -42,7 +42,7 @@ class PieceSettings:
     box: tuple[tuple[float, ...], ...] | None
     """Lower and upper corner, world, m."""
     min_confidence: float
-    """As of :meth:`RadarMap.mesh`."""
+    """As of :meth:`Map.mesh`."""
     max_uncertainty: float
     """Likewise, m."""
     min_detection_rate: float

@@ -106,7 +106,7 @@ def contents_of_tile(root: Path, plan: Plan, tile: TilePlan) -> MapContents:
 
 
 def report_of(root: Path, tile: TilePlan) -> dict[str, Any]:
-    """The report of the fit of a tile that is done; see :attr:`RadarMap.report`. Nothing else is read.
+    """The report of the fit of a tile that is done; see :attr:`Map.report`. Nothing else is read.
 
     Raises
     ------

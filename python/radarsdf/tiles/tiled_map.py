@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from concurrent.futures import Executor
 from functools import cached_property, partial
@@ -15,9 +16,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import check_poses, instance, real_array
+from radarsdf.checks import check_poses, instance, path_of, real_array
 from radarsdf.map import queries, storage
-from radarsdf.map.positions import as_positions
+from radarsdf.map.map import Map
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.blend import Share, TileBlend, averages, distance
 from radarsdf.tiles.plan import map_path
@@ -33,10 +34,10 @@ if TYPE_CHECKING:
 _Floats = NDArray[np.float64]
 
 
-class TiledMap(TileBlend):
+class TiledMap(TileBlend, Map):
     """A map in tiles, made by :func:`radarsdf.fit_tiles` or ``radarsdf.load(folder)``.
 
-    It answers as :class:`RadarMap` does. Where tiles overlap, their answers are averaged with weights that fall smoothly
+    :class:`Map` says what it answers. Where tiles overlap, their answers are averaged with weights that fall smoothly
     to zero, so that neither surface, gradient nor intensity has a seam. Tiles are read when they are asked for.
 
     Parameters
@@ -64,6 +65,193 @@ class TiledMap(TileBlend):
 
     def __reduce__(self) -> tuple[Callable[..., TiledMap], tuple[Any, ...]]:
         return _opened, (str(self.folder), self.memory_bytes)
+
+    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
+        positions = _contiguous(world)
+        shares = self.known_shares(positions, extrapolate=extrapolate)
+        return torch.from_numpy(averages(shares, len(positions), distance)[:, 0])
+
+    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
+        positions = _contiguous(world)
+        count = len(positions)
+        # Of the quotient of two sums, of w f and of w: the weights change with the position, too.
+        sums, distances, slopes = np.zeros((count, 4)), np.zeros((count, 3)), np.zeros((count, 3))
+        totals = np.zeros(count)
+        for share in self.known_shares(positions, extrapolate=extrapolate):
+            gradients = queries.gradient(share.contents, share.local).numpy().astype(np.float64)
+            values = np.column_stack([distance(share), gradients])
+            sums[share.rows] += share.weights[:, None] * values
+            totals[share.rows] += share.weights
+            distances[share.rows] += values[:, :1] * share.slopes
+            slopes[share.rows] += share.slopes
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means = sums / totals[:, None]
+            found = means[:, 1:] + (distances - means[:, :1] * slopes) / totals[:, None]
+        return torch.from_numpy(found)
+
+    def _observed(self, world: Tensor) -> Tensor:
+        return torch.from_numpy(self.seen(_contiguous(world)))
+
+    def _uncertainty(self, world: Tensor) -> Tensor:
+        return queries.uncertainty(self.any_contents, self.evidence(_contiguous(world)))
+
+    def _confidence(self, world: Tensor) -> Tensor:
+        return queries.confidence(self.any_contents, self.evidence(_contiguous(world)))
+
+    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
+        positions, places = _contiguous(world), _contiguous(sensors)
+
+        def of_tile(share: Share) -> _Floats:
+            there = queries.to_local(
+                share.contents, torch.from_numpy(np.ascontiguousarray(places[share.rows]))
+            )
+            predicted = partial(queries.intensity, share.contents)
+            values = queries.where(there.isfinite().all(dim=1), share.local, there, function=predicted)
+            return values.numpy().astype(np.float64)[:, None]
+
+        shares = self.known_shares(positions, extrapolate=extrapolate)
+        return torch.from_numpy(averages(shares, len(positions), of_tile)[:, 0])
+
+    def mesh(
+        self,
+        voxel_size: float = queries.VOXEL_M,
+        *,
+        box: ArrayLike | None = None,
+        viewpoint: ArrayLike | None = None,
+        min_confidence: float = 0.0,
+        max_uncertainty: float | None = None,
+        min_detection_rate: float = queries.MIN_DETECTION_RATE,
+        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
+        executor: Executor | None = None,
+        progress: bool | None = None,
+    ) -> trimesh.Trimesh:
+        """Extracts the surface, without gaps or doubled triangles between tiles; see :meth:`Map.mesh`.
+
+        Each tile is a task for the `executor`. `voxel_size` must divide the leaf cell's edge. :meth:`export` writes a mesh
+        that does not fit into memory.
+        """
+        from radarsdf.map.meshing import add_intensity, check_viewpoint  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - likewise
+
+        sensor_position = None if viewpoint is None else check_viewpoint(self.intensity_scale, viewpoint)
+        mesh = mesh_of(
+            self, voxel_size, min_component_triangles, executor, progress,
+            box=box,
+            min_confidence=min_confidence,
+            max_uncertainty=max_uncertainty,
+            min_detection_rate=min_detection_rate,
+        )  # fmt: skip
+        if sensor_position is not None and self.intensity_scale is not None:
+            values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position, extrapolate=True)
+            add_intensity(mesh, values.astype(np.float32), self.intensity_scale)
+        return mesh
+
+    def render(
+        self,
+        T_world_sensor: ArrayLike,
+        sensor: Sensor | None = None,
+        *,
+        returns: float | None = None,
+        noise: bool = False,
+        seed: int | np.random.Generator = 0,
+    ) -> View:
+        """The returns that a radar would get from a pose; see :meth:`Map.render`.
+
+        The surface of the tiles within the sensor's range is held until a view needs others.
+
+        Raises
+        ------
+        ValueError
+            If the pose is not a rigid transform, or a number is out of range.
+        """
+        from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
+        from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - likewise
+
+        pose = check_poses(np.asarray(real_array(T_world_sensor, "T_world_sensor"))[None], 1)[0]
+        range_m = (self.sensor if sensor is None else instance(sensor, Sensor, "sensor")).range_m[1]
+        # Of a pose far away from all tiles, any will do to see nothing.
+        tiles = tiles_within(self, pose[:3, 3], range_m) or [self.tiles[0].tile]
+        held = self._viewed
+        if held is None or held[0] != tiles:
+
+            def intensity(points: _Floats, sensor_position: _Floats) -> _Floats:
+                return self.intensity(points, sensor_position, extrapolate=True)
+
+            viewed = viewed_tiles(self, tiles, intensity if self.has_intensity else None)
+            held = self._viewed = tiles, viewed
+        return view_from(held[1], pose, sensor, returns=returns, noise=noise, seed=seed)
+
+    def export(
+        self,
+        path: str | PathLike[str],
+        voxel_size: float = queries.VOXEL_M,
+        *,
+        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
+        executor: Executor | None = None,
+        progress: bool | None = None,
+        **limits: Any,
+    ) -> tuple[int, int]:
+        """Writes the mesh tile by tile; arguments are those of :meth:`mesh`, without a viewpoint.
+
+        Parameters
+        ----------
+        path : path-like
+            ``NAME.ply``: one file, binary, in double precision. ``NAME.json``: 3D Tiles 1.1, a GLB file for each tile in a
+            folder ``NAME`` beside it, in the frame of the world. To place it on the earth, set the ``transform`` of its root.
+
+        Returns
+        -------
+        tuple
+            Numbers of vertices and triangles.
+        """
+        from radarsdf.tiles.meshing import export_mesh  # noqa: PLC0415 - as above
+
+        return export_mesh(self, path, voxel_size, min_component_triangles, executor, progress, **limits)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Copies the plan and the maps of the tiles that are done to a new folder. The rays of the tiles stay behind.
+
+        Raises
+        ------
+        OSError
+            If the folder exists, or cannot be written.
+        """
+        folder = path_of(path, "path")
+        folder.mkdir()
+        for tile in self.tiles:
+            copy = map_path(folder, tile)
+            copy.parent.mkdir(parents=True)
+            shutil.copyfile(map_path(self.folder, tile), copy)
+        self.plan.save(folder)  # last: without it, the folder is no map
+
+    def clean(self) -> int:
+        """Removes the rays of the tiles that are done, which only their fits need, and the pieces of meshes.
+
+        Without its rays, a tile cannot be fitted again, so its map is read whole before. A mesh makes its pieces again.
+        No other step may run on the folder meanwhile.
+
+        Returns
+        -------
+        int
+            Bytes that are free now.
+
+        Raises
+        ------
+        ValueError
+            If a map is damaged, or of another version. Its rays are kept.
+        OSError
+            If a file cannot be read or removed.
+        """
+        from radarsdf.tiles.pieces import pieces_in  # noqa: PLC0415 - as above
+
+        freed = 0
+        for tile in self.tiles:
+            storage.load_contents(map_path(self.folder, tile))
+            rays = rays_path(self.folder, tile.name)
+            for path in [*pieces_in(rays.parent), *([rays] if rays.exists() else [])]:
+                freed += path.stat().st_size
+                path.unlink()
+        return freed
 
     @property
     def origin(self) -> _Floats:
@@ -116,197 +304,9 @@ class TiledMap(TileBlend):
         """Size of the files of the tiles, bytes."""
         return sum(map_path(self.folder, tile).stat().st_size for tile in self.tiles)
 
-    def sdf(self, x: Any, *, extrapolate: bool = False) -> Any:
-        """Signed distance, m; see :meth:`RadarMap.sdf`. NaN where not observed; with `extrapolate` where there is no tile."""
-        world, answer = _given(x)
-        shares = self.known_shares(world, extrapolate=extrapolate)
-        return answer(torch.from_numpy(averages(shares, len(world), distance)[:, 0]))
 
-    def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
-        """Gradient of :meth:`sdf`, (N, 3); see :meth:`RadarMap.gradient`. NaN as there."""
-        world, answer = _given(x)
-        # Of the quotient of two sums, of w f and of w: the weights change with the position, too.
-        sums, distances, slopes = (
-            np.zeros((len(world), 4)),
-            np.zeros((len(world), 3)),
-            np.zeros((len(world), 3)),
-        )
-        totals = np.zeros(len(world))
-        for share in self.known_shares(world, extrapolate=extrapolate):
-            gradients = queries.gradient(share.contents, share.local).numpy().astype(np.float64)
-            values = np.column_stack([distance(share), gradients])
-            sums[share.rows] += share.weights[:, None] * values
-            totals[share.rows] += share.weights
-            distances[share.rows] += values[:, :1] * share.slopes
-            slopes[share.rows] += share.slopes
-        with np.errstate(invalid="ignore", divide="ignore"):
-            means = sums / totals[:, None]
-            found = means[:, 1:] + (distances - means[:, :1] * slopes) / totals[:, None]
-        return answer(torch.from_numpy(found))
-
-    def observed(self, x: Any) -> Any:
-        """Whether x (N, 3) is in a leaf cell of the map, (N,) bool; see :meth:`RadarMap.observed`."""
-        world, answer = _given(x)
-        return answer(torch.from_numpy(self.seen(world)))
-
-    def confidence(self, x: Any) -> Any:
-        """Probability of a surface, (N,); see :meth:`RadarMap.confidence`."""
-        world, answer = _given(x)
-        return answer(queries.confidence(self.any_contents, self.evidence(world)))
-
-    def uncertainty(self, x: Any) -> Any:
-        """Standard error of the surface's position, (N,), m; see :meth:`RadarMap.uncertainty`."""
-        world, answer = _given(x)
-        return answer(queries.uncertainty(self.any_contents, self.evidence(world)))
-
-    def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
-        """Intensity of a return, (N,), sensor units; see :meth:`RadarMap.intensity`. NaN as for :meth:`sdf`."""
-        if not self.has_intensity:
-            msg = "this map was fitted without intensities"
-            raise ValueError(msg)
-        world, answer = _given(x)
-        sensors = as_positions(sensor_positions, rows=len(world))[0].double().numpy()
-
-        def of_tile(share: Share) -> _Floats:
-            there = queries.to_local(
-                share.contents, torch.from_numpy(np.ascontiguousarray(sensors[share.rows]))
-            )
-            predicted = partial(queries.intensity, share.contents)
-            values = queries.where(there.isfinite().all(dim=1), share.local, there, function=predicted)
-            return values.numpy().astype(np.float64)[:, None]
-
-        shares = self.known_shares(world, extrapolate=extrapolate)
-        return answer(torch.from_numpy(averages(shares, len(world), of_tile)[:, 0]))
-
-    def mesh(
-        self,
-        voxel_size: float = queries.VOXEL_M,
-        *,
-        box: ArrayLike | None = None,
-        viewpoint: ArrayLike | None = None,
-        min_confidence: float = 0.0,
-        max_uncertainty: float | None = None,
-        min_detection_rate: float = queries.MIN_DETECTION_RATE,
-        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
-        executor: Executor | None = None,
-        progress: bool | None = None,
-    ) -> trimesh.Trimesh:
-        """Extracts the surface, without gaps or doubled triangles between tiles; arguments are of :meth:`RadarMap.mesh`.
-
-        Each tile is a task for the `executor`. `voxel_size` must divide the leaf cell's edge. :meth:`export` writes a mesh
-        that does not fit into memory.
-        """
-        from radarsdf.map.meshing import add_intensity, check_viewpoint  # noqa: PLC0415 - trimesh is slow to import
-        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - likewise
-
-        sensor_position = None if viewpoint is None else check_viewpoint(self.intensity_scale, viewpoint)
-        mesh = mesh_of(
-            self, voxel_size, min_component_triangles, executor, progress,
-            box=box,
-            min_confidence=min_confidence,
-            max_uncertainty=max_uncertainty,
-            min_detection_rate=min_detection_rate,
-        )  # fmt: skip
-        if sensor_position is not None and self.intensity_scale is not None:
-            values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position, extrapolate=True)
-            add_intensity(mesh, values.astype(np.float32), self.intensity_scale)
-        return mesh
-
-    def render(
-        self,
-        T_world_sensor: ArrayLike,
-        sensor: Sensor | None = None,
-        *,
-        returns: float | None = None,
-        noise: bool = False,
-        seed: int | np.random.Generator = 0,
-    ) -> View:
-        """The returns that a radar would get from a pose; see :meth:`RadarMap.render`.
-
-        The surface of the tiles within the sensor's range is held until a view needs others.
-
-        Raises
-        ------
-        ValueError
-            If the pose is not a rigid transform, or a number is out of range.
-        """
-        from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
-        from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - likewise
-
-        pose = check_poses(np.asarray(real_array(T_world_sensor, "T_world_sensor"))[None], 1)[0]
-        range_m = (self.sensor if sensor is None else instance(sensor, Sensor, "sensor")).range_m[1]
-        # Of a pose far away from all tiles, any will do to see nothing.
-        tiles = tiles_within(self, pose[:3, 3], range_m) or [self.tiles[0].tile]
-        held = self._viewed
-        if held is None or held[0] != tiles:
-            held = self._viewed = (
-                tiles,
-                viewed_tiles(
-                    self, tiles, partial(self.intensity, extrapolate=True) if self.has_intensity else None
-                ),
-            )
-        return view_from(held[1], pose, sensor, returns=returns, noise=noise, seed=seed)
-
-    def export(
-        self,
-        path: str | PathLike[str],
-        voxel_size: float = queries.VOXEL_M,
-        *,
-        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
-        executor: Executor | None = None,
-        progress: bool | None = None,
-        **limits: Any,
-    ) -> tuple[int, int]:
-        """Writes the mesh tile by tile; arguments are those of :meth:`mesh`, without a viewpoint.
-
-        Parameters
-        ----------
-        path : path-like
-            ``NAME.ply``: one file, binary, in double precision. ``NAME.json``: 3D Tiles 1.1, a GLB file for each tile in a
-            folder ``NAME`` beside it, in the frame of the world. To place it on the earth, set the ``transform`` of its root.
-
-        Returns
-        -------
-        tuple
-            Numbers of vertices and triangles.
-        """
-        from radarsdf.tiles.meshing import export_mesh  # noqa: PLC0415 - as above
-
-        return export_mesh(self, path, voxel_size, min_component_triangles, executor, progress, **limits)
-
-    def clean(self) -> int:
-        """Removes the rays of the tiles that are done, which only their fits need, and the pieces of meshes.
-
-        Without its rays, a tile cannot be fitted again, so its map is read whole before. A mesh makes its pieces again.
-        No other step may run on the folder meanwhile.
-
-        Returns
-        -------
-        int
-            Bytes that are free now.
-
-        Raises
-        ------
-        ValueError
-            If a map is damaged, or of another version. Its rays are kept.
-        OSError
-            If a file cannot be read or removed.
-        """
-        from radarsdf.tiles.pieces import pieces_in  # noqa: PLC0415 - as above
-
-        freed = 0
-        for tile in self.tiles:
-            storage.load_contents(map_path(self.folder, tile))
-            rays = rays_path(self.folder, tile.name)
-            for path in [*pieces_in(rays.parent), *([rays] if rays.exists() else [])]:
-                freed += path.stat().st_size
-                path.unlink()
-        return freed
-
-
-def _given(x: Any) -> tuple[_Floats, Callable[[Tensor], Any]]:
-    world, answer = as_positions(x)
-    return np.ascontiguousarray(world.double().numpy()), answer
+def _contiguous(world: Tensor) -> _Floats:
+    return np.ascontiguousarray(world.double().numpy())
 
 
 def _opened(folder: str, memory_bytes: float) -> TiledMap:

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.map.colors import NEUTRAL
-from radarsdf.tiles.any_map import AnyMap
+from radarsdf.map.map import Map
 from radarsdf.view.glb import glb
 from radarsdf.view.light import shaded
 from radarsdf.view.painter import Wish
 from radarsdf.view.quantities import Quantity
 from radarsdf.view.serving import wait_until_drawn
-from radarsdf.view.surface import Surface
+from radarsdf.view.surface import ShownSurface
 from radarsdf.view.thinning import spread_evenly
 from radarsdf.view.walk import Walk
 
@@ -54,8 +54,8 @@ class SurfaceCanvas:
     def __init__(
         self,
         server: Any,
-        radar_map: AnyMap,
-        surface: Surface,
+        radar_map: Map,
+        surface: ShownSurface,
         quantities: Mapping[str, Quantity],
         walk: Walk | None,
         shown: Callable[[Wish], None],

@@ -12,7 +12,7 @@ from radarsdf.view.canvas import SurfaceCanvas
 from radarsdf.view.legends import legend, marks, paragraph, table
 from radarsdf.view.painter import SLID_S, Painter
 from radarsdf.view.quantities import Colors, Quantity
-from radarsdf.view.surface import Surface
+from radarsdf.view.surface import ShownSurface
 from radarsdf.view.walk import MEASURED_COLOR, PATH_COLOR, PREDICTED_COLOR, Walk
 
 _STEPS = 100
@@ -41,7 +41,7 @@ class Controls:
     def __init__(
         self,
         server: Any,
-        surface: Surface,
+        surface: ShownSurface,
         quantities: Mapping[str, Quantity],
         measured: Colors | None,
         scans: int = 0,
@@ -62,7 +62,7 @@ class Controls:
                 with gui.add_folder("scans"):
                     self._fill_scans(gui, measured, scans)
 
-    def _fill_surface(self, gui: Any, surface: Surface) -> None:
+    def _fill_surface(self, gui: Any, surface: ShownSurface) -> None:
         self._surface = gui.add_checkbox("show", True)
         step_m, largest_m = _range(float(surface.uncertainty_m.max()))
         self._uncertainty = gui.add_slider(

@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.map.colors import NEUTRAL, intensity_colors
+from radarsdf.map.map import Map
 from radarsdf.threads import resolve_num_threads
-from radarsdf.tiles.any_map import AnyMap
-from radarsdf.view.surface import Surface
+from radarsdf.view.surface import ShownSurface
 
 SCALE_PERCENTILES = (2.0, 98.0)
 """Of the values on the surface: these are the ends of a scale."""
@@ -73,7 +73,7 @@ class Quantity:
 
 
 def quantities_of(
-    radar_map: AnyMap, surface: Surface, scans: Scans | None, sensor: _Position
+    radar_map: Map, surface: ShownSurface, scans: Scans | None, sensor: _Position
 ) -> dict[str, Quantity]:
     """All that the surface can be coloured by, by name; the first is shown first.
 
@@ -111,7 +111,7 @@ def quantities_of(
 class _Observed:
     """Whether a return is within the edge of a leaf cell: elsewhere the surface was continued from its neighbours."""
 
-    def __init__(self, surface: Surface, scans: Scans, edge_m: float) -> None:
+    def __init__(self, surface: ShownSurface, scans: Scans, edge_m: float) -> None:
         self._surface, self._scans, self._edge_m = surface, scans, edge_m
         self._observed: NDArray[np.bool_] | None = (
             None  # when it is asked for: it takes seconds of many returns

@@ -15,7 +15,7 @@ from radarsdf.map.meshing import renumbered
 from radarsdf.view.thinning import thinned
 
 if TYPE_CHECKING:
-    from radarsdf.tiles.any_map import AnyMap
+    from radarsdf.map.map import Map
 
 _Floats = NDArray[np.float64]
 _Rows = NDArray[np.int64]
@@ -26,7 +26,7 @@ _SHADE = 0.87  # lightness where the light does not come: colours must still be 
 
 
 @dataclass(frozen=True)
-class Surface:
+class ShownSurface:
     """Triangles with what the map knows of their vertices."""
 
     vertices: _Floats
@@ -34,9 +34,9 @@ class Surface:
     faces: NDArray[np.int32]
     """(F, 3) rows of vertices. They face free space."""
     uncertainty_m: NDArray[np.float32]
-    """(V,) see `RadarMap.uncertainty`."""
+    """(V,) see `Map.uncertainty`."""
     confidence: NDArray[np.float32]
-    """(V,) see `RadarMap.confidence`."""
+    """(V,) see `Map.confidence`."""
     lightness: NDArray[np.float32]
     """(V,) factor of the lightness of colours, at most 1, so that the shape is seen."""
     spacing_m: float
@@ -45,20 +45,20 @@ class Surface:
     @classmethod
     def of(
         cls,
-        radar_map: AnyMap,
+        radar_map: Map,
         voxel_size: float,
         *,
         max_vertices: int,
         box: ArrayLike | None = None,
         progress: bool | None = None,
         **limits: Any,
-    ) -> Surface:
-        """Mesh a map, and thin the mesh if it has more than `max_vertices`. `limits`: as `RadarMap.mesh`.
+    ) -> ShownSurface:
+        """Mesh a map, and thin the mesh if it has more than `max_vertices`. `limits`: as `Map.mesh`.
 
         Raises
         ------
         ValueError
-            If there is no surface, or as `RadarMap.mesh`.
+            If there is no surface, or as `Map.mesh`.
         """
         whole_number(max_vertices, "max_vertices", _FEWEST)
         mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress, **limits)

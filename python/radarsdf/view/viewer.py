@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.io.scans import Scans
-from radarsdf.tiles.any_map import AnyMap
+from radarsdf.map.map import Map
 from radarsdf.view.canvas import SurfaceCanvas
 from radarsdf.view.controls import Controls
 from radarsdf.view.framing import FOV_RAD, Look, look_at_all
@@ -19,7 +19,7 @@ from radarsdf.view.painter import HELD_S, SLID_S, Painter, Wish
 from radarsdf.view.picking import first_hit
 from radarsdf.view.quantities import Colors, quantities_of
 from radarsdf.view.serving import free_port, require_viser, start_server, stop_server
-from radarsdf.view.surface import Surface
+from radarsdf.view.surface import ShownSurface
 from radarsdf.view.walk import Walk
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Viewer:
     progress : bool, optional
         Whether to show a progress bar. By default only on a terminal.
     **limits
-        What the mesh leaves out, such as ``min_confidence``: as :meth:`RadarMap.mesh`.
+        What the mesh leaves out, such as ``min_confidence``: as :meth:`Map.mesh`.
 
     Raises
     ------
@@ -76,7 +76,7 @@ class Viewer:
 
     def __init__(
         self,
-        radar_map: AnyMap,
+        radar_map: Map,
         scans: Scans | None = None,
         *,
         voxel_size: float = 0.1,
@@ -91,7 +91,7 @@ class Viewer:
         self.host = host
         self.port = free_port(host, 8080 if port is None else port, exactly=port is not None)
         self._map = radar_map
-        self.surface = Surface.of(
+        self.surface = ShownSurface.of(
             radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
         )
         """What is shown."""

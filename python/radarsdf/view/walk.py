@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.scans import Scan, Scans
-from radarsdf.tiles.any_map import AnyMap
+from radarsdf.map.map import Map
 
 ALL_RETURNS = 200_000
 """Returns of all scans that are shown together at most."""
@@ -44,7 +44,7 @@ class Walk:
     def __init__(
         self,
         server: Any,
-        radar_map: AnyMap,
+        radar_map: Map,
         scans: Scans,
         colors: Callable[[NDArray[Any]], NDArray[np.uint8]] | None,
         say: Callable[[str], None],
