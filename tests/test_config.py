@@ -15,7 +15,7 @@ import sys
 import numpy as np
 import pytest
 from radarsdf import FitConfig, _core
-from radarsdf import config as module
+from radarsdf.config import fit_config, groups
 from radarsdf.lattice import WorldLattice
 
 GROUPS = ("returns", "encoding", "networks", "sampling", "training")
@@ -210,8 +210,8 @@ def test_widths(name):
 
 
 def test_limits_are_those_of_the_core():
-    assert module.MAX_LEVELS == _core.MAX_LEVELS
-    assert module.MAX_FREQUENCIES == _core.MAX_FREQUENCIES
+    assert groups.MAX_LEVELS == _core.MAX_LEVELS
+    assert groups.MAX_FREQUENCIES == _core.MAX_FREQUENCIES
 
 
 @pytest.mark.parametrize(
@@ -456,7 +456,7 @@ def test_rows_move_unless_normals_are_learnt_with_the_geometry():
 
 
 def test_every_setting_says_what_it_is():
-    source = inspect.getsource(module)
+    source = inspect.getsource(fit_config) + inspect.getsource(groups)
     for name in names():
         own = name.split(".")[-1]
         assert f"\n    {own}: " in source

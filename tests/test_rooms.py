@@ -29,7 +29,6 @@ ROOMS = (
         "versions",
     ),
     ("config",),
-    ("config_toml",),
     ("io",),
     ("returns",),
     ("field",),

@@ -9,7 +9,7 @@ from .budget.estimate import Estimate as Estimate
 from .budget.estimate import estimate as estimate
 from .checking.check import check as check
 from .checking.finding import Finding as Finding
-from .config import FitConfig as FitConfig
+from .config.fit_config import FitConfig as FitConfig
 from .fitting.fit import fit as fit
 from .fitting.stopping import Diverged as Diverged
 from .fitting.stopping import Interrupted as Interrupted

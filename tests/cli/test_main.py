@@ -21,7 +21,7 @@ try:
     main(sys.argv[1:])
 except SystemExit as end:
     imported = set(sys.modules) - before
-    foreign = {name.partition(".")[0] for name in imported} - sys.stdlib_module_names - {"radarsdf"}
+    foreign = {name.partition(".")[0] for name in imported} - sys.stdlib_module_names - {"radarsdf", "lazy_loader"}
     assert not foreign, foreign
     print("imported:", *(name for name in COMMANDS if f"radarsdf.cli.{name}" in imported))
     sys.exit(end.code)
@@ -29,7 +29,7 @@ except SystemExit as end:
 
 
 def answer(*words):
-    """What help or a usage error says, and its status. Only the standard library and modules of the command line may
+    """What help or a usage error says, and its status. Only the standard library, lazy_loader and modules of the command line may
     be imported for it; the last line names the commands among these."""
     done = subprocess.run(
         [sys.executable, "-c", ANSWERED, *words],

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from radarsdf import config_toml
+from radarsdf.config import toml
 from radarsdf.io import read
 from radarsdf.io.clouds.reading import read_columns
 from radarsdf.io.poses.reading import read_calibration, read_poses
@@ -65,7 +65,7 @@ def test_a_calibration_and_settings_with_a_byte_order_mark(tmp_path):
     (tmp_path / "calib.txt").write_text(f"Tr: {matrix}\n", "utf-8-sig")
     assert_array_equal(read_calibration(tmp_path / "calib.txt"), np.eye(4))
     (tmp_path / "a.toml").write_text("seed = 3\n", "utf-8-sig")
-    assert config_toml.read_toml(tmp_path / "a.toml") == {"seed": 3}
+    assert toml.read_toml(tmp_path / "a.toml") == {"seed": 3}
 
 
 @pytest.mark.parametrize(

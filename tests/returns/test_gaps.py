@@ -9,7 +9,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
-from radarsdf.config import BLOCK_CELLS
+from radarsdf.config.fit_config import BLOCK_CELLS
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.gaps import _MAX_SUPPORT, bridged
 from radarsdf.returns.rays import prepare

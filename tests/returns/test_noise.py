@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from radarsdf.config import ReturnsConfig
+from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.surfels import Surfels

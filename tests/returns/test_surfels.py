@@ -11,7 +11,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
-from radarsdf.config import ReturnsConfig
+from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 
 from radarsdf.budget.schedule import Schedule, seen_jointly
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.widths import intensity_widths, sdf_widths, weights_of
 
 # Seconds on one thread, measured on the machine that BENCHMARK.md names: `python -m bench.stress durations`

@@ -17,7 +17,7 @@ from radarsdf.budget.durations import SECONDS, shared, work_of
 from radarsdf.budget.extent import check_extent
 from radarsdf.budget.schedule import Schedule, seen_jointly
 from radarsdf.checks import instance
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.widths import fourier_width, intensity_widths, parameters_of, sdf_widths
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.rays import Rays, prepare

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.rays import Rays
 

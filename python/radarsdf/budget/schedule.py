@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 
 # The sdf stage makes so many passes over the samples, within these limits. If they contradict each other, the least
 # number of iterations wins over the most passes and the most samples. Measured: bench/history/time.md.

@@ -11,7 +11,7 @@ from radarsdf.budget.extent import check_extent
 from radarsdf.checking.common_surfaces import check_poses_by_noise
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import Recording
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.noise import sensor_noise
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.surfels import Surfels

@@ -15,7 +15,7 @@ from radarsdf.checking.finding import SEVERITIES, Finding
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
 from radarsdf.checks import instance
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
 
 

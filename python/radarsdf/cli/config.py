@@ -17,6 +17,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the configuration."""
-    from radarsdf.config_toml import to_toml
+    from radarsdf.config.toml import to_toml
 
     say(to_toml(config_of(options)), end="")

@@ -50,8 +50,8 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
 
 def config_of(options: argparse.Namespace) -> FitConfig:
     """The configuration: the chosen preset, then the changes of ``--config``, then those of ``--set``."""
-    from radarsdf.config import FitConfig
-    from radarsdf.config_toml import read_toml
+    from radarsdf.config.fit_config import FitConfig
+    from radarsdf.config.toml import read_toml
 
     config = FitConfig.paper() if options.paper else FitConfig.quick() if options.quick else FitConfig()
     if options.config is not None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.encodings import Fourier, Octree, TriQuadtree
 from radarsdf.field.networks import IntensityNetwork, SDFNetwork
 

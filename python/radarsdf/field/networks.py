@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.encodings import SphericalHarmonics
 from radarsdf.field.mlp import mlp
 from radarsdf.field.widths import intensity_widths, sdf_widths

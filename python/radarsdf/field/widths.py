@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 
 from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 
 
 def cells_width(config: FitConfig) -> int:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.checks import path_of
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors

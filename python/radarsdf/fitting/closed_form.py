@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents

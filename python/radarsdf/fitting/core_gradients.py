@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from radarsdf import _core
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field import kernels
 from radarsdf.field.field import Field
 from radarsdf.fitting.gradients import GradientBackend, Gradients, RandomDropout, Touched

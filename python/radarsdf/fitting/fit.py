@@ -10,7 +10,7 @@ from os import PathLike
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import instance
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.scans import Scans

@@ -18,7 +18,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.widths import cells_width, fourier_width
 from radarsdf.fitting.sampling import Batch, Dropout

@@ -22,7 +22,7 @@ from radarsdf._core import (
     stable_order,
 )
 from radarsdf.budget.schedule import near_and_labelled
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import Rays
 
 _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly over an interval of length 1

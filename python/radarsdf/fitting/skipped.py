@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from radarsdf.budget.durations import SECONDS, shared, work_of
 from radarsdf.budget.schedule import Schedule
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf._core import CellSet, count_scans
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.returns.cells import ReturnCells

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.budget.estimate import check_fit
 from radarsdf.budget.extent import check_extent
 from radarsdf.budget.schedule import Schedule
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint

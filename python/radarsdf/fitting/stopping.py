@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.map.radar_map import RadarMap
 
 _KEPT = 0.99  # of the sums, in each iteration: they are of about the last hundred

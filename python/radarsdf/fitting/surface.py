@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays

@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf.budget.schedule import Schedule
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.autograd_gradients import AutogradGradients

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.budget.estimate import check_mesh
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.isosurface import sparse_lattice

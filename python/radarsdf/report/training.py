@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from radarsdf.config import FitConfig
-from radarsdf.config_toml import to_toml
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.toml import to_toml
 from radarsdf.report import plots
 from radarsdf.report.page import Section, folded, grid, image, items, note, paragraph, table
 from radarsdf.report.subject import Subject

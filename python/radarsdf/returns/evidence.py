@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, count_looks
-from radarsdf.config import ReturnsConfig
+from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
 
 CELLS_OF_SURFACE = 9

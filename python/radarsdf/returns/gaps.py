@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, bridge_cells
-from radarsdf.config import BLOCK_CELLS
+from radarsdf.config.fit_config import BLOCK_CELLS
 from radarsdf.returns.support import support_at
 
 # Measured on simulated and real scans; see bench/history/surface.md.

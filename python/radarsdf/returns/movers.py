@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import check_values_of_scans, one_for_each_scan, real_array
-from radarsdf.config import FitConfig, ReturnsConfig
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.groups import ReturnsConfig
 from radarsdf.io.scans import Scans
 from radarsdf.returns.doppler import MIN_RETURNS, sensor_velocities
 from radarsdf.returns.rays import Rays, check_scans, prepare

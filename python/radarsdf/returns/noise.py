@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.config import ReturnsConfig
+from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from radarsdf.checks import positive
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents

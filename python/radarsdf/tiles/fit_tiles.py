@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from radarsdf.checks import instance, one_for_each_scan, path_of, positive
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.files import write_whole
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans

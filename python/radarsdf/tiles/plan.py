@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from radarsdf.checks import MAX_POSITION_M
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.returns.sensor import Sensor

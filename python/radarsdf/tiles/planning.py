@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.budget.estimate import estimate_rays
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.io.scans import Scan
 from radarsdf.returns.movers import Standing

@@ -12,7 +12,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from radarsdf.config import FitConfig
+from radarsdf.config.fit_config import FitConfig
 
 if sys.version_info >= (3, 11):
     import tomllib

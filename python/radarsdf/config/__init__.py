@@ -1,0 +1,3 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The settings of a fit, and their file."""

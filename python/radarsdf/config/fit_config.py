@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The configuration of a fit: what is changed most often, the groups, and the presets."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BeforeValidator, Field
+
+from radarsdf.config.groups import (
+    MAX_THREADS,
+    EncodingConfig,
+    NetworksConfig,
+    ReturnsConfig,
+    SamplingConfig,
+    TrainingConfig,
+)
+from radarsdf.lattice import WorldLattice
+from radarsdf.settings import by_name, settings
+
+BLOCK_CELLS = 32  # edge of a block, leaf cells: a multiple of that of the cubes in which looks are counted
+_MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
+_Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
+
+_Group = ReturnsConfig | EncodingConfig | NetworksConfig | SamplingConfig | TrainingConfig
+
+
+def _from_mapping(group: Any) -> Callable[[Any], Any]:
+    """A validator that also accepts a dict of the group's settings."""
+    name = group.__name__.removesuffix("Config").lower()
+    return lambda value: group(**by_name(value, name)) if isinstance(value, Mapping) else value
+
+
+@settings
+class FitConfig:
+    """The settings of a fit. The defaults are the best ones measured; :meth:`paper` is 3QFPI as published.
+
+    The settings that are changed most often are at the top. The others are in groups; a group can be given as
+    a dict.
+
+    Raises
+    ------
+    ValueError
+        At construction: for an unknown setting, or a value of the wrong type or out of range.
+
+    Examples
+    --------
+    >>> config = FitConfig(leaf_size_m=0.3, training={"sdf_iterations": 200})
+    >>> config.training.sdf_iterations, config.near_band_m
+    (200, 0.45)
+    """
+
+    leaf_size_m: _Length = 0.2
+    """Edge of a leaf cell, m (3QFPI: 0.2). It is the unit of all settings in `_cells`."""
+    effort: Annotated[float, Field(gt=0, le=1000)] = 1.0
+    """Multiplies the iterations that follow from the size of the data. 0.5 takes about half the time."""
+    seed: Annotated[int, Field(ge=0, le=_MAX_SEED)] = 0
+    """Seed of all random numbers of the fit. The same seed and data give the same bits, see :func:`radarsdf.fit`."""
+    num_threads: Annotated[int, Field(ge=0, le=MAX_THREADS)] = 0
+    """Threads of the fit. 0: as many as PyTorch uses."""
+    max_memory_bytes: Annotated[int, Field(ge=1, lt=2**63)] | None = None
+    """A fit or mesh that takes more is refused with a MemoryError, bytes. None: what the system has left."""
+    returns: Annotated[ReturnsConfig, BeforeValidator(_from_mapping(ReturnsConfig))] = ReturnsConfig()
+    """Which returns are used, and how they are cleaned."""
+    encoding: Annotated[EncodingConfig, BeforeValidator(_from_mapping(EncodingConfig))] = EncodingConfig()
+    """How a position is encoded for the networks."""
+    networks: Annotated[NetworksConfig, BeforeValidator(_from_mapping(NetworksConfig))] = NetworksConfig()
+    """The two networks and their inputs."""
+    sampling: Annotated[SamplingConfig, BeforeValidator(_from_mapping(SamplingConfig))] = SamplingConfig()
+    """Where on the rays the training samples are."""
+    training: Annotated[TrainingConfig, BeforeValidator(_from_mapping(TrainingConfig))] = TrainingConfig()
+    """Losses, schedule and optimiser."""
+
+    if TYPE_CHECKING:  # a group can be given as a dict, and is never read as one
+
+        def __init__(
+            self,
+            *,
+            leaf_size_m: float = ...,
+            effort: float = ...,
+            seed: int = ...,
+            num_threads: int = ...,
+            max_memory_bytes: int | None = ...,
+            returns: ReturnsConfig | Mapping[str, Any] = ...,
+            encoding: EncodingConfig | Mapping[str, Any] = ...,
+            networks: NetworksConfig | Mapping[str, Any] = ...,
+            sampling: SamplingConfig | Mapping[str, Any] = ...,
+            training: TrainingConfig | Mapping[str, Any] = ...,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        if self.training.start == "average":
+            if self.encoding.kind != "octree" or min(self.networks.sdf_hidden) < 2:
+                msg = "training.start 'average' needs encoding.kind 'octree' and networks.sdf_hidden of at least 2"
+                raise ValueError(msg)
+            # A vertex of the map that no ray counts at would keep the distance 0, that of the surface.
+            if self.training.truncation_cells < self.sampling.near_band_cells:
+                msg = f"training.truncation_cells must be at least sampling.near_band_cells, {self.sampling.near_band_cells}"
+                raise ValueError(msg)
+
+    @property
+    def near_band_m(self) -> float:
+        """`sampling.near_band_cells`, m."""
+        return self._metres(self.sampling.near_band_cells)
+
+    @property
+    def free_beyond_m(self) -> float:
+        """`sampling.free_beyond_cells`, m."""
+        return self._metres(self.sampling.free_beyond_cells)
+
+    @property
+    def truncation_m(self) -> float:
+        """`training.truncation_cells`, m."""
+        return self._metres(self.training.truncation_cells)
+
+    @property
+    def sigma_m(self) -> float:
+        """`training.sigma_cells`, m."""
+        return self._metres(self.training.sigma_cells)
+
+    @property
+    def fourier_half_width_m(self) -> float:
+        """`encoding.fourier_half_width_cells`, m."""
+        return self._metres(self.encoding.fourier_half_width_cells)
+
+    @property
+    def lattice(self) -> WorldLattice:
+        """Where cells lie in the world, from leaf cells to the coarsest."""
+        return WorldLattice(self.leaf_size_m, max(BLOCK_CELLS, 2 ** (self.encoding.num_levels - 1)))
+
+    @property
+    def preparation(self) -> dict[str, Any]:
+        """Keyword arguments of :func:`radarsdf.returns.rays.prepare`."""
+        names = ("min_range_m", "max_range_m", "accumulate_scans")
+        return {name: getattr(self.returns, name) for name in names} | {"lattice": self.lattice}
+
+    @property
+    def trains_intensity(self) -> bool:
+        """Whether intensities, where there are any, train a network."""
+        return self.networks.reflectance != "closed-form"
+
+    @property
+    def closes_intensity(self) -> bool:
+        """Whether intensities, or what a network leaves of them, are in closed form."""
+        return self.networks.reflectance != "network"
+
+    def moves_rows(self, with_intensity: bool) -> bool:
+        """Whether an iteration changes only the features that its samples use: see `training.row_updates`."""
+        # Normals are gradients of the features, which only autograd differentiates again, for all features at
+        # once.
+        through_normals = with_intensity and self.training.joint and self.networks.normals
+        return self.training.row_updates and not through_normals
+
+    def differentiates_in_core(self, with_intensity: bool) -> bool:
+        """Whether the gradients come from the compiled core: see `training.gradients`."""
+        # Normals are gradients, and the core does not differentiate twice.
+        normals = with_intensity and self.networks.normals
+        return self.training.gradients == "core" and not normals
+
+    def _metres(self, cells: float) -> float:
+        return float(f"{cells * self.leaf_size_m:.12g}")  # 1.5 · 0.2 gives 0.3, not 0.30000000000000004
+
+    @classmethod
+    def quick(cls, **changes: Any) -> FitConfig:
+        """Settings for a surface that is averaged over the rays instead of trained.
+
+        The fit takes a fraction of the time; the surface is rougher and the map larger. Mesh it with voxels of the
+        size of its leaf cells, since smaller ones show no more detail. Intensities are in closed form, and take a
+        quarter to a half of the time without them. `changes`: as for :meth:`override`.
+        """
+        return cls(
+            encoding=EncodingConfig(kind="octree", num_levels=1, fourier_count=0, bridge_cells=0),
+            networks=NetworksConfig(sdf_hidden=(2,), reflectance="closed-form"),
+            sampling=SamplingConfig(near_band_cells=2.0),
+            training=TrainingConfig(start="average", sdf_iterations=0, joint=False),
+        ).override(**changes)
+
+    @classmethod
+    def paper(cls, **changes: Any) -> FitConfig:
+        """The settings of 3QFPI as published. `changes`: as for :meth:`override`.
+
+        For a mesh as published, call ``mesh(min_detection_rate=0, max_uncertainty=math.inf, min_component_triangles=300)``.
+        """
+        return cls(
+            returns=ReturnsConfig(
+                accumulate_scans=5, drop_movers=False, drop_ghosts=False, onto_planes=False
+            ),
+            encoding=EncodingConfig(bridge_cells=0, fourier_count=16),
+            networks=NetworksConfig(
+                intensity_hidden=(64, 64),
+                geometry_feature_dim=15,
+                reflectance="network",
+                normals=True,
+                log_range=False,
+                feature_dropout=0.0,
+                fourier_dropout=0.0,
+            ),
+            sampling=SamplingConfig(cross_range_noise_rad=0.0),
+            training=TrainingConfig(
+                sigma_cells=0.1375,  # 0.55 · 0.05 m
+                intensity_in_free_space=True,
+                batch_size=8192,
+                intensity_batch_size=8192,
+                sdf_iterations=1000,
+                intensity_iterations=4000,
+                optimiser="adam",
+                learning_rate=1e-3,
+                intensity_learning_rate=1e-3,
+                cosine_schedule=False,
+                row_updates=False,
+            ),
+        ).override(**changes)
+
+    def override(self, /, **changes: Any) -> FitConfig:
+        """This configuration with some settings changed.
+
+        Parameters
+        ----------
+        **changes
+            Settings by name. For a group: a dict of the settings that change, or the whole group.
+
+        Examples
+        --------
+        >>> FitConfig.paper().override(seed=1, training={"sdf_iterations": 200}).training.batch_size
+        8192
+        """
+        merged: dict[str, Any] = {}
+        for name, value in changes.items():
+            group = getattr(self, name, None)
+            if isinstance(group, _Group) and isinstance(value, Mapping):
+                own = {field.name: getattr(group, field.name) for field in dataclasses.fields(group)}
+                merged[name] = type(group)(**(own | by_name(value, name)))
+            else:
+                merged[name] = value
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return FitConfig(**(own | merged))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as nested dicts of plain values, for JSON and TOML."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> FitConfig:
+        """The inverse of :meth:`to_dict`. Missing settings have defaults; unknown ones raise a ValueError."""
+        return cls().override(**by_name(values, "the settings"))
