@@ -3,249 +3,20 @@
 #include "field/field_loss.hpp"
 
 #include <algorithm>
-#include <cmath>
 #include <memory>
 #include <stdexcept>
 #include <string>
 #include <utility>
 
+#include "field/field_pass.hpp"
 #include "kernels/fourier_kernels.hpp"
 #include "util/large_array.hpp"
-#include "util/random_bytes.hpp"
 
 namespace radarsdf {
 namespace {
 
-template <typename T>
-using Matrix = std::unique_ptr<T[]>;
-
-template <typename T>
-Matrix<T> matrix(std::int64_t rows, std::int64_t columns) {
-  return large_array<T>(rows * columns);
-}
-
 // What a sum over a batch is to be multiplied by.
 double mean(std::int64_t count) { return 1 / static_cast<double>(std::max<std::int64_t>(count, 1)); }
-
-// The samples of a part of a batch.
-template <typename T>
-struct Part {
-  const T* points;
-  const T* sdf_m;
-  std::int64_t count;
-  const T* rays;
-  std::int64_t ray_stride;
-  std::int64_t num_labelled;
-  std::int64_t num_seen;             // the intensity network sees the first so many
-  std::int64_t before, seen_before;  // samples of the batch
-  Dropout dropout[2];
-};
-
-// What is asked for of a part.
-template <typename T>
-struct Request {
-  FieldLosses shares;                               // of one sample in the weighted means over the batch
-  const std::vector<LayerGradients<T>>* sdf;        // null: features and SDF network are frozen, without a loss
-  const std::vector<LayerGradients<T>>* intensity;  // null: there is no loss of intensities
-  FeatureGradients<T> by_features;                  // `interpolated` is null where they are frozen
-};
-
-template <typename T>
-class Pass {
- public:
-  Pass(const FieldParameters<T>& field, const LossOptions& options, const Part<T>& part, const Request<T>& request)
-      : field_(field),
-        options_(options),
-        part_(part),
-        request_(request),
-        levels_(field.levels()),
-        cells_(field.cells()),
-        waves_(field.waves()),
-        feature_(field.feature()) {}
-
-  // Sums over the samples.
-  FieldLosses run() {
-    encode();
-    const bool trains = request_.sdf != nullptr;
-    const std::int64_t outputs = 1 + feature_;
-    out_ = matrix<T>(part_.count, outputs);
-    const Matrix<T> hidden = trains ? matrix<T>(part_.count, mlp_hidden_columns(field_.sdf)) : nullptr;
-    std::vector<Columns<const T>> inputs = {{encoding_.get(), dim(), cells_}};
-    if (waves_ > 0) inputs.push_back({encoding_.get() + cells_, dim(), waves_});
-    mlp(field_.sdf, inputs, part_.count, hidden.get(), out_.get(), 1);
-
-    FieldLosses losses{0, 0};
-    if (request_.intensity != nullptr) losses.intensity = intensity_loss(trains);
-    if (!trains) return losses;
-    out_grad_ = matrix<T>(part_.count, outputs);
-    std::fill_n(out_grad_.get(), part_.count * outputs, T(0));
-    losses.sdf = sdf_loss();
-    add_links();
-    const Matrix<T> own = sums_levels() ? matrix<T>(part_.count, cells_) : nullptr;
-    T* cells_grad = own ? own.get() : request_.by_features.interpolated;
-    std::vector<Columns<T>> input_grads = {{cells_grad, cells_, cells_}};
-    if (waves_ > 0) input_grads.push_back({nullptr, 0, waves_});
-    mlp_backward(field_.sdf, inputs, part_.count, hidden.get(), {out_grad_.get(), outputs, outputs}, *request_.sdf,
-                 input_grads, 1);
-    add_cells(cells_grad);
-    if (own) spread(own.get());
-    return losses;
-  }
-
- private:
-  bool sums_levels() const { return field_.table->encoding() == Encoding::kOctree; }
-  std::int64_t dim() const { return cells_ + waves_; }
-
-  void encode() {
-    encoding_ = matrix<T>(part_.count, dim());
-    const Matrix<T> own = sums_levels() ? matrix<T>(part_.count, levels_) : nullptr;
-    radarsdf::encode(*field_.table, field_.features, part_.points, part_.count, request_.by_features.located,
-                     own ? own.get() : encoding_.get(), own ? levels_ : dim(), 1);
-    for (std::int64_t i = 0; own && i < part_.count; ++i) {
-      for (std::int64_t d = 0; d < cells_; ++d) {
-        T sum = 0;
-        for (std::int64_t at = d; at < levels_; at += cells_) sum += own[i * levels_ + at];
-        encoding_[i * dim() + d] = sum;
-      }
-    }
-    if (waves_ > 0) {
-      fourier(part_.points, part_.count, field_.frequencies.half_width_m, field_.frequencies.first,
-              field_.frequencies.count, encoding_.get() + cells_, dim(), 1);
-    }
-  }
-
-  // Binary cross-entropy of sigmoid(logit) and sigmoid(sdf / sigma), as `sdf_loss` of the Python package has it.
-  double sdf_loss() {
-    const std::int64_t outputs = 1 + feature_;
-    const T inverse_sigma = static_cast<T>(1 / options_.sigma_m);
-    const T share = static_cast<T>(request_.shares.sdf);
-    double sum = 0;
-    for (std::int64_t i = 0; i < part_.count; ++i) {
-      const T logit = out_[i * outputs], label = 1 / (1 + std::exp(-part_.sdf_m[i] * inverse_sigma));
-      const T tail = std::exp(-std::abs(logit));
-      sum += static_cast<double>(std::max(logit, T(0)) - logit * label + std::log1p(tail));
-      out_grad_[i * outputs] = share * ((logit < 0 ? tail : T(1)) / (1 + tail) - label);
-    }
-    return sum;
-  }
-
-  // Applies a dropout to rows of an encoding, or of its gradient, one for each sample that is seen. `to` may be `from`.
-  void drop(const Dropout& dropout, std::int64_t columns, const T* from, std::int64_t from_row, T* to,
-            std::int64_t to_row) const {
-    if (dropout.keep >= 256 && to == from) return;
-    RandomRows random(dropout.seed, columns);
-    const T scale = T(256) / static_cast<T>(dropout.keep);
-    for (std::int64_t i = 0; i < part_.num_seen; ++i, from += from_row, to += to_row) {
-      if (dropout.keep >= 256) {
-        std::copy_n(from, columns, to);
-        continue;
-      }
-      const std::uint8_t* bytes = random.row(part_.seen_before + i);
-      for (std::int64_t d = 0; d < columns; ++d) to[d] = from[d] * (bytes[d] < dropout.keep ? scale : T(0));
-    }
-  }
-
-  // Mean absolute error, and the gradients by the layers and, where `trains`, by what the SDF network hands on.
-  double intensity_loss(bool trains) {
-    const std::int64_t count = part_.num_seen, width = field_.intensity[0].inputs;
-    const std::int64_t links = feature_ + field_.sees.sdf;  // columns that the SDF network gives
-    const std::int64_t rest = dim() + links;                // the columns from here on are data and need no gradient
-    const Matrix<T> x = matrix<T>(count, width);
-    drop(part_.dropout[0], cells_, encoding_.get(), dim(), x.get(), width);
-    drop(part_.dropout[1], waves_, encoding_.get() + cells_, dim(), x.get() + cells_, width);
-    for (std::int64_t i = 0; i < count; ++i) fill(i, x.get() + i * width + dim());
-    if (field_.sees.view_direction) {
-      const Matrix<T> directions = matrix<T>(count, 3);
-      for (std::int64_t i = 0; i < count; ++i) {
-        std::copy_n(part_.rays + i * part_.ray_stride + kRayDirection, 3, directions.get() + 3 * i);
-      }
-      spherical_harmonics(directions.get(), count, x.get() + rest, width, 1);
-    }
-
-    std::vector<Columns<const T>> inputs;
-    std::vector<Columns<T>> input_grads;
-    if (trains) {
-      cells_grad_ = matrix<T>(count, cells_);
-      links_grad_ = matrix<T>(count, links);
-    }
-    std::int64_t first = 0;
-    const auto add = [&](std::int64_t columns, T* gradient) {
-      if (columns == 0) return;
-      inputs.push_back({x.get() + first, width, columns});
-      input_grads.push_back({gradient, columns, columns});
-      first += columns;
-    };
-    add(cells_, cells_grad_.get());
-    add(waves_, nullptr);
-    add(links, links_grad_.get());
-    add(width - rest, nullptr);
-
-    const Matrix<T> predicted = matrix<T>(count, 1);
-    const Matrix<T> hidden = matrix<T>(count, mlp_hidden_columns(field_.intensity));
-    mlp(field_.intensity, inputs, count, hidden.get(), predicted.get(), 1);
-    const T share = static_cast<T>(request_.shares.intensity);
-    double sum = 0;
-    for (std::int64_t i = 0; i < count; ++i) {
-      // No return is expected from free space (3QFPI).
-      const T label = i < part_.num_labelled ? part_.rays[i * part_.ray_stride + kRayIntensity] : T(0);
-      const T error = std::isnan(label) ? T(0) : predicted[i] - label;
-      sum += static_cast<double>(std::abs(error));
-      predicted[i] = error > 0 ? share : error < 0 ? -share : T(0);
-    }
-    mlp_backward(field_.intensity, inputs, count, hidden.get(), {predicted.get(), 1, 1}, *request_.intensity,
-                 input_grads, 1);
-    return sum;
-  }
-
-  // What the intensity network sees of a sample after the encodings, but for the harmonics.
-  void fill(std::int64_t i, T* x) const {
-    const T* out = out_.get() + i * (1 + feature_);
-    x = std::copy_n(out + 1, feature_, x);
-    if (field_.sees.sdf) *x++ = out[0];
-    if (field_.sees.view_direction) x += kHarmonics;
-    if (field_.sees.log_range) {
-      const T range_m = part_.rays[i * part_.ray_stride + kRayRange] - part_.sdf_m[i];
-      *x = std::log10(std::max(range_m, T(1e-3)) / 10);
-    }
-  }
-
-  // Gradients of the intensity by the outputs of the SDF network.
-  void add_links() {
-    if (!links_grad_) return;
-    const std::int64_t links = feature_ + field_.sees.sdf;
-    for (std::int64_t i = 0; i < part_.num_seen; ++i) {
-      const T* from = links_grad_.get() + i * links;
-      T* to = out_grad_.get() + i * (1 + feature_);
-      for (std::int64_t g = 0; g < feature_; ++g) to[1 + g] += from[g];
-      if (field_.sees.sdf) to[0] += from[feature_];
-    }
-  }
-
-  // Gradients of the intensity by the cells' encoding.
-  void add_cells(T* cells_grad) {
-    if (!cells_grad_) return;
-    T* own = cells_grad_.get();
-    drop(part_.dropout[0], cells_, own, cells_, own, cells_);
-    for (std::int64_t i = 0; i < part_.num_seen * cells_; ++i) cells_grad[i] += own[i];
-  }
-
-  // The encoding is the sum of the levels, so each level's gradient is that of the sum.
-  void spread(const T* cells_grad) const {
-    for (std::int64_t i = 0; i < part_.count; ++i) {
-      for (std::int64_t first = 0; first < levels_; first += cells_) {
-        std::copy_n(cells_grad + i * cells_, cells_, request_.by_features.interpolated + i * levels_ + first);
-      }
-    }
-  }
-
-  const FieldParameters<T>& field_;
-  const LossOptions& options_;
-  const Part<T>& part_;
-  const Request<T>& request_;
-  std::int64_t levels_, cells_, waves_, feature_;  // numbers of columns
-  Matrix<T> encoding_, out_, out_grad_;
-  Matrix<T> cells_grad_, links_grad_;  // of the intensity's loss alone
-};
 
 template <typename T>
 void check_layers(const std::vector<Layer<T>>& layers, std::int64_t num_gradients, std::int64_t inputs,
@@ -293,7 +64,7 @@ FieldLoss<T>::FieldLoss(const FieldParameters<T>& parameters, const LossOptions&
 
 template <typename T>
 struct FieldLoss<T>::Job {
-  std::vector<Part<T>> parts;
+  std::vector<PassInput<T>> parts;
   std::vector<NetworkGradients<T>> by_networks;  // of each part
   std::vector<FieldLosses> sums;                 // of each part
   FieldLosses means;                             // what the sums are multiplied by
@@ -354,13 +125,13 @@ void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const F
   const FieldLosses shares{weights.sdf * job->means.sdf, weights.intensity * job->means.intensity};
   crew.begin(static_cast<std::int64_t>(job->parts.size()), [this, job, to, shares](std::int64_t task) {
     const auto i = static_cast<std::size_t>(task);
-    const Part<T>& part = job->parts[i];
-    const Request<T> request{shares,
-                             job->trains ? &job->by_networks[i].sdf : nullptr,
-                             job->sees ? &job->by_networks[i].intensity : nullptr,
-                             {to.located + part.before * parameters_.table->num_levels(),
-                              job->trains ? to.interpolated + part.before * parameters_.levels() : nullptr}};
-    job->sums[i] = Pass<T>(parameters_, options_, part, request).run();
+    const PassInput<T>& part = job->parts[i];
+    const PassRequest<T> request{shares,
+                                 job->trains ? &job->by_networks[i].sdf : nullptr,
+                                 job->sees ? &job->by_networks[i].intensity : nullptr,
+                                 {to.located + part.before * parameters_.table->num_levels(),
+                                  job->trains ? to.interpolated + part.before * parameters_.levels() : nullptr}};
+    job->sums[i] = run_pass(parameters_, options_, part, request);
   });
   job_ = job;
 }
