@@ -97,27 +97,36 @@ void bind_cell_sums(py::module_& m) {
       "Keys, ascending, of `leaf_keys` (C,) and of the at most `max_cells` cells between two of `ends` (E,), in one of "
       "13 directions, where the `support` (E,) float64 of the two, added up, is below `least_dense`. All keys uint64, "
       "ascending, each once.");
+  m.attr("DIRECTION_QUANTA") = kDirectionQuanta;
   m.def(
-      "sum_moments",
-      [](const Array<float>& points, const Array<float>& directions, const Array<std::int32_t>& cells,
-         std::int64_t num_cells, int num_threads) {
+      "sum_returns",
+      [](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
+         const Array<std::int32_t>& cells, const Array<std::int64_t>& corners, double quantum_m, int num_threads) {
+        const std::int64_t num_cells = corners.ndim() == 2 ? corners.shape(0) : 0;
+        check_shape(corners, num_cells, 3, "corners");
         const std::int64_t count = check_cells_of_returns(cells, num_cells);
         check_shape(points, count, 3, "points");
         check_shape(directions, count, 3, "directions");
-        const std::int32_t* c = cells.data();
-        py::array_t<double> moments({static_cast<py::ssize_t>(num_cells), py::ssize_t{kMoments}});
-        const float *p = points.data(), *d = directions.data();
-        double* result = moments.mutable_data();
+        if (check_column(ranges_m, "ranges_m") != count) throw std::invalid_argument("ranges_m must be one a return");
+        if (!(quantum_m > 0)) throw std::invalid_argument("quantum_m must be positive");
+        const ReturnsInCells returns{points.data(), directions.data(), ranges_m.data(), cells.data(), count};
+        const std::int64_t* c = corners.data();
+        py::array_t<std::int64_t> sums({static_cast<py::ssize_t>(num_cells), py::ssize_t{kSums}});
+        std::int64_t* result = sums.mutable_data();
         {
           const py::gil_scoped_release release;
-          sum_moments(p, d, c, count, num_cells, result, num_threads);
+          sum_returns(returns, c, num_cells, quantum_m, result, num_threads);
         }
-        return moments;
+        return sums;
       },
-      "points"_a.noconvert(), "directions"_a.noconvert(), "cells"_a.noconvert(), "num_cells"_a, "num_threads"_a = 0,
-      "Sums over the returns of each cell, (num_cells, 13): 1, x, y, z, xx, xy, xz, yy, yz, zz, direction. `points` "
-      "and "
-      "`directions` (N, 3) float32; `cells` (N,) int32, the row of each return's cell.");
+      "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "cells"_a.noconvert(),
+      "corners"_a.noconvert(), "quantum_m"_a, "num_threads"_a = 0,
+      "Sums over the returns of each cell, (C, 14) int64: 1, x, y, z, xx, xy, xz, yy, yz, zz, direction, range. "
+      "Lengths "
+      "are in quanta, positions from the corners (C, 3) int64 of the cells, in quanta; directions are times "
+      "DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, the row of "
+      "each "
+      "return's cell.");
   m.def(
       "principal_axes",
       [](const Array<double>& matrices, int num_threads) {

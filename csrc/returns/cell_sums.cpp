@@ -145,20 +145,30 @@ bool in_crowd(const std::uint64_t* keys, std::int64_t count, std::int64_t i) {
 
 }  // namespace
 
-void sum_moments(const float* points, const float* directions, const std::int32_t* cells, std::int64_t count,
-                 std::int64_t num_cells, double* moments, int num_threads) {
-  std::fill(moments, moments + kMoments * num_cells, 0.0);
-  // Every thread reads all returns and adds those of its own cells: the order of a sum is that of the returns, whatever
-  // the number of threads. Its cells are scattered, since returns are denser in some places than in others.
-  const std::int64_t threads = count > (1 << 14) ? resolve_num_threads(num_threads) : 1;
+void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std::int64_t num_cells, double quantum_m,
+                 std::int64_t* sums, int num_threads) {
+  std::fill(sums, sums + kSums * num_cells, std::int64_t{0});
+  const double quanta = 1 / quantum_m;  // in 1 m
+  // Every thread reads all returns and adds those of its own cells. These are scattered, since returns are denser in
+  // some places than in others.
+  const std::int64_t threads = returns.count > (1 << 14) ? resolve_num_threads(num_threads) : 1;
   parallel_tasks(threads, num_threads, [&](std::int64_t task) {
-    for (std::int64_t i = 0; i < count; ++i) {
-      if ((cells[i] >> 6) % threads != task) continue;
-      const double x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
-      const float* d = directions + 3 * i;
-      const double terms[kMoments] = {1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, d[0], d[1], d[2]};
-      double* sums = moments + kMoments * std::int64_t{cells[i]};
-      for (int k = 0; k < kMoments; ++k) sums[k] += terms[k];
+    for (std::int64_t i = 0; i < returns.count; ++i) {
+      const std::int64_t cell = returns.cells[i];
+      if ((cell >> 6) % threads != task) continue;
+      // Unsigned, which may wrap around.
+      std::uint64_t place[3], direction[3];
+      for (int axis = 0; axis < 3; ++axis) {
+        const std::int64_t at = std::llrint(quanta * returns.points[3 * i + axis]);
+        place[axis] = static_cast<std::uint64_t>(at - corners[3 * cell + axis]);
+        direction[axis] = static_cast<std::uint64_t>(std::llrint(kDirectionQuanta * returns.directions[3 * i + axis]));
+      }
+      const std::uint64_t x = place[0], y = place[1], z = place[2];
+      const auto range = static_cast<std::uint64_t>(std::llrint(quanta * returns.ranges_m[i]));
+      const std::uint64_t terms[kSums] = {
+          1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, direction[0], direction[1], direction[2], range};
+      std::int64_t* own = sums + kSums * cell;
+      for (int k = 0; k < kSums; ++k) own[k] = static_cast<std::int64_t>(static_cast<std::uint64_t>(own[k]) + terms[k]);
     }
   });
 }

@@ -10,13 +10,24 @@
 
 namespace radarsdf {
 
-// Of a return at (x, y, z): 1, x, y, z, xx, xy, xz, yy, yz, zz, and its direction's three components.
-constexpr int kMoments = 13;
+// Of a return at (x, y, z): 1, x, y, z, xx, xy, xz, yy, yz, zz, its direction's three components, and its range.
+constexpr int kSums = 14;
+constexpr double kDirectionQuanta = 1 << 24;  // in 1
 
-// moments: (num_cells, kMoments), the sums over the returns of each cell, in the order of the returns. points,
-// directions: (count, 3), local frame, m; cells: the cell of each.
-void sum_moments(const float* points, const float* directions, const std::int32_t* cells, std::int64_t count,
-                 std::int64_t num_cells, double* moments, int num_threads);
+// Returns of scans, and the cell of each.
+struct ReturnsInCells {
+  const float* points;      // (count, 3), local frame, m
+  const float* directions;  // (count, 3), unit vectors
+  const float* ranges_m;    // (count,)
+  const std::int32_t* cells;
+  std::int64_t count;
+};
+
+// sums: (num_cells, kSums), over the returns of each cell, in integers, so that their order does not matter and some
+// can be taken out again. Lengths are in quanta, from the corners (num_cells, 3) of the cells; directions in 1 /
+// kDirectionQuanta. Sums wrap around: of products they mean nothing where a corner is far away.
+void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std::int64_t num_cells, double quantum_m,
+                 std::int64_t* sums, int num_threads);
 
 // sums: (count, columns), for each key those over its cell and the 26 round it of values, (cells.size(), columns). A
 // cell that shares a face with the key's counts `weight` times, one that shares an edge weight^2, a corner weight^3.

@@ -14,6 +14,7 @@ __all__: list[str] = [
     "CellMeans",
     "CellSet",
     "Crew",
+    "DIRECTION_QUANTA",
     "Encoding",
     "FEATURE_DIM",
     "FieldLoss",
@@ -61,7 +62,7 @@ __all__: list[str] = [
     "sparse_lattice",
     "spherical_harmonics",
     "stable_order",
-    "sum_moments",
+    "sum_returns",
 ]
 
 class Crew:
@@ -1213,17 +1214,20 @@ def stable_order(keys: numpy.typing.NDArray[numpy.uint64]) -> numpy.typing.NDArr
     Positions (N,) int32 of `keys` (N,) uint64 in ascending order; equal ones in their own.
     """
 
-def sum_moments(
+def sum_returns(
     points: numpy.typing.NDArray[numpy.float32],
     directions: numpy.typing.NDArray[numpy.float32],
+    ranges_m: numpy.typing.NDArray[numpy.float32],
     cells: numpy.typing.NDArray[numpy.int32],
-    num_cells: typing.SupportsInt | typing.SupportsIndex,
+    corners: numpy.typing.NDArray[numpy.int64],
+    quantum_m: typing.SupportsFloat | typing.SupportsIndex,
     num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-) -> numpy.typing.NDArray[numpy.float64]:
+) -> numpy.typing.NDArray[numpy.int64]:
     """
-    Sums over the returns of each cell, (num_cells, 13): 1, x, y, z, xx, xy, xz, yy, yz, zz, direction. `points` and `directions` (N, 3) float32; `cells` (N,) int32, the row of each return's cell.
+    Sums over the returns of each cell, (C, 14) int64: 1, x, y, z, xx, xy, xz, yy, yz, zz, direction, range. Lengths are in quanta, positions from the corners (C, 3) int64 of the cells, in quanta; directions are times DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, the row of each return's cell.
     """
 
+DIRECTION_QUANTA: float = 16777216.0
 FEATURE_DIM: int = 8
 MAX_FREQUENCIES: int = 24
 MAX_LEVELS: int = 12

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf._core import CellBlocks, cell_keys, principal_axes, sum_moments
+from radarsdf._core import DIRECTION_QUANTA, CellBlocks, cell_keys, principal_axes, sum_returns
 
 
 def keys_of(cells):
@@ -47,19 +47,23 @@ def test_sums_round_a_key(weight):
     np.testing.assert_array_equal(sums, backwards[::-1])
 
 
-def test_moments_of_the_returns_in_a_cell():
+def test_sums_over_the_returns_of_a_cell():
     rng = np.random.default_rng(0)
-    count, num_cells = 50_000, 300  # enough for several threads
+    count, num_cells, quantum_m = 50_000, 300, 1e-4  # enough for several threads
     points, directions = (rng.normal(size=(count, 3)).astype(np.float32) for _ in range(2))
+    ranges_m = rng.uniform(1, 100, count).astype(np.float32)
     cells = rng.integers(0, num_cells - 1, count).astype(np.int32)  # the last stays empty
-    x, y, z = points.astype(np.float64).T
-    columns = [np.ones(count), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, *directions.T]
-    expected = np.stack([np.bincount(cells, column, num_cells) for column in columns], 1)
-    moments = sum_moments(points, directions, cells, num_cells)
-    np.testing.assert_allclose(moments, expected, rtol=1e-10, atol=1e-10)
-    for num_threads in (1, 3):
-        again = sum_moments(points, directions, cells, num_cells, num_threads)
-        np.testing.assert_array_equal(moments, again)
+    corners = rng.integers(-5000, 5000, (num_cells, 3))
+    x, y, z = (np.rint(points.astype(np.float64) / quantum_m).astype(np.int64) - corners[cells]).T
+    along = np.rint(directions * DIRECTION_QUANTA).astype(np.int64).T
+    ranges = np.rint(ranges_m.astype(np.float64) / quantum_m).astype(np.int64)
+    ones = np.ones(count, np.int64)
+    expected = np.zeros((num_cells, 14), np.int64)
+    for k, column in enumerate([ones, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, *along, ranges]):
+        np.add.at(expected[:, k], cells, column)
+    for num_threads in (0, 1, 3):
+        sums = sum_returns(points, directions, ranges_m, cells, corners, quantum_m, num_threads)
+        np.testing.assert_array_equal(sums, expected)
 
 
 def test_arguments_are_checked():
@@ -73,12 +77,18 @@ def test_arguments_are_checked():
         CellBlocks(keys).sum_round(keys, np.zeros(3), 1.0)
     with pytest.raises(ValueError, match="keys"):
         CellBlocks(keys).rows(keys[None])
-    points = np.zeros((2, 3), np.float32)
+    points, corners = np.zeros((2, 3), np.float32), np.zeros((5, 3), np.int64)
     for cell in (-1, 5):
         with pytest.raises(ValueError, match="cells"):
-            sum_moments(points, points, np.array([0, cell], np.int32), 5)
-    with pytest.raises(ValueError, match="directions"):
-        sum_moments(points, points[:1], np.zeros(2, np.int32), 5)
+            sum_returns(points, points, points[:, 0].copy(), np.array([0, cell], np.int32), corners, 0.1)
+    for name, given in (
+        ("directions", (points, points[:1], points[:, 0].copy(), np.zeros(2, np.int32), corners, 0.1)),
+        ("ranges_m", (points, points, points[:1, 0].copy(), np.zeros(2, np.int32), corners, 0.1)),
+        ("corners", (points, points, points[:, 0].copy(), np.zeros(2, np.int32), corners[:, :2].copy(), 0.1)),
+        ("quantum_m", (points, points, points[:, 0].copy(), np.zeros(2, np.int32), corners, 0.0)),
+    ):
+        with pytest.raises(ValueError, match=name):
+            sum_returns(*given)
 
 
 def test_values_between_the_centres_of_cells():

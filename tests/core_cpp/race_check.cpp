@@ -183,20 +183,24 @@ void sums_and_rays(int threads, Results& results) {
   std::vector<std::int32_t> rows(kPoints);
   blocks.rows(keys.data(), kPoints, rows.data(), threads);
   results.add(rows.data(), kPoints);
-  std::vector<double> moments(static_cast<std::size_t>(radarsdf::kMoments * num_cells)), round(moments.size());
-  radarsdf::sum_moments(points.data(), directions.data(), rows.data(), kPoints, num_cells, moments.data(), threads);
-  radarsdf::sum_round(blocks, sorted.data(), num_cells, moments.data(), radarsdf::kMoments, 0.5, round.data(), threads);
-  results.add(moments.data(), radarsdf::kMoments * num_cells);
-  results.add(round.data(), radarsdf::kMoments * num_cells);
+  const std::vector<float> ranges(kPoints, 6.0F);
+  const std::vector<std::int64_t> corners(static_cast<std::size_t>(3 * num_cells));
+  std::vector<std::int64_t> sums(static_cast<std::size_t>(radarsdf::kSums * num_cells));
+  radarsdf::sum_returns({points.data(), directions.data(), ranges.data(), rows.data(), kPoints}, corners.data(),
+                        num_cells, 1e-4, sums.data(), threads);
+  const std::vector<double> values(sums.begin(), sums.end());
+  std::vector<double> round(values.size());
+  radarsdf::sum_round(blocks, sorted.data(), num_cells, values.data(), radarsdf::kSums, 0.5, round.data(), threads);
+  results.add(values.data(), radarsdf::kSums * num_cells);
+  results.add(round.data(), radarsdf::kSums * num_cells);
 
   std::vector<radarsdf::Surfel> surfels;
   for (std::int64_t cell = 0; cell < num_cells; ++cell) {
-    const double* m = moments.data() + radarsdf::kMoments * cell;
-    const auto mean = [&](int k) { return static_cast<float>(m[k] / m[0]); };
+    const double* m = values.data() + radarsdf::kSums * cell;
+    const auto mean = [&](int k) { return static_cast<float>(1e-4 * m[k] / m[0]); };
     surfels.push_back({{mean(1), mean(2), mean(3)}, {0, 0, 1}, 0.05F});
   }
   const radarsdf::SurfelMap map(sorted.data(), surfels.data(), num_cells, 0.4);
-  const std::vector<float> ranges(kPoints, 6.0F);
   std::vector<std::int32_t> crossed(kPoints);
   map.first_crossings(points.data(), directions.data(), ranges.data(), kPoints, {0.1F, 0.01F}, 0.1F, 2.0F,
                       crossed.data(), threads);

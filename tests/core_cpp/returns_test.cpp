@@ -171,38 +171,56 @@ TEST_CASE("rays cross a plane where they end behind it") {
   CHECK_THROWS_AS(radarsdf::SurfelMap(keys.data(), surfels.data(), 2, 0), std::invalid_argument);
 }
 
-TEST_CASE("moments are the sums over the returns of each cell") {
+TEST_CASE("sums over the returns of a cell do not depend on their order") {
   constexpr std::int64_t kCount = 40000;
-  const auto points = test::normal_numbers<float>(3 * kCount, 2, 3);
-  const auto directions = test::unit_vectors<float>(kCount, 4);
-  const Cells cells = cells_of(points, 0.5);
+  constexpr double kQuantum = 0.001;
+  auto points = test::normal_numbers<float>(3 * kCount, 2, 3);
+  auto directions = test::unit_vectors<float>(kCount, 4);
+  Cells cells = cells_of(points, 0.5);
   const auto num_cells = static_cast<std::int64_t>(cells.keys.size());
-  std::vector<double> expected(static_cast<std::size_t>(radarsdf::kMoments * num_cells));
+  std::vector<float> ranges(kCount);
+  for (std::size_t i = 0; i < kCount; ++i) ranges[i] = 5 + points[3 * i];
+  std::vector<std::int64_t> corners(static_cast<std::size_t>(3 * num_cells));
+  for (std::size_t i = 0; i < corners.size(); ++i) corners[i] = static_cast<std::int64_t>(i % 7) * 500 - 1500;
+  std::vector<std::int64_t> expected(static_cast<std::size_t>(radarsdf::kSums * num_cells));
   for (std::size_t i = 0; i < kCount; ++i) {
-    const double x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
-    const double terms[] = {1,
-                            x,
-                            y,
-                            z,
-                            x * x,
-                            x * y,
-                            x * z,
-                            y * y,
-                            y * z,
-                            z * z,
-                            directions[3 * i],
-                            directions[3 * i + 1],
-                            directions[3 * i + 2]};
-    for (std::size_t k = 0; k < radarsdf::kMoments; ++k) {
-      expected[radarsdf::kMoments * static_cast<std::size_t>(cells.rows[i]) + k] += terms[k];
+    const auto cell = static_cast<std::size_t>(cells.rows[i]);
+    std::int64_t at[3], along[3];
+    for (std::size_t axis = 0; axis < 3; ++axis) {
+      at[axis] = std::llrint(points[3 * i + axis] * (1 / kQuantum)) - corners[3 * cell + axis];
+      along[axis] = std::llrint(directions[3 * i + axis] * radarsdf::kDirectionQuanta);
     }
+    const std::int64_t range = std::llrint(ranges[i] * (1 / kQuantum));
+    const std::int64_t terms[] = {1,
+                                  at[0],
+                                  at[1],
+                                  at[2],
+                                  at[0] * at[0],
+                                  at[0] * at[1],
+                                  at[0] * at[2],
+                                  at[1] * at[1],
+                                  at[1] * at[2],
+                                  at[2] * at[2],
+                                  along[0],
+                                  along[1],
+                                  along[2],
+                                  range};
+    for (std::size_t k = 0; k < radarsdf::kSums; ++k) expected[radarsdf::kSums * cell + k] += terms[k];
   }
-  for (const int threads : test::kThreads) {
-    std::vector<double> moments(expected.size(), -1);
-    radarsdf::sum_moments(points.data(), directions.data(), cells.rows.data(), kCount, num_cells, moments.data(),
-                          threads);
-    CHECK(moments == expected);  // the same order of sums, so the same bits
+  const auto sums = [&](int threads) {
+    std::vector<std::int64_t> found(expected.size(), -1);
+    radarsdf::sum_returns({points.data(), directions.data(), ranges.data(), cells.rows.data(), kCount}, corners.data(),
+                          num_cells, kQuantum, found.data(), threads);
+    return found;
+  };
+  for (const int threads : test::kThreads) CHECK(sums(threads) == expected);
+  std::reverse(cells.rows.begin(), cells.rows.end());
+  std::reverse(ranges.begin(), ranges.end());
+  for (std::vector<float>* vectors : {&points, &directions}) {
+    std::reverse(vectors->begin(), vectors->end());
+    for (std::size_t i = 0; i < kCount; ++i) std::swap((*vectors)[3 * i], (*vectors)[3 * i + 2]);
   }
+  CHECK(sums(2) == expected);
 }
 
 TEST_CASE("sums round a cell are those of its 27 cells") {

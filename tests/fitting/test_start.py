@@ -66,7 +66,7 @@ def test_one_ray_of_a_cell_is_the_mean_of_its_rays():
     rng = np.random.default_rng(0)
     points, poses = [rng.normal(0, 3, (3000, 3))], np.eye(4)[None]
     rays = prepare(points, poses)
-    averaged = MeanRays.of(rays, ReturnCells.of(rays, 0.8))
+    averaged = MeanRays.of(rays, ReturnCells.of(rays, 0.8), 0.8)
     keys = cell_keys(rays.points, 0.8)
     assert averaged.keys.tolist() == np.unique(keys).tolist()
     assert averaged.counts.sum() == len(rays)
@@ -83,7 +83,7 @@ def test_rays_that_cancel_each_other_have_a_direction():
     poses = np.stack([np.eye(4), np.eye(4)])
     poses[1, 0, 3] = 10.0
     rays = prepare([[[5.0, 0.0, 0.0]], [[-5.0, 0.0, 0.0]]], poses)
-    averaged = MeanRays.of(rays, ReturnCells.of(rays, 0.4))
+    averaged = MeanRays.of(rays, ReturnCells.of(rays, 0.4), 0.4)
     np.testing.assert_allclose(averaged.directions, rays.directions[:1])
 
 

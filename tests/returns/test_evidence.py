@@ -155,7 +155,7 @@ def test_returns_beside_the_leaf_cells_count_nowhere(rays):
 
 
 def test_mean_rays_know_how_many_scans_they_are_of(rays):
-    means = MeanRays.of(rays, ReturnCells.of(rays, LEAF_M))
+    means = MeanRays.of(rays, ReturnCells.of(rays, LEAF_M), LEAF_M)
     expected = returns_of(rays, np.ones(len(rays)))
     np.testing.assert_array_equal(means.keys, expected.keys)
     np.testing.assert_array_equal(means.scans, expected.scans)

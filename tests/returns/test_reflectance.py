@@ -38,7 +38,7 @@ def unit(rays):
 
 def learnt(rays, values, num_threads=1):
     return Reflectance.of(
-        Residuals.of(rays, values, Surfels.of(rays, LEAF_M, num_threads), LEAF_M, num_threads), num_threads
+        Residuals.of(rays, values, Surfels.of(rays, LEAF_M, num_threads), LEAF_M), num_threads
     )
 
 
@@ -83,8 +83,8 @@ def test_with_a_network_the_answer_is_the_mean_of_two(rays):
     """That of the network, and of half of it with what that leaves in closed form."""
     answers = np.linspace(0.2, 0.6, len(rays), dtype=np.float32)
     surfels = Surfels.of(rays, LEAF_M, 1)
-    found = Reflectance.of(Residuals.of(rays, unit(rays), surfels, LEAF_M, 1, lambda *_: answers))
-    closed = Reflectance.of(Residuals.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1))
+    found = Reflectance.of(Residuals.of(rays, unit(rays), surfels, LEAF_M, lambda *_: answers))
+    closed = Reflectance.of(Residuals.of(rays, unit(rays) - answers / 2, surfels, LEAF_M))
     whole, leaves = (r.at(rays.points, rays.directions, rays.ranges_m, 1) for r in (found, closed))
     assert closed.network_share == 0
     expected = (answers + (answers / 2 + leaves)) / 2
@@ -103,9 +103,9 @@ def test_a_network_is_asked_once_for_a_group(rays, monkeypatch):
 
     answers = ask(rays.points, rays.directions, rays.ranges_m)
     surfels = Surfels.of(rays, LEAF_M, 1)
-    found = Reflectance.of(Residuals.of(rays, unit(rays), surfels, LEAF_M, 1, ask))
+    found = Reflectance.of(Residuals.of(rays, unit(rays), surfels, LEAF_M, ask))
     assert asked[1] < 0.8 * len(rays)
-    each = Reflectance.of(Residuals.of(rays, unit(rays) - answers / 2, surfels, LEAF_M, 1))
+    each = Reflectance.of(Residuals.of(rays, unit(rays) - answers / 2, surfels, LEAF_M))
     closed, leaves = (r.at(rays.points, rays.directions, rays.ranges_m, 1) for r in (found, each))
     assert answers.std() > 0.04
     # Within a group the answer differs by some hundredths.

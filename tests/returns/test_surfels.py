@@ -44,7 +44,7 @@ def test_one_ray_of_a_cell_finds_them_too():
     points, poses, is_ghost = a_wall(ghosts=40)
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
-    averaged = MeanRays.of(rays, ReturnCells.of(rays, 0.2))
+    averaged = MeanRays.of(rays, ReturnCells.of(rays, 0.2), 0.2)
     assert len(averaged.first) < 0.7 * len(rays)
     dropped = find_ghosts(surfels, rays, NOISE, averaged)
     assert dropped[is_ghost].mean() > 0.9

@@ -58,7 +58,5 @@ class ClosedForm:
         unit = np.nan_to_num(scale.to_unit(self.rays.intensities), copy=False)
         network = ask if contents.config.trains_intensity else None
         leaf_size_m = contents.config.leaf_size_m
-        residuals = Residuals.of(
-            self.rays, unit, self.surfels, leaf_size_m, num_threads, network, self.cell_of_ray
-        )
+        residuals = Residuals.of(self.rays, unit, self.surfels, leaf_size_m, network, self.cell_of_ray)
         return dataclasses.replace(contents, reflectance=Reflectance.of(residuals, num_threads))

@@ -41,7 +41,7 @@ class SurfaceReturns:
         # Without an sdf stage, only the average uses the surface, and it takes distances to surfels anyway.
         onto_planes = config.returns.onto_planes and config.training.sdf_iterations != 0
         leaves = ReturnCells.of(rays, config.leaf_size_m, num_threads) if averages else None
-        means = None if leaves is None else MeanRays.of(rays, leaves, num_threads)
+        means = None if leaves is None else MeanRays.of(rays, leaves, config.leaf_size_m, num_threads)
         surfels = Surfels.of(rays, config.leaf_size_m, num_threads, leaves)
         del leaves  # frees memory: 4 bytes a return
         # An average counts cells, not returns, so it needs the noise of those: one return of each.

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, CellSet, cell_keys, sum_moments
+from radarsdf._core import CellBlocks, CellSet, cell_keys
 from radarsdf.returns.rays import Rays
 
 MAX_CELLS_FROM_ORIGIN = 1_000_000
@@ -78,10 +78,10 @@ class ReturnCells:
         """(C,) number of returns in each cell."""
         return np.bincount(self.cell_of_ray, minlength=len(self.keys)).astype(np.float64)
 
-    def moments(self, rays: Rays, num_threads: int = 0) -> NDArray[np.float64]:
-        """(C, 13) sums over the returns of each cell: of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m², and of the direction (3) of the ray.
-
-        `rays` are those that the cells are of.
-        """
-        points, directions = np.ascontiguousarray(rays.points), np.ascontiguousarray(rays.directions)
-        return sum_moments(points, directions, self.cell_of_ray, len(self.keys), num_threads)
+    @cached_property
+    def first(self) -> NDArray[np.int64]:
+        """(C,) row of the first return in each cell."""
+        first = np.zeros(len(self.keys), np.int64)
+        # Backwards: NumPy assigns in order, so the first return of a cell is written last and stays.
+        first[self.cell_of_ray[::-1]] = np.arange(len(self.cell_of_ray) - 1, -1, -1)
+        return first

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellSet, count_scans
+from radarsdf._core import CellSet
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.scan_sums import ScanSums
 
-_MIN_LENGTH = 1e-3  # of the sum of unit directions. A shorter sum has no meaningful direction
+_MIN_LENGTH = 1e-6  # of the mean of unit directions. A shorter one has no meaningful direction
 
 
 @dataclass(frozen=True)
@@ -37,30 +38,27 @@ class MeanRays:
     scans: NDArray[np.uint32]
     """(M,) number of different scans that they are of."""
     ranges_m: NDArray[np.float32]
-    """(M,) range of the first return in each cell."""
+    """(M,) mean range of the returns in each cell, m."""
 
     @classmethod
-    def of(cls, rays: Rays, cells: ReturnCells, num_threads: int = 0) -> MeanRays:
-        """The mean rays of the `cells` that hold the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
-        rows, moments = cells.cell_of_ray, cells.moments(rays, num_threads)
-        first = np.zeros(len(cells.keys), np.int64)
-        first[rows[::-1]] = np.arange(
-            len(rows) - 1, -1, -1
-        )  # backwards: NumPy assigns in order, so the first return of a cell is written last and stays
-        lengths = np.linalg.norm(moments[:, 10:], axis=1)[:, None]
+    def of(cls, rays: Rays, cells: ReturnCells, leaf_size_m: float, num_threads: int = 0) -> MeanRays:
+        """The mean rays of the leaf `cells` that hold the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
+        sums = ScanSums.of(rays, cells, 1, leaf_size_m, num_threads)
+        directions = sums.mean_directions
+        lengths = np.linalg.norm(directions, axis=1)[:, None]
         directions = np.where(
             lengths > _MIN_LENGTH,
-            moments[:, 10:] / np.maximum(lengths, _MIN_LENGTH),
-            rays.directions[first],  # without a mean direction, that of the first ray
+            directions / np.maximum(lengths, _MIN_LENGTH),
+            rays.directions[cells.first],  # without a mean direction, that of the first ray
         )
         return cls(
             keys=cells.keys,
-            first=first,
-            points=(moments[:, 1:4] / moments[:, :1]).astype(np.float32),
+            first=cells.first,
+            points=sums.mean_points.astype(np.float32),
             directions=directions.astype(np.float32),
-            counts=moments[:, 0].astype(np.float32),
-            scans=count_scans(rows, rays.scans, len(cells.keys), num_threads),
-            ranges_m=rays.ranges_m[first],
+            counts=sums.counts.astype(np.float32),
+            scans=sums.scans,
+            ranges_m=sums.mean_ranges_m.astype(np.float32),
         )
 
     def select(self, part: NDArray[np.bool_]) -> MeanRays:

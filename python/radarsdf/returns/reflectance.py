@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means, sum_moments
+from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.response import NUM_COEFFICIENTS, NUM_KINDS, TABLE_SHAPE, Response, kinds_of
@@ -168,7 +168,6 @@ class Residuals:
         unit: Float32,
         surfels: Surfels,
         leaf_size_m: float,
-        num_threads: int = 0,
         ask: Ask | None = None,
         cell_of_ray: NDArray[np.int32] | None = None,
     ) -> Residuals:
@@ -184,8 +183,6 @@ class Residuals:
             Surfels of the same returns, or of more.
         leaf_size_m : float
             Edge of a leaf cell, m.
-        num_threads : int
-            0: as many as OpenMP uses. The result has the same bits with any number.
         ask : callable, optional
             What a network answers: intensities (M,) float32, scaled alike, at points (M, 3), local frame, m, seen along
             directions (M, 3), unit vectors, from ranges (M,), m. Default: there is no network.
@@ -198,7 +195,7 @@ class Residuals:
         points = np.ascontiguousarray(rays.points)
         directions = np.ascontiguousarray(rays.directions)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
-        groups = _Groups.of(points, directions, incidence, leaf_size_m, num_threads)
+        groups = _Groups.of(points, directions, incidence, leaf_size_m)
         if ask is not None:
             answers = ask(groups.points, _unit_vectors(groups.directions), groups.means(rays.ranges_m))
             unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
@@ -254,14 +251,17 @@ class _Groups:
         directions: Float32,
         incidence_rad: Float32,
         leaf_size_m: float,
-        num_threads: int,
     ) -> _Groups:
         if len(points) <= _MOST_RETURNS:
             return cls(None, points, directions, np.ones(len(points)))
         rows, count = cell_rows(_in_metres(_GROUPS, leaf_size_m), points, directions, incidence_rad)
-        moments = sum_moments(points, directions, rows, count, num_threads)
-        counts = moments[:, 0].copy()
-        return cls(rows, _divided(moments[:, 1:4], counts), _divided(moments[:, 10:], counts), counts)
+        counts = np.bincount(rows, minlength=count).astype(np.float64)
+
+        def means(columns: Float32) -> Float32:
+            sums = np.stack([np.bincount(rows, column, count) for column in columns.T], 1)
+            return _divided(sums, counts)
+
+        return cls(rows, means(points), means(directions), counts)
 
     @property
     def weights(self) -> Float32:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from radarsdf._core import principal_axes
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.scan_sums import ScanSums
 
 # Measured on simulated and real scans; see bench/history/surface.md.
 LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m with leaf cells of 0.2 m
@@ -51,7 +52,7 @@ class Surfels:
         """
         cell_size_m = LEAVES_PER_SURFEL * leaf_size_m
         cells = ReturnCells.of(rays, cell_size_m, num_threads) if leaves is None else leaves.merged()
-        sums = cells.moments(rays, num_threads)
+        sums = ScanSums.of(rays, cells, LEAVES_PER_SURFEL, leaf_size_m, num_threads).moments
         support = cells.blocks.sum_round(cells.keys, cells.counts[:, None], NEIGHBOUR_WEIGHT, num_threads)[
             :, 0
         ]
