@@ -43,9 +43,13 @@ def test_the_names_are_those_of_the_reference():
     assert named | {"evaluation", "io", "simulate"} == set(radarsdf.__all__)
 
 
-@pytest.mark.parametrize("name", radarsdf.__all__)
-def test_a_name_is_imported_when_it_is_used(name):
-    run(f"import radarsdf; radarsdf.{name}; assert {name!r} in vars(radarsdf)")
+def test_names_are_imported_when_they_are_used():
+    run(
+        "import radarsdf\n"
+        "for name in radarsdf.__all__:\n"
+        "    assert name not in vars(radarsdf) or name in ('io', 'simulate', 'evaluation'), name\n"
+        "    assert getattr(radarsdf, name) is vars(radarsdf)[name]"
+    )
 
 
 def test_functions_are_not_hidden_by_packages_of_similar_names():
