@@ -40,9 +40,13 @@ NOT_HERE = {
 }
 
 
+# The others are named by what `fit` checks, too, in a tenth of the time.
+WHOLE_CHECK = {"poses of a vehicle, sensor turned by 15 degrees of pitch", "Doppler with the other sign"}
+
+
 @pytest.mark.parametrize("way", sorted(set(WAYS) - NOT_HERE))
 def test_a_way_breaks_the_data_and_is_named(good, way):
     finding, broken = WAYS[way]
     data = broken(good)
     assert differs(good, data)
-    assert finding in [name for name, _ in found_in(data, cheap=False)]
+    assert finding in [name for name, _ in found_in(data, cheap=way not in WHOLE_CHECK)]
