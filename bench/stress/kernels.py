@@ -7,7 +7,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -73,31 +73,51 @@ def relative_error(got: Array, exact: tuple[Array, Array]) -> float:
     return float((error[scale > 0] / scale[scale > 0]).max(initial=0.0))
 
 
-def interpolation_errors(place: str, count: int, dtype: Any, encoding: Any) -> dict[str, float]:
-    """Largest relative error of the features y and of their gradients dF and dx; the same of derivatives along v."""
+class InterpolationCase(NamedTuple):
+    """Arguments of the kernels, and what the reference makes of them."""
+
+    table: _core.VertexTable
+    points: Array
+    features: Array
+    g: Array
+    directions: dict[str, Array | None]
+    """By what is added to the names of the errors: none, and those of derivatives along v."""
+    exact: dict[str, tuple[Array, Array]]
+    """By the names of the errors."""
+
+
+def interpolation_case(place: str, count: int, dtype: Any, encoding: Any) -> InterpolationCase:
+    """The case of `count` points at one of `PLACES`: it takes much longer than the kernels do."""
     table, reference = table_and_reference(place, dtype, encoding)
     assert table.num_rows == reference.num_rows
     rng = np.random.default_rng(count)
     points = points_of(place, count, dtype)
     features = rng.normal(size=(table.num_rows, 8)).astype(dtype)
     g = rng.normal(size=(count, 8 * NUM_LEVELS)).astype(dtype)
-    v = rng.normal(size=(count, 3)).astype(dtype)
-    located = np.zeros((count, NUM_LEVELS), np.int32)
+    directions = {"": None, " along v": rng.normal(size=(count, 3)).astype(dtype)}
+    exact = {}
+    for name, v in directions.items():
+        exact["y" + name] = reference.interpolate(features, points, v)
+        exact["dF" + name] = reference.scatter(g, points, v)
+        exact["dx" + name] = reference.coordinate_gradient(features, g, points, v)
+    return InterpolationCase(table, points, features, g, directions, exact)
+
+
+def interpolation_errors(case: InterpolationCase) -> dict[str, float]:
+    """Largest relative error of the features y and of their gradients dF and dx; the same of derivatives along v."""
+    table, points, features, g = case[:4]
+    located = np.zeros((len(points), NUM_LEVELS), np.int32)
     table.locate(points, located)
-    errors = {}
-    for name, directions in (("", None), (" along v", v)):
+    found: dict[str, Array] = {}
+    for name, v in case.directions.items():
         # The core must write every number of these two.
         out, points_grad = np.full_like(g, np.nan), np.full_like(points, np.nan)
         features_grad = np.zeros_like(features)
-        table.interpolate(features, points, located, directions, out)
-        table.scatter(points, located, directions, g, features_grad)
-        table.coordinate_gradient(features, points, located, directions, g, points_grad)
-        errors["y" + name] = relative_error(out, reference.interpolate(features, points, directions))
-        errors["dF" + name] = relative_error(features_grad, reference.scatter(g, points, directions))
-        errors["dx" + name] = relative_error(
-            points_grad, reference.coordinate_gradient(features, g, points, directions)
-        )
-    return errors
+        table.interpolate(features, points, located, v, out)
+        table.scatter(points, located, v, g, features_grad)
+        table.coordinate_gradient(features, points, located, v, g, points_grad)
+        found |= {"y" + name: out, "dF" + name: features_grad, "dx" + name: points_grad}
+    return {name: relative_error(got, case.exact[name]) for name, got in found.items()}
 
 
 def fourier_error(count: int, dtype: Any) -> dict[str, float]:
@@ -198,7 +218,9 @@ def run(batches: tuple[int, ...] = BATCHES) -> None:
             for count in batches:
                 if count > _OFTEN and (isa, place) != (before, "anywhere"):
                     continue
-                for key, error in interpolation_errors(place, count, dtype, encoding).items():
+                for key, error in interpolation_errors(
+                    interpolation_case(place, count, dtype, encoding)
+                ).items():
                     worst[key] = max(worst.get(key, 0.0), error)
             rows.append([name, np.dtype(dtype).name, place, *(f"{e:.1e}" for e in worst.values())])
         print(markdown(["encoding", "type", "points", *worst], rows), flush=True)
