@@ -156,13 +156,17 @@ def test_a_rotation_changes_the_surface_by_less_than_its_noise():
 
 
 def test_centimetres_for_metres_change_nothing_but_roundings():
-    """Tolerance: 1 mm, and 0.1 dB, in the median. The range in log10(range / 10 m) is left out: it knows of metres."""
+    """Tolerance: 0.1 mm, and 0.1 dB, in the median. The range in log10(range / 10 m) is left out: it knows of metres.
+
+    The training is short. In 60 iterations roundings grow to a millimetre with half of the seeds.
+    """
     scene = ground_and_wall()
     # Cells that look for ghosts are of 0.4 m, whatever the units.
     config = QUICK.override(
         networks={"log_range": False},
         returns={"drop_ghosts": False},
-        training={"optimiser": "adam"},  # SOAP's first steps make much of roundings
+        # SOAP's first steps make much of roundings.
+        training={"optimiser": "adam", "sdf_iterations": 20, "intensity_iterations": 20},
     )
     poses = scene.poses.copy()
     poses[:, :3, 3] *= 100
@@ -178,7 +182,7 @@ def test_centimetres_for_metres_change_nothing_but_roundings():
     )  # fmt: skip
     x = np.random.default_rng(0).uniform([8, -5, -0.2], [20, 5, 0.2], (500, 3))
     distances_m = centimetres.sdf(100 * x, extrapolate=True) / 100
-    assert np.median(np.abs(distances_m - metres.sdf(x, extrapolate=True))) < 1e-3
+    assert np.median(np.abs(distances_m - metres.sdf(x, extrapolate=True))) < 1e-4
     sensor = np.array([0.5, 0, 1.5])
     differences = centimetres.intensity(100 * x, 100 * sensor, extrapolate=True)
     differences -= metres.intensity(x, sensor, extrapolate=True)
