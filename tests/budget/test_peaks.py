@@ -12,17 +12,16 @@ from radarsdf import FitConfig
 from bench.stress.memory import peak_of_a_fit
 
 OCTREE = {"encoding": {"kind": "octree"}}
-NORMALS = {"networks": {"normals": True}}
+# Ten iterations with normals reach 97 % of the peak of sixty, in half the time.
+NORMALS = {"networks": {"normals": True}, "training": {"sdf_iterations": 10, "intensity_iterations": 12}}
 ALL_ROWS = {"training": {"row_updates": False}}
 # As the preset has it, in spite of the settings that the measurement brings along.
 QUICK = FitConfig.quick(training={"intensity_iterations": 72}).to_dict()
 CASES = {
     "quick": QUICK,
     "normals, 1 thread": NORMALS | {"num_threads": 1},
-    "normals, 2 threads": NORMALS | {"num_threads": 2},
     "normals, 8 threads": NORMALS | {"num_threads": 8},
     "all rows, 1 thread": ALL_ROWS | {"num_threads": 1},
-    "all rows, 2 threads": ALL_ROWS | {"num_threads": 2},
     "all rows, 8 threads": ALL_ROWS | {"num_threads": 8},
     "all rows by autograd, 4 threads": {
         "training": {"row_updates": False, "gradients": "autograd"},
