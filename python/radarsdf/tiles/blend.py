@@ -62,22 +62,7 @@ class Share(NamedTuple):
 
 
 class TileBlend:
-    """What the tiles of a folder say of positions in the world: an average of those that know.
-
-    Parameters
-    ----------
-    folder : path-like
-        Where the plan and the maps are.
-    memory_bytes : float
-        About so much memory is used for tiles. One tile at a time is always held.
-
-    Raises
-    ------
-    ValueError
-        If the plan is damaged, or no tile is done.
-    OSError
-        If it cannot be read.
-    """
+    """What the tiles of a folder say of positions in the world: an average of those that know. See :class:`TiledMap`."""
 
     def __init__(self, folder: str | PathLike[str], *, memory_bytes: float = MEMORY_BYTES) -> None:
         self.folder = Path(folder)
