@@ -17,6 +17,7 @@ import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
+from radarsdf.budget.schedule import Schedule
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.field.losses import intensity_loss, sdf_loss
@@ -306,11 +307,18 @@ def test_whole(benchmark, step, rays):
             "joint": joint,
         }
     )
+    schedule = Schedule.of(
+        config,
+        surface_returns=len(rays),
+        returns=len(rays),
+        vertices=field.cells.table.num_rows,
+        with_intensity=scale is not None,
+    )
     losses = []
 
     def setup():
         field.requires_grad_(True)  # a training freezes all parameters at its end
-        training = Training(field, rays, rays, scale, config, workers)
+        training = Training(field, rays, rays, scale, schedule, config, workers)
         return (training,), {}
 
     def run(training):
