@@ -76,7 +76,7 @@ def row(returns: int, threads: int) -> dict[str, Any]:
 def _ghosts(rays: Rays, config: FitConfig, threads: int) -> NDArray[np.bool_]:
     surfels = Surfels.of(rays, config.leaf_size_m, threads)
     noise = sensor_noise(surfels, rays, config.returns)
-    return find_ghosts(surfels, rays, noise, num_threads=threads)
+    return find_ghosts(surfels, rays, noise, threads)[surfels.cells_at(rays.points, threads)]
 
 
 def _measured(name: str, function: Callable[[], Result]) -> tuple[Result, dict[str, float]]:

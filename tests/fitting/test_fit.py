@@ -13,6 +13,7 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.budget.schedule import Schedule
 from radarsdf.fitting.sampling import Dropout, RaySampler
+from radarsdf.returns.cells import lattice_of
 
 from ..conftest import ground_and_wall
 
@@ -348,9 +349,16 @@ def test_effort_is_that_of_the_fit(scene):
 
 
 def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
-    is_ghost = np.concatenate(scene.points)[:, 2] > -0.5  # of the sensor frame: the wall, for once
-    assert 0.1 < is_ghost.mean() < 0.9
-    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", lambda *_: is_ghost)
+    is_ghost = np.zeros(0, bool)
+
+    def upper_wall(surfels, rays, *_):
+        nonlocal is_ghost
+        height = lattice_of(surfels.keys)[:, 2]
+        high = height > height.min() + 2
+        is_ghost = high[surfels.cells_at(rays.points)]
+        return high
+
+    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", upper_wall)
     drawn_from = []
     spread = RaySampler.spread
     monkeypatch.setattr(
@@ -360,6 +368,7 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
         num_threads=1, training={"joint": False}, returns={"drop_ghosts": True, "onto_planes": False}
     )
     with_ghosts = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
+    assert 0.1 < is_ghost.mean() < 0.9
     assert with_ghosts.report["ghosts"] == is_ghost.sum()
     assert set(drawn_from) == {len(is_ghost)}
     real = np.split(~is_ghost, np.cumsum([len(p) for p in scene.points])[:-1])

@@ -102,13 +102,13 @@ rng = np.random.default_rng(0)
 points = rng.normal(size=(1_000_000, 3))
 points *= 300 / np.linalg.norm(points, axis=1, keepdims=True)
 ended = []
-find_surfels = Surfels.of
+find_surfels = Surfels.of_sums
 def announced(*arguments):
     print("ready", flush=True)
     surfels = find_surfels(*arguments)
     ended.append(surfels)
     return surfels
-Surfels.of = announced
+Surfels.of_sums = announced
 try:
     config = radarsdf.FitConfig(num_threads=1)
     radarsdf.fit([points], np.eye(4)[None], config=config, progress=False)

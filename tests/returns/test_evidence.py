@@ -11,10 +11,11 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import cell_keys
-from radarsdf.returns.cells import ReturnCells, lattice_of
+from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.scan_sums import ScanSums
 
 from ..reference_looks import looks_at
 
@@ -155,7 +156,7 @@ def test_returns_beside_the_leaf_cells_count_nowhere(rays):
 
 
 def test_mean_rays_know_how_many_scans_they_are_of(rays):
-    means = MeanRays.of(rays, ReturnCells.of(rays, LEAF_M), LEAF_M)
+    means = MeanRays.of_sums(ScanSums.of(rays, LEAF_M))
     expected = returns_of(rays, np.ones(len(rays)))
     np.testing.assert_array_equal(means.keys, expected.keys)
     np.testing.assert_array_equal(means.scans, expected.scans)
@@ -175,7 +176,13 @@ STARTS = {
 @pytest.mark.parametrize("drop_ghosts", [False, True])
 def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeypatch):
     """With a noise that does not grow with the range: each return tells as much."""
-    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", lambda *_: is_false(rays))
+
+    def cells_of_ghosts(surfels, *_):
+        cells = surfels.cells_at(rays.points)
+        assert not set(cells[is_false(rays)]) & set(cells[~is_false(rays)])
+        return np.isin(np.arange(len(surfels.keys)), cells[is_false(rays)])
+
+    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", cells_of_ghosts)
     config = STARTS[start].override(
         num_threads=2,
         returns={

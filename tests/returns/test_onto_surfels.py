@@ -47,7 +47,7 @@ def test_the_shift_is_the_best_linear_estimate():
     noise = SensorNoise(0.1, 0.012, 0.02)
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
-    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray)
+    plane = surfels.flat_planes_at(rays.points)
     variances, of_plane = {}, {}
     for i in np.flatnonzero(plane >= 0):
         direction, normal = rays.directions[i].astype(float), surfels.normals[plane[i]]
@@ -73,8 +73,8 @@ def test_returns_that_make_no_plane_stay_where_they_are():
     rays = prepare([points], np.eye(4)[None])
     surfels = Surfels.of(rays, LEAF_M)
     moved = onto_surfels(surfels, rays, noise)
-    assert (surfels.flat_plane_of(surfels.cells.cell_of_ray) < 0).mean() > 0.5
-    still = surfels.flat_plane_of(surfels.cells.cell_of_ray) < 0
+    still = surfels.flat_planes_at(rays.points) < 0
+    assert still.mean() > 0.5
     for name in ("points", "directions", "ranges_m"):
         np.testing.assert_array_equal(getattr(moved, name)[still], getattr(rays, name)[still])
     lone = prepare([[[5.0, 0, 0]]], np.eye(4)[None])

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import QUANTA, ScanSums
+from radarsdf.returns.scan_sums import QUANTA, UPPER, ScanSums
 
 from ..conftest import ground_and_wall
 
 LEAF_M = 0.2
 
 
-def sums_of(rays, cells_of_edge):
-    return ScanSums.of(rays, ReturnCells.of(rays, cells_of_edge * LEAF_M), cells_of_edge, LEAF_M)
+def sums_of(rays):
+    return ScanSums.of(rays, LEAF_M)
 
 
 def same(a, b):
@@ -35,42 +35,56 @@ def rays():
     return prepare(scene.points, scene.poses)
 
 
-@pytest.mark.parametrize("cells_of_edge", [1, 2])
-def test_scans_one_after_another_in_any_order_are_all_scans_at_once(rays, cells_of_edge):
-    parts = [sums_of(rays.select(rays.scans == scan), cells_of_edge) for scan in np.unique(rays.scans)]
+def test_scans_one_after_another_in_any_order_are_all_scans_at_once(rays):
+    parts = [sums_of(rays.select(rays.scans == scan)) for scan in np.unique(rays.scans)]
     order = np.random.default_rng(0).permutation(len(parts))
-    whole = sums_of(rays, cells_of_edge)
+    whole = sums_of(rays)
     assert whole.scans.max() > 1
     assert same(functools.reduce(operator.add, [parts[i] for i in order]), whole)
 
 
-@pytest.mark.parametrize("cells_of_edge", [1, 2])
-def test_a_scan_that_is_taken_out_was_never_there(rays, cells_of_edge):
+def test_a_scan_that_is_taken_out_was_never_there(rays):
     gone = rays.scans == 2
-    without = sums_of(rays.select(~gone), cells_of_edge)
-    found = sums_of(rays, cells_of_edge) - sums_of(rays.select(gone), cells_of_edge)
-    assert len(found.keys) < len(sums_of(rays, cells_of_edge).keys)
+    without = sums_of(rays.select(~gone))
+    found = sums_of(rays) - sums_of(rays.select(gone))
+    assert len(found.keys) < len(sums_of(rays).keys)
     assert same(found, without)
 
 
-def test_means_and_moments_are_those_of_the_returns(rays):
-    cells = ReturnCells.of(rays, LEAF_M)
-    sums = ScanSums.of(rays, cells, 1, LEAF_M)
-    points, quantum_m = rays.points.astype(np.float64), LEAF_M / QUANTA
-    products = [points[:, i] * points[:, j] for i in range(3) for j in range(i, 3)]
+def test_means_are_those_of_the_returns(rays):
+    cells, sums = ReturnCells.of(rays, LEAF_M), sums_of(rays)
+    quantum_m, counts = LEAF_M / QUANTA, sums.counts
+
+    def means(values):
+        columns = np.atleast_2d(values.T.astype(np.float64))
+        return np.stack([np.bincount(cells.cell_of_ray, column) for column in columns], 1) / counts[:, None]
+
+    assert np.array_equal(counts, np.bincount(cells.cell_of_ray))
+    assert np.abs(sums.mean_points - means(rays.points)).max() <= quantum_m / 2 + 1e-9
+    assert np.abs(sums.mean_ranges_m - means(rays.ranges_m)[:, 0]).max() <= quantum_m / 2 + 1e-9
+    np.testing.assert_allclose(sums.mean_directions, means(rays.directions), rtol=0, atol=1e-7)
+
+
+def test_moments_are_those_of_the_returns_in_cells_twice_as_large(rays):
+    cells = ReturnCells.of(rays, 2 * LEAF_M)
+    points = rays.points.astype(np.float64)
+    products = [points[:, i] * points[:, j] for i, j in UPPER]
     columns = [np.ones(len(points)), *points.T, *products, *rays.directions.T.astype(np.float64)]
     expected = np.stack([np.bincount(cells.cell_of_ray, column) for column in columns], 1)
-    counts = expected[:, 0]
-    assert np.array_equal(sums.counts, counts)
-    assert np.abs(sums.mean_points - expected[:, 1:4] / counts[:, None]).max() <= quantum_m / 2 + 1e-9
-    ranges_m = np.bincount(cells.cell_of_ray, rays.ranges_m) / counts
-    assert np.abs(sums.mean_ranges_m - ranges_m).max() <= quantum_m / 2 + 1e-9
-    np.testing.assert_allclose(sums.mean_directions, expected[:, 10:] / counts[:, None], rtol=0, atol=1e-7)
+    keys, moments = sums_of(rays).merged_moments()
+    np.testing.assert_array_equal(keys, cells.keys)
+    np.testing.assert_array_equal(moments[:, 0], expected[:, 0])
     # A product of two coordinates has an error of a quantum times both.
-    bound = quantum_m * (np.abs(points).max() + quantum_m) * counts
-    assert (np.abs(sums.moments - expected).max(axis=1) <= bound).all()
+    quantum_m = LEAF_M / QUANTA
+    bound = quantum_m * (np.abs(points).max() + quantum_m) * expected[:, 0]
+    assert (np.abs(moments - expected).max(axis=1) <= bound).all()
+
+
+def test_no_returns_have_no_moments(rays):
+    keys, moments = sums_of(rays.select(slice(0))).merged_moments()
+    assert (keys.shape, moments.shape) == ((0,), (0, 13))
 
 
 def test_cells_of_other_sizes_are_refused(rays):
     with pytest.raises(ValueError, match="different sizes"):
-        sums_of(rays, 1) + sums_of(rays, 2)
+        sums_of(rays) + ScanSums.of(rays, 2 * LEAF_M)

@@ -12,11 +12,11 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.scan_sums import ScanSums
 from radarsdf.returns.support import support_at
 from radarsdf.returns.surfels import Surfels
 
@@ -29,44 +29,49 @@ NOISE = SensorNoise(0.05, 0.01, 0.01)
 """That of `a_wall`."""
 
 
+def ghosts_of(rays, surfels, noise=NOISE, num_threads=0):
+    """(N,) bool of the returns."""
+    return find_ghosts(surfels, rays, noise, num_threads)[surfels.cells_at(rays.points)]
+
+
 def test_ghosts_are_found_and_the_surface_is_kept():
     points, poses, is_ghost = a_wall(ghosts=40)
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
-    dropped = find_ghosts(surfels, rays, NOISE)
+    dropped = ghosts_of(rays, surfels)
     assert dropped[is_ghost].mean() > 0.9
     assert dropped[~is_ghost].mean() < 0.005
-    np.testing.assert_array_equal(dropped, find_ghosts(surfels, rays, NOISE, num_threads=1))
-    np.testing.assert_array_equal(dropped, find_ghosts(surfels, rays, NOISE, num_threads=3))
+    np.testing.assert_array_equal(dropped, ghosts_of(rays, surfels, num_threads=1))
+    np.testing.assert_array_equal(dropped, ghosts_of(rays, surfels, num_threads=3))
 
 
-def test_one_ray_of_a_cell_finds_them_too():
+def test_the_mean_rays_of_leaf_cells_find_them_too():
     points, poses, is_ghost = a_wall(ghosts=40)
     rays = prepare(points, poses)
-    surfels = Surfels.of(rays, LEAF_M)
-    averaged = MeanRays.of(rays, ReturnCells.of(rays, 0.2), 0.2)
-    assert len(averaged.first) < 0.7 * len(rays)
-    dropped = find_ghosts(surfels, rays, NOISE, averaged)
+    surfels, means = Surfels.of(rays, LEAF_M), MeanRays.of_sums(ScanSums.of(rays, LEAF_M))
+    assert len(means.keys) < 0.7 * len(rays)
+    cells = find_ghosts(surfels, means, NOISE)
+    dropped = cells[surfels.cells_at(rays.points)]
     assert dropped[is_ghost].mean() > 0.9
     assert dropped[~is_ghost].mean() < 0.005
-    everyone = find_ghosts(
-        surfels,
-        rays,
-        NOISE,
-        dataclasses.replace(averaged, first=np.arange(len(rays)), counts=np.ones(len(rays), np.float32)),
-    )
-    np.testing.assert_array_equal(everyone, find_ghosts(surfels, rays, NOISE))
+    # A mean counts as often as it has returns. If each counted less, too few of a cell would be behind a surface.
+    fewer = dataclasses.replace(means, counts=means.counts * np.float32(0.3))
+    assert not find_ghosts(surfels, fewer, NOISE).any()
 
 
 def test_planes_of_cells():
     points, poses, _ = a_wall()
     rays = prepare(points, poses)
     surfels = Surfels.of(rays, LEAF_M)
-    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray)
+    plane, cells = surfels.flat_planes_at(rays.points), surfels.cells_at(rays.points)
     assert (plane >= 0).mean() > 0.9
-    np.testing.assert_array_equal(
-        surfels.cell_of_plane[plane[plane >= 0]], surfels.cells.cell_of_ray[plane >= 0]
-    )
+    np.testing.assert_array_equal(surfels.cell_of_plane[plane[plane >= 0]], cells[plane >= 0])
+    np.testing.assert_array_equal(surfels.keys[cells], cell_keys(rays.points, CELL_M))
+    nowhere = np.array([[500, 500, 500]], np.float32)
+    assert (surfels.cells_at(nowhere).tolist(), surfels.flat_planes_at(nowhere).tolist()) == ([-1], [-1])
+    leaf_keys = cell_keys(rays.points, LEAF_M)
+    np.testing.assert_array_equal(surfels.cells_of_leaves(leaf_keys), cells)
+    np.testing.assert_array_equal(surfels.flat_planes_of_leaves(leaf_keys), plane)
     on_ground = (np.abs(rays.in_world()[0][:, 2]) < 0.05) & (rays.in_world()[0][:, 0] < 14) & (plane >= 0)
     assert np.median(surfels.normals[plane[on_ground], 2]) > 0.98
 
@@ -95,7 +100,7 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     behind = np.concatenate([np.arange(1500 + 3750) >= 1500] * len(points))
     surfels = Surfels.of(rays, LEAF_M)
     noise = sensor_noise(surfels, rays, ReturnsConfig())
-    assert find_ghosts(surfels, rays, noise)[behind].mean() < 0.05
+    assert ghosts_of(rays, surfels, noise)[behind].mean() < 0.05
 
 
 def test_few_returns_make_no_plane():

@@ -51,7 +51,7 @@ def check_poses_by_noise(rays: Rays, surfels: Surfels, noise: SensorNoise) -> li
 def _variances(rays: Rays, surfels: Surfels, noise: SensorNoise) -> tuple[float, float, float, int] | None:
     """Variances within and between scans over those of the noise; standard error of the logarithm of their ratio; number of
     surfels. None if too few tell."""
-    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray)
+    plane = surfels.flat_planes_at(rays.points)
     rows = np.flatnonzero(plane >= 0)
     plane = plane[rows]
     normals = surfels.normals[plane]

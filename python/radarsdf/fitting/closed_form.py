@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.surface import SurfaceReturns
@@ -28,22 +27,16 @@ class ClosedForm:
     """N returns that the map is learnt from, with ghosts. All have intensities, or none has."""
     surfels: Surfels
     """Of all returns."""
-    cell_of_ray: NDArray[np.int32]
-    """(N,) cells of the surfels."""
 
     @classmethod
-    def of(
-        cls, rays: Rays, inside: NDArray[np.bool_] | None, surface: SurfaceReturns, config: FitConfig
-    ) -> ClosedForm | None:
-        """Of `rays`, those of the returns of `surface` that are `inside`, (N',). None: none are asked for or given."""
+    def of(cls, rays: Rays, surface: SurfaceReturns, config: FitConfig) -> ClosedForm | None:
+        """Of `rays`. None: none are asked for or given."""
         if rays.intensities is None or not config.closes_intensity:
             return None
-        cells = surface.surfels.cells.cell_of_ray
-        cells = cells if inside is None else cells[inside]
         known = rays.with_intensity
         if known.any() and not known.all():  # a tile may have none: its returns then count as the lowest
-            rays, cells = rays.select(known), cells[known]
-        return cls(rays, surface.surfels, cells)
+            rays = rays.select(known)
+        return cls(rays, surface.surfels)
 
     def added_to(self, contents: MapContents, num_threads: int) -> MapContents:
         """The contents of a map with intensities in closed form: all of them, or what its network leaves."""
@@ -58,5 +51,5 @@ class ClosedForm:
         unit = np.nan_to_num(scale.to_unit(self.rays.intensities), copy=False)
         network = ask if contents.config.trains_intensity else None
         leaf_size_m = contents.config.leaf_size_m
-        residuals = Residuals.of(self.rays, unit, self.surfels, leaf_size_m, network, self.cell_of_ray)
+        residuals = Residuals.of(self.rays, unit, self.surfels, leaf_size_m, network, num_threads)
         return dataclasses.replace(contents, reflectance=Reflectance.of(residuals, num_threads))

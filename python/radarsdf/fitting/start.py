@@ -121,7 +121,7 @@ def average_rays(field: Field, rays: MeanRays, surfels: Surfels, config: FitConf
     return. Its value there is the vertex's distance to a plane through its return: parallel to the surfel
     there, or, if there is none, perpendicular to the ray.
     """
-    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray[rays.first])
+    plane = surfels.flat_planes_of_leaves(rays.keys, num_threads)
     normals = np.where(
         plane[:, None] >= 0,
         surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0,

@@ -33,6 +33,7 @@ from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.scan_sums import ScanSums
 from radarsdf.returns.sensor import Sensor
 from radarsdf.threads import Workers
 
@@ -58,6 +59,8 @@ class FitInput:
     """Share of the returns that lie on no thin surface. None: of these returns."""
     sensor: Sensor | None = None
     """The radar. None: as these rays and poses show it."""
+    sums: ScanSums | None = None
+    """Over the scans of the rays, if they were kept up scan by scan. None: made here, of all at once."""
 
 
 def fit_rays(
@@ -181,7 +184,7 @@ def _learn_directly(
     check_fit(rays, config, inside)
     saved = None if checkpoint is None else Checkpoint(checkpoint, rays, scale, config)
     clock.lap("prepare_s")
-    surface = SurfaceReturns.of(rays, config, num_threads, inside)
+    surface = SurfaceReturns.of(rays, config, num_threads, inside, given.sums)
     learnt = rays if inside is None else rays.select(inside)
     clock.lap("ghosts_s")
     start = STARTS[config.training.start](surface, config, num_threads)
@@ -216,7 +219,7 @@ def _learn_directly(
         sensor=sensor,
         report=_report(given, learnt, surface, field, schedule, config, num_threads),
     )
-    closed_form = ClosedForm.of(learnt, inside, surface, config)
+    closed_form = ClosedForm.of(learnt, surface, config)
     return _Known(contents, closed_form, surface.rays, learnt, schedule, saved)
 
 

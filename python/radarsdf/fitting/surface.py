@@ -16,6 +16,7 @@ from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.onto_surfels import onto_surfels
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.scan_sums import ScanSums
 from radarsdf.returns.surfels import Surfels
 
 
@@ -34,24 +35,32 @@ class SurfaceReturns:
 
     @classmethod
     def of(
-        cls, rays: Rays, config: FitConfig, num_threads: int, inside: NDArray[np.bool_] | None = None
+        cls,
+        rays: Rays,
+        config: FitConfig,
+        num_threads: int,
+        inside: NDArray[np.bool_] | None = None,
+        given: ScanSums | None = None,
     ) -> SurfaceReturns:
         """Cleans `rays` as ``config.returns`` says, and keeps those that are `inside`, (N,). None: all."""
         averages = config.training.start == "average"
         # Without an sdf stage, only the average uses the surface, and it takes distances to surfels anyway.
         onto_planes = config.returns.onto_planes and config.training.sdf_iterations != 0
-        leaves = ReturnCells.of(rays, config.leaf_size_m, num_threads) if averages else None
-        means = None if leaves is None else MeanRays.of(rays, leaves, config.leaf_size_m, num_threads)
-        surfels = Surfels.of(rays, config.leaf_size_m, num_threads, leaves)
-        del leaves  # frees memory: 4 bytes a return
-        # An average counts cells, not returns, so it needs the noise of those: one return of each.
-        noise = sensor_noise(surfels, rays, config.returns, None if means is None else means.first)
+        sums = ScanSums.of(rays, config.leaf_size_m, num_threads) if given is None else given
+        surfels = Surfels.of_sums(sums, num_threads)
+        means = MeanRays.of_sums(sums) if averages else None
+        del sums  # frees memory: a hundred bytes a cell
+        noise = sensor_noise(surfels, rays, config.returns, num_threads)
         kept = inside
+        if means is not None and inside is not None:
+            leaf_cells = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
+            means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
         if config.returns.drop_ghosts:
-            true = ~find_ghosts(surfels, rays, noise, means, num_threads)
+            of_ghosts = find_ghosts(surfels, rays if means is None else means, noise, num_threads)
+            true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)]
             kept = true if inside is None else true & inside
-        if means is not None and kept is not None:
-            means = means.select(kept[means.first])
+            if means is not None:
+                means = means.select(~of_ghosts[surfels.cells_of_leaves(means.keys, num_threads)])
         if onto_planes:
             rays = onto_surfels(surfels, rays, noise, num_threads)
         return cls(rays if kept is None else rays.select(kept), surfels, noise, means)

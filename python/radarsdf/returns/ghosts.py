@@ -29,41 +29,39 @@ _MIN_SHARE = 0.5
 
 
 def find_ghosts(
-    surfels: Surfels, rays: Rays, noise: SensorNoise, means: MeanRays | None = None, num_threads: int = 0
+    surfels: Surfels, rays: Rays | MeanRays, noise: SensorNoise, num_threads: int = 0
 ) -> NDArray[np.bool_]:
-    """Finds the returns that are ghosts.
+    """Finds the cells of surfels whose returns are ghosts.
 
     Parameters
     ----------
     surfels : Surfels
         Surfels of the returns of `rays`.
-    rays : Rays
-        N rays.
+    rays : Rays or MeanRays
+        All rays, or the mean rays of leaf cells, which are fewer.
     noise : SensorNoise
         Noise of the returns.
-    means : MeanRays, optional
-        Makes it faster: only the first ray of each of these cells is followed, for all returns of the cell.
     num_threads : int
         0: as many as OpenMP uses.
 
     Returns
     -------
     ndarray
-        (N,) bool, True for ghosts.
+        (C,) bool, True for the cells of `surfels` with ghosts.
     """
-    cells, all_cell_of_ray = surfels.cells, surfels.cells.cell_of_ray
-    if means is None:
-        cell_of_ray, weights = all_cell_of_ray, None
-        returns = cells.counts
-    else:
-        rays, cell_of_ray, weights = rays.select(means.first), all_cell_of_ray[means.first], means.counts
-        returns = np.bincount(cell_of_ray, weights, len(cells.keys)).astype(np.float64)
+    cell_of_ray, weights = (
+        (surfels.cells_of_leaves(rays.keys, num_threads), rays.counts)
+        if isinstance(rays, MeanRays)
+        else (surfels.cells_at(rays.points, num_threads), None)
+    )
     table = np.concatenate([surfels.centres, surfels.normals, np.sqrt(surfels.variances[:, :1])], 1)
     table = table.astype(np.float32)
 
-    def crossed(planes: NDArray[np.int64], rays: Rays) -> NDArray[np.int32]:
+    def crossed(planes: NDArray[np.int64], rays: Rays | MeanRays) -> NDArray[np.int32]:
         """(N,) row in `planes` of the first plane that each ray crosses from its front, or -1."""
-        surfel_map = SurfelMap(cells.keys[surfels.cell_of_plane[planes]], table[planes], surfels.cell_size_m)
+        surfel_map = SurfelMap(
+            surfels.keys[surfels.cell_of_plane[planes]], table[planes], surfels.cell_size_m
+        )
         return surfel_map.first_crossings(
             np.ascontiguousarray(rays.points),
             np.ascontiguousarray(rays.directions),
@@ -81,17 +79,19 @@ def find_ghosts(
 
     flat = np.flatnonzero(surfels.is_flat())
     first = crossed(flat, rays)
-    passed = np.zeros((len(cells.keys), 1))
+    passed = np.zeros((len(surfels.keys), 1))
     flat_cells = surfels.cell_of_plane[flat]
     passed[flat_cells, 0] = count(first, first >= 0, len(flat))
     support = surfels.support[flat_cells]
-    passed_round = cells.blocks.sum_round(cells.keys[flat_cells], passed, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
+    flat_keys = surfels.keys[flat_cells]
+    passed_round = surfels.blocks.sum_round(flat_keys, passed, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
     opaque = support / (support + passed_round) > _MIN_OPACITY
     # A ray through a surface that is not opaque may cross an opaque one behind it. There are few such rays.
     behind = first >= 0
     through = np.flatnonzero(behind)[~opaque[first[behind]]]
     behind[through] = crossed(flat[opaque], rays.select(through)) >= 0
-    behind_in_cell = count(cell_of_ray, behind, len(cells.keys))
-    sums = cells.blocks.sum_round(cells.keys, np.stack([behind_in_cell, returns], 1), 1.0, num_threads)
-    ghosts: NDArray[np.bool_] = (sums[:, 0] > _MIN_SHARE * sums[:, 1])[all_cell_of_ray]
+    behind_in_cell = count(cell_of_ray, behind, len(surfels.keys))
+    columns = np.stack([behind_in_cell, surfels.counts], 1)
+    sums = surfels.blocks.sum_round(surfels.keys, columns, 1.0, num_threads)
+    ghosts: NDArray[np.bool_] = sums[:, 0] > _MIN_SHARE * sums[:, 1]
     return ghosts

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellSet
-from radarsdf.returns.cells import ReturnCells
-from radarsdf.returns.rays import Rays
 from radarsdf.returns.scan_sums import ScanSums
 
 _MIN_LENGTH = 1e-6  # of the mean of unit directions. A shorter one has no meaningful direction
@@ -27,12 +25,10 @@ class MeanRays:
 
     keys: NDArray[np.uint64]
     """(M,) Morton keys of the cells, ascending."""
-    first: NDArray[np.int64]
-    """(M,) row of the first return in each cell."""
     points: NDArray[np.float32]
     """(M, 3) mean of the returns in each cell, local, m."""
     directions: NDArray[np.float32]
-    """(M, 3) mean direction of their rays, unit vectors."""
+    """(M, 3) mean direction of their rays, unit vectors. Downwards where rays from opposite sides leave none."""
     counts: NDArray[np.float32]
     """(M,) number of returns in each cell."""
     scans: NDArray[np.uint32]
@@ -41,19 +37,15 @@ class MeanRays:
     """(M,) mean range of the returns in each cell, m."""
 
     @classmethod
-    def of(cls, rays: Rays, cells: ReturnCells, leaf_size_m: float, num_threads: int = 0) -> MeanRays:
-        """The mean rays of the leaf `cells` that hold the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
-        sums = ScanSums.of(rays, cells, 1, leaf_size_m, num_threads)
+    def of_sums(cls, sums: ScanSums) -> MeanRays:
+        """The mean rays of scans that are known by their `sums`."""
         directions = sums.mean_directions
         lengths = np.linalg.norm(directions, axis=1)[:, None]
         directions = np.where(
-            lengths > _MIN_LENGTH,
-            directions / np.maximum(lengths, _MIN_LENGTH),
-            rays.directions[cells.first],  # without a mean direction, that of the first ray
+            lengths > _MIN_LENGTH, directions / np.maximum(lengths, _MIN_LENGTH), [0.0, 0.0, -1.0]
         )
         return cls(
-            keys=cells.keys,
-            first=cells.first,
+            keys=sums.keys,
             points=sums.mean_points.astype(np.float32),
             directions=directions.astype(np.float32),
             counts=sums.counts.astype(np.float32),
@@ -61,11 +53,10 @@ class MeanRays:
             ranges_m=sums.mean_ranges_m.astype(np.float32),
         )
 
-    def select(self, part: NDArray[np.bool_]) -> MeanRays:
-        """The mean rays of some of the cells."""
+    def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
+        """The mean rays of some of the cells: a mask (M,) bool, or row numbers."""
         return MeanRays(
             self.keys[part],
-            self.first[part],
             self.points[part],
             self.directions[part],
             self.counts[part],

@@ -14,8 +14,8 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
-# Measured: so many give each deviation to 1 to 1.5 % of what all returns give, half as many to 1 to 3 %.
-_RETURNS = 40_000
+# Measured: so many give each deviation to 1 to 3 % of what all returns give, twice as many to 1 to 1.5 %.
+_RETURNS = 20_000
 _MIN_RETURNS = 100  # with fewer, the result is the guess that the estimate starts from
 _SIGMAS2 = 6.0  # variances. A larger squared residual is an outlier
 # The variance of a normal distribution is so many times its variance without these outliers.
@@ -52,9 +52,7 @@ class SensorNoise:
         return variances
 
 
-def sensor_noise(
-    surfels: Surfels, rays: Rays, config: ReturnsConfig, some: NDArray[np.int64] | None = None
-) -> SensorNoise:
+def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> SensorNoise:
     """Estimates the noise of the sensor from the distances of returns to their surfels.
 
     The variance across a plane is the sum of the three variances, each times the squared share of its axis in
@@ -72,18 +70,16 @@ def sensor_noise(
         N rays. About `_RETURNS` of those on a flat surfel are used, evenly spread.
     config : ReturnsConfig
         Deviations that the user knows.
-    some : ndarray, optional
-        (M,) rows of `rays` of which they are taken. Default: all.
+    num_threads : int
+        0: as many as OpenMP uses.
     """
     known = np.array([config.range_noise_m, config.azimuth_noise_rad, config.elevation_noise_rad], np.float64)
     free = np.isnan(known)
     sigma2 = np.where(free, [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD], known) ** 2
-    on_flat = surfels.cells.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
-    size = len(rays) if some is None else len(some)
-    tried = min(size, int(_RETURNS * len(rays) / max(on_flat, 1.0)))
-    rows = np.linspace(0, size - 1, tried).astype(np.int64)
-    rows = rows if some is None else some[rows]
-    plane = surfels.flat_plane_of(surfels.cells.cell_of_ray[rows])
+    on_flat = surfels.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
+    tried = min(len(rays), int(_RETURNS * len(rays) / max(on_flat, 1.0)))
+    rows = np.linspace(0, len(rays) - 1, tried).astype(np.int64)
+    plane = surfels.flat_planes_at(rays.points[rows], num_threads)
     rows, plane = rows[plane >= 0], plane[plane >= 0]
     if free.any() and len(rows) >= _MIN_RETURNS:
         normals = surfels.normals[plane]

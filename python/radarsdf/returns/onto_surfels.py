@@ -40,7 +40,7 @@ def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: 
         np.ascontiguousarray(rays.ranges_m),
         np.ascontiguousarray(rays.scans),
         rays.up_of_scan,
-        surfels.flat_plane_of(surfels.cells.cell_of_ray),
+        surfels.flat_planes_at(rays.points, num_threads),
         surfels.centres,
         surfels.normals,
         np.ascontiguousarray(surfels.variances[:, 0]),

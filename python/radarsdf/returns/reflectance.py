@@ -169,7 +169,7 @@ class Residuals:
         surfels: Surfels,
         leaf_size_m: float,
         ask: Ask | None = None,
-        cell_of_ray: NDArray[np.int32] | None = None,
+        num_threads: int = 0,
     ) -> Residuals:
         """The residuals of `rays`.
 
@@ -186,13 +186,13 @@ class Residuals:
         ask : callable, optional
             What a network answers: intensities (M,) float32, scaled alike, at points (M, 3), local frame, m, seen along
             directions (M, 3), unit vectors, from ranges (M,), m. Default: there is no network.
-        cell_of_ray : (N,) int32, optional
-            Row of each return's cell in those of `surfels`. Default: `surfels` are of the same returns.
+        num_threads : int
+            0: as many as OpenMP uses.
         """
         flat = np.flatnonzero(surfels.is_flat())
         normals = surfels.normals.astype(np.float32)
-        plane = surfels.flat_plane_of(surfels.cells.cell_of_ray if cell_of_ray is None else cell_of_ray)
         points = np.ascontiguousarray(rays.points)
+        plane = surfels.flat_planes_at(points, num_threads)
         directions = np.ascontiguousarray(rays.directions)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
         groups = _Groups.of(points, directions, incidence, leaf_size_m)
@@ -203,7 +203,7 @@ class Residuals:
         return cls(
             leaf_size_m,
             response,
-            surfels.cells.keys[surfels.cell_of_plane[flat]],
+            surfels.keys[surfels.cell_of_plane[flat]],
             normals[flat],
             groups,
             groups.means(incidence),

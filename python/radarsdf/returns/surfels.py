@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import principal_axes
-from radarsdf.returns.cells import ReturnCells
+from radarsdf._core import CellBlocks, cell_keys, principal_axes
+from radarsdf.returns.cells import merged_keys
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.scan_sums import ScanSums
+from radarsdf.returns.scan_sums import UPPER, ScanSums
 
 # Measured on simulated and real scans; see bench/history/surface.md.
 LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m with leaf cells of 0.2 m
@@ -28,8 +28,12 @@ class Surfels:
 
     cell_size_m: float
     """Edge of a cell, m."""
-    cells: ReturnCells
-    """The cells that hold returns."""
+    keys: NDArray[np.uint64]
+    """(C,) Morton keys of the cells that hold returns, ascending."""
+    blocks: CellBlocks
+    """Finds the row of a cell from its key."""
+    counts: NDArray[np.float64]
+    """(C,) number of returns in each cell."""
     support: NDArray[np.float64]
     """(C,) weighted number of returns in a cell and the 26 cells round it. Neighbours have less weight."""
     cell_of_plane: NDArray[np.int64]
@@ -43,35 +47,33 @@ class Surfels:
     plane."""
 
     @classmethod
-    def of(
-        cls, rays: Rays, leaf_size_m: float, num_threads: int = 0, leaves: ReturnCells | None = None
-    ) -> Surfels:
-        """Surfels of the returns of `rays`. `num_threads` 0: as many as OpenMP uses.
+    def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
+        """Surfels of the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
+        return cls.of_sums(ScanSums.of(rays, leaf_size_m, num_threads), num_threads)
 
-        `leaves` are the leaf cells that hold the returns, if they are known.
-        """
-        cell_size_m = LEAVES_PER_SURFEL * leaf_size_m
-        cells = ReturnCells.of(rays, cell_size_m, num_threads) if leaves is None else leaves.merged()
-        sums = ScanSums.of(rays, cells, LEAVES_PER_SURFEL, leaf_size_m, num_threads).moments
-        support = cells.blocks.sum_round(cells.keys, cells.counts[:, None], NEIGHBOUR_WEIGHT, num_threads)[
-            :, 0
-        ]
+    @classmethod
+    def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> Surfels:
+        """Surfels of the returns of scans that are known by their `sums`."""
+        cell_size_m = LEAVES_PER_SURFEL * sums.leaf_size_m
+        keys, of_cells = sums.merged_moments()
+        blocks, counts = CellBlocks(keys), of_cells[:, 0].copy()
+        support = blocks.sum_round(keys, counts[:, None], NEIGHBOUR_WEIGHT, num_threads)[:, 0]
         # Most cells have few returns. Surfels for all of them would take most of the time and the memory.
         cell_of_plane = np.flatnonzero(support >= _MIN_RETURNS)
-        moments = cells.blocks.sum_round(cells.keys[cell_of_plane], sums, NEIGHBOUR_WEIGHT, num_threads)
-        del sums  # frees memory: a hundred bytes for each cell
+        moments = blocks.sum_round(keys[cell_of_plane], of_cells, NEIGHBOUR_WEIGHT, num_threads)
         means = moments[:, 1:10] / moments[:, :1]
         centres = means[:, :3].copy()
-        upper = [(i, j) for i in range(3) for j in range(i, 3)]
         covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
-        for mean, (i, j) in zip(means[:, 3:].T, upper, strict=True):
+        for mean, (i, j) in zip(means[:, 3:].T, UPPER, strict=True):
             covariance[:, i, j] = covariance[:, j, i] = mean - centres[:, i] * centres[:, j]
         variances, axes = principal_axes(covariance, num_threads)
         normals = axes[:, :, 0]
         normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
         return cls(
             cell_size_m=cell_size_m,
-            cells=cells,
+            keys=keys,
+            blocks=blocks,
+            counts=counts,
             support=support,
             cell_of_plane=cell_of_plane,
             centres=centres,
@@ -92,16 +94,33 @@ class Surfels:
         It tells clutter and rough ground from walls, whatever the number of returns. Measured: 0.02 to 0.06 on
         simulated scenes without clutter, whole or of every tenth scan; 0.27 to 0.44 on five real drives.
         """
-        returns = self.cells.counts[self.cell_of_plane]
+        returns = self.counts[self.cell_of_plane]
         total = float(returns.sum())
         return 1 - float(returns[self.is_flat()].sum()) / total if total else 0.0
 
     def plane_of_cell(self, planes: NDArray[np.int64]) -> NDArray[np.int32]:
         """(C,) row of the surfel of each cell, -1 if it is none of the rows `planes`."""
-        plane_of_cell = np.full(len(self.cells.keys), -1, np.int32)
+        plane_of_cell = np.full(len(self.keys), -1, np.int32)
         plane_of_cell[self.cell_of_plane[planes]] = planes
         return plane_of_cell
 
-    def flat_plane_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """(N,) row of the surfel of each of the `cells` (N,), rows of cells. -1: it has none that is flat."""
-        return self.plane_of_cell(np.flatnonzero(self.is_flat()))[cells]
+    def cells_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
+        """(N,) row of the cell of each of the `points` (N, 3), local, m. -1: it holds no return."""
+        keys = cell_keys(np.ascontiguousarray(points), self.cell_size_m, num_threads)
+        return self.blocks.rows(keys, num_threads)
+
+    def cells_of_leaves(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.int32]:
+        """(M,) row of the cell that each leaf cell with one of these Morton keys (M,) is in. -1: it holds no return."""
+        return self.blocks.rows(merged_keys(leaf_keys), num_threads)
+
+    def flat_planes_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
+        """(N,) row of the surfel of the cell of each of the `points` (N, 3), local, m. -1: it has none that is flat."""
+        return self._flat_planes(self.cells_at(points, num_threads))
+
+    def flat_planes_of_leaves(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.int32]:
+        """(M,) likewise, of the cell that each leaf cell with one of these Morton keys (M,) is in."""
+        return self._flat_planes(self.cells_of_leaves(leaf_keys, num_threads))
+
+    def _flat_planes(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        planes = self.plane_of_cell(np.flatnonzero(self.is_flat()))
+        return np.append(planes, np.int32(-1))[cells]  # the row -1, of no cell, is that of the last number
