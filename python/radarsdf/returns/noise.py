@@ -21,6 +21,7 @@ _SIGMAS2 = 6.0  # variances. A larger squared residual is an outlier
 # The variance of a normal distribution is so many times its variance without these outliers.
 _TRUNCATION = 1.05
 _ROUNDS = 10
+_SETTLED = 0.01  # change of a variance. The returns that were drawn make more of a difference
 _FIRST_ANGLE_RAD = 0.01
 _MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
 
@@ -87,13 +88,17 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
         shares = _shares(rays, rows, normals)
         unexplained = residual2 - np.einsum("k,kn->n", sigma2[~free], shares[~free])
         least = np.array([0.025 * surfels.cell_size_m, 1e-3, 1e-3]) ** 2
+        wanted = shares[free]
         for _ in range(_ROUNDS):  # the weights are the variances of the round before
+            before = sigma2[free]
             variance = np.einsum("k,kn->n", sigma2, shares)
             weights = (residual2 < _SIGMAS2 * variance) / np.square(variance)
-            weighted = shares[free] * weights
-            normal = np.einsum("kn,ln->kl", weighted, shares[free])
+            weighted = wanted * weights
+            normal = np.einsum("kn,ln->kl", weighted, wanted)
             solution = np.linalg.lstsq(normal, np.einsum("kn,n->k", weighted, unexplained), rcond=None)[0]
             sigma2[free] = _TRUNCATION * np.maximum(solution, least[free])
+            if (np.abs(sigma2[free] - before) <= _SETTLED * before).all():
+                break
     return SensorNoise(*np.sqrt(sigma2).tolist())
 
 
