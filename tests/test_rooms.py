@@ -31,6 +31,7 @@ ROOMS = (
     ("config",),
     ("io",),
     ("returns",),
+    ("poses",),
     ("field",),
     ("budget",),
     ("checking",),

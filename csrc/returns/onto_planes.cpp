@@ -11,19 +11,7 @@
 namespace radarsdf {
 namespace {
 
-constexpr double kMinSine = 1e-6;    // of the angle between a ray and the z axis of its sensor, to divide by
 constexpr double kMinRangeM = 1e-6;  // to divide by
-
-template <typename A, typename B>
-double dot(const A* a, const B* b) {
-  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
-
-void cross(const double* a, const double* b, double* product) {
-  product[0] = a[1] * b[2] - a[2] * b[1];
-  product[1] = a[2] * b[0] - a[0] * b[2];
-  product[2] = a[0] * b[1] - a[1] * b[0];
-}
 
 }  // namespace
 
@@ -31,17 +19,8 @@ void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnV
                       int num_threads) {
   // Of a return's position along the plane's normal.
   const auto variance_m2 = [&](std::int64_t i, const double* normal) {
-    const float* d = rays.directions + 3 * i;
-    const double direction[3] = {d[0], d[1], d[2]}, range_m = rays.ranges_m[i];
-    double azimuth[3], elevation[3];  // in which they grow
-    cross(rays.up_of_scan + 3 * std::int64_t{rays.scans[i]}, direction, azimuth);
-    const double sine = std::max(std::sqrt(dot(azimuth, azimuth)), kMinSine);
-    for (double& component : azimuth) component /= sine;
-    cross(direction, azimuth, elevation);
-    const auto square = [](double x) { return x * x; };
-    return square(dot(direction, normal)) * noise.range_m2 +
-           square(range_m) * (square(dot(azimuth, normal)) * noise.azimuth_rad2 +
-                              square(dot(elevation, normal)) * noise.elevation_rad2);
+    return variance_along(normal, rays.directions + 3 * i, rays.ranges_m[i],
+                          rays.up_of_scan + 3 * std::int64_t{rays.scans[i]}, noise);
   };
 
   // Every thread reads all returns and adds those of its own planes, in their order.
@@ -74,13 +53,13 @@ void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnV
       const double *normal = planes.normals + 3 * std::int64_t{plane},
                    *centre = planes.centres + 3 * std::int64_t{plane};
       const double variance = variance_m2(i, normal), off[3] = {p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]};
-      const double step_m = dot(off, normal) * (variance / (variance + roughness_m2[static_cast<std::size_t>(plane)]));
+      const double step_m = dot3(off, normal) * (variance / (variance + roughness_m2[static_cast<std::size_t>(plane)]));
       double ray[3];
       for (int axis = 0; axis < 3; ++axis) {
         point[axis] = static_cast<float>(p[axis] - step_m * normal[axis]);
         ray[axis] = double{d[axis]} * double{rays.ranges_m[i]} - step_m * normal[axis];
       }
-      const double range_m = std::max(std::sqrt(dot(ray, ray)), kMinRangeM);
+      const double range_m = std::max(std::sqrt(dot3(ray, ray)), kMinRangeM);
       for (int axis = 0; axis < 3; ++axis) direction[axis] = static_cast<float>(ray[axis] / range_m);
       moved.ranges_m[i] = static_cast<float>(range_m);
     }

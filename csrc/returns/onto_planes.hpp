@@ -6,6 +6,8 @@
 
 #include <cstdint>
 
+#include "returns/return_noise.hpp"
+
 namespace radarsdf {
 
 // Rays in the local frame, m.
@@ -24,11 +26,6 @@ struct Planes {
   const double* normals;       ///< (count, 3), unit
   const double* variances_m2;  ///< (count), of the returns across each plane
   std::int64_t count;
-};
-
-// Variances of a return's position: along the beam, m^2, in azimuth and in elevation, rad^2.
-struct ReturnVariances {
-  double range_m2, azimuth_rad2, elevation_rad2;
 };
 
 struct MovedRays {

@@ -16,6 +16,8 @@ from .fitting.stopping import Interrupted as Interrupted
 from .map.isosurface import marching_cubes as marching_cubes
 from .map.map import Map as Map
 from .map.radar_map import RadarMap as RadarMap
+from .poses.refine import RefinedPoses as RefinedPoses
+from .poses.refine import refine_poses as refine_poses
 from .tiles.any_map import load as load
 from .tiles.fit_tiles import fit_tiles as fit_tiles
 from .tiles.tiled_map import TiledMap as TiledMap

@@ -13,6 +13,7 @@ __all__: list[str] = [
     "CellBlocks",
     "CellMeans",
     "CellSet",
+    "CommonPlanes",
     "Crew",
     "DIRECTION_QUANTA",
     "Encoding",
@@ -646,6 +647,65 @@ class CellBlocks:
     ) -> numpy.typing.NDArray[numpy.float64]:
         """
         For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that shares a face counts `weight` times, an edge its square, a corner its cube.
+        """
+
+class CommonPlanes:
+    """
+    What returns of different scans on common planes say of their poses.
+    """
+    def __init__(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        directions: numpy.typing.NDArray[numpy.float32],
+        ranges_m: numpy.typing.NDArray[numpy.float32],
+        scans: numpy.typing.NDArray[numpy.int32],
+        planes: numpy.typing.NDArray[numpy.int32],
+        positions: numpy.typing.NDArray[numpy.float64],
+        up_of_scan: numpy.typing.NDArray[numpy.float64],
+        centres: numpy.typing.NDArray[numpy.float64],
+        normals: numpy.typing.NDArray[numpy.float64],
+        extent_m: typing.SupportsFloat | typing.SupportsIndex,
+        variances: typing.Annotated[
+            collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+        ],
+        scans_together: typing.SupportsInt | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> None:
+        """
+        Returns (N, 3) and directions (N, 3) float32, local frame, m; `ranges_m` (N,) float32; `scans` (N,) int32, ascending; `planes` (N,) int32, -1: none. `positions` and `up_of_scan` (F, 3), `centres` and `normals` (P, 3) float64. `extent_m` of a plane; `variances` along the beam, m^2, in azimuth and elevation, rad^2.
+        """
+    def solve(
+        self,
+        diagonal: numpy.typing.NDArray[numpy.float64],
+        below: numpy.typing.NDArray[numpy.float64],
+        gradient: numpy.typing.NDArray[numpy.float64],
+        tolerance: typing.SupportsFloat | typing.SupportsIndex,
+        max_iterations: typing.SupportsInt | typing.SupportsIndex,
+        with_inverse: bool,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> tuple[
+        numpy.typing.NDArray[numpy.float64],
+        numpy.typing.NDArray[numpy.float64],
+        numpy.typing.NDArray[numpy.float64],
+        float,
+    ]:
+        """
+        Increments (F, 6) of the poses: translation, rotation vector, from the left about the sensor; blocks of the inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), if wanted; the square of the increments over their deviations. The prior is block tridiagonal: `diagonal` (F, 6, 6), `below` (F - 1, 6, 6), `gradient` (F, 6), all float64.
+        """
+    @property
+    def num_used(self) -> int:
+        """
+        Number of returns on planes of several scans.
+        """
+    @property
+    def scale(self) -> float:
+        """
+        Median of squared residuals over their variances, over that of noise; at least 1.
+        """
+    @property
+    def weights(self) -> numpy.typing.NDArray[numpy.float64]:
+        """
+        (F,) float64, sum of the weights of the returns of each scan, each at most 1.
         """
 
 class SurfelMap:

@@ -1,0 +1,392 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "poses/common_planes.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+#include <stdexcept>
+
+#include "util/parallel.hpp"
+
+namespace radarsdf {
+namespace {
+
+constexpr double kMedianOfSquare = 0.4549;  // of a standard normal deviate
+constexpr double kSigmas2 = 4;              // where the weight of Geman and McClure is a quarter: two deviations
+constexpr double kLeastM2 = 1e-10;          // of a variance, to divide by
+constexpr int kPlane = 3;                   // unknowns of a plane
+constexpr int kCoupling = kPlane * kPose;
+
+std::size_t size(std::int64_t i) { return static_cast<std::size_t>(i); }
+
+// Two unit vectors across n and each other.
+void across(const double* n, double* e1, double* e2) {
+  const double axis[3] = {std::abs(n[0]) < 0.9 ? 1.0 : 0.0, std::abs(n[0]) < 0.9 ? 0.0 : 1.0, 0.0};
+  cross3(n, axis, e1);
+  const double length = std::sqrt(dot3(e1, e1));
+  for (int i = 0; i < 3; ++i) e1[i] /= length;
+  cross3(n, e1, e2);
+}
+
+void add_product(const double* block, const double* x, double* y) {
+  for (int a = 0; a < kPose; ++a) {
+    for (int b = 0; b < kPose; ++b) y[a] += block[kPose * a + b] * x[b];
+  }
+}
+
+void add_transposed_product(const double* block, const double* x, double* y) {
+  for (int a = 0; a < kPose; ++a) {
+    for (int b = 0; b < kPose; ++b) y[b] += block[kPose * a + b] * x[a];
+  }
+}
+
+// Sums over the returns of a plane, or of some scans of it.
+struct PlaneSums {
+  double a[kPlane][kPlane] = {};  // w t t^T
+  double u[kPlane] = {};          // w t r
+
+  void add(const double* t, double w, double value) {
+    for (int k = 0; k < kPlane; ++k) {
+      for (int l = 0; l <= k; ++l) a[k][l] += w * t[k] * t[l];
+      u[k] += w * t[k] * value;
+    }
+  }
+
+  void add(const PlaneSums& other) {
+    for (int k = 0; k < kPlane; ++k) {
+      for (int l = 0; l <= k; ++l) a[k][l] += other.a[k][l];
+      u[k] += other.u[k];
+    }
+  }
+
+  // a becomes its Cholesky factor. What the returns do not tell, a tilt across a line of them say, stays as it is.
+  void factor() {
+    const double small = 1e-9 * (a[0][0] + a[1][1] + a[2][2]) + 1e-30;
+    for (int j = 0; j < kPlane; ++j) {
+      double pivot = a[j][j] + small;
+      for (int k = 0; k < j; ++k) pivot -= a[j][k] * a[j][k];
+      pivot = std::sqrt(std::max(pivot, small));
+      a[j][j] = pivot;
+      for (int i = j + 1; i < kPlane; ++i) {
+        for (int k = 0; k < j; ++k) a[i][j] -= a[i][k] * a[j][k];
+        a[i][j] /= pivot;
+      }
+    }
+  }
+
+  // L^-1 of `columns` columns, in place.
+  void divide(double* b, int columns) const {
+    for (int c = 0; c < columns; ++c) {
+      for (int k = 0; k < kPlane; ++k) {
+        for (int l = 0; l < k; ++l) b[columns * k + c] -= a[k][l] * b[columns * l + c];
+        b[columns * k + c] /= a[k][k];
+      }
+    }
+  }
+};
+
+}  // namespace
+
+struct CommonPlanes::Input {
+  const PosedReturns& returns;
+  const PlanesOfScans& planes;
+  const ReturnVariances& noise;
+  std::vector<std::int64_t> first = {};  // (planes + 1), in `rows`
+  std::vector<std::int32_t> rows = {};  // of returns, plane by plane; those of a plane stay in the order of their scans
+  std::vector<float> weights = {};      // of each return, 0 where only one scan sees its plane
+  std::vector<double> taken = {};       // (clusters, 6), what the unknowns of planes take of the gradient
+
+  struct Residual {
+    double value;            // distance from the plane, m
+    double variance;         // of its noise, m^2
+    double along[kPlane];    // how it falls with the offset and the tilts of the plane
+    double jacobian[kPose];  // how it grows with the increment of the pose
+  };
+
+  Residual residual(std::int64_t i) const {
+    Residual found;
+    const std::int64_t plane = returns.planes[i], scan = returns.scans[i];
+    const double *n = planes.normals + 3 * plane, *c = planes.centres + 3 * plane, *p = returns.positions + 3 * scan;
+    double off[3], arm[3], e1[3], e2[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      off[axis] = returns.points[3 * i + axis] - c[axis];
+      arm[axis] = returns.points[3 * i + axis] - p[axis];
+    }
+    across(n, e1, e2);
+    found.value = dot3(off, n);
+    found.along[0] = 1;
+    found.along[1] = dot3(off, e1) / planes.extent_m;
+    found.along[2] = dot3(off, e2) / planes.extent_m;
+    found.variance =
+        variance_along(n, returns.directions + 3 * i, returns.ranges_m[i], returns.up_of_scan + 3 * scan, noise);
+    std::copy(n, n + 3, found.jacobian);
+    cross3(arm, n, found.jacobian + 3);
+    return found;
+  }
+};
+
+CommonPlanes::CommonPlanes(const PosedReturns& returns, const PlanesOfScans& planes, const ReturnVariances& noise,
+                           std::int64_t scans_together, int num_threads)
+    : num_scans_(returns.num_scans),
+      width_(std::min(scans_together, returns.num_scans) - 1),
+      weights_(size(returns.num_scans)),
+      diagonal_(size(kBlock * returns.num_scans)),
+      gradient_(size(kPose * returns.num_scans)) {
+  Input input{returns, planes, noise};
+  find_clusters(input);
+  find_scale(input, num_threads);
+  eliminate_planes(input, num_threads);
+  sum_scans(input, num_threads);
+}
+
+void CommonPlanes::find_clusters(Input& input) {
+  const PosedReturns& returns = input.returns;
+  const std::int64_t num_planes = input.planes.count;
+  input.first.assign(size(num_planes + 1), 0);
+  for (std::int64_t i = 0; i < returns.count; ++i) {
+    if (returns.planes[i] >= 0) ++input.first[size(returns.planes[i] + 1)];
+  }
+  std::partial_sum(input.first.begin(), input.first.end(), input.first.begin());
+  input.rows.resize(size(input.first.back()));
+  std::vector<std::int64_t> next(input.first.begin(), input.first.end() - 1);
+  for (std::int64_t i = 0; i < returns.count; ++i) {
+    if (returns.planes[i] < 0) continue;
+    input.rows[size(next[size(returns.planes[i])]++)] = static_cast<std::int32_t>(i);
+  }
+  const auto scan = [&](std::int64_t at) { return returns.scans[input.rows[size(at)]]; };
+  first_of_plane_.assign(1, 0);
+  for (std::int64_t p = 0; p < num_planes; ++p) {
+    const std::int64_t begin = input.first[size(p)], end = input.first[size(p + 1)];
+    if (begin < end && scan(begin) != scan(end - 1)) {  // or only one scan sees the plane, which tells nothing
+      for (std::int64_t k = begin; k < end; ++k) {
+        if (k > begin && scan(k) == scan(k - 1)) continue;
+        plane_of_cluster_.push_back(static_cast<std::int32_t>(p));
+        scan_of_cluster_.push_back(scan(k));
+      }
+      num_used_ += end - begin;
+    }
+    first_of_plane_.push_back(static_cast<std::int64_t>(scan_of_cluster_.size()));
+  }
+  first_of_scan_.assign(size(num_scans_ + 1), 0);
+  for (const std::int32_t of : scan_of_cluster_) ++first_of_scan_[size(of + 1)];
+  std::partial_sum(first_of_scan_.begin(), first_of_scan_.end(), first_of_scan_.begin());
+  order_.resize(scan_of_cluster_.size());
+  next.assign(first_of_scan_.begin(), first_of_scan_.end() - 1);
+  for (std::size_t k = 0; k < order_.size(); ++k) {
+    order_[size(next[size(scan_of_cluster_[k])]++)] = static_cast<std::int32_t>(k);
+  }
+}
+
+void CommonPlanes::find_scale(const Input& input, int num_threads) {
+  std::vector<double> ratios(input.rows.size());
+  if (ratios.empty()) return;
+  parallel_blocks(static_cast<std::int64_t>(ratios.size()), 1 << 10, num_threads,
+                  [&](std::int64_t begin, std::int64_t end) {
+                    for (std::int64_t k = begin; k < end; ++k) {
+                      const Input::Residual found = input.residual(input.rows[size(k)]);
+                      ratios[size(k)] = found.value * found.value / std::max(found.variance, kLeastM2);
+                    }
+                  });
+  const auto middle = ratios.begin() + static_cast<std::ptrdiff_t>(ratios.size() / 2);
+  std::nth_element(ratios.begin(), middle, ratios.end());
+  scale_ = std::max(1.0, *middle / kMedianOfSquare);
+}
+
+void CommonPlanes::eliminate_planes(Input& input, int num_threads) {
+  const std::size_t clusters = scan_of_cluster_.size();
+  input.weights.resize(size(input.returns.count));
+  input.taken.resize(kPose * clusters);
+  group_end_.resize(clusters);
+  coupling_.resize(kCoupling * clusters);
+  if (width_ + 1 < num_scans_) band_coupling_.resize(kCoupling * clusters);
+  parallel_blocks(input.planes.count, 1 << 6, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t p = begin; p < end; ++p) eliminate_plane(input, p);
+  });
+}
+
+void CommonPlanes::eliminate_plane(Input& input, std::int64_t plane) {
+  const std::size_t base = size(first_of_plane_[size(plane)]), last = size(first_of_plane_[size(plane + 1)]);
+  if (base == last) return;
+  std::vector<PlaneSums> sums(last - base);
+  std::size_t cluster = base;
+  for (std::int64_t k = input.first[size(plane)]; k < input.first[size(plane + 1)]; ++k) {
+    const std::int64_t i = input.rows[size(k)];
+    if (input.returns.scans[i] != scan_of_cluster_[cluster]) ++cluster;
+    const Input::Residual found = input.residual(i);
+    const double variance = scale_ * std::max(found.variance, kLeastM2);
+    const double robust = 1 / (1 + found.value * found.value / (kSigmas2 * variance));
+    const auto w = static_cast<float>(robust * robust / variance);
+    input.weights[size(i)] = w;
+    sums[cluster - base].add(found.along, w, found.value);
+    double* c = &coupling_[kCoupling * cluster];
+    for (int l = 0; l < kPlane; ++l) {
+      for (int a = 0; a < kPose; ++a) c[kPose * l + a] += w * found.along[l] * found.jacobian[a];
+    }
+  }
+  // In the band, each group of neighbouring scans has the plane for itself.
+  for (std::size_t group = base, end = base; group < last; group = end) {
+    while (end < last && scan_of_cluster_[end] - scan_of_cluster_[group] <= width_) ++end;
+    PlaneSums own;
+    for (std::size_t k = group; k < end; ++k) {
+      group_end_[k] = static_cast<std::int32_t>(end);
+      own.add(sums[k - base]);
+    }
+    if (band_coupling_.empty()) continue;
+    own.factor();
+    for (std::size_t k = group; k < end; ++k) {
+      double* c = &band_coupling_[kCoupling * k];
+      std::copy(&coupling_[kCoupling * k], &coupling_[kCoupling * k] + kCoupling, c);
+      own.divide(c, kPose);
+    }
+  }
+  PlaneSums all;
+  for (const PlaneSums& part : sums) all.add(part);
+  all.factor();
+  all.divide(all.u, 1);
+  for (std::size_t k = base; k < last; ++k) {
+    double *c = &coupling_[kCoupling * k], *taken = &input.taken[kPose * k];
+    all.divide(c, kPose);
+    for (int l = 0; l < kPlane; ++l) {
+      for (int a = 0; a < kPose; ++a) taken[a] += c[kPose * l + a] * all.u[l];
+    }
+  }
+}
+
+void CommonPlanes::sum_scans(const Input& input, int num_threads) {
+  const PosedReturns& returns = input.returns;
+  const auto begin_of = [&](std::int64_t scan) {
+    return std::lower_bound(returns.scans, returns.scans + returns.count, scan) - returns.scans;
+  };
+  parallel_blocks(num_scans_, 1, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t s = begin; s < end; ++s) {
+      double *h = &diagonal_[size(kBlock * s)], *g = &gradient_[size(kPose * s)];
+      for (std::int64_t i = begin_of(s); i < begin_of(s + 1); ++i) {
+        const double w = input.weights[size(i)];
+        if (!(w > 0)) continue;
+        const Input::Residual found = input.residual(i);
+        const double* j = found.jacobian;
+        for (int a = 0; a < kPose; ++a) {
+          for (int b = 0; b < kPose; ++b) h[kPose * a + b] += w * j[a] * j[b];
+          g[a] += w * j[a] * found.value;
+        }
+        weights_[size(s)] += w * scale_ * std::max(found.variance, kLeastM2);
+      }
+      for (std::int64_t k = first_of_scan_[size(s)]; k < first_of_scan_[size(s + 1)]; ++k) {
+        const double* taken = &input.taken[size(kPose * std::int64_t{order_[size(k)]})];
+        for (int a = 0; a < kPose; ++a) g[a] -= taken[a];
+      }
+    }
+  });
+}
+
+void CommonPlanes::subtract_planes(BlockBand& band, int num_threads) const {
+  const std::vector<double>& coupling = band_coupling_.empty() ? coupling_ : band_coupling_;
+  // Every scan has its own row.
+  parallel_blocks(num_scans_, 1, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t s = begin; s < end; ++s) {
+      for (std::int64_t k = first_of_scan_[size(s)]; k < first_of_scan_[size(s + 1)]; ++k) {
+        const auto own = size(order_[size(k)]);
+        // Backwards over the clusters of the group: those with the same end.
+        for (std::size_t other = own + 1; other-- > 0;) {
+          if (group_end_[other] != group_end_[own]) break;
+          const double *a = &coupling[kCoupling * own], *b = &coupling[kCoupling * other];
+          double* entry = band.block(s, scan_of_cluster_[other]);
+          for (int l = 0; l < kPlane; ++l) {
+            for (int i = 0; i < kPose; ++i) {
+              const double factor = a[kPose * l + i];
+              for (int j = 0; j < kPose; ++j) entry[kPose * i + j] -= factor * b[kPose * l + j];
+            }
+          }
+        }
+      }
+    }
+  });
+}
+
+void CommonPlanes::apply(const double* diagonal, const double* below, const double* x, double* y,
+                         int num_threads) const {
+  const std::size_t planes = first_of_plane_.size() - 1;
+  std::vector<double> of_plane(kPlane * planes);
+  parallel_blocks(static_cast<std::int64_t>(planes), 1 << 8, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t p = begin; p < end; ++p) {
+      double* z = &of_plane[size(kPlane * p)];
+      for (std::int64_t k = first_of_plane_[size(p)]; k < first_of_plane_[size(p + 1)]; ++k) {
+        const double *c = &coupling_[size(kCoupling * k)], *own = x + kPose * scan_of_cluster_[size(k)];
+        for (int l = 0; l < kPlane; ++l) {
+          for (int a = 0; a < kPose; ++a) z[l] += c[kPose * l + a] * own[a];
+        }
+      }
+    }
+  });
+  parallel_blocks(num_scans_, 8, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t s = begin; s < end; ++s) {
+      double* out = y + kPose * s;
+      std::fill(out, out + kPose, 0.0);
+      add_product(&diagonal_[size(kBlock * s)], x + kPose * s, out);
+      add_product(diagonal + kBlock * s, x + kPose * s, out);
+      if (s > 0) add_product(below + kBlock * (s - 1), x + kPose * (s - 1), out);
+      if (s + 1 < num_scans_) add_transposed_product(below + kBlock * s, x + kPose * (s + 1), out);
+      for (std::int64_t k = first_of_scan_[size(s)]; k < first_of_scan_[size(s + 1)]; ++k) {
+        const std::size_t cluster = size(order_[size(k)]);
+        const double *c = &coupling_[kCoupling * cluster], *z = &of_plane[kPlane * size(plane_of_cluster_[cluster])];
+        for (int l = 0; l < kPlane; ++l) {
+          for (int a = 0; a < kPose; ++a) out[a] -= c[kPose * l + a] * z[l];
+        }
+      }
+    }
+  });
+}
+
+double CommonPlanes::solve(const double* diagonal, const double* below, const double* q, double tolerance,
+                           int max_iterations, double* x, double* inverse_diagonal, double* inverse_below,
+                           int num_threads) const {
+  BlockBand band(num_scans_, std::max<std::int64_t>(width_, 1));
+  for (std::int64_t s = 0; s < num_scans_; ++s) {
+    for (int k = 0; k < kBlock; ++k) {
+      band.block(s, s)[k] = diagonal_[size(kBlock * s + k)] + diagonal[kBlock * s + k];
+      if (s > 0) band.block(s, s - 1)[k] = below[kBlock * (s - 1) + k];
+    }
+  }
+  subtract_planes(band, num_threads);
+  if (!band.factor()) throw std::runtime_error("the poses are not determined: their prior must be positive definite");
+  if (inverse_diagonal != nullptr) {
+    const BlockBand inverse = band.inverse();
+    for (std::int64_t s = 0; s < num_scans_; ++s) {
+      std::copy(inverse.block(s, s), inverse.block(s, s) + kBlock, inverse_diagonal + kBlock * s);
+      if (s > 0) std::copy(inverse.block(s, s - 1), inverse.block(s, s - 1) + kBlock, inverse_below + kBlock * (s - 1));
+    }
+  }
+  const std::size_t numbers = size(kPose * num_scans_);
+  std::vector<double> residual(numbers), direction(numbers), product(numbers), solved(numbers);
+  std::fill(x, x + numbers, 0.0);
+  for (std::size_t i = 0; i < numbers; ++i) residual[i] = -(gradient_[i] + q[i]);
+  solved = residual;
+  band.solve(solved.data());
+  direction = solved;
+  double energy = std::inner_product(residual.begin(), residual.end(), solved.begin(), 0.0);
+  const double enough = tolerance * tolerance * energy;
+  int iterations = 0;
+  while (iterations < max_iterations && energy > enough && energy > 0) {
+    check_interrupt();
+    apply(diagonal, below, direction.data(), product.data(), num_threads);
+    const double curvature = std::inner_product(direction.begin(), direction.end(), product.begin(), 0.0);
+    if (!(curvature > 0)) break;
+    const double step = energy / curvature;
+    for (std::size_t i = 0; i < numbers; ++i) {
+      x[i] += step * direction[i];
+      residual[i] -= step * product[i];
+    }
+    solved = residual;
+    band.solve(solved.data());
+    const double next = std::inner_product(residual.begin(), residual.end(), solved.begin(), 0.0);
+    for (std::size_t i = 0; i < numbers; ++i) direction[i] = solved[i] + next / energy * direction[i];
+    energy = next;
+    ++iterations;
+  }
+  double decrement = 0;
+  for (std::size_t i = 0; i < numbers; ++i) decrement -= x[i] * (gradient_[i] + q[i]);
+  return decrement;
+}
+
+}  // namespace radarsdf

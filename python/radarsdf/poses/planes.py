@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The planes that scans have in common, where their poses put them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf._core import CommonPlanes
+from radarsdf.config.groups import ReturnsConfig
+from radarsdf.poses.rigid import Floats
+from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.rays import Rays
+from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
+
+# Scans in the band that is factored. 16 to 128 take the same time, since fewer need more iterations.
+_TOGETHER = 32
+_LEAST_RANGE_M = 1e-6  # to divide by
+
+
+@dataclass(frozen=True)
+class SensorReturns:
+    """Returns in the frames of their sensors, scan by scan."""
+
+    directions: NDArray[np.float32]
+    """(N, 3) unit vectors."""
+    ranges_m: NDArray[np.float32]
+    """(N,)."""
+    scans: NDArray[np.int32]
+    """(N,) ascending."""
+
+    @classmethod
+    def of(
+        cls, scans: Sequence[NDArray[np.float64]], min_range_m: float, max_range_m: float | None
+    ) -> SensorReturns:
+        """Of scans (N_i, 3), sensor frame, m; without returns beyond these ranges."""
+        points = np.concatenate(scans)
+        ranges_m = np.sqrt(np.einsum("ni,ni->n", points, points))
+        number = np.repeat(np.arange(len(scans), dtype=np.int32), [len(scan) for scan in scans])
+        kept = ranges_m >= max(min_range_m, _LEAST_RANGE_M)
+        kept &= ranges_m <= (np.inf if max_range_m is None else max_range_m)
+        directions = points[kept] / ranges_m[kept, None]
+        return cls(directions.astype(np.float32), ranges_m[kept].astype(np.float32), number[kept])
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    def select(self, part: NDArray[np.bool_]) -> SensorReturns:
+        """Those of a mask (N,)."""
+        return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part])
+
+    def posed(self, poses: Floats) -> Rays:
+        """As rays of sensors with these poses (F, 4, 4). Their local frame begins at the mean position."""
+        origin = poses[:, :3, 3].mean(axis=0)
+        first = np.searchsorted(self.scans, np.arange(len(poses) + 1))
+        directions = np.empty_like(self.directions)
+        for i, R in enumerate(poses[:, :3, :3].astype(np.float32)):
+            rows = slice(first[i], first[i + 1])
+            np.einsum("ij,nj->ni", R, self.directions[rows], out=directions[rows])
+        positions = (poses[:, :3, 3] - origin).astype(np.float32)
+        points = directions * self.ranges_m[:, None] + positions[self.scans]
+        up = poses[:, :3, 2].copy()
+        return Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self))
+
+
+def windows(num_scans: int, size: int, shifted: bool) -> list[tuple[int, int]]:
+    """Ranges of at most `size` scans that follow each other. `shifted`: by half of one."""
+    begin = -(size // 2) if shifted and size < num_scans else 0
+    ranges = [(max(0, k), min(num_scans, k + size)) for k in range(begin, num_scans, size)]
+    return [(low, high) for low, high in ranges if high - low > 1]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How returns are put together to planes."""
+
+    window: int
+    """So many scans that follow each other share planes."""
+    shifted: bool
+    """Whether windows begin in the middle of one."""
+    cell_m: float
+    """Edge of the cell of a plane, m."""
+
+
+def common_planes(
+    returns: SensorReturns,
+    poses: Floats,
+    grid: Grid,
+    noise: SensorNoise | None,
+    config: ReturnsConfig,
+    num_threads: int = 0,
+) -> tuple[CommonPlanes, SensorNoise]:
+    """What returns on common planes say of the poses (F, 4, 4), and the noise of the sensor that this supposes.
+
+    `noise` None: as these planes show it. `num_threads` 0: as many as OpenMP uses.
+    """
+    rays = returns.posed(poses)
+    planes = np.full(len(rays), -1, np.int32)
+    centres, normals, noises, total = [], [], [], 0
+    for low, high in windows(len(poses), grid.window, grid.shifted):
+        rows = slice(*np.searchsorted(rays.scans, [low, high]).tolist())
+        part = rays.select(rows)
+        surfels = Surfels.of(part, grid.cell_m / LEAVES_PER_SURFEL, num_threads)
+        found = surfels.flat_planes_at(part.points, num_threads)
+        planes[rows] = np.where(found >= 0, found + np.int32(total), np.int32(-1))
+        centres.append(surfels.centres)
+        normals.append(surfels.normals)
+        total += len(surfels.centres)
+        if noise is None:
+            noises.append(dataclasses.astuple(sensor_noise(surfels, part, config, num_threads)))
+    known = SensorNoise(*np.median(noises, axis=0).tolist()) if noise is None else noise
+    common = CommonPlanes(
+        rays.points,
+        rays.directions,
+        rays.ranges_m,
+        rays.scans,
+        planes,
+        poses[:, :3, 3] - rays.origin,
+        rays.up_of_scan,
+        np.concatenate(centres),
+        np.ascontiguousarray(np.concatenate(normals)),
+        grid.cell_m,
+        np.square(dataclasses.astuple(known)).tolist(),
+        min(grid.window, _TOGETHER),
+        num_threads,
+    )
+    return common, known

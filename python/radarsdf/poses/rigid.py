@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Rigid motions: increments of poses, relative motions, and the motion that brings one trajectory onto another."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Floats = NDArray[np.float64]
+
+
+def moved(poses: Floats, increments: Floats) -> Floats:
+    """The poses (F, 4, 4) with increments (F, 6): each adds a translation, m, and turns about the sensor, rad, both in world axes."""
+    found = poses.copy()
+    turn = Rotation.from_rotvec(increments[:, 3:]).as_matrix()
+    found[:, :3, :3] = np.einsum("fij,fjk->fik", turn, poses[:, :3, :3])
+    found[:, :3, 3] += increments[:, :3]
+    return found
+
+
+def steps(poses: Floats) -> Floats:
+    """(F - 1, 4, 4) motion from each pose to the next, in the frame of the first of the two."""
+    found = np.tile(np.eye(4), (len(poses) - 1, 1, 1))
+    back = poses[:-1, :3, :3]
+    found[:, :3, :3] = np.einsum("fji,fjk->fik", back, poses[1:, :3, :3])
+    found[:, :3, 3] = np.einsum("fji,fj->fi", back, poses[1:, :3, 3] - poses[:-1, :3, 3])
+    return found
+
+
+def aligned(poses: Floats, reference: Floats) -> Floats:
+    """The poses (F, 4, 4), as a whole moved and turned so that their mean position and mean rotation are those of `reference`."""
+    turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
+    whole = np.eye(4)
+    whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
+    middle = poses[:, :3, 3].mean(axis=0)
+    whole[:3, 3] = reference[:, :3, 3].mean(axis=0) - np.einsum("ij,j->i", whole[:3, :3], middle)
+    found: Floats = np.einsum("ij,fjk->fik", whole, poses)
+    return found
+
+
+def turned_by(poses: Floats, others: Floats) -> Floats:
+    """(F,) angles between the rotations of poses and others (F, 4, 4), rad."""
+    between = np.einsum("fji,fjk->fik", poses[:, :3, :3], others[:, :3, :3])
+    found: Floats = Rotation.from_matrix(between).magnitude()
+    return found
+
+
+def skew(vectors: Floats) -> Floats:
+    """(N, 3, 3) matrices that are the cross products with `vectors` (N, 3)."""
+    x, y, z = vectors.T
+    o = np.zeros(len(vectors))
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], 1).reshape(-1, 3, 3)

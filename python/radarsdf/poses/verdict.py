@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Whether returns that took no part agree better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from radarsdf.poses.planes import SensorReturns
+from radarsdf.poses.rigid import Floats
+
+_NEIGHBOURS = 8  # of a return, among which the nearest one of another scan is looked for
+_MOST_RETURNS = 50_000  # that are asked
+_ERRORS = 3.0  # standard errors of a gain that is no chance
+_BLOCKS = 20  # of neighbouring scans, whose errors have causes in common
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How much nearer returns are to those of other scans."""
+
+    gain: float
+    """Mean logarithm of the distance to the nearest return of another scan, with the poses before, less the same after."""
+    error: float
+    """Its standard error."""
+
+    @property
+    def improved(self) -> bool:
+        """Whether the gain is significant: with true poses, one of several hundred recordings passes by chance."""
+        return self.gain > _ERRORS * self.error
+
+    @property
+    def words(self) -> str:
+        """One sentence."""
+        figures = (
+            f"{self.gain:+.2%} of their distance, {_ERRORS:g} standard errors are {_ERRORS * self.error:.2%}"
+        )
+        if self.improved:
+            return f"The refined poses make a sharper map: returns that took no part are nearer to those of other scans ({figures})."
+        return f"The given poses are kept: returns that took no part are not nearer to those of other scans ({figures})."
+
+    @classmethod
+    def of(cls, held: SensorReturns, used: SensorReturns, before: Floats, after: Floats) -> Verdict:
+        """Of the returns `held` that took no part, beside those that were `used`."""
+        step = max(1, len(held) // _MOST_RETURNS)
+        asked = held.select(np.arange(len(held)) % step == 0)
+        gains = np.log(_distances(asked, used, before) / _distances(asked, used, after))
+        block = asked.scans.astype(np.int64) * min(_BLOCKS, len(before)) // len(before)
+        counts = np.bincount(block)
+        means = np.bincount(block, gains)[counts > 0] / counts[counts > 0]
+        if len(means) < 2:
+            return cls(0.0, np.inf)
+        return cls(float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means))))
+
+
+def _distances(asked: SensorReturns, used: SensorReturns, poses: Floats) -> NDArray[np.float64]:
+    tree = cKDTree(used.posed(poses).points)
+    distances, rows = tree.query(asked.posed(poses).points, _NEIGHBOURS)
+    others = used.scans[np.minimum(rows, len(used) - 1)] != asked.scans[:, None]
+    first = np.where(others.any(axis=1), others.argmax(axis=1), _NEIGHBOURS - 1)
+    found: NDArray[np.float64] = distances[np.arange(len(first)), first]
+    return np.maximum(found, 1e-3)

@@ -1,0 +1,35 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Trajectories, and errors that add up from step to step."""
+
+from __future__ import annotations
+
+import numpy as np
+from radarsdf.poses.rigid import moved, steps
+from scipy.spatial.transform import Rotation
+
+
+def trajectory(count):
+    """A winding drive of steps of half a metre."""
+    k = np.arange(count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler(
+        "zyx", np.stack([0.05 * k, 0.02 * np.sin(k), 0.01 * k], 1)
+    ).as_matrix()
+    poses[:, :3, 3] = np.stack([0.5 * k, 2 * np.sin(0.1 * k), 0.1 * np.cos(k)], 1)
+    return poses
+
+
+def drifted(poses, sigma_m, sigma_rad, seed, yaw_rad=0.0):
+    """The poses with errors in each step, which all have `yaw_rad` in common."""
+    rng = np.random.default_rng(seed)
+    found = [poses[0]]
+    for step in steps(poses):
+        error = np.concatenate([rng.normal(0, sigma_m, 3), rng.normal(0, sigma_rad, 3) + [0, 0, yaw_rad]])
+        found.append(found[-1] @ step @ moved(np.eye(4)[None], error[None])[0])
+    return np.stack(found)
+
+
+def position_error_m(poses, true):
+    """Root mean square, m."""
+    return float(np.sqrt(((poses - true)[:, :3, 3] ** 2).sum(axis=1).mean()))

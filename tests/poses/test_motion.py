@@ -1,0 +1,75 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What given steps say of poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radarsdf.poses.motion import Motion
+from radarsdf.poses.rigid import aligned, moved, steps, turned_by
+
+from .drift import drifted, trajectory
+
+
+def test_steps_lead_from_pose_to_pose():
+    poses = trajectory(9)
+    np.testing.assert_allclose(poses[:-1] @ steps(poses), poses[1:], atol=1e-12)
+
+
+def test_alignment_undoes_a_motion_of_the_whole():
+    poses = trajectory(20)
+    other = drifted(poses, 0.1, 0.02, 1)
+    whole = moved(np.eye(4)[None], np.array([[3.0, -2, 1, 0.2, -0.3, 1.1]]))[0]
+    np.testing.assert_allclose(aligned(whole @ poses, poses), poses, atol=1e-12)
+    found = aligned(whole @ other, poses)
+    np.testing.assert_allclose(found, aligned(other, poses), atol=1e-12)
+    np.testing.assert_allclose(found[:, :3, 3].mean(axis=0), poses[:, :3, 3].mean(axis=0), atol=1e-12)
+    assert turned_by(found, poses).max() < turned_by(whole @ other, poses).min()
+
+
+@pytest.mark.parametrize("times", [None, [0.0, 1, 2, 3, 8, 9]])
+def test_the_prior_has_the_derivatives_of_its_cost(times):
+    given = trajectory(6)
+    motion = Motion.of(given, 0.1, 0.02, None if times is None else np.array(times))
+    motion = Motion(motion.steps, np.array([0.01, 0, 0, 0, 0, 0.01]), 0.1, 0.02, motion.spans)
+    poses = drifted(given, 1e-3, 1e-3, 2)
+
+    def cost(increments):
+        errors = motion.errors(moved(poses, increments)) - motion.bias * motion.spans[:, None]
+        return 0.5 * (errors**2 / np.repeat([0.1**2, 0.02**2], 3) / motion.spans[:, None]).sum()
+
+    diagonal, below, gradient = motion.prior(poses)
+    h = 1e-5
+    for s, a in [(0, 0), (2, 4), (3, 5), (5, 2)]:
+        step = np.zeros((6, 6))
+        step[s, a] = h
+        slope = (cost(step) - cost(-step)) / (2 * h)
+        assert slope == pytest.approx(gradient[s, a], rel=5e-3, abs=0.05)
+        curvature = (cost(step) - 2 * cost(0 * step) + cost(-step)) / h**2
+        assert curvature == pytest.approx(diagonal[s, a, a], rel=0.02)
+    one, other = np.zeros((2, 6, 6))
+    one[3, 1], other[2, 1] = h, h
+    crossed = (cost(one + other) - cost(one - other) - cost(other - one) + cost(-one - other)) / (4 * h**2)
+    assert crossed == pytest.approx(below[2, 1, 1], rel=0.02)
+
+
+def test_deviations_and_bias_are_learnt_from_poses_that_are_known():
+    true = trajectory(400)
+    given = drifted(true, 0.03, 0.004, 3, yaw_rad=0.01)
+    nothing = np.zeros((400, 6, 6)), np.zeros((399, 6, 6))
+    learnt = Motion.of(given, 0.1, 0.01).learnt(true, *nothing, (False, False))
+    assert learnt.sigma_m == pytest.approx(0.03, rel=0.1)
+    assert learnt.sigma_rad == pytest.approx(0.004, rel=0.1)
+    assert learnt.bias[5] == pytest.approx(-0.01, abs=5e-4)
+    kept = Motion.of(given, 0.1, 0.01).learnt(true, *nothing, (True, True))
+    assert (kept.sigma_m, kept.sigma_rad) == (0.1, 0.01)
+
+
+def test_a_step_over_a_gap_may_have_larger_errors():
+    poses = trajectory(5)
+    assert Motion.of(poses, 0.1, 0.01).spans.tolist() == [1, 1, 1, 1]
+    assert Motion.of(poses, 0.1, 0.01, np.array([0.0, 0.1, 0.2, 2.2, 2.3])).spans == pytest.approx(
+        [1, 1, 20, 1]
+    )
+    assert Motion.of(poses, 0.1, 0.01, np.zeros(5)).spans.tolist() == [1, 1, 1, 1]

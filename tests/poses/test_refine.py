@@ -1,0 +1,157 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Poses that returns mend, and those that they leave alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.io import Scans
+from radarsdf.poses.rigid import aligned, turned_by
+
+from .drift import drifted, position_error_m
+
+
+@pytest.fixture(scope="module")
+def street():
+    return radarsdf.simulate.hugin(seed=61, frames=24)
+
+
+@pytest.fixture(scope="module")
+def refined(street):
+    return radarsdf.refine_poses(street.points, drifted(street.poses, 0.05, 0.004, 1))
+
+
+def test_a_drift_is_mended(street, refined):
+    given = drifted(street.poses, 0.05, 0.004, 1)
+    assert refined.improved
+    before, after = (
+        position_error_m(aligned(poses, street.poses), street.poses) for poses in (given, refined.poses)
+    )
+    assert after < 0.7 * before
+    turns = [
+        np.sqrt((turned_by(aligned(p, street.poses), street.poses) ** 2).mean())
+        for p in (given, refined.poses)
+    ]
+    assert turns[1] < 0.9 * turns[0]
+    assert 0.03 < refined.report["sigma_m"] < 0.07
+    assert 0.001 < refined.report["sigma_rad"] < 0.008
+    assert refined.report["moved_m"] > 0.5 * before
+    assert "sharper map" in refined.report["verdict"]
+    assert refined.report["scans"] == 24
+
+
+def test_the_whole_is_neither_moved_nor_turned(street, refined):
+    given = drifted(street.poses, 0.05, 0.004, 1)
+    np.testing.assert_allclose(refined.poses, aligned(refined.poses, given), atol=1e-9)
+    np.testing.assert_allclose(
+        np.einsum("fij,fkj->fik", refined.poses[:, :3, :3], refined.poses[:, :3, :3]),
+        np.tile(np.eye(3), (24, 1, 1)),
+        atol=1e-9,
+    )
+
+
+def test_a_bias_is_no_noise(street):
+    given = drifted(street.poses, 0.01, 0.0005, 2, yaw_rad=0.01)
+    found = radarsdf.refine_poses(street.points, given)
+    assert found.improved
+    assert found.report["bias"][5] == pytest.approx(-0.01, abs=0.001)
+    assert found.report["sigma_rad"] < 0.003
+
+
+def test_true_poses_come_back_to_the_bit(street):
+    found = radarsdf.refine_poses(street.points, street.poses)
+    assert not found.improved
+    np.testing.assert_array_equal(found.poses, street.poses)
+    assert "are kept" in found.report["verdict"]
+
+
+def test_errors_are_as_large_as_the_covariance_says(street, refined):
+    middle = len(street.poses) // 2
+    whole = street.poses[middle] @ np.linalg.inv(refined.poses[middle])
+    errors = (whole @ refined.poses)[:, :3, 3] - street.poses[:, :3, 3]
+    normalised = [
+        error @ np.linalg.solve(covariance[:3, :3], error) / 3
+        for i, (error, covariance) in enumerate(zip(errors, refined.covariance, strict=True))
+        if i != middle
+    ]
+    assert 0.2 < np.mean(normalised) < 5
+    assert np.abs(refined.covariance[middle]).max() < 1e-8
+    assert np.linalg.eigvalsh(np.delete(refined.covariance, middle, 0)).min() > 0
+
+
+def test_the_bits_do_not_depend_on_threads(street):
+    given = drifted(street.poses, 0.05, 0.004, 1)
+    one, three = (
+        radarsdf.refine_poses(street.points[:12], given[:12], config=FitConfig(num_threads=threads))
+        for threads in (1, 3)
+    )
+    np.testing.assert_array_equal(one.poses, three.poses)
+    np.testing.assert_array_equal(one.covariance, three.covariance)
+
+
+def test_a_plane_tells_heights_and_says_that_it_tells_no_more():
+    rng = np.random.default_rng(0)
+    given = np.tile(np.eye(4), (8, 1, 1))
+    given[:, 0, 3] = np.arange(8.0)
+    height_m = rng.normal(0, 0.1, 8)
+    scans = []
+    for error_m in height_m:
+        scan = np.column_stack([rng.uniform(-6, 6, (1500, 2)), rng.normal(-2, 0.02, 1500)])
+        scan[:, 2] -= error_m
+        scans.append(scan)
+    found = radarsdf.refine_poses(scans, given)
+    assert found.improved
+    moved = (found.poses - given)[:, :3, 3]
+    assert np.abs(moved[:, 2] - (height_m - height_m.mean())).max() < 0.02
+    along, across = np.sqrt(np.einsum("fii->fi", found.covariance))[[0, -1]][:, [0, 2]].T
+    assert (along > 30 * across).all()
+
+
+def test_scans_that_share_nothing_keep_their_poses():
+    rng = np.random.default_rng(0)
+    scans = [rng.normal(0, 1, (200, 3)) + [5, 0, 0] for _ in range(3)]
+    given = np.tile(np.eye(4), (3, 1, 1))
+    given[:, 0, 3] = [0, 1000, 2000]
+    found = radarsdf.refine_poses(scans, given)
+    assert not found.improved
+    np.testing.assert_array_equal(found.poses, given)
+
+
+@pytest.mark.parametrize("counts", [[50], [0, 5], [1, 1], [5, 5, 0]])
+def test_hardly_any_returns_keep_their_poses(counts):
+    rng = np.random.default_rng(1)
+    scans = [rng.normal(0, 3, (max(n, 1), 3)) for n in counts]
+    given = np.tile(np.eye(4), (len(counts), 1, 1))
+    found = radarsdf.refine_poses(scans, given)
+    assert not found.improved
+    assert found.covariance.shape == (len(counts), 6, 6)
+    np.testing.assert_array_equal(found.poses, given)
+
+
+def test_scans_have_their_own_poses_and_times(street):
+    given = drifted(street.poses, 0.05, 0.004, 1)
+    scans = Scans(street.points, given, times_s=np.arange(24.0))
+    np.testing.assert_array_equal(
+        radarsdf.refine_poses(scans).poses,
+        radarsdf.refine_poses(street.points, given, times=np.arange(24.0)).poses,
+    )
+
+
+def test_known_deviations_stay(street):
+    found = radarsdf.refine_poses(street.points[:6], street.poses[:6], sigma_m=0.02, sigma_rad=0.001)
+    assert (found.report["sigma_m"], found.report["sigma_rad"]) == (0.02, 0.001)
+
+
+def test_wrong_arguments_are_refused(street):
+    points, poses = street.points[:3], street.poses[:3]
+    with pytest.raises(ValueError, match="poses are missing"):
+        radarsdf.refine_poses(points)
+    with pytest.raises(ValueError, match="times must be one"):
+        radarsdf.refine_poses(points, poses, times=[0.0])
+    with pytest.raises(ValueError, match="ascend"):
+        radarsdf.refine_poses(points, poses, times=[0.0, 2, 1])
+    with pytest.raises(ValueError, match="sigma_m"):
+        radarsdf.refine_poses(points, poses, sigma_m=-1)
