@@ -8,6 +8,7 @@
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "poses/common_planes.hpp"
+#include "poses/local_planes.hpp"
 
 namespace radarsdf {
 namespace {
@@ -18,10 +19,64 @@ void check_blocks(const Array<double>& blocks, std::int64_t count, const char* n
   }
 }
 
+ReturnVariances variances_of(const std::array<double, 3>& variances) {
+  return {variances[0], variances[1], variances[2]};
+}
+
+void bind_local_planes(py::module_& m) {
+  using namespace py::literals;
+  py::class_<LocalPlanes>(m, "LocalPlanes", "The planes of scans, each in the cells of a lattice.")
+      .def(py::init<double>(), "cell_size_m"_a)
+      .def_property_readonly("num_cells", &LocalPlanes::num_cells, "Number of cells with returns.")
+      .def(
+          "add",
+          [](LocalPlanes& planes, const Array<double>& points, int sign) {
+            if (sign != 1 && sign != -1) throw std::invalid_argument("sign must be 1 or -1");
+            planes.add(points.data(), check_points(points), sign);
+          },
+          "points"_a.noconvert(), "sign"_a = 1,
+          "Adds points (N, 3) float64, world frame, m; with sign -1, takes them out again, exactly.")
+      .def(
+          "beside",
+          [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& pose,
+             const std::array<double, 3>& variances) {
+            const std::int64_t count = check_points(points);
+            check_shape(pose, 4, 4, "pose");
+            const Agreement found = planes.beside(points.data(), count, pose.data(), variances_of(variances));
+            py::array_t<double> hessian({kPose, kPose}), gradient(kPose), doubt({kPose, kPose});
+            std::copy(found.doubt.begin(), found.doubt.end(), doubt.mutable_data());
+            std::copy(found.hessian.begin(), found.hessian.end(), hessian.mutable_data());
+            std::copy(found.gradient.begin(), found.gradient.end(), gradient.mutable_data());
+            return py::make_tuple(hessian, gradient, doubt, found.weight);
+          },
+          "points"_a.noconvert(), "pose"_a.noconvert(), "variances"_a,
+          "Of points (N, 3) float64, sensor frame, m, at `pose` (4, 4): the Hessian (6, 6) and the gradient (6,) of "
+          "half "
+          "the sum of squares of their distances over the deviations, by increments of the pose as in CommonPlanes; "
+          "the part of the Hessian (6, 6) that errors of the normals make; the sum of the weights.")
+      .def(
+          "scores",
+          [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& poses,
+             const std::array<double, 3>& variances) {
+            const std::int64_t count = check_points(points);
+            if (poses.ndim() != 3 || poses.shape(1) != 4 || poses.shape(2) != 4) {
+              throw std::invalid_argument("poses must have shape (K, 4, 4)");
+            }
+            py::array_t<double> scores({poses.shape(0), static_cast<py::ssize_t>(count)});
+            planes.scores(points.data(), count, poses.data(), poses.shape(0), variances_of(variances),
+                          scores.mutable_data());
+            return scores;
+          },
+          "points"_a.noconvert(), "poses"_a.noconvert(), "variances"_a,
+          "(K, N) float64, of each of the poses (K, 4, 4) and the points (N, 3), sensor frame, m: 1 / (1 + r² / 4), r "
+          "a distance from a plane in deviations; 0 for a point without a plane.");
+}
+
 }  // namespace
 
 void bind_poses(py::module_& m) {
   using namespace py::literals;
+  bind_local_planes(m);
   py::class_<CommonPlanes>(m, "CommonPlanes", "What returns of different scans on common planes say of their poses.")
       .def(py::init([](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
                        const Array<std::int32_t>& scans, const Array<std::int32_t>& planes,
@@ -53,7 +108,7 @@ void bind_poses(py::module_& m) {
                throw std::invalid_argument("extent_m and scans_together must be positive");
              }
              const PlanesOfScans of_scans{centres.data(), normals.data(), num_planes, extent_m};
-             const ReturnVariances noise{variances[0], variances[1], variances[2]};
+             const ReturnVariances noise = variances_of(variances);
              const py::gil_scoped_release release;
              return std::make_unique<CommonPlanes>(returns, of_scans, noise, scans_together, num_threads);
            }),

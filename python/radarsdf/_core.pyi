@@ -19,6 +19,7 @@ __all__: list[str] = [
     "Encoding",
     "FEATURE_DIM",
     "FieldLoss",
+    "LocalPlanes",
     "MAX_FREQUENCIES",
     "MAX_LEVELS",
     "NUM_SPHERICAL_HARMONICS",
@@ -647,6 +648,50 @@ class CellBlocks:
     ) -> numpy.typing.NDArray[numpy.float64]:
         """
         For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that shares a face counts `weight` times, an edge its square, a corner its cube.
+        """
+
+class LocalPlanes:
+    """
+    The planes of scans, each in the cells of a lattice.
+    """
+    def __init__(self, cell_size_m: typing.SupportsFloat | typing.SupportsIndex) -> None: ...
+    def add(
+        self, points: numpy.typing.NDArray[numpy.float64], sign: typing.SupportsInt | typing.SupportsIndex = 1
+    ) -> None:
+        """
+        Adds points (N, 3) float64, world frame, m; with sign -1, takes them out again, exactly.
+        """
+    def beside(
+        self,
+        points: numpy.typing.NDArray[numpy.float64],
+        pose: numpy.typing.NDArray[numpy.float64],
+        variances: typing.Annotated[
+            collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+        ],
+    ) -> tuple[
+        numpy.typing.NDArray[numpy.float64],
+        numpy.typing.NDArray[numpy.float64],
+        numpy.typing.NDArray[numpy.float64],
+        float,
+    ]:
+        """
+        Of points (N, 3) float64, sensor frame, m, at `pose` (4, 4): the Hessian (6, 6) and the gradient (6,) of half the sum of squares of their distances over the deviations, by increments of the pose as in CommonPlanes; the part of the Hessian (6, 6) that errors of the normals make; the sum of the weights.
+        """
+    def scores(
+        self,
+        points: numpy.typing.NDArray[numpy.float64],
+        poses: numpy.typing.NDArray[numpy.float64],
+        variances: typing.Annotated[
+            collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
+        ],
+    ) -> numpy.typing.NDArray[numpy.float64]:
+        """
+        (K, N) float64, of each of the poses (K, 4, 4) and the points (N, 3), sensor frame, m: 1 / (1 + r² / 4), r a distance from a plane in deviations; 0 for a point without a plane.
+        """
+    @property
+    def num_cells(self) -> int:
+        """
+        Number of cells with returns.
         """
 
 class CommonPlanes:

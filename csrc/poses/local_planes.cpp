@@ -1,0 +1,248 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include "poses/local_planes.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+#include "returns/principal_axes.hpp"
+
+namespace radarsdf {
+namespace {
+
+constexpr int kAxisBits = 21;  // of a key
+constexpr std::int64_t kHalf = std::int64_t{1} << (kAxisBits - 1);
+constexpr std::uint64_t kAxisMask = (std::uint64_t{1} << kAxisBits) - 1;
+constexpr double kQuanta = 1 << 12;       // in the edge of a cell
+constexpr double kNeighbourWeight = 0.7;  // as of surfels: with a face in common; an edge has its square
+constexpr double kMinReturns = 8;         // weighted. A plane's variance says how little it is known
+constexpr double kMaxFlatness = 0.5;      // as of surfels
+constexpr double kSigmas2 = 4;            // where the weight of Geman and McClure is a quarter: two deviations
+constexpr double kMedianOfSquare = 0.4549;
+constexpr double kLeastM2 = 1e-10;  // of a variance, to divide by
+constexpr int kFirstProduct = 4;
+
+std::int64_t axis_of(std::uint64_t key, int axis) {
+  return static_cast<std::int64_t>((key >> (kAxisBits * axis)) & kAxisMask);
+}
+
+std::uint64_t key_of(const std::int64_t* cell) {
+  std::uint64_t key = 0;
+  for (int axis = 0; axis < 3; ++axis) key |= static_cast<std::uint64_t>(cell[axis]) << (kAxisBits * axis);
+  return key;
+}
+
+// Directions and ranges of returns, sensor frame.
+struct Beams {
+  std::vector<double> directions;
+  std::vector<double> ranges_m;
+
+  Beams(const double* points, std::int64_t count)
+      : directions(static_cast<std::size_t>(3 * count)), ranges_m(static_cast<std::size_t>(count)) {
+    for (std::size_t i = 0; i < ranges_m.size(); ++i) {
+      ranges_m[i] = std::sqrt(dot3(points + 3 * i, points + 3 * i));
+      for (std::size_t axis = 0; axis < 3; ++axis) {
+        directions[3 * i + axis] = points[3 * i + axis] / std::max(ranges_m[i], 1e-9);
+      }
+    }
+  }
+};
+
+void rotate(const double* pose, const double* vector, double* rotated) {
+  for (int row = 0; row < 3; ++row) rotated[row] = dot3(pose + 4 * row, vector);
+}
+
+}  // namespace
+
+LocalPlanes::LocalPlanes(double cell_size_m) : cell_size_m_(cell_size_m) {
+  if (!(cell_size_m > 0)) throw std::invalid_argument("cell_size_m must be positive");
+}
+
+std::optional<std::uint64_t> LocalPlanes::key(const double* point) const {
+  std::int64_t cell[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    const double place = std::floor(point[axis] / cell_size_m_) + static_cast<double>(kHalf);
+    if (!(place >= 1 && place < static_cast<double>(kAxisMask))) return std::nullopt;  // neighbours have keys, too
+    cell[axis] = static_cast<std::int64_t>(place);
+  }
+  return key_of(cell);
+}
+
+LocalPlanes::Moments LocalPlanes::moments(const double* point, std::uint64_t key) const {
+  std::int64_t x[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    const double corner = static_cast<double>(axis_of(key, axis) - kHalf);
+    x[axis] = std::llround((point[axis] / cell_size_m_ - corner) * kQuanta);
+  }
+  return {1, x[0], x[1], x[2], x[0] * x[0], x[0] * x[1], x[0] * x[2], x[1] * x[1], x[1] * x[2], x[2] * x[2]};
+}
+
+void LocalPlanes::add(const double* points, std::int64_t count, int sign) {
+  std::unordered_map<std::uint64_t, Moments> change;
+  for (std::int64_t i = 0; i < count; ++i) {
+    const auto cell = key(points + 3 * i);
+    if (!cell) throw std::invalid_argument("a point is too far from the origin for cells of this size");
+    Moments& sums = change.try_emplace(*cell).first->second;
+    const Moments of_point = moments(points + 3 * i, *cell);
+    for (std::size_t k = 0; k < kMoments; ++k) sums[k] += sign * of_point[k];
+  }
+  for (const auto& [cell, sums] : change) {
+    const auto there = cells_.find(cell);
+    if ((there == cells_.end() ? 0 : there->second[0]) + sums[0] < 0) {
+      throw std::invalid_argument("points that were never added cannot be taken out");
+    }
+  }
+  for (const auto& [cell, sums] : change) {
+    Moments& all = cells_.try_emplace(cell).first->second;
+    for (std::size_t k = 0; k < kMoments; ++k) all[k] += sums[k];
+    if (all[0] == 0) cells_.erase(cell);
+  }
+  planes_.clear();
+}
+
+LocalPlanes::Plane LocalPlanes::plane_of(std::uint64_t key) const {
+  // Round the middle of the cell, where products of coordinates are small.
+  double count = 0, sum[3] = {}, products[6] = {};
+  std::int64_t cell[3];
+  for (int axis = 0; axis < 3; ++axis) cell[axis] = axis_of(key, axis);
+  for (int i = 0; i < 27; ++i) {
+    const std::int64_t step[3] = {i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1};
+    const std::int64_t other[3] = {cell[0] + step[0], cell[1] + step[1], cell[2] + step[2]};
+    const auto there = cells_.find(key_of(other));
+    if (there == cells_.end()) continue;
+    const Moments& m = there->second;
+    const double w = std::pow(kNeighbourWeight, std::abs(step[0]) + std::abs(step[1]) + std::abs(step[2]));
+    const double n = static_cast<double>(m[0]);
+    double inner[3], shift[3];
+    for (std::size_t a = 0; a < 3; ++a) {
+      inner[a] = static_cast<double>(m[1 + a]) / kQuanta;
+      shift[a] = static_cast<double>(step[a]) - 0.5;
+      sum[a] += w * (inner[a] + n * shift[a]);
+    }
+    std::size_t k = 0;
+    for (std::size_t a = 0; a < 3; ++a) {
+      for (std::size_t b = a; b < 3; ++b, ++k) {
+        const double inside = static_cast<double>(m[kFirstProduct + k]) / (kQuanta * kQuanta);
+        products[k] += w * (inside + shift[a] * inner[b] + shift[b] * inner[a] + n * shift[a] * shift[b]);
+      }
+    }
+    count += w * n;
+  }
+  Plane found;
+  found.count = count;
+  if (count < kMinReturns) return found;
+  double covariance[9], vectors[9];
+  std::size_t k = 0;
+  for (std::size_t a = 0; a < 3; ++a) {
+    for (std::size_t b = a; b < 3; ++b, ++k) {
+      covariance[3 * a + b] = covariance[3 * b + a] = products[k] / count - sum[a] / count * sum[b] / count;
+    }
+  }
+  principal_axes(covariance, 1, found.variances, vectors, 1);
+  for (int a = 0; a < 3; ++a) {
+    const double middle = static_cast<double>(cell[a] - kHalf) + 0.5;
+    found.centre[a] = cell_size_m_ * (middle + sum[a] / count);
+    // Three unknowns were fitted to these returns.
+    found.variances[a] = std::max(cell_size_m_ * cell_size_m_ * found.variances[a] * count / (count - 3), kLeastM2);
+    for (int axis = 0; axis < 3; ++axis) found.axes[a][axis] = vectors[3 * axis + a];
+  }
+  found.flat = found.variances[0] < kMaxFlatness * found.variances[1];
+  return found;
+}
+
+const LocalPlanes::Plane& LocalPlanes::plane(std::uint64_t key) const {
+  const auto known = planes_.find(key);
+  return known != planes_.end() ? known->second : planes_.emplace(key, plane_of(key)).first->second;
+}
+
+std::optional<LocalPlanes::Residual> LocalPlanes::residual(const double* point, const float* direction, double range_m,
+                                                           const double* up, const ReturnVariances& noise) const {
+  const auto cell = key(point);
+  if (!cell) return std::nullopt;
+  const Plane& here = plane(*cell);
+  if (!here.flat) return std::nullopt;
+  double off[3];
+  for (int axis = 0; axis < 3; ++axis) off[axis] = point[axis] - here.centre[axis];
+  // Of a regression at this place: its mean, and its two slopes.
+  double spread = 1;
+  for (int a = 1; a < 3; ++a) {
+    const double along = dot3(off, here.axes[a]);
+    spread += along * along / here.variances[a];
+  }
+  const double of_plane = here.variances[0] / here.count * spread;
+  const double of_return = variance_along(here.axes[0], direction, range_m, up, noise);
+  return Residual{dot3(off, here.axes[0]), of_return + of_plane + kLeastM2, &here};
+}
+
+Agreement LocalPlanes::beside(const double* points, std::int64_t count, const double* pose,
+                              const ReturnVariances& noise) const {
+  const Beams beams(points, count);
+  const double up[3] = {pose[2], pose[6], pose[10]};
+  struct Row {
+    double value, variance, jacobian[3][kPose];  // the normal first, then how it may be tilted
+  };
+  std::vector<Row> rows;
+  std::vector<double> squares;
+  for (std::size_t i = 0; i < beams.ranges_m.size(); ++i) {
+    double arm[3], direction[3], point[3];
+    rotate(pose, points + 3 * i, arm);
+    rotate(pose, beams.directions.data() + 3 * i, direction);
+    for (int axis = 0; axis < 3; ++axis) point[axis] = arm[axis] + pose[4 * axis + 3];
+    const float along[3] = {static_cast<float>(direction[0]), static_cast<float>(direction[1]),
+                            static_cast<float>(direction[2])};
+    const auto found = residual(point, along, beams.ranges_m[i], up, noise);
+    if (!found) continue;
+    Row row{found->value, found->variance, {}};
+    const Plane& of = *found->plane;
+    for (int k = 0; k < 3; ++k) {
+      const double tilt = k == 0 ? 1 : std::sqrt(of.variances[0] / (of.count * of.variances[k]));
+      for (int axis = 0; axis < 3; ++axis) row.jacobian[k][axis] = tilt * of.axes[k][axis];
+      cross3(arm, row.jacobian[k], row.jacobian[k] + 3);
+    }
+    rows.push_back(row);
+    squares.push_back(row.value * row.value / row.variance);
+  }
+  Agreement found;
+  found.on = static_cast<std::int64_t>(rows.size());
+  if (rows.empty()) return found;
+  const auto middle = squares.begin() + static_cast<std::ptrdiff_t>(squares.size() / 2);
+  std::nth_element(squares.begin(), middle, squares.end());
+  found.scale = std::max(1.0, *middle / kMedianOfSquare);
+  for (const Row& row : rows) {
+    const double variance = found.scale * row.variance;
+    const double share = 1 / (1 + row.value * row.value / (kSigmas2 * variance));
+    const double weight = share * share;
+    found.weight += weight;
+    for (std::size_t a = 0; a < kPose; ++a) {
+      found.gradient[a] += weight / variance * row.value * row.jacobian[0][a];
+      for (std::size_t b = 0; b < kPose; ++b) {
+        found.hessian[kPose * a + b] += weight / variance * row.jacobian[0][a] * row.jacobian[0][b];
+        for (int k = 1; k < 3; ++k) {
+          found.doubt[kPose * a + b] += weight / variance * row.jacobian[k][a] * row.jacobian[k][b];
+        }
+      }
+    }
+  }
+  return found;
+}
+
+void LocalPlanes::scores(const double* points, std::int64_t count, const double* poses, std::int64_t num_poses,
+                         const ReturnVariances& noise, double* scores) const {
+  const Beams beams(points, count);
+  for (std::int64_t k = 0; k < num_poses; ++k) {
+    const double* pose = poses + 16 * k;
+    const double up[3] = {pose[2], pose[6], pose[10]};
+    for (std::size_t i = 0; i < beams.ranges_m.size(); ++i) {
+      double direction[3], point[3];
+      rotate(pose, beams.directions.data() + 3 * i, direction);
+      for (int axis = 0; axis < 3; ++axis) point[axis] = beams.ranges_m[i] * direction[axis] + pose[4 * axis + 3];
+      const float along[3] = {static_cast<float>(direction[0]), static_cast<float>(direction[1]),
+                              static_cast<float>(direction[2])};
+      const auto found = residual(point, along, beams.ranges_m[i], up, noise);
+      *scores++ = found ? 1 / (1 + found->value * found->value / (kSigmas2 * found->variance)) : 0.0;
+    }
+  }
+}
+
+}  // namespace radarsdf

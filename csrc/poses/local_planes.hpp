@@ -1,0 +1,77 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// The planes that a scan is held against while its pose is looked for: those of the scans before it.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <optional>
+#include <unordered_map>
+#include <vector>
+
+#include "poses/block_band.hpp"
+#include "returns/return_noise.hpp"
+
+namespace radarsdf {
+
+// How well returns lie on planes, as a function of the pose of their sensor.
+struct Agreement {
+  std::array<double, kBlock> hessian{};  // of half the sum of squares, by increments as in CommonPlanes
+  std::array<double, kPose> gradient{};
+  // The part of the Hessian that errors of the normals make: across a wall, normals point along it by chance. Where it
+  // is all, the returns tell nothing.
+  std::array<double, kBlock> doubt{};
+  double scale = 1;     // as in CommonPlanes
+  double weight = 0;    // sum over the returns, each at most 1
+  std::int64_t on = 0;  // returns near a plane
+};
+
+// Scans are added and taken out again, exactly: sums over their returns are integers. A cell's plane is that of the
+// returns in it and in the 26 cells round it.
+class LocalPlanes {
+ public:
+  explicit LocalPlanes(double cell_size_m);
+
+  double cell_size_m() const { return cell_size_m_; }
+
+  // points: (count, 3), world frame, m. sign: 1 adds them, -1 takes them out. Throws std::invalid_argument, and changes
+  // nothing, if a point is too far away, or was never added.
+  void add(const double* points, std::int64_t count, int sign);
+
+  std::int64_t num_cells() const { return static_cast<std::int64_t>(cells_.size()); }
+
+  // points: (count, 3), sensor frame, m; pose: (4, 4) T_world_sensor. The variance of a residual is that of the return
+  // and that of the plane at its place; its weight is that of Geman and McClure.
+  Agreement beside(const double* points, std::int64_t count, const double* pose, const ReturnVariances& noise) const;
+
+  // scores: (num_poses, count), of each of the poses (num_poses, 4, 4) and the returns 1 / (1 + r^2 / (4 variance)); 0
+  // for a return without a plane.
+  void scores(const double* points, std::int64_t count, const double* poses, std::int64_t num_poses,
+              const ReturnVariances& noise, double* scores) const;
+
+ private:
+  static constexpr int kMoments = 10;  // 1, x, y, z, xx, xy, xz, yy, yz, zz, in quanta from the corner of the cell
+  using Moments = std::array<std::int64_t, kMoments>;
+  struct Plane {
+    bool flat = false;
+    double centre[3], axes[3][3], variances[3], count;  // axes: the normal first
+  };
+  struct Residual {
+    double value, variance;
+    const Plane* plane;
+  };
+
+  std::optional<std::uint64_t> key(const double* point) const;
+  Moments moments(const double* point, std::uint64_t key) const;
+  Plane plane_of(std::uint64_t key) const;
+  const Plane& plane(std::uint64_t key) const;
+  std::optional<Residual> residual(const double* point, const float* direction, double range_m, const double* up,
+                                   const ReturnVariances& noise) const;
+
+  double cell_size_m_;
+  std::unordered_map<std::uint64_t, Moments> cells_;
+  mutable std::unordered_map<std::uint64_t, Plane> planes_;  // that were asked for since scans changed
+};
+
+}  // namespace radarsdf
