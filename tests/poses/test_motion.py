@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from radarsdf.poses.motion import Motion
@@ -32,7 +34,7 @@ def test_alignment_undoes_a_motion_of_the_whole():
 def test_the_prior_has_the_derivatives_of_its_cost(times):
     given = trajectory(6)
     motion = Motion.of(given, 0.1, 0.02, None if times is None else np.array(times))
-    motion = Motion(motion.steps, np.array([0.01, 0, 0, 0, 0, 0.01]), 0.1, 0.02, motion.spans)
+    motion = dataclasses.replace(motion, bias=np.array([0.01, 0, 0, 0, 0, 0.01]))
     poses = drifted(given, 1e-3, 1e-3, 2)
 
     def cost(increments):
@@ -58,12 +60,12 @@ def test_deviations_and_bias_are_learnt_from_poses_that_are_known():
     true = trajectory(400)
     given = drifted(true, 0.03, 0.004, 3, yaw_rad=0.01)
     nothing = np.zeros((400, 6, 6)), np.zeros((399, 6, 6))
-    learnt = Motion.of(given, 0.1, 0.01).learnt(true, *nothing, (False, False))
+    learnt = Motion.of(given, 0.1, 0.01).learnt(true, *nothing)
     assert learnt.sigma_m == pytest.approx(0.03, rel=0.1)
     assert learnt.sigma_rad == pytest.approx(0.004, rel=0.1)
     assert learnt.bias[5] == pytest.approx(-0.01, abs=5e-4)
-    kept = Motion.of(given, 0.1, 0.01).learnt(true, *nothing, (True, True))
-    assert (kept.sigma_m, kept.sigma_rad) == (0.1, 0.01)
+    kept = Motion.of(given, 0.1, 0.01, known=(True, True)).learnt(true, *nothing)
+    assert (kept.sigma_m, kept.sigma_rad) == pytest.approx((0.1, 0.01))
 
 
 def test_a_step_over_a_gap_may_have_larger_errors():
@@ -73,3 +75,17 @@ def test_a_step_over_a_gap_may_have_larger_errors():
         [1, 1, 20, 1]
     )
     assert Motion.of(poses, 0.1, 0.01, np.zeros(5)).spans.tolist() == [1, 1, 1, 1]
+
+
+def test_what_a_source_does_not_tell_is_left_to_others():
+    poses = trajectory(8)
+    turns = Motion.of(poses, 0.1, 0.01).rotations_only()
+    diagonal, below, gradient = turns.prior(drifted(poses, 0.1, 0.01, 5))
+    assert np.abs(diagonal[:, :3]).max() == 0
+    assert np.abs(below[:, :3]).max() == 0
+    assert np.abs(gradient[:, :3]).max() == 0
+    assert np.abs(gradient[:, 3:]).max() > 0
+    learnt = turns.learnt(drifted(poses, 0.1, 0.01, 5), np.zeros((8, 6, 6)), np.zeros((7, 6, 6)))
+    assert learnt.sigma_m == turns.sigma_m
+    assert learnt.sigma_rad != turns.sigma_rad
+    assert learnt.bias[:3].tolist() == [0, 0, 0]

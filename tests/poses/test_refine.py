@@ -142,7 +142,7 @@ def test_scans_have_their_own_poses_and_times(street):
 
 def test_known_deviations_stay(street):
     found = radarsdf.refine_poses(street.points[:6], street.poses[:6], sigma_m=0.02, sigma_rad=0.001)
-    assert (found.report["sigma_m"], found.report["sigma_rad"]) == (0.02, 0.001)
+    assert (found.report["sigma_m"], found.report["sigma_rad"]) == pytest.approx((0.02, 0.001))
 
 
 def test_wrong_arguments_are_refused(street):

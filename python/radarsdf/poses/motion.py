@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the given poses say: from each scan to the next, but for noise and a bias that all steps have in common."""
+"""What is measured of the motion from each scan to the next, but for noise and a bias that all steps have in common."""
 
 from __future__ import annotations
 
@@ -18,28 +18,62 @@ _LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # deviations to divide by: no radar tells les
 
 @dataclass(frozen=True)
 class Motion:
-    """The given motions between neighbouring scans, with their errors."""
+    """Motions between neighbouring scans as one source has them, with its errors: of given poses, of Doppler, of a gyroscope."""
 
     steps: Floats
-    """(F - 1, 4, 4) as given."""
+    """(F - 1, 4, 4) as measured."""
     bias: Floats
     """(6,) that each step has too much: translation, m, rotation vector, rad, in the frame of the sensor."""
-    sigma_m: float
-    """Standard deviation of each component of a step's translation."""
-    sigma_rad: float
-    """Likewise of its rotation."""
+    variances: Floats
+    """(2,) of each component of a step's translation, m², and of its rotation, rad², where its share is 1."""
+    shares: Floats
+    """(F - 1, 6) by which each step's variances differ from these. Infinite: the source does not tell this component."""
+    known: tuple[bool, bool]
+    """Whether the variances of translations, and of rotations, stay as they are."""
     spans: Floats
-    """(F - 1,) duration of each step over the median. Biases grow with it, and variances: errors of steps add up."""
+    """(F - 1,) duration of each step over the median. Biases grow with it."""
 
     @classmethod
-    def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> Motion:
-        """Of the given poses (F, 4, 4), at `times_s` (F,). None: they are equally far apart."""
-        spans = np.ones(len(poses) - 1)
-        if times_s is not None:
-            durations = np.maximum(np.diff(times_s), 0.0)
-            median = float(np.median(durations))
-            spans = np.maximum(durations / median, _LEAST_SPAN) if median > 0 else spans
-        return cls(steps(poses), np.zeros(6), max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD), spans)
+    def of(
+        cls,
+        poses: Floats,
+        sigma_m: float,
+        sigma_rad: float,
+        times_s: Floats | None = None,
+        known: tuple[bool, bool] = (False, False),
+    ) -> Motion:
+        """Of given poses (F, 4, 4), at `times_s` (F,). None: they are equally far apart. Errors of steps add up: variances grow
+        with time."""
+        spans = spans_of(times_s, len(poses))
+        shares = np.repeat(spans[:, None], 6, axis=1)
+        variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
+        return cls(steps(poses), np.zeros(6), variances, shares, known, spans)
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of each component of a step's translation."""
+        return float(np.sqrt(self.variances[0]))
+
+    @property
+    def sigma_rad(self) -> float:
+        """Likewise of its rotation."""
+        return float(np.sqrt(self.variances[1]))
+
+    def with_turns(self, turns: Floats) -> Motion:
+        """With rotation vectors (F - 1, 3), rad, that another source measured."""
+        measured = self.steps.copy()
+        measured[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+        return dataclasses.replace(self, steps=measured)
+
+    def rotations_only(self) -> Motion:
+        """Without the translations."""
+        shares = self.shares.copy()
+        shares[:, :3] = np.inf
+        return dataclasses.replace(self, shares=shares)
+
+    def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
+        """As measured by a sensor with these poses (F, 4, 4). Most measurements are the same for all."""
+        return self
 
     def errors(self, poses: Floats) -> Floats:
         """(F - 1, 6) of the given steps, if `poses` (F, 4, 4) are right: translations, m, and rotation vectors, rad."""
@@ -60,7 +94,7 @@ class Motion:
 
     def prior(self, poses: Floats) -> tuple[Floats, Floats, Floats]:
         """Of increments of `poses` (F, 4, 4): blocks on the diagonal (F, 6, 6) and below it (F - 1, 6, 6), and the gradient (F, 6)."""
-        information = np.repeat([self.sigma_m**-2, self.sigma_rad**-2], 3) / self.spans[:, None]
+        information = 1 / (np.repeat(self.variances, 3) * self.shares)
         first, second = self._jacobians(poses)
         errors = (self.errors(poses) - self.bias * self.spans[:, None]) * information
         diagonal, gradient = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
@@ -69,11 +103,11 @@ class Motion:
             gradient[rows] += np.einsum("fki,fk->fi", jacobian, errors)
         return diagonal, np.einsum("fki,fk,fkj->fij", second, information, first), gradient
 
-    def learnt(self, poses: Floats, diagonal: Floats, below: Floats, known: tuple[bool, bool]) -> Motion:
+    def learnt(self, poses: Floats, diagonal: Floats, below: Floats) -> Motion:
         """With the bias and the deviations that `poses` show, whose covariance has blocks (F, 6, 6) and (F - 1, 6, 6).
 
         A step of expectation maximisation (Dempster et al. 1977): the square of an error is that of its estimate and its
-        variance. `known`: whether the deviations of translations, and of rotations, stay as they are.
+        variance.
         """
         first, second = self._jacobians(poses)
         crossed = np.einsum("fai,fij,faj->fa", second, below, first)
@@ -82,14 +116,23 @@ class Motion:
             + np.einsum("fai,fij,faj->fa", second, diagonal[1:], second)
             + 2 * crossed
         )
-        errors = self.errors(poses)
-        bias = errors.sum(axis=0) / self.spans.sum()
-        spans = self.spans[:, None]
-        squares = (((errors - bias * spans) ** 2 + variances) / spans).mean(axis=0)
-        sigma_m, sigma_rad = np.sqrt([squares[:3].mean(), squares[3:].mean()]).tolist()
-        return dataclasses.replace(
-            self,
-            bias=bias,
-            sigma_m=self.sigma_m if known[0] else max(sigma_m, _LEAST_M),
-            sigma_rad=self.sigma_rad if known[1] else max(sigma_rad, _LEAST_RAD),
-        )
+        errors, spans = self.errors(poses), self.spans[:, None]
+        told = np.isfinite(self.shares)
+        weights = 1 / self.shares
+        bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)
+        squares = ((errors - bias * spans) ** 2 + variances) * weights
+        floors, found = (_LEAST_M**2, _LEAST_RAD**2), self.variances.copy()
+        for k, rows in enumerate((slice(0, 3), slice(3, 6))):
+            if not self.known[k] and told[:, rows].any():
+                found[k] = max(squares[:, rows].sum() / told[:, rows].sum(), floors[k])
+        return dataclasses.replace(self, bias=bias, variances=found)
+
+
+def spans_of(times_s: Floats | None, num_scans: int) -> Floats:
+    """(F - 1,) durations of steps over the median. Without times, all are alike."""
+    spans = np.ones(num_scans - 1)
+    if times_s is None:
+        return spans
+    durations = np.maximum(np.diff(times_s), 0.0)
+    median = float(np.median(durations)) if len(durations) else 0.0
+    return np.maximum(durations / median, _LEAST_SPAN) if median > 0 else spans

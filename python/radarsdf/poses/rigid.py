@@ -52,3 +52,29 @@ def skew(vectors: Floats) -> Floats:
     x, y, z = vectors.T
     o = np.zeros(len(vectors))
     return np.stack([o, -z, y, z, o, -x, -y, x, o], 1).reshape(-1, 3, 3)
+
+
+def rotation(vector: Floats) -> Floats:
+    """(3, 3) rotation by a rotation vector (3,), rad."""
+    found: Floats = Rotation.from_rotvec(vector).as_matrix()
+    return found
+
+
+def transform(turn: Floats, translation: Floats) -> Floats:
+    """(4, 4) of a rotation vector, rad, and a translation, m."""
+    found = np.eye(4)
+    found[:3, :3] = rotation(turn)
+    found[:3, 3] = translation
+    return found
+
+
+def rotation_vector(matrix: Floats, near: Floats | None = None) -> Floats:
+    """(3,) of a rotation (3, 3), rad. Of those that differ by whole turns, the one nearest to `near`, or to 0."""
+    found: Floats = Rotation.from_matrix(matrix).as_rotvec()
+    angle = float(np.linalg.norm(found))
+    if near is None or angle == 0:
+        return found
+    axis = found / angle
+    whole_turns = np.round((np.einsum("i,i->", axis, near) - angle) / (2 * np.pi))
+    unwound: Floats = found + 2 * np.pi * whole_turns * axis
+    return unwound

@@ -17,6 +17,12 @@ _NEIGHBOURS = 8  # of a return, among which the nearest one of another scan is l
 _MOST_RETURNS = 50_000  # that are asked
 _ERRORS = 3.0  # standard errors of a gain that is no chance
 _BLOCKS = 20  # of neighbouring scans, whose errors have causes in common
+_HELD_OUT = 0.2  # of the returns
+
+
+def held_out(count: int, seed: int) -> NDArray[np.bool_]:
+    """(count,) which returns take no part, so that they may judge."""
+    return np.random.default_rng(seed).random(count) < _HELD_OUT
 
 
 @dataclass(frozen=True)

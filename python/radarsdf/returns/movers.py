@@ -48,7 +48,7 @@ class Movers:
             If `doppler_mps` are not numbers, their shapes do not fit to `points`, or a fit refuses these.
         """
         scans, _ = check_scans(points)
-        speeds = _checked(scans, doppler_mps)
+        speeds = checked_doppler(scans, doppler_mps)
         none = [np.zeros(len(scan), bool) for scan in scans]
         tried = [i for i, scan in enumerate(scans) if len(scan) >= MIN_RETURNS]
         found = sensor_velocities([scans[i] for i in tried], [speeds[i] for i in tried])
@@ -106,7 +106,8 @@ class Standing:
         return cls(movers.without(points), values, movers.count, movers.why_none)
 
 
-def _checked(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+    """F arrays (N_i,) of numbers. Raises TypeError or ValueError where they are none, or do not fit to the scans."""
     speeds = [
         real_array(values, f"doppler_mps of scan {i}")
         for i, values in enumerate(one_for_each_scan(doppler_mps, "doppler_mps"))

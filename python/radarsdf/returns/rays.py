@@ -177,7 +177,9 @@ def middle_scan(scan: int, scans: int, accumulate_scans: int) -> int:
     return (first + min(first + accumulate_scans, scans) - 1) // 2
 
 
-def _kept(scan: NDArray[np.float64], min_range_m: float, max_range_m: float | None) -> NDArray[np.bool_]:
+def within_ranges(
+    scan: NDArray[np.float64], min_range_m: float, max_range_m: float | None
+) -> NDArray[np.bool_]:
     """Mask (N,) of the returns of a scan (N, 3) within the ranges."""
     ranges = _lengths(scan)
     keep = (ranges > 0) & (ranges >= min_range_m)  # a return at the sensor itself has no direction
@@ -256,7 +258,7 @@ def prepare(
             continue  # it is only counted
         num_given += len(scan)
         seen_from = positions[middle_scan(i, num_scans, accumulate_scans)]
-        keep = _kept(scan, min_range_m, max_range_m)
+        keep = within_ranges(scan, min_range_m, max_range_m)
         values = None if of_scan is None else of_scan[keep]
         local = turned(scan if keep.all() else scan[keep], T_world_sensor[i, :3, :3])
         local += positions[i] - local_origin

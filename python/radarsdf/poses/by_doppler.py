@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Motion from the Doppler of scans: velocities of the sensor, and the way from scan to scan."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from radarsdf.poses.motion import Motion, spans_of
+from radarsdf.poses.rigid import Floats, rotation, rotation_vector, steps
+from radarsdf.returns.doppler import sensor_velocities
+
+_ASKED = 400  # returns of a scan, and
+_PAIRS = 40  # pairs of neighbouring scans, that tell the sign
+_ERRORS = 3.0  # standard errors of a difference that is no chance
+# Measured (Astyx drives): a velocity is off by more than its returns say, since they are not independent. So is one of
+# elevations that all have the same error.
+_LEAST_MPS = 0.02
+_LEAST_STEP_M = 1e-4  # deviation of a step, to divide by
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """Of the sensor in its own frame, at each of F scans."""
+
+    mean_mps: Floats
+    """(F, 3)."""
+    covariance: Floats
+    """(F, 3, 3), m²/s²."""
+    change: Floats
+    """(3,) by how much the square of each component's change grows with time, m²/s³."""
+    static: list[NDArray[np.bool_]]
+    """Of each scan (N_i,): returns that do not contradict the velocity. All, where none was found."""
+    found: NDArray[np.bool_]
+    """(F,) whether the returns of a scan agree on a velocity. Elsewhere it is that between its neighbours."""
+
+    @classmethod
+    def of(
+        cls, scans: Sequence[Floats], doppler_mps: Sequence[NDArray[Any]], times_s: Floats
+    ) -> Velocities | None:
+        """Of scans (N_i, 3), sensor frame, m. None: fewer than half of them tell a velocity."""
+        each = sensor_velocities(scans, doppler_mps)
+        found = np.array([velocity.found for velocity in each], bool)
+        if 2 * found.sum() < max(len(found), 2):
+            return None
+        mean = np.stack([velocity.velocity_mps for velocity in each])
+        covariance = np.stack([velocity.covariance for velocity in each]) + _LEAST_MPS**2 * np.eye(3)
+        static = [
+            velocity.static if velocity.found else np.ones(len(scan), bool)
+            for velocity, scan in zip(each, scans, strict=True)
+        ]
+        at = times_s[found]
+        durations = np.diff(at)
+        usual = (durations > 0) & (durations <= 2 * np.median(durations))
+        # With the noise of the velocities in it: rather too much.
+        squares = np.diff(mean[found], axis=0)[usual] ** 2
+        change = squares.sum(axis=0) / max(durations[usual].sum(), 1e-9) + _LEAST_MPS**2
+        for i in np.flatnonzero(~found):
+            mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
+            away_s = np.abs(at - times_s[i]).min()
+            covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
+        return cls(mean, covariance, change, static, found)
+
+    def select(self, rows: slice) -> Velocities:
+        """Of these scans."""
+        return Velocities(
+            self.mean_mps[rows], self.covariance[rows], self.change, self.static[rows], self.found[rows]
+        )
+
+    @property
+    def turned(self) -> Velocities:
+        """For a radar whose Doppler is positive if the sensor comes nearer."""
+        return dataclasses.replace(self, mean_mps=-self.mean_mps)
+
+    def step_covariance(self, i: int, duration_s: float) -> Floats:
+        """(3, 3) of the way from scan `i` to the next one, m²: of both velocities, and of those between (a Brownian bridge)."""
+        ends = (self.covariance[i] + self.covariance[i + 1]) * duration_s**2 / 4
+        between: Floats = ends + np.diag(self.change) * duration_s**3 / 12
+        return between
+
+
+def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
+    """(3,) of a sensor that turns evenly by the rotation vector `turn` while its velocity changes evenly, in its first frame, m."""
+    middle = rotation(0.5 * turn) @ (0.5 * (begin_mps + end_mps))
+    found: Floats = duration_s / 6 * (begin_mps + 4 * middle + rotation(turn) @ end_mps)
+    return found
+
+
+@dataclass(frozen=True)
+class DopplerMotion(Motion):
+    """Translations from scan to scan, by velocities. Which way a step leads depends on how the sensor turned meanwhile."""
+
+    velocities: Velocities
+    durations_s: Floats
+    """(F - 1,)."""
+    turns: Floats | None
+    """(F - 1, 3) rotation vectors of the steps, roughly: over a gap, a sensor may have turned by more than half a turn."""
+
+    @classmethod
+    def by(
+        cls, velocities: Velocities, times_s: Floats, poses: Floats, turns: Floats | None = None
+    ) -> DopplerMotion:
+        """Of scans with these times (F,) and about these poses (F, 4, 4)."""
+        durations_s = np.diff(times_s)
+        ways = np.stack([velocities.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
+        shares = np.full((len(durations_s), 6), np.inf)
+        shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
+        nothing = np.tile(np.eye(4), (len(durations_s), 1, 1))
+        spans = spans_of(times_s, len(times_s))
+        return cls(
+            nothing, np.zeros(6), np.ones(2), shares, (True, True), spans, velocities, durations_s, turns
+        ).at(poses)
+
+    def learnt(self, poses: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002
+        """As it is: the velocities' own covariances are known. If they were learnt, real drives ended four times as far off."""
+        return self
+
+    def at(self, poses: Floats) -> DopplerMotion:
+        """As measured by a sensor that turned as these poses do."""
+        between, means = steps(poses), self.velocities.mean_mps
+        for i, step in enumerate(between):
+            turn = rotation_vector(step[:3, :3], None if self.turns is None else self.turns[i])
+            step[:3, 3] = way(turn, means[i], means[i + 1], float(self.durations_s[i]))
+        return dataclasses.replace(self, steps=between)
+
+
+def doppler_sign(scans: Sequence[Floats], velocities: Velocities, times_s: Floats) -> int:
+    """-1 if neighbouring scans, without what moves, agree better once all velocities are turned round, else 1."""
+    moved_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * np.diff(times_s)
+    usable = (
+        velocities.found[1:] & velocities.found[:-1] & (np.diff(times_s) <= 2 * np.median(np.diff(times_s)))
+    )
+    usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
+    pairs = np.flatnonzero(usable)
+    pairs = np.sort(pairs[np.argsort(moved_m[pairs])[-_PAIRS:]])  # the longest ways tell most
+    gains = []
+    for i in pairs.tolist():
+        first, second = scans[i : i + 2]
+        asked = second[:: max(1, len(second) // _ASKED)]
+        moved = 0.5 * (velocities.mean_mps[i] + velocities.mean_mps[i + 1]) * (times_s[i + 1] - times_s[i])
+        tree = cKDTree(first)
+        ahead, back = (np.log(np.maximum(tree.query(asked + s * moved)[0], 1e-3)).mean() for s in (1, -1))
+        gains.append(ahead - back)
+    if len(gains) < 2:
+        return 1
+    return -1 if np.mean(gains) > _ERRORS * np.std(gains, ddof=1) / np.sqrt(len(gains)) else 1

@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Poses of all scans at once, from common planes and what was measured of the motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from radarsdf.config.groups import ReturnsConfig
+from radarsdf.poses.motion import Motion
+from radarsdf.poses.planes import Grid, SensorReturns, common_planes
+from radarsdf.poses.rigid import Floats, aligned, moved
+from radarsdf.returns.noise import SensorNoise
+
+# Of scans in short windows, the drift is small beside a cell. So each window may be twice as long as the one before.
+_FIRST_WINDOW = 8  # scans
+_OF_WINDOWS = (4, 2)  # edges of cells, in those of a map's surfels
+_OF_ALL = (4, 4, 2, 2)  # likewise, once all scans are together
+_MOST_ROUNDS = 12  # with cells as small as a map's surfels
+# Standard deviations that poses still move by. Planes are drawn anew in each round, so that 0.1 is often never reached; 0.3
+# ends with the same errors in half the time.
+_SETTLED = 0.3
+_TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
+_WEAK = (
+    1e-4  # information about each pose, 1/m² and 1/rad²: what returns and steps leave free stays where it is
+)
+_FIXED = 1e10  # likewise, about the pose that the covariance is relative to
+
+
+@dataclass(frozen=True)
+class PosesEstimate:
+    """Poses, and what was found with them."""
+
+    poses: Floats
+    covariance: Floats
+    motions: list[Motion]
+    noise: SensorNoise
+    rounds: int
+
+    @classmethod
+    def of(
+        cls,
+        returns: SensorReturns,
+        given: Floats,
+        motions: Sequence[Motion],
+        cell_m: float,
+        config: ReturnsConfig,
+        num_threads: int,
+        first_window: int = _FIRST_WINDOW,
+    ) -> PosesEstimate:
+        """From `given` (F, 4, 4) and what was measured, by Gauss and Newton's method, with planes drawn anew in each round."""
+        poses, noise, rounds, motions = given, None, 0, list(motions)
+        for grid in _grids(len(given), cell_m, first_window):
+            # The noise is estimated every other round: with the poses, it changes slowly.
+            planes, noise = common_planes(
+                returns, poses, grid, None if rounds % 2 == 0 else noise, config, num_threads
+            )
+            diagonal, below, gradient = _prior(motions, poses)
+            increments, inverse, inverse_below, decrement = planes.solve(
+                diagonal, below, gradient, _TOLERANCE, _MOST_ITERATIONS, True, num_threads
+            )
+            poses = aligned(moved(poses, increments), given)
+            motions = [motion.at(poses).learnt(poses, inverse, inverse_below) for motion in motions]
+            rounds += 1
+            finest = grid.window == len(given) and grid.cell_m == cell_m
+            if finest and decrement < _SETTLED**2 * increments.size:
+                break
+        assert noise is not None
+        diagonal, below, gradient = _prior(motions, poses)
+        diagonal[len(given) // 2] += _FIXED * np.eye(6)
+        covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
+        return cls(poses, covariance, motions, noise, rounds)
+
+
+def _prior(motions: Sequence[Motion], poses: Floats) -> tuple[Floats, Floats, Floats]:
+    """What all that was measured says together, as :meth:`Motion.prior`."""
+    diagonal, below, gradient = (
+        np.sum(parts, axis=0) for parts in zip(*(motion.prior(poses) for motion in motions), strict=True)
+    )
+    return diagonal + _WEAK * np.eye(6), below, gradient
+
+
+def _grids(num_scans: int, cell_m: float, window: int) -> Iterator[Grid]:
+    """Coarse to fine, and from short windows to all scans."""
+    plan = []
+    while window < num_scans:
+        plan += [(window, cells) for cells in _OF_WINDOWS]
+        window *= 2
+    plan += [(num_scans, cells) for cells in _OF_ALL] + [(num_scans, 1)] * _MOST_ROUNDS
+    for i, (window, cells) in enumerate(plan):
+        yield Grid(window, i % 2 == 1, cells * cell_m)

@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What was recorded besides poses, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from radarsdf.checks import real_array
+from radarsdf.io.scans import Scans
+from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.rigid import Floats
+from radarsdf.returns.movers import checked_doppler
+from radarsdf.returns.rays import check_scans
+
+NO_VELOCITY = "The Doppler is not used: less than half of the scans agree on a velocity of the sensor."
+
+
+@dataclass(frozen=True)
+class Recording:
+    """F scans of one drive."""
+
+    scans: list[Floats]
+    """(N_i, 3) each, sensor frame, m; without the returns that move."""
+    times_s: Floats | None
+    """(F,) from the first scan on."""
+    begin_s: float
+    """Time of the first scan."""
+    velocities: Velocities | None
+    """By the Doppler. None: there is none, or it tells no velocity."""
+    movers: int
+    """Number of returns that were left out, because they move."""
+    notes: list[str]
+    """Sentences on what was not used."""
+
+    @classmethod
+    def of(
+        cls,
+        points: Iterable[ArrayLike] | Scans,
+        doppler_mps: Sequence[ArrayLike] | None,
+        times: ArrayLike | None,
+    ) -> Recording:
+        """Of scans (N_i, 3), Doppler (N_i,) and times (F,). Raises TypeError or ValueError where they are none."""
+        if isinstance(points, Scans):
+            of_scans, points = points, points.points  # first: it reads all there is, in one pass
+            doppler_mps = of_scans.doppler_mps if doppler_mps is None else doppler_mps
+            times = of_scans.times_s if times is None else times
+            doppler_mps = None if times is None else doppler_mps
+        elif doppler_mps is not None and times is None:
+            msg = "Doppler needs times: when each scan was taken, s"
+            raise ValueError(msg)
+        scans, _ = check_scans(points)
+        times_s = None if times is None else _checked_times(times, len(scans))
+        begin_s = 0.0 if times_s is None else float(times_s[0])
+        times_s = None if times_s is None else times_s - begin_s
+        if doppler_mps is None or times_s is None:
+            return cls(scans, times_s, begin_s, None, 0, [])
+        velocities = Velocities.of(scans, checked_doppler(scans, doppler_mps), times_s)
+        if velocities is None:
+            return cls(scans, times_s, begin_s, None, 0, [NO_VELOCITY])
+        movers = sum(int((~static).sum()) for static in velocities.static)
+        standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
+        return cls(standing, times_s, begin_s, velocities, movers, [])
+
+
+def _checked_times(times: ArrayLike, num_scans: int) -> Floats:
+    """(F,) s."""
+    times_s: Floats = real_array(times, "times")
+    if times_s.shape != (num_scans,):
+        msg = f"times must be one for each of {num_scans} scans, not {times_s.shape}"
+        raise ValueError(msg)
+    if not np.isfinite(times_s).all() or (np.diff(times_s) < 0).any():
+        msg = "times must be finite, and ascend from scan to scan"
+        raise ValueError(msg)
+    return times_s
