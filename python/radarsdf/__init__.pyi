@@ -16,6 +16,8 @@ from .fitting.stopping import Interrupted as Interrupted
 from .map.isosurface import marching_cubes as marching_cubes
 from .map.map import Map as Map
 from .map.radar_map import RadarMap as RadarMap
+from .poses.odometry import Odometry as Odometry
+from .poses.odometry import odometry as odometry
 from .poses.refine import RefinedPoses as RefinedPoses
 from .poses.refine import refine_poses as refine_poses
 from .tiles.any_map import load as load

@@ -13,6 +13,7 @@ Examples
 """
 
 from .materials import Material
+from .measured_motion import MeasuredMotion, measured_motion
 from .primitives import Box, CornerReflector, Pole, Primitive
 from .radar import Origin, RadarSensor, Scan
 from .scene import Hits, Scene
@@ -26,6 +27,7 @@ __all__ = [
     "CornerReflector",
     "Hits",
     "Material",
+    "MeasuredMotion",
     "Origin",
     "Pole",
     "Primitive",
@@ -36,6 +38,7 @@ __all__ = [
     "Terrain",
     "astyx",
     "hugin",
+    "measured_motion",
     "oculii",
     "simulate",
     "wall",

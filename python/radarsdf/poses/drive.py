@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A drive without poses: scan after scan, pass after pass."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.poses.by_doppler import DopplerMotion, Velocities
+from radarsdf.poses.expected import ExpectedStep
+from radarsdf.poses.gyroscope import Gyroscope
+from radarsdf.poses.motion import Motion
+from radarsdf.poses.rates import Habits, Rate
+from radarsdf.poses.rigid import Floats, rotation
+from radarsdf.poses.tracking import Tracked, Tracker
+from radarsdf.returns.surfels import LEAVES_PER_SURFEL
+
+# What a drive begins with. Its own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
+# scans were lost, up to 9 degrees.
+_TURNS = Habits(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
+_MOVES = Habits(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
+_PASSES = 3
+_TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until the estimate finds them
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What is known of a drive without its poses."""
+
+    scans: list[Floats]
+    times_s: Floats
+    velocities: Velocities | None
+    gyroscope: Gyroscope | None
+    turns: Habits = _TURNS
+    """Of the sensor, in its own frame."""
+    moves: Habits = _MOVES
+    """Likewise."""
+
+    def expected(self, i: int, turn: Rate | None, move: Rate | None) -> ExpectedStep:
+        """The step to scan `i`, after one with these rates. None: nothing came before."""
+        duration_s = float(self.times_s[i] - self.times_s[i - 1])
+        before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
+        elapsed_s = (duration_s + before_s) / 2
+        if self.gyroscope is not None:
+            by = self.gyroscope.step(i - 1)
+        else:
+            rate = (
+                Rate(np.zeros(3), np.diag(self.turns.usual))
+                if turn is None
+                else self.turns.after(turn, elapsed_s)
+            )
+            by = Rate(rate.mean * duration_s, rate.covariance * duration_s**2)
+        if self.velocities is not None:
+            begin, end = self.velocities.mean_mps[i - 1 : i + 1]
+            return ExpectedStep(
+                by, begin, end, self.velocities.step_covariance(i - 1, duration_s), duration_s
+            )
+        rate = (
+            Rate(np.zeros(3), np.diag(self.moves.usual))
+            if move is None
+            else self.moves.after(move, elapsed_s)
+        )
+        return ExpectedStep(by, rate.mean, rate.mean, rate.covariance * duration_s**2, duration_s)
+
+    def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
+        """What was measured of the motion from scan to scan among these."""
+        times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
+        # The tracked steps begin the estimate; it finds how good they are. Where something else was measured, that tells.
+        motion = Motion.of(poses, _TRACKED_M, _TRACKED_RAD, times_s)
+        if self.gyroscope is not None:
+            motion = motion.with_turns(
+                np.stack([self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)])
+            )
+        if self.velocities is None:
+            return [motion]
+        turns = np.stack([found.turn for found in tracked[rows][1:]])
+        # Tracked translations beside Doppler, or in its place, double the errors of positions on simulated drives.
+        return [
+            motion.rotations_only(),
+            DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns),
+        ]
+
+    def learnt(self, found: _Pass) -> Drive:
+        """With what a pass shows of it."""
+        durations_s = np.diff(self.times_s)
+        return dataclasses.replace(
+            self,
+            turns=self.turns.learnt(found.turns, durations_s),
+            moves=self.moves.learnt(found.moves, durations_s),
+        )
+
+
+@dataclass
+class _Pass:
+    """All scans of a drive, tracked once."""
+
+    tracked: list[Tracked]
+    turns: list[Rate | None]
+    """Of each of the F - 1 steps, rad/s in the frame of the sensor. None: the drive was lost there."""
+    moves: list[Rate | None]
+    """Likewise, m/s."""
+
+    @classmethod
+    def of(cls, drive: Drive, tracker: Tracker) -> _Pass:
+        found = cls([tracker.follow(drive.scans[0], None)], [], [])
+        turn = move = None
+        for i in range(1, len(drive.scans)):
+            expected = drive.expected(i, turn, move)
+            before = found.tracked[-1]
+            now = tracker.follow(drive.scans[i], expected)
+            turn = move = None
+            if now.piece == before.piece and expected.duration_s > 0:
+                turn, move = _rates(before.pose, now, expected.duration_s)
+            found.turns.append(turn)
+            found.moves.append(move)
+            found.tracked.append(now)
+        return found
+
+    def rotations(self, times_s: Floats) -> tuple[Floats, Floats]:
+        """(F - 1, 3) rotation vectors of the steps, rad, and their covariances. NaN where the drive was lost."""
+        durations_s = np.diff(times_s)
+        turns = np.full((len(durations_s), 3), np.nan)
+        covariance = np.tile(np.eye(3), (len(durations_s), 1, 1))
+        for i, (rate, duration_s) in enumerate(zip(self.turns, durations_s.tolist(), strict=True)):
+            if rate is not None:
+                turns[i], covariance[i] = rate.mean * duration_s, rate.covariance * duration_s**2
+        return turns, covariance
+
+
+def _rates(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rate]:
+    """Of turning and moving, in the frame of the sensor."""
+    back = before[:3, :3].T
+    half = rotation(0.5 * now.turn).T @ back
+    way = half @ (now.pose[:3, 3] - before[:3, 3])
+    of_way, of_turn = (
+        matrix @ now.covariance[rows, rows] @ matrix.T / duration_s**2
+        for matrix, rows in ((half, slice(0, 3)), (back, slice(3, 6)))
+    )
+    return Rate(now.turn / duration_s, of_turn), Rate(way / duration_s, of_way)
+
+
+def followed(drive: Drive, config: FitConfig, num_threads: int) -> tuple[Drive, list[Tracked]]:
+    """The drive with its habits, and its scans where the last pass found them."""
+    gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
+    tracked: list[Tracked] = []
+    for i in range(_PASSES):
+        tracker = Tracker(LEAVES_PER_SURFEL * config.leaf_size_m, config.returns, num_threads)
+        found = _Pass.of(drive, tracker)
+        tracked, drive = found.tracked, drive.learnt(found)
+        if i == 0 and gyroscope is not None:
+            # Rotations that were found with its help could not tell its bias.
+            drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(*found.rotations(drive.times_s)))
+    return drive, tracked

@@ -1,0 +1,249 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scan after scan onto the planes of those before it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from radarsdf._core import LocalPlanes
+from radarsdf.config.groups import ReturnsConfig
+from radarsdf.poses.expected import ExpectedStep
+from radarsdf.poses.planes import SensorReturns
+from radarsdf.poses.rigid import Floats, moved, rotation_vector
+from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
+
+_WINDOW = (
+    25  # scans whose planes are kept. 60: no gain on simulated drives, and a longer memory of wrong poses
+)
+_CELLS = (4.0, 2.0)  # edges of cells, in those of a map's surfels
+_ITERATIONS, _SETTLED = 8, 0.03  # of Gauss and Newton's method, in each cell size; in standard deviations
+_MOST_RETURNS = 2000  # of a scan that are held against planes, evenly spread
+_SEARCHED = 250  # likewise, of a search
+_FOLLOWED = 12  # best poses of a search
+_ELSEWHERE = 500  # poses that tell what agrees by chance
+_ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
+_NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimated anew
+_LEAST_VARIANCE = 1e-12
+
+
+@dataclass
+class Tracked:
+    """One scan, where it was found."""
+
+    pose: Floats
+    """(4, 4) T_world_sensor, in the frame of its piece."""
+    covariance: Floats
+    """(6, 6) of the step that led here: translation, m, and rotation vector, rad, in world axes."""
+    agreeing: float
+    """Share of the returns that lie on planes of the scans before it, in [0, 1]. NaN: it begins a piece."""
+    piece: int
+    """Number of the piece of the drive that it is part of."""
+    turn: Floats
+    """(3,) rotation vector of the step that led here, in the frame of the scan before, rad. It may be more than half a turn."""
+    told: float = 0.0
+    """Share of the expected step's variance that the returns took away, in the direction of the translation that they tell
+    least of. 0: nothing."""
+
+
+@dataclass
+class Tracker:
+    """The last scans' planes, and where the last scan was."""
+
+    cell_size_m: float
+    """Edge of the cell of a map's surfel, m."""
+    config: ReturnsConfig
+    num_threads: int = 0
+    last: Tracked | None = None
+    _planes: list[LocalPlanes] = field(default_factory=list)
+    _world: deque[Floats] = field(default_factory=deque)
+    _recent: deque[tuple[Floats, Floats]] = field(default_factory=deque)
+    _noise: SensorNoise | None = None
+    _scans: int = 0
+
+    def follow(self, scan: Floats, expected: ExpectedStep | None) -> Tracked:
+        """The next scan (N, 3), sensor frame, m, is where its returns agree, near `expected`. None: it is the first."""
+        if expected is None or self.last is None:
+            return self._begin(scan, np.eye(4), 0)
+        found = self._sought(scan, expected)
+        if found is None:
+            # Where a drive was lost, what was mapped before and after cannot be joined.
+            return self._begin(scan, self.last.pose @ expected.pose(), self.last.piece + 1)
+        self._keep(scan, found)
+        return found
+
+    def _begin(self, scan: Floats, pose: Floats, piece: int) -> Tracked:
+        self._planes = [LocalPlanes(cells * self.cell_size_m) for cells in _CELLS]
+        self._world.clear()
+        self._recent.clear()
+        self._scans = 0
+        found = Tracked(pose, np.zeros((6, 6)), np.nan, piece, np.zeros(3))
+        self._keep(scan, found)
+        return found
+
+    def _keep(self, scan: Floats, found: Tracked) -> None:
+        points = np.ascontiguousarray(np.einsum("ij,nj->ni", found.pose[:3, :3], scan) + found.pose[:3, 3])
+        gone = self._world.popleft() if len(self._world) == _WINDOW else None
+        for planes in self._planes:
+            planes.add(points)
+            if gone is not None:
+                planes.add(gone, -1)
+        self._world.append(points)
+        self._recent.append((scan, found.pose))
+        if len(self._recent) > _WINDOW:
+            self._recent.popleft()
+        self.last = found
+        self._scans += 1
+        if self._scans in _NOISE_AT:
+            self._noise = self._estimated_noise()
+
+    def _estimated_noise(self) -> SensorNoise:
+        scans, poses = zip(*self._recent, strict=True)
+        rays = SensorReturns.of(scans, 0.0, None).posed(np.stack(poses))
+        surfels = Surfels.of(rays, self.cell_size_m / LEAVES_PER_SURFEL, self.num_threads)
+        return sensor_noise(surfels, rays, self.config, self.num_threads)
+
+    def _sought(self, scan: Floats, expected: ExpectedStep) -> Tracked | None:
+        assert self.last is not None
+        assert self._noise is not None
+        scan = thinned(scan, _MOST_RETURNS)
+        if len(scan) == 0:
+            return self._as_expected(expected)
+        radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
+        capture_m = 0.5 * _CELLS[0] * self.cell_size_m
+        if expected.spread_m(radius_m) <= capture_m:
+            return self._fitted(scan, expected, expected.turn.mean)
+        return self._searched(scan, expected, capture_m, radius_m)
+
+    def _as_expected(self, expected: ExpectedStep) -> Tracked:
+        assert self.last is not None
+        pose = self.last.pose @ expected.pose()
+        covariance = self._in_world(expected.covariance())
+        return Tracked(pose, covariance, 0.0, self.last.piece, expected.turn.mean)
+
+    def _in_world(self, covariance: Floats) -> Floats:
+        assert self.last is not None
+        both = np.kron(np.eye(2), self.last.pose[:3, :3])
+        found: Floats = both @ covariance @ both.T
+        return found
+
+    def _fitted(
+        self, scan: Floats, expected: ExpectedStep, turn: Floats, start: Floats | None = None
+    ) -> Tracked:
+        """By Gauss and Newton's method from `start`, with what is expected of a sensor that turned by `turn`."""
+        assert self.last is not None
+        middle = self.last.pose @ expected.pose(turn)
+        prior = self._in_world(expected.covariance(turn)) + _LEAST_VARIANCE * np.eye(6)
+        pose, covariance, agreeing = self._settled(scan, middle if start is None else start, middle, prior)
+        turned = rotation_vector(self.last.pose[:3, :3].T @ pose[:3, :3], turn)
+        root = np.linalg.cholesky(prior[:3, :3])
+        left = np.linalg.solve(root, np.linalg.solve(root, covariance[:3, :3]).T)
+        told = 1 - float(np.linalg.eigvalsh(left)[-1])
+        return Tracked(pose, covariance, agreeing, self.last.piece, turned, told)
+
+    def _settled(
+        self, scan: Floats, pose: Floats, middle: Floats, prior: Floats
+    ) -> tuple[Floats, Floats, float]:
+        """The pose that the returns and a prior round `middle` lead to, its covariance, and the share of returns that agree."""
+        information, weight, covariance = np.linalg.inv(prior), 0.0, prior
+        for planes in self._planes:
+            for _ in range(_ITERATIONS):
+                hessian, gradient, doubt, weight = planes.beside(
+                    scan, np.ascontiguousarray(pose), self._variances()
+                )
+                hessian, gradient = _told(hessian, gradient, doubt)
+                off = np.concatenate(
+                    [pose[:3, 3] - middle[:3, 3], rotation_vector(pose[:3, :3] @ middle[:3, :3].T)]
+                )
+                total = hessian + information
+                increment = -np.linalg.solve(total, gradient + np.einsum("ij,j->i", information, off))
+                pose = moved(pose[None], increment[None])[0]
+                covariance = np.linalg.inv(total)
+                if np.einsum("i,ij,j->", increment, total, increment) < 6 * _SETTLED**2:
+                    break
+        return pose, covariance, weight / len(scan)
+
+    def _searched(
+        self, scan: Floats, expected: ExpectedStep, capture_m: float, radius_m: float
+    ) -> Tracked | None:
+        """The best of many poses, if the returns agree there clearly better than at places where the sensor cannot be."""
+        assert self.last is not None
+        coarse, variances = self._planes[0], self._variances()
+        asked = thinned(scan, _SEARCHED)
+        turns, steps = expected.candidates(capture_m, radius_m)
+        poses = np.ascontiguousarray(np.einsum("ij,kjl->kil", self.last.pose, steps))
+        found = [
+            self._fitted(scan, expected, turns[i], poses[i]) for i in _best(coarse, asked, poses, variances)
+        ]
+        at = np.stack([one.pose for one in found])
+        chance = self._elsewhere()
+        chance = chance[_best(coarse, asked, chance, variances)]
+        scores, by_chance = (coarse.scores(asked, poses, variances) for poses in (at, chance))
+        best = int(np.argmax(scores.mean(axis=1)))
+        gains = scores[best] - by_chance
+        clear = gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(asked))
+        return found[best] if clear.all() else None
+
+    def _elsewhere(self) -> Floats:
+        """(_ELSEWHERE, 4, 4) upright poses among those of the last scans, that look anywhere but where they looked."""
+        assert self.last is not None
+        rng = np.random.default_rng(0)
+        known = np.stack([pose for _, pose in self._recent])
+        reach_m = float(np.median(np.linalg.norm(self._recent[-1][0], axis=1)))
+        poses = known[rng.integers(0, len(known), _ELSEWHERE)]
+        turns = Rotation.from_rotvec(
+            rng.uniform(np.pi / 6, 2 * np.pi - np.pi / 6, _ELSEWHERE)[:, None] * self.last.pose[:3, 2]
+        ).as_matrix()
+        poses[:, :3, :3] = np.einsum("kij,kjl->kil", turns, poses[:, :3, :3])
+        shifts = rng.uniform(-reach_m, reach_m, (_ELSEWHERE, 3))
+        up = self.last.pose[:3, 2]
+        poses[:, :3, 3] += shifts - np.einsum("ki,i->k", shifts, up)[:, None] * up
+        return np.ascontiguousarray(poses)
+
+    def _variances(self) -> list[float]:
+        assert self._noise is not None
+        found: list[float] = np.square(dataclasses.astuple(self._noise)).tolist()
+        return found
+
+
+def _best(planes: LocalPlanes, scan: Floats, poses: Floats, variances: list[float]) -> list[int]:
+    """Rows of the poses on which most returns agree."""
+    scores = planes.scores(scan, poses, variances).mean(axis=1)
+    rows: list[int] = np.argsort(-scores, kind="stable")[:_FOLLOWED].tolist()
+    return rows
+
+
+def _told(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
+    """Hessian and gradient without the share that errors of the normals make (errors in variables, Fuller 1987).
+
+    Along a wall, normals that point a little along it would tell where the sensor is.
+    """
+    values, axes = np.linalg.eigh(hessian)
+    root = np.sqrt(np.maximum(values, 1e-12 * max(values[-1], 1e-12)))
+    white = axes / root
+    shares, turned = np.linalg.eigh(np.einsum("ij,ik,kl->jl", white, doubt, white))
+    kept = np.maximum(1 - shares, 0.0)
+    into = np.einsum("ij,jk->ik", axes * root, turned)
+    back = np.einsum("ij,jk->ik", white, turned)
+    hessian = np.einsum("ij,j,kj->ik", into, kept, into)
+    return hessian, np.einsum("ij,j,kj,k->i", into, kept, back, gradient)
+
+
+def thinned(scan: Floats, most: int) -> Floats:
+    """At most about so many returns, evenly spread over the scan."""
+    return np.ascontiguousarray(scan[:: max(1, -(-len(scan) // most))])
+
+
+def pieces_of(tracked: Sequence[Tracked]) -> list[slice]:
+    """The scans of each piece."""
+    number = np.array([found.piece for found in tracked])
+    edges = np.flatnonzero(np.diff(number, prepend=-1, append=number[-1] + 1))
+    return [slice(int(low), int(high)) for low, high in itertools.pairwise(edges)]

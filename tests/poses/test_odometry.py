@@ -1,0 +1,242 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Poses of simulated drives, from nothing but what a radar and a gyroscope measure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.io import Scans
+from radarsdf.poses.rigid import aligned, turned_by
+from radarsdf.simulate import Simulation, measured_motion
+
+from .drift import drifted, position_error_m
+
+BIAS_RAD_S = (0.01, -0.02, 0.03)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return radarsdf.simulate.oculii(seed=62, frames=120)
+
+
+@pytest.fixture(scope="module")
+def motion(drive):
+    return measured_motion(drive, gyroscope_bias_rad_s=BIAS_RAD_S)
+
+
+@pytest.fixture(scope="module")
+def found(drive, motion):
+    return radarsdf.odometry(drive.points, doppler_mps=motion.doppler_mps, times=motion.times_s)
+
+
+def length_m(poses):
+    return np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+
+
+def errors(poses, true):
+    """Of positions, m, and rotations, rad, root mean square, without a motion of the whole."""
+    at = aligned(poses, true)
+    return position_error_m(at, true), float(np.sqrt((turned_by(at, true) ** 2).mean()))
+
+
+def only(drive, rows):
+    """Some scans of a simulation."""
+    return [drive.points[i] for i in rows], drive.poses[rows]
+
+
+def test_doppler_and_returns_find_the_poses(drive, found):
+    position_m, turn_rad = errors(found.poses, drive.poses)
+    assert position_m < 0.003 * length_m(drive.poses)
+    assert turn_rad < 0.02
+    assert found.report["pieces"] == 1
+    assert found.report["length_m"] == pytest.approx(length_m(drive.poses), rel=0.01)
+    assert found.report["doppler_sign"] == 1
+    assert 0.04 < found.report["movers"] / sum(map(len, drive.points)) < 0.2
+    assert np.isnan(found.agreeing[0])
+    assert found.agreeing[1:].min() > 0.2
+    assert "placed by returns and Doppler" in found.report["verdict"]
+
+
+def test_the_world_is_the_first_scan(found):
+    np.testing.assert_allclose(found.poses[0], np.eye(4), atol=1e-9)
+
+
+def test_errors_are_as_large_as_the_covariance_says(drive, found):
+    middle = len(drive.poses) // 2
+    whole = drive.poses[middle] @ np.linalg.inv(found.poses[middle])
+    off = (whole @ found.poses)[:, :3, 3] - drive.poses[:, :3, 3]
+    turned = np.einsum("ij,fjk,lk->fil", whole[:3, :3], found.covariance[:, :3, :3], whole[:3, :3])
+    normalised = [
+        e @ np.linalg.solve(c, e) / 3 for i, (e, c) in enumerate(zip(off, turned, strict=True)) if i != middle
+    ]
+    assert 0.2 < np.mean(normalised) < 5
+
+
+def test_a_gyroscope_turns_and_its_bias_is_found(drive, motion, found):
+    with_it = radarsdf.odometry(
+        drive.points,
+        doppler_mps=motion.doppler_mps,
+        times=motion.times_s,
+        angular_velocity=motion.angular_velocity,
+    )
+    assert errors(with_it.poses, drive.poses)[1] < errors(found.poses, drive.poses)[1]
+    np.testing.assert_allclose(with_it.report["gyroscope_bias"], BIAS_RAD_S, atol=0.006)
+    assert "Doppler and a gyroscope" in with_it.report["verdict"]
+
+
+def test_the_sign_and_the_folds_of_the_doppler_do_not_matter(drive, motion):
+    folded = measured_motion(drive, interval_mps=6.0, gyroscope_bias_rad_s=BIAS_RAD_S)
+    assert max(np.abs(speeds).max() for speeds in folded.doppler_mps) <= 3.0 + 1e-6
+    turned = radarsdf.odometry(
+        drive.points, doppler_mps=[-speeds for speeds in folded.doppler_mps], times=motion.times_s
+    )
+    assert turned.report["doppler_sign"] == -1
+    assert errors(turned.poses, drive.poses)[0] < 0.005 * length_m(drive.poses)
+
+
+def test_a_gap_is_bridged(drive, motion):
+    rows = np.r_[0:50, 56:120]
+    points, true = only(drive, rows)
+    found = radarsdf.odometry(
+        points, doppler_mps=[motion.doppler_mps[i] for i in rows], times=motion.times_s[rows]
+    )
+    assert found.report["pieces"] == 1
+    assert errors(found.poses, true)[0] < 0.005 * length_m(drive.poses)
+
+
+def test_a_drive_that_goes_on_elsewhere_is_in_two_pieces(drive):
+    other = radarsdf.simulate.hugin(seed=63, frames=20)
+    motions = [measured_motion(scene) for scene in (drive, other)]
+    found = radarsdf.odometry(
+        drive.points[:30] + other.points,
+        doppler_mps=motions[0].doppler_mps[:30] + motions[1].doppler_mps,
+        times=np.r_[motions[0].times_s[:30], motions[1].times_s + 60],
+    )
+    assert found.pieces.tolist() == [0] * 30 + [1] * 20
+    assert np.flatnonzero(np.isnan(found.agreeing)).tolist() == [0, 30]
+    assert "lost before the scans 30: 2 pieces" in found.report["verdict"]
+    assert found.longest_piece() == slice(0, 30)
+    assert errors(found.poses[30:], other.poses)[0] < 0.1
+
+
+def test_scans_alone_are_enough_where_they_tell(drive, motion):
+    found = radarsdf.odometry(drive.points, times=motion.times_s)
+    assert not found.report["doppler"]
+    assert errors(found.poses, drive.poses)[0] < 0.01 * length_m(drive.poses)
+
+
+def test_a_wall_alone_is_refused():
+    wall = radarsdf.simulate.wall(seed=5, frames=40)
+    with pytest.raises(ValueError, match="returns alone do not tell"):
+        radarsdf.odometry(wall.points, times=np.arange(40) / 10)
+    motion = measured_motion(wall)
+    found = radarsdf.odometry(wall.points, times=motion.times_s, doppler_mps=motion.doppler_mps)
+    assert errors(found.poses, wall.poses)[0] < 0.05
+
+
+def test_the_bits_do_not_depend_on_threads(drive, motion):
+    one, three = (
+        radarsdf.odometry(
+            drive.points[:16],
+            doppler_mps=motion.doppler_mps[:16],
+            times=motion.times_s[:16],
+            config=FitConfig(num_threads=threads),
+        )
+        for threads in (1, 3)
+    )
+    np.testing.assert_array_equal(one.poses, three.poses)
+    np.testing.assert_array_equal(one.covariance, three.covariance)
+
+
+def test_scans_have_their_own_times_and_doppler(drive, motion):
+    scans = Scans(
+        drive.points[:8], drive.poses[:8], doppler_mps=motion.doppler_mps[:8], times_s=motion.times_s[:8]
+    )
+    given = radarsdf.odometry(drive.points[:8], doppler_mps=motion.doppler_mps[:8], times=motion.times_s[:8])
+    np.testing.assert_array_equal(radarsdf.odometry(scans).poses, given.poses)
+
+
+@pytest.mark.parametrize("counts", [[40], [1, 1], [3, 200, 1]])
+def test_hardly_any_returns_have_poses_as_well(counts):
+    rng = np.random.default_rng(1)
+    scans = [rng.normal(0, 3, (n, 3)) for n in counts]
+    speeds = [rng.normal(0, 1, n) for n in counts]
+    try:
+        found = radarsdf.odometry(scans, doppler_mps=speeds, times=np.arange(len(counts)))
+    except ValueError as error:
+        assert "returns alone do not tell" in str(error)  # noqa: PT017 - where the Doppler tells no velocity
+    else:
+        assert np.isfinite(found.poses).all()
+        assert found.covariance.shape == (len(counts), 6, 6)
+
+
+def test_refined_poses_with_doppler_are_better(drive, motion):
+    given = drifted(drive.poses[:40], 0.05, 0.004, 1)
+    plain, by_doppler = (
+        radarsdf.refine_poses(drive.points[:40], given, times=motion.times_s[:40], doppler_mps=speeds)
+        for speeds in (None, [-speeds for speeds in motion.doppler_mps[:40]])
+    )
+    assert by_doppler.improved
+    assert by_doppler.report["movers"] > 0
+    assert errors(by_doppler.poses, drive.poses[:40])[0] < 0.5 * errors(plain.poses, drive.poses[:40])[0]
+
+
+def test_doppler_that_tells_no_velocity_is_said(drive):
+    rng = np.random.default_rng(0)
+    noise = [rng.uniform(-20, 20, len(scan)) for scan in drive.points[:6]]
+    found = radarsdf.refine_poses(
+        drive.points[:6], drive.poses[:6], times=np.arange(6) / 10, doppler_mps=noise
+    )
+    assert "The Doppler is not used" in found.report["notes"][0]
+
+
+def test_wrong_arguments_are_refused(drive, motion):
+    points, speeds, times = drive.points[:4], motion.doppler_mps[:4], motion.times_s[:4]
+    rates = np.zeros((4, 3))
+    with pytest.raises(ValueError, match="times are missing"):
+        radarsdf.odometry(points)
+    with pytest.raises(ValueError, match="Doppler needs times"):
+        radarsdf.odometry(points, doppler_mps=speeds)
+    with pytest.raises(ValueError, match="doppler_mps"):
+        radarsdf.odometry(points, doppler_mps=speeds[:3], times=times)
+    with pytest.raises(ValueError, match="shape"):
+        radarsdf.odometry(points, doppler_mps=speeds, times=times, angular_velocity=rates[:3])
+    with pytest.raises(ValueError, match="ascend"):
+        radarsdf.odometry(
+            points,
+            doppler_mps=speeds,
+            times=times,
+            angular_velocity=rates,
+            angular_velocity_times=times[::-1],
+        )
+    with pytest.raises(ValueError, match="one clock"):
+        radarsdf.odometry(
+            points,
+            doppler_mps=speeds,
+            times=times,
+            angular_velocity=rates,
+            angular_velocity_times=times + 1e9,
+        )
+
+
+def test_a_simulated_motion_is_that_of_the_poses():
+    wall = radarsdf.simulate.wall(seed=3, frames=30)
+    quiet = measured_motion(
+        wall, doppler_noise_mps=0, movers=0, gyroscope_noise_rad_s=0, gyroscope_bias_rad_s=(0, 0, 0)
+    )
+    assert isinstance(wall, Simulation)
+    between = np.linalg.norm(np.diff(wall.poses[:, :3, 3], axis=0), axis=1) / 0.1
+    velocity = np.linalg.lstsq(
+        -wall.points[14] / np.linalg.norm(wall.points[14], axis=1, keepdims=True), quiet.doppler_mps[14]
+    )[0]
+    assert np.linalg.norm(velocity) == pytest.approx(between[13:15].mean(), rel=0.03)
+    turned = turned_by(wall.poses[13:15], wall.poses[14:16]).mean() / 0.1
+    assert np.linalg.norm(quiet.angular_velocity[14]) == pytest.approx(turned, rel=0.1)
+    moving = measured_motion(wall, doppler_noise_mps=0, movers=0.2)
+    share = np.mean(np.concatenate(moving.doppler_mps) != np.concatenate(quiet.doppler_mps))
+    assert share == pytest.approx(0.2, abs=0.01)
+    with pytest.raises(ValueError, match="two scans"):
+        measured_motion(radarsdf.simulate.wall(frames=1))
