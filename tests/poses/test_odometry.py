@@ -137,6 +137,17 @@ def test_a_wall_alone_is_refused():
     assert errors(found.poses, wall.poses)[0] < 0.05
 
 
+def test_hardly_any_returns_of_a_turning_sensor_are_refused(drive, motion):
+    few = [scan[:: max(1, len(scan) // 20)] for scan in drive.points]
+    speeds = [v[:: max(1, len(v) // 20)] for v in motion.doppler_mps]
+    with pytest.raises(ValueError, match="how the sensor turned"):
+        radarsdf.odometry(few, doppler_mps=speeds, times=motion.times_s)
+    found = radarsdf.odometry(
+        few, doppler_mps=speeds, times=motion.times_s, angular_velocity=motion.angular_velocity
+    )
+    assert found.report["length_m"] == pytest.approx(length_m(drive.poses), rel=0.05)
+
+
 def test_the_bits_do_not_depend_on_threads(drive, motion):
     one, three = (
         radarsdf.odometry(

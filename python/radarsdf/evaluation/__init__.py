@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
 """Errors of a map: its surface against lidar points, its intensity against held-out radar scans, its uncertainty
-and confidence against both.
+and confidence against both; of a trajectory against the true one.
 
 The functions take meshes and arrays, not maps, so they measure the results of other programs in the same way.
 """
@@ -18,15 +18,18 @@ from .calibration import (
 )
 from .intensity import INTENSITY_PROTOCOL, IntensityMetrics, KNNIntensity, holdout, intensity_metrics
 from .surface import PROTOCOL, SurfaceMetrics, adjacent_angles, gamma_from_moments, surface_metrics
+from .trajectory import TRAJECTORY_PROTOCOL, TrajectoryMetrics, trajectory_metrics
 
 __all__ = [
     "CALIBRATION_PROTOCOL",
     "INTENSITY_PROTOCOL",
     "PROTOCOL",
+    "TRAJECTORY_PROTOCOL",
     "ConfidenceMetrics",
     "IntensityMetrics",
     "KNNIntensity",
     "SurfaceMetrics",
+    "TrajectoryMetrics",
     "UncertaintyMetrics",
     "adjacent_angles",
     "confidence_metrics",
@@ -35,5 +38,6 @@ __all__ = [
     "holdout",
     "intensity_metrics",
     "surface_metrics",
+    "trajectory_metrics",
     "uncertainty_metrics",
 ]

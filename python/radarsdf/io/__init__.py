@@ -6,10 +6,14 @@ from radarsdf.io.clouds.reading import read_points
 from radarsdf.io.clouds.writing import write_cloud
 from radarsdf.io.meshes import read_mesh, write_mesh
 from radarsdf.io.npz import read_scans, write_scans
+from radarsdf.io.poses.reading import UNPOSED, NoPoses
+from radarsdf.io.poses.writing import write_poses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
 
 __all__ = [
+    "UNPOSED",
+    "NoPoses",
     "Scan",
     "Scans",
     "read",
@@ -18,5 +22,6 @@ __all__ = [
     "read_scans",
     "write_cloud",
     "write_mesh",
+    "write_poses",
     "write_scans",
 ]

@@ -19,7 +19,7 @@ from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
 from radarsdf.io.datasets import published
 from radarsdf.io.datasets.folders import base_T_radar, lidar_map
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.reading import POSE_FILES, extrinsic_of, poses_of
+from radarsdf.io.poses.reading import FIND_POSES, POSE_FILES, UNPOSED, NoPoses, extrinsic_of, poses_of
 from radarsdf.io.poses.trajectory import MAX_GAP_S
 from radarsdf.io.scans import Notes, Scan, Scans
 from radarsdf.io.sources import (
@@ -68,7 +68,7 @@ def read(
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
         (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices. By
-        default what the data set says; in a folder, a file of `radarsdf.io.poses.reading.POSE_FILES`; in a bag, `pose_topic`.
+        default what the data set says; `radarsdf.io.UNPOSED` reads scans that have none; in a folder, a file of `radarsdf.io.poses.reading.POSE_FILES`; in a bag, `pose_topic`.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
     topic, pose_topic : str, optional
@@ -96,6 +96,8 @@ def read(
 
     Raises
     ------
+    NoPoses
+        If scans have no poses: a ValueError.
     ValueError
         If files are damaged or do not fit together, something is missing, or a choice is not clear.
     OSError
@@ -195,8 +197,8 @@ def _files(
             request.notes.add(f"poses: of {poses}")
         if poses is None:
             what = files[0] if len(files) == 1 else folder
-            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4)"
-            raise ValueError(msg)
+            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
+            raise NoPoses(msg)
     if isinstance(poses, (str, PathLike)):
         places = dict.fromkeys((Path(poses).parent, *places))
     calibrations = [place / name for place in places for name in _CALIBRATIONS]
@@ -209,7 +211,7 @@ def _files(
 
 
 def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
-    if request.poses is not None or request.extrinsic is not None:
+    if (request.poses is not None and request.poses is not UNPOSED) or request.extrinsic is not None:
         msg = f"{path} has its own poses T_world_sensor: poses and extrinsic are not used for .npz files"
         raise ValueError(msg)
     if request.fields is not None or request.columns is not None:

@@ -22,14 +22,17 @@ from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.recording import Recording
 from radarsdf.poses.rigid import Floats, steps
-from radarsdf.poses.tracking import Tracked, pieces_of
+from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
 from radarsdf.returns.rays import within_ranges
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 from radarsdf.threads import Workers
 
 # Of a step's variance, that the returns must take away where nothing else measures the way. Below a half, the motion before
-# says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82: 0.58 to 0.81.
+# says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
 _LEAST_TOLD = 0.5
+# Likewise of its rotation. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
+# which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
+_LEAST_TOLD_TURN = 1 / WINDOW
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,8 @@ class Odometry:
     agreeing: Floats
     """(F,) share of the returns of each scan that lie on planes of the scans before it. NaN where a piece begins."""
     report: dict[str, Any]
-    """`verdict` in words; `length_m` of the way; `pieces`, their number; `told`, the share of a step's uncertainty that the
-    returns took away, in the direction that they tell least of, median; `doppler` and `gyroscope`, whether they were used;
+    """`verdict` in words; `length_m` of the way; `pieces`, their number; `told` and `told_turn`, the share of the
+    variance of a step's translation and rotation that the returns took away, in the direction that they tell least of, median; `doppler` and `gyroscope`, whether they were used;
     `doppler_sign`, -1 if the radar's Doppler is positive as the sensor comes nearer; `gyroscope_bias`, rad/s; `movers`,
     returns that were left out; `notes`; `scans`, `seconds`."""
 
@@ -97,8 +100,8 @@ def odometry(
     Raises
     ------
     ValueError
-        If scans, Doppler, times or rates are invalid, if there are no times, or if without Doppler the returns tell less of the
-        way than the motion before: along a wall, say, or of scans with few returns.
+        If scans, Doppler, times or rates are invalid, if there are no times, or if the returns do not tell what nothing
+        else measures: without Doppler, the way along a wall, say; without a gyroscope, the turns of a radar with few returns.
 
     Notes
     -----
@@ -135,13 +138,7 @@ def odometry(
         ]
         drive = Drive(scans, times_s, velocities, gyroscope)
         drive, tracked = followed(drive, config, workers.num_threads)
-        told = float(np.median([found.told for found in tracked[1:]])) if len(tracked) > 1 else 0.0
-        if velocities is None and told < _LEAST_TOLD:
-            msg = (
-                f"the returns alone do not tell how the sensor moved: of a step's variance, they take away {told:.0%}; "
-                f"{_LEAST_TOLD:.0%} is needed. Give their Doppler (doppler_mps), or poses"
-            )
-            raise ValueError(msg)
+        told = _checked_told(tracked, drive)
         poses, covariance = _together(drive, tracked, config, workers.num_threads)
     pieces = np.array([found.piece for found in tracked])
     length_m = sum(
@@ -151,7 +148,8 @@ def odometry(
         "verdict": _words(pieces, length_m, velocities is not None, gyroscope is not None),
         "length_m": length_m,
         "pieces": int(pieces[-1]) + 1,
-        "told": told,
+        "told": told[0],
+        "told_turn": told[1],
         "doppler": velocities is not None,
         "doppler_sign": sign,
         "gyroscope": gyroscope is not None,
@@ -181,6 +179,24 @@ def _together(
         found = PosesEstimate.of(returns, poses[rows], motions, cell_m, limits, num_threads, len(poses))
         poses[rows], covariance[rows] = found.poses, found.covariance
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance
+
+
+def _checked_told(tracked: list[Tracked], drive: Drive) -> tuple[float, float]:
+    """What the returns tell of translations and rotations. Raises a ValueError where nothing does."""
+    if len(tracked) < 2:
+        return 0.0, 0.0
+    way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
+    for told, least, measured, moved, missing in (
+        (way, _LEAST_TOLD, drive.velocities is not None, "moved", "their Doppler (doppler_mps)"),
+        (turn, _LEAST_TOLD_TURN, drive.gyroscope is not None, "turned", "its angular_velocity"),
+    ):
+        if not measured and told < least:
+            msg = (
+                f"the returns alone do not tell how the sensor {moved}: of a step's variance, they take away {told:.1%}, and "
+                f"{least:.0%} is needed. Give {missing}, or poses"
+            )
+            raise ValueError(msg)
+    return way, turn
 
 
 def _words(pieces: NDArray[np.int64], length_m: float, doppler: bool, gyroscope: bool) -> str:

@@ -22,10 +22,15 @@ def moved(poses: Floats, increments: Floats) -> Floats:
 
 def steps(poses: Floats) -> Floats:
     """(F - 1, 4, 4) motion from each pose to the next, in the frame of the first of the two."""
-    found = np.tile(np.eye(4), (len(poses) - 1, 1, 1))
-    back = poses[:-1, :3, :3]
-    found[:, :3, :3] = np.einsum("fji,fjk->fik", back, poses[1:, :3, :3])
-    found[:, :3, 3] = np.einsum("fji,fj->fi", back, poses[1:, :3, 3] - poses[:-1, :3, 3])
+    return between(poses[:-1], poses[1:])
+
+
+def between(first: Floats, second: Floats) -> Floats:
+    """(K, 4, 4) motion from each pose to the other one, in the frame of the first of the two."""
+    found = np.tile(np.eye(4), (len(first), 1, 1))
+    back = first[:, :3, :3]
+    found[:, :3, :3] = np.einsum("fji,fjk->fik", back, second[:, :3, :3])
+    found[:, :3, 3] = np.einsum("fji,fj->fi", back, second[:, :3, 3] - first[:, :3, 3])
     return found
 
 

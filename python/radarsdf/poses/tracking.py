@@ -21,9 +21,8 @@ from radarsdf.poses.rigid import Floats, moved, rotation_vector
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
 
-_WINDOW = (
-    25  # scans whose planes are kept. 60: no gain on simulated drives, and a longer memory of wrong poses
-)
+WINDOW = 25
+"""Scans whose planes are kept. With 60, nothing was better on simulated drives, and wrong poses were remembered longer."""
 _CELLS = (4.0, 2.0)  # edges of cells, in those of a map's surfels
 _ITERATIONS, _SETTLED = 8, 0.03  # of Gauss and Newton's method, in each cell size; in standard deviations
 _MOST_RETURNS = 2000  # of a scan that are held against planes, evenly spread
@@ -33,6 +32,7 @@ _ELSEWHERE = 500  # poses that tell what agrees by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
 _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimated anew
 _LEAST_VARIANCE = 1e-12
+_PARTS = slice(0, 3), slice(3, 6)  # of an increment: translation, rotation
 
 
 @dataclass
@@ -49,9 +49,9 @@ class Tracked:
     """Number of the piece of the drive that it is part of."""
     turn: Floats
     """(3,) rotation vector of the step that led here, in the frame of the scan before, rad. It may be more than half a turn."""
-    told: float = 0.0
-    """Share of the expected step's variance that the returns took away, in the direction of the translation that they tell
-    least of. 0: nothing."""
+    told: tuple[float, float] = (0.0, 0.0)
+    """Share of the expected step's variance that the returns took away, of the translation and of the rotation, each in the
+    direction that they tell least of. 0: nothing."""
 
 
 @dataclass
@@ -91,14 +91,14 @@ class Tracker:
 
     def _keep(self, scan: Floats, found: Tracked) -> None:
         points = np.ascontiguousarray(np.einsum("ij,nj->ni", found.pose[:3, :3], scan) + found.pose[:3, 3])
-        gone = self._world.popleft() if len(self._world) == _WINDOW else None
+        gone = self._world.popleft() if len(self._world) == WINDOW else None
         for planes in self._planes:
             planes.add(points)
             if gone is not None:
                 planes.add(gone, -1)
         self._world.append(points)
         self._recent.append((scan, found.pose))
-        if len(self._recent) > _WINDOW:
+        if len(self._recent) > WINDOW:
             self._recent.popleft()
         self.last = found
         self._scans += 1
@@ -144,10 +144,8 @@ class Tracker:
         prior = self._in_world(expected.covariance(turn)) + _LEAST_VARIANCE * np.eye(6)
         pose, covariance, agreeing = self._settled(scan, middle if start is None else start, middle, prior)
         turned = rotation_vector(self.last.pose[:3, :3].T @ pose[:3, :3], turn)
-        root = np.linalg.cholesky(prior[:3, :3])
-        left = np.linalg.solve(root, np.linalg.solve(root, covariance[:3, :3]).T)
-        told = 1 - float(np.linalg.eigvalsh(left)[-1])
-        return Tracked(pose, covariance, agreeing, self.last.piece, turned, told)
+        told = tuple(_taken_away(prior[part, part], covariance[part, part]) for part in _PARTS)
+        return Tracked(pose, covariance, agreeing, self.last.piece, turned, (told[0], told[1]))
 
     def _settled(
         self, scan: Floats, pose: Floats, middle: Floats, prior: Floats
@@ -212,6 +210,13 @@ class Tracker:
         assert self._noise is not None
         found: list[float] = np.square(dataclasses.astuple(self._noise)).tolist()
         return found
+
+
+def _taken_away(prior: Floats, covariance: Floats) -> float:
+    """Share of the variance before that is gone, in the direction where it is least."""
+    root = np.linalg.cholesky(prior)
+    left = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
+    return 1 - float(np.linalg.eigvalsh(left)[-1])
 
 
 def _best(planes: LocalPlanes, scan: Floats, poses: Floats, variances: list[float]) -> list[int]:

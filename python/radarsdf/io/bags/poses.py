@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.io.bags.files import Message, Topic, messages_of, topics_of
 from radarsdf.io.bags.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage, read_pose_messages
-from radarsdf.io.poses.reading import StampedPoses, TransformChain, trajectory_of
+from radarsdf.io.poses.reading import FIND_POSES, NoPoses, StampedPoses, TransformChain, trajectory_of
 from radarsdf.io.poses.trajectory import Trajectory
 from radarsdf.io.sources import Request
 
@@ -147,8 +147,8 @@ def _pose_topic(
         msg = f"{path} has several topics with poses: say by pose_topic which one counts, of {', '.join(sorted(fitting))}"
         raise ValueError(msg)
     if not transforms:
-        msg = f"{path} has no poses (Odometry, PoseStamped, Path or TF): give a file of poses, such as TUM"
-        raise ValueError(msg)
+        msg = f"{path} has no poses (Odometry, PoseStamped, Path or TF): give a file of poses, such as TUM; {FIND_POSES}"
+        raise NoPoses(msg)
     return None
 
 

@@ -23,6 +23,9 @@ from radarsdf.io.text import number_rows, read_text
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 """Names of files of poses that are found beside scans."""
 
+FIND_POSES = "radarsdf.odometry, or `radarsdf poses`, finds them from the radar alone"
+"""Ends what is said of scans without poses."""
+
 _TUM_COLUMNS, _KITTI_COLUMNS, _MATRIX_COLUMNS = 8, 12, 16
 _MIN_QUATERNION, _MAX_QUATERNION = 0.49, 1.01  # largest of the four numbers of a unit quaternion
 _CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam")
@@ -36,6 +39,27 @@ class StampedPoses(Protocol):
 
     def span(self) -> str:
         """First and last time, for messages."""
+
+
+class NoPoses(ValueError):
+    """Scans have no poses, and none are given."""
+
+
+class _Unposed:
+    """Scans without poses: the identity at all times."""
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64]:  # noqa: ARG002
+        return np.eye(4)
+
+    def span(self) -> str:
+        return "all times"
+
+    def __repr__(self) -> str:
+        return "UNPOSED"
+
+
+UNPOSED: StampedPoses = _Unposed()
+"""In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,167 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Errors of a trajectory against the true one, as evo and KITTI define them."""
+
+from __future__ import annotations
+
+from typing import Literal, TypedDict
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from radarsdf.checks import check_poses, pose_matrices, positive, real_array
+from radarsdf.poses.rigid import Floats, aligned, between, steps, turned_by
+
+TRAJECTORY_PROTOCOL = "radarsdf-trajectory-1"
+"""Name and version of the definitions in `trajectory_metrics`."""
+
+Alignment = Literal["positions", "poses", "first", "none"]
+
+_ALIGNMENTS = ("positions", "poses", "first", "none")
+_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)  # of the way, where it is shorter than KITTI's
+_KITTI_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+
+
+class TrajectoryMetrics(TypedDict):
+    """Result of `trajectory_metrics`: lengths in metres, angles in radians."""
+
+    protocol: str
+    align: str
+    num_poses: int
+    length_m: float
+    absolute_m: float
+    absolute_rad: float
+    step_m: float
+    step_rad: float
+    relative_ratio: float | None
+    relative_rad_per_m: float | None
+    relative_lengths_m: list[float]
+
+
+def trajectory_metrics(
+    poses: ArrayLike,
+    true_poses: ArrayLike,
+    *,
+    align: Alignment = "positions",
+    lengths_m: ArrayLike | None = None,
+) -> TrajectoryMetrics:
+    """Errors of poses.
+
+    Parameters
+    ----------
+    poses, true_poses : (F, 4, 4) array_like
+        T_world_sensor, m, of the same scans. Their worlds may differ.
+    align : {"positions", "poses", "first", "none"}
+        What one rigid motion of the whole brings together first: all positions (Umeyama 1991, as ``evo_ape --align``),
+        mean position and mean rotation, the first pose, or nothing. Positions on a straight line leave the rotation about it
+        open; "poses" does not.
+    lengths_m : (K,) array_like, optional
+        Of the parts of the way for relative errors. By default those of KITTI, 100 to 800 m, or for a way of less than 800 m
+        10, 20, 30, 40 and 50 % of it.
+
+    Returns
+    -------
+    TrajectoryMetrics
+        ``absolute_m`` and ``absolute_rad``, root mean square over the scans; ``step_m`` and ``step_rad``, root mean square
+        of the motion from each scan to the next; ``relative_ratio`` and ``relative_rad_per_m``, mean error of parts of the way
+        over their length, from each scan on; ``length_m`` of the true way.
+
+    Raises
+    ------
+    ValueError
+        If poses are no rigid transforms, or are not as many; if `align` or a length is none of these.
+
+    Notes
+    -----
+    Checked against evo 1.38: ``evo_ape --align`` and ``evo_rpe --delta 1 --delta_unit f``, of positions and of angles.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from radarsdf.evaluation import trajectory_metrics
+    >>> true = np.tile(np.eye(4), (11, 1, 1))
+    >>> true[:, 0, 3] = np.arange(11.0)
+    >>> stretched = true.copy()
+    >>> stretched[:, 0, 3] *= 1.02
+    >>> metrics = trajectory_metrics(stretched, true)
+    >>> round(metrics["relative_ratio"], 3), round(metrics["step_m"], 3)
+    (0.02, 0.02)
+    """
+    if align not in _ALIGNMENTS:
+        msg = f"align must be one of {', '.join(_ALIGNMENTS)}, not {align!r:.50}"
+        raise ValueError(msg)
+    true = real_array(true_poses, "true_poses")
+    true = check_poses(true, len(true) if true.ndim else 0)
+    found = pose_matrices(poses, len(true))
+    found = check_poses(found, len(true))
+    at = _brought(found, true, align)
+    true_steps = steps(true)
+    off = between(true_steps, steps(found))
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])
+    lengths = _lengths(way[-1], lengths_m)
+    ratio, rad_per_m = _relative(found, true, way, lengths)
+    return TrajectoryMetrics(
+        protocol=TRAJECTORY_PROTOCOL,
+        align=align,
+        num_poses=len(true),
+        length_m=float(way[-1]),
+        absolute_m=_rms(np.linalg.norm((at - true)[:, :3, 3], axis=1)),
+        absolute_rad=_rms(turned_by(at, true)),
+        step_m=_rms(np.linalg.norm(off[:, :3, 3], axis=1)),
+        step_rad=_rms(_angles(off)),
+        relative_ratio=ratio,
+        relative_rad_per_m=rad_per_m,
+        relative_lengths_m=lengths.tolist(),
+    )
+
+
+def _brought(poses: Floats, true: Floats, align: Alignment) -> Floats:
+    if align == "poses":
+        return aligned(poses, true)
+    whole = np.eye(4)
+    if align == "first":
+        whole = true[0] @ np.linalg.inv(poses[0])
+    elif align == "positions":
+        middle, middle_true = poses[:, :3, 3].mean(axis=0), true[:, :3, 3].mean(axis=0)
+        left, _, right = np.linalg.svd(
+            np.einsum("fi,fj->ij", true[:, :3, 3] - middle_true, poses[:, :3, 3] - middle)
+        )
+        # No reflection: the weakest axis turns round.
+        left[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
+        whole[:3, :3] = left @ right
+        whole[:3, 3] = middle_true - whole[:3, :3] @ middle
+    found: Floats = np.einsum("ij,fjk->fik", whole, poses)
+    return found
+
+
+def _lengths(way_m: float, lengths_m: ArrayLike | None) -> Floats:
+    if lengths_m is None:
+        return np.array(_KITTI_M) if way_m >= _KITTI_M[-1] else way_m * np.array(_SHARES)
+    return np.array(
+        [positive(length, "lengths_m") for length in np.atleast_1d(real_array(lengths_m, "lengths_m"))]
+    )
+
+
+def _relative(poses: Floats, true: Floats, way: Floats, lengths: Floats) -> tuple[float | None, float | None]:
+    """Mean errors of translation, m/m, and rotation, rad/m, of all parts of these lengths."""
+    ratios, angles = [], []
+    for length in lengths[lengths > 0]:
+        last = np.searchsorted(way, way + length)
+        first = np.flatnonzero(last < len(way))
+        last = last[first]
+        off = between(between(true[first], true[last]), between(poses[first], poses[last]))
+        ratios.append(np.linalg.norm(off[:, :3, 3], axis=1) / length)
+        angles.append(_angles(off) / length)
+    if not ratios or not sum(map(len, ratios)):
+        return None, None
+    return float(np.concatenate(ratios).mean()), float(np.concatenate(angles).mean())
+
+
+def _angles(motions: Floats) -> Floats:
+    found: Floats = Rotation.from_matrix(motions[:, :3, :3]).magnitude() if len(motions) else np.zeros(0)
+    return found
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
