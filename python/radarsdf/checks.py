@@ -109,6 +109,10 @@ def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, num
         raise ValueError(msg)
 
 
+MISSING_POSES = "poses are missing: T_world_sensor (4, 4) of each scan; radarsdf.odometry(points, doppler_mps=..., times=...) finds them"
+"""What is said where poses are None."""
+
+
 def pose_matrices(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
     """`poses` as (F, 4, 4) float64, of any numbers. Raises a ValueError if the shape is wrong."""
     T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")

@@ -14,7 +14,7 @@ from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.finding import SEVERITIES, Finding
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
-from radarsdf.checks import instance
+from radarsdf.checks import MISSING_POSES, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
 
@@ -76,8 +76,7 @@ def check(
         doppler_mps = scans.doppler_mps if doppler_mps is None else doppler_mps
         times_s = scans.times_s if times_s is None else times_s
     if poses is None:
-        msg = "poses are missing: T_world_sensor (4, 4) of each scan"
-        raise ValueError(msg)
+        raise ValueError(MISSING_POSES)
     recording = Recording.of(points, poses, intensities, doppler_mps, times_s)
     return _sorted(_find(recording, config, frames.FULL))
 

@@ -22,6 +22,7 @@ from radarsdf.cli.saying import complain, say
 COMMANDS = {
     "demo": "simulate a drive, fit it, write scans, map, mesh and picture, print the errors",
     "check": "say what is wrong with scans and poses, before a fit",
+    "poses": "mend the poses of scans by their returns, or find them from the radar alone",
     "fit": "fit a map to scans",
     "tiles": "fit a map that does not fit into memory, in tiles, here or on a cluster",
     "mesh": "extract the surface of a map as a triangle mesh",
@@ -128,7 +129,7 @@ def _parser(words: Sequence[str], every: bool = False) -> argparse.ArgumentParse
     """The parser of all commands. Only the command on the command line has its arguments, unless `every` one has."""
     parser = _Parser(
         prog="radarsdf",
-        description="From 3D radar scans with known poses to a surface and a reflectance map, on a CPU.",
+        description="From 3D radar scans to a surface and a reflectance map, on a CPU.",
         epilog="radarsdf COMMAND --help says more. To begin: radarsdf demo, or radarsdf check SCANS.",
     )
     parser.add_argument("--version", action=_Version, help="print the version and end")

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 from radarsdf.cli.map_in import MAP_SUFFIX
 from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
+from radarsdf.cli.posing import scans_and_poses
 from radarsdf.cli.results import Results, counted
 from radarsdf.cli.saying import complain
-from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of, words_of
+from radarsdf.cli.scans_in import add_scans, inputs_of, words_of
 
 if TYPE_CHECKING:
     from radarsdf import RadarMap
@@ -35,6 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--no-check", action="store_true", help="fit the scans even if radarsdf check would find an error"
+    )
+    parser.add_argument(
+        "--refine",
+        action="store_true",
+        help="mend the poses by the returns first; radarsdf poses writes them",
     )
     parser.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
     parser.add_argument(
@@ -69,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
         msg = f"{options.out}: a map is written as {MAP_SUFFIX}, by which the other commands know it"
         raise ValueError(msg)
     results = Results(options)
-    every_scan = scans = scans_of(options)
+    every_scan = scans = scans_and_poses(options, config, results, refine=options.refine).scans
     held_out = None
     if options.holdout is not None:
         from radarsdf.evaluation import holdout

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from radarsdf.io.poses.reading import StampedPoses
     from radarsdf.io.scans import Scans
 
 
@@ -59,11 +60,12 @@ def inputs_of(options: argparse.Namespace) -> list[Path]:
     return [path for path in (options.scans, options.poses, options.extrinsic) if path is not None]
 
 
-def scans_of(options: argparse.Namespace) -> Scans:
-    """The scans of the command. What was assumed or left out is said on standard error."""
+def scans_of(options: argparse.Namespace, poses: StampedPoses | None = None) -> Scans:
+    """The scans of the command, with `poses` in place of theirs. What was assumed or left out is said on standard error."""
     from radarsdf.io.poses.trajectory import read_table
     from radarsdf.io.read import read
 
+    given: Any = options.poses if poses is None else poses
     extrinsic = None
     if options.extrinsic is not None:
         try:
@@ -73,7 +75,7 @@ def scans_of(options: argparse.Namespace) -> Scans:
             raise ValueError(msg) from error
     return read(
         options.scans,
-        options.poses,
+        given,
         extrinsic=extrinsic,
         topic=options.topic,
         pose_topic=options.pose_topic,

@@ -9,7 +9,7 @@ from os import PathLike
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import instance
+from radarsdf.checks import MISSING_POSES, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.steps import FitInput, fit_rays
@@ -122,6 +122,5 @@ def _given(
         intensities = scans.intensities if intensities is None else intensities
         doppler_mps = scans.doppler_mps if doppler_mps is None else doppler_mps
     if poses is None:
-        msg = "poses are missing: T_world_sensor (4, 4) of each scan"
-        raise ValueError(msg)
+        raise ValueError(MISSING_POSES)
     return points, poses, intensities, doppler_mps

@@ -246,6 +246,26 @@ class Scans:
             truth_kind=self.truth_kind,
         )
 
+    def select_range(self, rows: slice) -> Scans:
+        """The scans of a range of numbers. All scans are read."""
+        return self.select(np.arange(len(self.points))[rows])
+
+    def with_poses(self, poses: NDArray[np.float64], *, other_world: bool = False) -> Scans:
+        """The same scans with other poses (F, 4, 4) T_world_sensor, m. All scans are read.
+
+        `other_world`: the poses are not in the world of the ground truth, which is then left out.
+        """
+        return Scans(
+            self.points,
+            poses,
+            self.intensities,
+            None if other_world else self.ground_truth,
+            doppler_mps=self.doppler_mps,
+            times_s=self.times_s,
+            sigmas=self.sigmas,
+            truth_kind=self.truth_kind,
+        )
+
     def _scan(self, i: int) -> Scan:
         assert self._points is not None
         return Scan(

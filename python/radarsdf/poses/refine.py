@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import check_poses, instance, not_negative
+from radarsdf.checks import MISSING_POSES, check_poses, instance, not_negative
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import DopplerMotion
@@ -109,8 +109,7 @@ def refine_poses(
     if isinstance(points, Scans) and poses is None:
         poses = points.poses
     if poses is None:
-        msg = "poses are missing: T_world_sensor (4, 4) of each scan; radarsdf.odometry finds them"
-        raise ValueError(msg)
+        raise ValueError(MISSING_POSES)
     recording = Recording.of(points, doppler_mps, times)
     scans, times_s, velocities = recording.scans, recording.times_s, recording.velocities
     given = check_poses(poses, len(scans))

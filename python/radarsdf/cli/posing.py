@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans whose poses the radar itself mends or finds, for the commands that need poses."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from radarsdf.cli.results import Results
+from radarsdf.cli.saying import complain
+from radarsdf.cli.scans_in import scans_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from radarsdf import FitConfig
+    from radarsdf.io.scans import Scans
+
+
+@dataclass(frozen=True)
+class PosedScans:
+    """Scans with their new poses, and what was given."""
+
+    scans: Scans
+    """Of the longest piece, if the poses were found in several."""
+    given: NDArray[np.float64] | None
+    """(F, 4, 4) poses of these scans before. None: there were none."""
+    pieces: int
+
+
+def scans_and_poses(
+    options: argparse.Namespace, config: FitConfig, results: Results, *, refine: bool, find: bool = False
+) -> PosedScans:
+    """The scans of a command. Their poses are refined, if that is wanted, or found, if there are none or `find` says so."""
+    from radarsdf.io.poses.reading import UNPOSED, NoPoses
+
+    scans = None
+    if not find:
+        try:
+            scans = scans_of(options)
+        except NoPoses:
+            if options.poses is not None:
+                raise
+            complain(
+                f"radarsdf {options.command}: there are no poses: the returns and their Doppler find them"
+            )
+    if scans is None:
+        return _found(scans_of(options, UNPOSED), config, results)
+    return _refined(scans, config, results) if refine else PosedScans(scans, scans.poses, 1)
+
+
+def _refined(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
+    from radarsdf import refine_poses
+
+    refined = refine_poses(scans, config=config)
+    results.add(refined.report["verdict"], poses=refined.report, improved=refined.improved)
+    if refined.improved:
+        results.add(
+            "they moved by {moved_m:.3f} m and {degrees:.2f} degrees; a given step is off by {sigma_m:.3f} m and {step:.2f} degrees "
+            "(root mean square, standard deviations)".format(
+                degrees=_degrees(refined.report["moved_rad"]),
+                step=_degrees(refined.report["sigma_rad"]),
+                **refined.report,
+            )
+        )
+    return PosedScans(scans.with_poses(refined.poses), scans.poses, 1)
+
+
+def _found(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
+    from radarsdf import odometry
+
+    found = odometry(scans, config=config)
+    results.add(found.report["verdict"], poses=found.report)
+    if found.report["doppler_sign"] < 0:
+        results.add("this radar's Doppler is positive where the sensor comes nearer")
+    pieces = found.report["pieces"]
+    posed = scans.with_poses(found.poses, other_world=True)
+    if pieces > 1:
+        rows = found.longest_piece()
+        results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest piece")
+        posed = posed.select_range(rows)
+    return PosedScans(posed, None, pieces)
+
+
+def _degrees(angle_rad: float) -> float:
+    import math
+
+    return math.degrees(angle_rad)

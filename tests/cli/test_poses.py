@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""`radarsdf poses`, and fits of scans whose poses are mended or missing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf.io.npz import Scans, read_scans, write_scans
+from radarsdf.simulate import MeasuredMotion, measured_motion
+
+from ..poses.drift import drifted, position_error_m
+from ..poses.test_odometry import errors
+from .calls import call, refusal, values
+
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return radarsdf.simulate.oculii(seed=62, frames=120)
+
+
+@pytest.fixture(scope="module")
+def drive(whole):
+    """Its first scans."""
+    return Scans(whole.points[:FRAMES], whole.poses[:FRAMES], whole.intensities[:FRAMES])
+
+
+@pytest.fixture(scope="module")
+def motion(whole):
+    """What they measure of their motion."""
+    motion = measured_motion(whole)
+    return MeasuredMotion(
+        motion.times_s[:FRAMES], motion.doppler_mps[:FRAMES], motion.angular_velocity[:FRAMES]
+    )
+
+
+@pytest.fixture
+def drifted_file(drive, motion, tmp_path):
+    """Scans whose poses drift."""
+    path = tmp_path / "drive.npz"
+    poses = drifted(drive.poses, 0.05, 0.004, 1)
+    speeds = motion.doppler_mps
+    write_scans(
+        path, Scans(drive.points, poses, drive.intensities, doppler_mps=speeds, times_s=motion.times_s)
+    )
+    return path
+
+
+@pytest.fixture
+def unposed(drive, motion, tmp_path):
+    """A folder of scans with Doppler and times, and no poses."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for scan, speeds, time_s in zip(drive.points, motion.doppler_mps, motion.times_s, strict=True):
+        table = np.column_stack([scan, speeds])
+        np.savetxt(
+            folder / f"{100 + time_s:.3f}.csv", table, delimiter=",", header="x,y,z,doppler", comments=""
+        )
+    return folder
+
+
+def test_poses_that_drift_are_refined(drive, drifted_file, tmp_path, capsys):
+    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
+    out, picture = tmp_path / "mended.npz", tmp_path / "way.png"
+    assert call("poses", drifted_file, "-o", out, "--picture", picture) == 0
+    said = capsys.readouterr().out
+    assert "The refined poses make a sharper map" in said
+    assert "they moved by" in said
+    assert f"next: radarsdf fit {out} -o mended.safetensors" in said
+    given, mended = read_scans(drifted_file), read_scans(out)
+    assert errors(mended.poses, drive.poses)[0] < 0.5 * errors(given.poses, drive.poses)[0]
+    for one, other in zip(given.points, mended.points, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_scans_without_poses_get_some(drive, unposed, tmp_path, capsys):
+    out = tmp_path / "poses.tum"
+    said = values(capsys, "poses", unposed, "-o", out)
+    assert said["poses"]["pieces"] == 1
+    assert said["next"] == f"radarsdf fit {unposed} {out} -o poses.safetensors"
+    scans = radarsdf.io.read(unposed, out)
+    assert errors(scans.poses, drive.poses)[0] < 0.05
+    refused = refusal(capsys, tmp_path, "poses", unposed, out, "--find", "-o", tmp_path / "again.tum")
+    assert "--find does not use poses" in refused
+
+
+def test_a_fit_finds_the_poses_that_are_missing(unposed, tmp_path, capsys):
+    out = tmp_path / "map.safetensors"
+    assert call("fit", unposed, "-o", out, "--quick") == 0
+    said = capsys.readouterr()
+    assert "there are no poses: the returns and their Doppler find them" in said.err
+    assert "placed by returns and Doppler" in said.out
+    assert len(radarsdf.load(out).mesh(0.2).faces) > 1000
+
+
+def test_a_fit_mends_the_poses(drive, drifted_file, tmp_path, capsys):
+    plain, mended = (
+        values(capsys, "fit", drifted_file, "-o", tmp_path / f"{i}.safetensors", "--quick", *words)
+        for i, words in enumerate([(), ("--refine",)])
+    )
+    assert mended["improved"]
+    assert "poses" not in plain
+    assert mended["poses"]["moved_m"] == pytest.approx(
+        position_error_m(read_scans(drifted_file).poses, drive.poses), rel=0.9
+    )
+
+
+def test_pieces_are_not_joined(drive, motion, tmp_path, capsys):
+    other = radarsdf.simulate.hugin(seed=63, frames=8)
+    later = measured_motion(other)
+    path = tmp_path / "two.npz"
+    write_scans(
+        path,
+        Scans(
+            drive.points + other.points,
+            np.tile(np.eye(4), (FRAMES + 8, 1, 1)),
+            doppler_mps=motion.doppler_mps + later.doppler_mps,
+            times_s=np.r_[motion.times_s, later.times_s + 60],
+        ),
+    )
+    out = tmp_path / "poses.tum"
+    assert call("poses", path, "--find", "-o", out) == 0
+    said = capsys.readouterr().out
+    assert "2 pieces, which do not belong together" in said
+    assert f"the scans 0 to {FRAMES - 1} are used" in said
+    assert len(out.read_text().splitlines()) == FRAMES
+    assert "would not say" in refusal(
+        capsys, tmp_path, "poses", path, "--find", "-o", tmp_path / "poses.kitti"
+    )
+
+
+def test_outputs_are_checked_before_the_work(drifted_file, tmp_path, capsys):
+    assert "no file of poses" in refusal(capsys, tmp_path, "poses", drifted_file, "-o", tmp_path / "a.txt")
+    assert "same file" in refusal(capsys, tmp_path, "poses", drifted_file, "-o", drifted_file)
