@@ -24,6 +24,7 @@ from . import (
     intensity,
     map_size,
     novel_views,
+    poses,
     ranges,
     sparse,
     surface,
@@ -45,6 +46,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "curve": curve.EXPERIMENT,
     "calibration": calibration.EXPERIMENT,
     "ranges": ranges.EXPERIMENT,
+    "poses": poses.EXPERIMENT,
 }
 _QUICK_FRAMES = 4
 

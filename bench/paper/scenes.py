@@ -53,6 +53,10 @@ class Scene:
     """Setting of `FitConfig`: farther returns are dropped by the fit. None: none are."""
     simulation: Simulation | None = None
     """The truth about the same scans if the scene is simulated."""
+    doppler_mps: list[NDArray[Any]] | None = None
+    """F arrays (N_i,), m/s, of a recorded scene."""
+    times_s: NDArray[np.float64] | None = None
+    """(F,) of a recorded scene, s."""
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -87,7 +91,9 @@ class Scene:
         return self._select(train), self._select(test)
 
     def _select(self, frames: NDArray[np.int64]) -> Scene:
-        scans = Scans(self.points, self.poses, self.intensities).select(frames)
+        scans = Scans(
+            self.points, self.poses, self.intensities, doppler_mps=self.doppler_mps, times_s=self.times_s
+        ).select(frames)
         simulation = self.simulation
         if simulation is not None:
             simulation = dataclasses.replace(
@@ -104,6 +110,8 @@ class Scene:
             poses=scans.poses,
             intensities=scans.intensities,
             simulation=simulation,
+            doppler_mps=scans.doppler_mps,
+            times_s=scans.times_s,
         )
 
 
@@ -191,6 +199,8 @@ def _recorded(name: str, scans: Scans, frames: int | None) -> Scene:
         poses=kept.poses,
         intensities=None if intensities is None else [np.asarray(v, np.float32) for v in intensities],
         ground_truth=None if kept.ground_truth is None else np.asarray(kept.ground_truth, np.float64),
+        doppler_mps=kept.doppler_mps,
+        times_s=kept.times_s,
     )
 
 
