@@ -44,9 +44,7 @@ def scans_and_poses(
         except NoPoses:
             if options.poses is not None:
                 raise
-            complain(
-                f"radarsdf {options.command}: there are no poses: the returns and their Doppler find them"
-            )
+            complain(f"radarsdf {options.command}: there are no poses: they are found from the radar alone")
     if scans is None:
         return _found(scans_of(options, UNPOSED), config, results)
     return _refined(scans, config, results) if refine else PosedScans(scans, scans.poses, 1)

@@ -53,8 +53,9 @@ def trajectory_picture(
     figure = new_figure(figsize=size, dpi=_DPI, facecolor="white", layout="constrained")
     axes = figure.add_subplot()
     axes.scatter(*world.T, s=0.6, c="#b9b9b9", linewidths=0, rasterized=True)
-    for (name, path), color in zip(trajectories.items(), _COLORS, strict=False):
-        axes.plot(*path[:, :2, 3].T, color=color, linewidth=1.8, label=name)
+    widths = np.linspace(3.5, 1.5, len(trajectories)) if len(trajectories) > 1 else [1.8]
+    for (name, path), color, width_pt in zip(trajectories.items(), _COLORS, widths, strict=False):
+        axes.plot(*path[:, :2, 3].T, color=color, linewidth=width_pt, label=name)
         axes.plot(*path[0, :2, 3], "o", color=color, markersize=5)
     axes.set_xlim(low[0] - 0.03 * width, high[0] + 0.03 * width)
     axes.set_ylim(low[1] - 0.03 * height, high[1] + 0.03 * height)

@@ -23,7 +23,7 @@ from radarsdf.io.text import number_rows, read_text
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 """Names of files of poses that are found beside scans."""
 
-FIND_POSES = "radarsdf.odometry, or `radarsdf poses`, finds them from the radar alone"
+FIND_POSES = "radarsdf poses finds them from the radar alone"
 """Ends what is said of scans without poses."""
 
 _TUM_COLUMNS, _KITTI_COLUMNS, _MATRIX_COLUMNS = 8, 12, 16
