@@ -101,15 +101,16 @@ class DopplerMotion(Motion):
     velocities: Velocities
     durations_s: Floats
     """(F - 1,)."""
-    turns: Floats | None
+    turns: Floats
     """(F - 1, 3) rotation vectors of the steps, roughly: over a gap, a sensor may have turned by more than half a turn."""
 
     @classmethod
     def by(
         cls, velocities: Velocities, times_s: Floats, poses: Floats, turns: Floats | None = None
     ) -> DopplerMotion:
-        """Of scans with these times (F,) and about these poses (F, 4, 4)."""
+        """Of scans with these times (F,) and about these poses (F, 4, 4). `turns` None: those that lead where the poses do."""
         durations_s = np.diff(times_s)
+        turns = _likely_turns(velocities, durations_s, steps(poses)) if turns is None else turns
         ways = np.stack([velocities.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
         shares = np.full((len(durations_s), 6), np.inf)
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
@@ -127,9 +128,25 @@ class DopplerMotion(Motion):
         """As measured by a sensor that turned as these poses do."""
         between, means = steps(poses), self.velocities.mean_mps
         for i, step in enumerate(between):
-            turn = rotation_vector(step[:3, :3], None if self.turns is None else self.turns[i])
+            turn = rotation_vector(step[:3, :3], self.turns[i])
             step[:3, 3] = way(turn, means[i], means[i + 1], float(self.durations_s[i]))
         return dataclasses.replace(self, steps=between)
+
+
+def _likely_turns(velocities: Velocities, durations_s: Floats, given: Floats) -> Floats:
+    """(F - 1, 3) rotation vectors of given steps: of those that differ by whole turns, the one whose way ends nearest."""
+    found = []
+    for i, step in enumerate(given):
+        shortest = rotation_vector(step[:3, :3])
+        angle = float(np.linalg.norm(shortest))
+        longer = shortest * (1 - 2 * np.pi / angle) if angle > 0 else shortest
+        ways = [
+            way(turn, velocities.mean_mps[i], velocities.mean_mps[i + 1], float(durations_s[i]))
+            for turn in (shortest, longer)
+        ]
+        off = [float(np.linalg.norm(end - step[:3, 3])) for end in ways]
+        found.append(longer if off[1] < off[0] else shortest)
+    return np.array(found).reshape(-1, 3)
 
 
 def doppler_sign(scans: Sequence[Floats], velocities: Velocities, times_s: Floats) -> int:
