@@ -41,7 +41,7 @@ class RefinedPoses:
     """(F, 6, 6) of the refined poses, relative to that of the scan in the middle: translation, m, and rotation vector about
     the sensor, rad, in world axes. Loops over more than 32 scans are left out, so it is rather too large there."""
     improved: bool
-    """Whether returns that took no part are nearer to those of other scans, by more than three standard errors."""
+    """Whether returns that took no part are nearer to those of other scans, by more than chance gives one of a thousand."""
     report: dict[str, Any]
     """`verdict` in words; `gain`, by which the logarithm of that distance fell, and its `gain_error`; `sigma_m` and
     `sigma_rad` of a given step and its `bias`; `movers`, returns left out by their Doppler, and `notes` on what was not used; how far the poses moved, `moved_m` and `moved_rad`, root mean square; `noise`
