@@ -92,7 +92,7 @@ def test_a_fit_finds_the_poses_that_are_missing(unposed, tmp_path, capsys):
     out = tmp_path / "map.safetensors"
     assert call("fit", unposed, "-o", out, "--quick") == 0
     said = capsys.readouterr()
-    assert "there are no poses: they are found from the radar alone" in said.err
+    assert "there are no poses: they were found from the radar alone" in said.err
     assert "placed by returns and Doppler" in said.out
     assert len(radarsdf.load(out).mesh(0.2).faces) > 1000
 

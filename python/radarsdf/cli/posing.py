@@ -37,16 +37,18 @@ def scans_and_poses(
     """The scans of a command. Their poses are refined, if that is wanted, or found, if there are none or `find` says so."""
     from radarsdf.io.poses.reading import UNPOSED, NoPoses
 
-    scans = None
-    if not find:
-        try:
-            scans = scans_of(options)
-        except NoPoses:
-            if options.poses is not None:
-                raise
-            complain(f"radarsdf {options.command}: there are no poses: they are found from the radar alone")
-    if scans is None:
+    if find:
         return _found(scans_of(options, UNPOSED), config, results)
+    try:
+        scans = scans_of(options)
+    except NoPoses as missing:
+        try:
+            posed = _found(scans_of(options, UNPOSED), config, results)
+        except ValueError as error:
+            msg = f"{missing}, but not here: {error}"
+            raise NoPoses(msg) from error
+        complain(f"radarsdf {options.command}: there are no poses: they were found from the radar alone")
+        return posed
     return _refined(scans, config, results) if refine else PosedScans(scans, scans.poses, 1)
 
 

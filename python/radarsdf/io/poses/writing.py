@@ -47,10 +47,11 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | 
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> import numpy as np
     >>> from radarsdf.io import write_poses
     >>> write_poses("poses.tum", [np.eye(4)], [12.5])
-    >>> print(open("poses.tum").read().strip())
+    >>> print(Path("poses.tum").read_text().strip())
     12.500000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 1.000000000
     """
     check_pose_suffix(path)
