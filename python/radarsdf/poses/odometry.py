@@ -49,10 +49,10 @@ class Odometry:
     agreeing: Floats
     """(F,) share of the returns of each scan that lie on planes of the scans before it. NaN where a piece begins."""
     report: dict[str, Any]
-    """`verdict` in words; `length_m` of the way; `pieces`, their number; `told` and `told_turn`, the share of the
-    variance of a step's translation and rotation that the returns took away, in the direction that they tell least of, median; `doppler` and `gyroscope`, whether they were used;
-    `doppler_sign`, -1 if the radar's Doppler is positive as the sensor comes nearer; `gyroscope_bias`, rad/s; `movers`,
-    returns that were left out; `notes`; `scans`, `seconds`."""
+    """`verdict` in words; `length_m` of the way; `pieces`, their number; `told` and `told_turn`, the share of the variance of a
+    step's translation and rotation that the returns took away, in the direction that they tell least of, median; `doppler` and
+    `gyroscope`, whether they were used; `doppler_sign`, -1 if the radar's Doppler is positive as the sensor comes nearer;
+    `gyroscope_bias`, rad/s; `movers`, returns that were left out; `notes`; `scans`, `seconds`."""
 
     def longest_piece(self) -> slice:
         """The scans of the piece with the most scans: those to make a map of."""
