@@ -204,13 +204,12 @@ Agreement LocalPlanes::beside(const double* points, std::int64_t count, const do
     squares.push_back(row.value * row.value / row.variance);
   }
   Agreement found;
-  found.on = static_cast<std::int64_t>(rows.size());
   if (rows.empty()) return found;
   const auto middle = squares.begin() + static_cast<std::ptrdiff_t>(squares.size() / 2);
   std::nth_element(squares.begin(), middle, squares.end());
-  found.scale = std::max(1.0, *middle / kMedianOfSquare);
+  const double scale = std::max(1.0, *middle / kMedianOfSquare);  // as in CommonPlanes
   for (const Row& row : rows) {
-    const double variance = found.scale * row.variance;
+    const double variance = scale * row.variance;
     const double share = 1 / (1 + row.value * row.value / (kSigmas2 * variance));
     const double weight = share * share;
     found.weight += weight;

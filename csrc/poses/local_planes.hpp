@@ -19,12 +19,10 @@ namespace radarsdf {
 struct Agreement {
   std::array<double, kBlock> hessian{};  // of half the sum of squares, by increments as in CommonPlanes
   std::array<double, kPose> gradient{};
-  // The part of the Hessian that errors of the normals make: across a wall, normals point along it by chance. Where it
-  // is all, the returns tell nothing.
+  // The part of the Hessian that errors of the normals make: along a wall, normals point a little along it by chance.
+  // Where it is all, the returns tell nothing.
   std::array<double, kBlock> doubt{};
-  double scale = 1;     // as in CommonPlanes
-  double weight = 0;    // sum over the returns, each at most 1
-  std::int64_t on = 0;  // returns near a plane
+  double weight = 0;  // sum over the returns, each at most 1
 };
 
 // Scans are added and taken out again, exactly: sums over their returns are integers. A cell's plane is that of the
@@ -32,8 +30,6 @@ struct Agreement {
 class LocalPlanes {
  public:
   explicit LocalPlanes(double cell_size_m);
-
-  double cell_size_m() const { return cell_size_m_; }
 
   // points: (count, 3), world frame, m. sign: 1 adds them, -1 takes them out. Throws std::invalid_argument, and changes
   // nothing, if a point is too far away, or was never added.

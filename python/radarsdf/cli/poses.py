@@ -75,7 +75,8 @@ def run(options: argparse.Namespace) -> None:
         )
         save_trajectory_picture(options.picture, scans.points, drawn)
         results.add(f"picture {options.picture}", picture=options.picture)
-    results.add(f"next: {_following(options, as_scans)}", next=_following(options, as_scans))
+    following = _following(options, as_scans)
+    results.add(f"next: {following}", next=following)
     results.end()
 
 

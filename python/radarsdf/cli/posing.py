@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -61,8 +62,8 @@ def _refined(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
         results.add(
             "they moved by {moved_m:.3f} m and {degrees:.2f} degrees; a given step is off by {sigma_m:.3f} m and {step:.2f} degrees "
             "(root mean square, standard deviations)".format(
-                degrees=_degrees(refined.report["moved_rad"]),
-                step=_degrees(refined.report["sigma_rad"]),
+                degrees=math.degrees(refined.report["moved_rad"]),
+                step=math.degrees(refined.report["sigma_rad"]),
                 **refined.report,
             )
         )
@@ -83,9 +84,3 @@ def _found(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
         results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest piece")
         posed = posed.select_range(rows)
     return PosedScans(posed, None, pieces)
-
-
-def _degrees(angle_rad: float) -> float:
-    import math
-
-    return math.degrees(angle_rad)

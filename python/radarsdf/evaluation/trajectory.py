@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checks import check_poses, pose_matrices, positive, real_array
+from radarsdf.checks import check_poses, positive, real_array
 from radarsdf.poses.rigid import Floats, aligned, between, steps, turned_by
 
 TRAJECTORY_PROTOCOL = "radarsdf-trajectory-1"
@@ -93,8 +93,7 @@ def trajectory_metrics(
         raise ValueError(msg)
     true = real_array(true_poses, "true_poses")
     true = check_poses(true, len(true) if true.ndim else 0)
-    found = pose_matrices(poses, len(true))
-    found = check_poses(found, len(true))
+    found = check_poses(poses, len(true))
     at = _brought(found, true, align)
     true_steps = steps(true)
     off = between(true_steps, steps(found))

@@ -54,6 +54,18 @@ class Tracked:
     direction that they tell least of. 0: nothing."""
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """A scan whose planes are kept."""
+
+    scan: Floats
+    """(N, 3) sensor frame, m."""
+    pose: Floats
+    """(4, 4)."""
+    world: Floats
+    """(N, 3) as they were added to the planes: taken out again, they leave nothing."""
+
+
 @dataclass
 class Tracker:
     """The last scans' planes, and where the last scan was."""
@@ -64,8 +76,7 @@ class Tracker:
     num_threads: int = 0
     last: Tracked | None = None
     _planes: list[LocalPlanes] = field(default_factory=list)
-    _world: deque[Floats] = field(default_factory=deque)
-    _recent: deque[tuple[Floats, Floats]] = field(default_factory=deque)
+    _recent: deque[_Kept] = field(default_factory=deque)
     _noise: SensorNoise | None = None
     _scans: int = 0
 
@@ -82,7 +93,6 @@ class Tracker:
 
     def _begin(self, scan: Floats, pose: Floats, piece: int) -> Tracked:
         self._planes = [LocalPlanes(cells * self.cell_size_m) for cells in _CELLS]
-        self._world.clear()
         self._recent.clear()
         self._scans = 0
         found = Tracked(pose, np.zeros((6, 6)), np.nan, piece, np.zeros(3))
@@ -91,22 +101,19 @@ class Tracker:
 
     def _keep(self, scan: Floats, found: Tracked) -> None:
         points = np.ascontiguousarray(np.einsum("ij,nj->ni", found.pose[:3, :3], scan) + found.pose[:3, 3])
-        gone = self._world.popleft() if len(self._world) == WINDOW else None
+        gone = self._recent.popleft() if len(self._recent) == WINDOW else None
         for planes in self._planes:
             planes.add(points)
             if gone is not None:
-                planes.add(gone, -1)
-        self._world.append(points)
-        self._recent.append((scan, found.pose))
-        if len(self._recent) > WINDOW:
-            self._recent.popleft()
+                planes.add(gone.world, -1)
+        self._recent.append(_Kept(scan, found.pose, points))
         self.last = found
         self._scans += 1
         if self._scans in _NOISE_AT:
             self._noise = self._estimated_noise()
 
     def _estimated_noise(self) -> SensorNoise:
-        scans, poses = zip(*self._recent, strict=True)
+        scans, poses = [kept.scan for kept in self._recent], [kept.pose for kept in self._recent]
         rays = SensorReturns.of(scans, 0.0, None).posed(np.stack(poses))
         surfels = Surfels.of(rays, self.cell_size_m / LEAVES_PER_SURFEL, self.num_threads)
         return sensor_noise(surfels, rays, self.config, self.num_threads)
@@ -194,8 +201,8 @@ class Tracker:
         """(_ELSEWHERE, 4, 4) upright poses among those of the last scans, that look anywhere but where they looked."""
         assert self.last is not None
         rng = np.random.default_rng(0)
-        known = np.stack([pose for _, pose in self._recent])
-        reach_m = float(np.median(np.linalg.norm(self._recent[-1][0], axis=1)))
+        known = np.stack([kept.pose for kept in self._recent])
+        reach_m = float(np.median(np.linalg.norm(self._recent[-1].scan, axis=1)))
         poses = known[rng.integers(0, len(known), _ELSEWHERE)]
         turns = Rotation.from_rotvec(
             rng.uniform(np.pi / 6, 2 * np.pi - np.pi / 6, _ELSEWHERE)[:, None] * self.last.pose[:3, 2]
