@@ -22,6 +22,7 @@ from . import (
     calibration,
     curve,
     intensity,
+    kinds,
     map_size,
     novel_views,
     poses,
@@ -47,6 +48,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "calibration": calibration.EXPERIMENT,
     "ranges": ranges.EXPERIMENT,
     "poses": poses.EXPERIMENT,
+    "kinds": kinds.EXPERIMENT,
 }
 _QUICK_FRAMES = 4
 
@@ -68,7 +70,7 @@ def main(arguments: list[str] | None = None) -> None:
         repetitions=words.repetitions or (2 if quick else experiment.repetitions),
         samples=words.samples or (100_000 if quick else 10_000_000),
         bases=tuple(words.base or experiment.bases),
-        peers=tuple(words.peers or PEERS),
+        peers=tuple(words.peers or experiment.peers),
         meshes=words.out / "meshes" if words.meshes else None,
         levers=levers,
     )
@@ -131,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--repetitions",
         type=int,
-        help="number of fits with different seeds, calibration: of simulated scenes too; default: as in the paper",
+        help="number of fits with different seeds, calibration, kinds: of simulated scenes too; default: as in the paper",
     )
     parser.add_argument(
         "--samples",
@@ -150,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[],
         metavar="PEER",
-        help=f"methods to compare; default: {', '.join(PEERS)}",
+        help=f"methods to compare, of {', '.join(PEERS)}; default: all that the experiment has",
     )
     parser.add_argument(
         "--base", nargs="+", choices=("default", "paper"), help="configurations of this package"

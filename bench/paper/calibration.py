@@ -72,7 +72,7 @@ def _name(changes: Changes) -> str:
 
 
 def _rows(scene: Scene, options: Options, base: str, changes: Changes, repetition: int) -> list[Row]:
-    scene = _repeated(scene, repetition)
+    scene = repeated(scene, repetition)
     row: Row = {"scene": scene.name, "base": base, "variant": _name(changes), "repetition": repetition}
     if scene.simulation is None and scene.ground_truth is None:
         return [row | {"why_not": "the scene has no ground truth"}]
@@ -89,7 +89,7 @@ def _rows(scene: Scene, options: Options, base: str, changes: Changes, repetitio
         return [row | {"why_not": str(error)}]
 
 
-def _repeated(scene: Scene, repetition: int) -> Scene:
+def repeated(scene: Scene, repetition: int) -> Scene:
     """The simulated scene of another seed, since a fit of another seed repeats most errors. A recorded one as it is."""
     if scene.simulation is None or repetition == 0:
         return scene

@@ -116,6 +116,8 @@ class Experiment:
     repetitions: int = 1
     """Number of fits with different seeds, as in the paper."""
     bases: tuple[str, ...] = ("default", "paper")
+    peers: tuple[str, ...] = tuple(PEERS)
+    """The methods by default."""
 
 
 def _cropped(mesh: trimesh.Trimesh, ground_truth: np.ndarray) -> trimesh.Trimesh:

@@ -16,7 +16,7 @@ from radarsdf.io.datasets.folders import is_posed_folder, read_posed_folder
 from radarsdf.io.datasets.snail_radar import is_snail_radar, read_snail_radar
 from radarsdf.io.npz import Scans, read_scans
 from radarsdf.returns.rays import prepare
-from radarsdf.simulate import SCENES, Simulation
+from radarsdf.simulate import KINDS, SCENES, Simulation
 from scipy.spatial import cKDTree
 
 SEEN_BY_RADAR_M = 1.0
@@ -123,7 +123,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
     spec : str
         One of
 
-        - the name of a simulated scene in `radarsdf.simulate.SCENES`;
+        - the name of a simulated scene in `radarsdf.simulate.SCENES`, or of a kind in `radarsdf.simulate.KINDS`;
         - an ``.npz`` file for :func:`radarsdf.io.npz.read_scans`. Only lidar points within 1 m of a return that is
           2.5 to 60 m from its sensor are ground truth;
         - a folder for :func:`radarsdf.io.datasets.folders.read_posed_folder`, such as a recording of Viking Hill;
@@ -148,8 +148,9 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
     if frames is not None and frames < 2:
         msg = f"frames must be at least 2, since one scan is held out, not {frames}"
         raise ValueError(msg)
-    if spec in SCENES:
-        scene = _simulated(SCENES[spec](seed=seed, frames=frames))
+    simulations = {**SCENES, **KINDS}
+    if spec in simulations:
+        scene = _simulated(simulations[spec](seed=seed, frames=frames))
     elif Path(spec).is_file() and Path(spec).suffix == ".npz":
         scene = _file(Path(spec), frames)
     elif is_snail_radar(Path(spec)):
@@ -159,7 +160,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
         scene = _recorded(Path(spec).resolve().name, read_posed_folder(Path(spec), frames), frames)
     else:
         msg = (
-            f"no scene {spec!r}: expected a simulated scene ({', '.join(sorted(SCENES))}), an .npz file of scans, "
+            f"no scene {spec!r}: expected a simulated scene ({', '.join([*sorted(SCENES), *sorted(KINDS)])}), an .npz file of scans, "
             "a folder with radar/*.pcd and poses.txt (export ROS bags, such as those of Viking Hill, to one) or "
             "a sequence of SNAIL-Radar with eagleg7/enhanced/*.pcd and utm50r_T_xt32.txt"
         )

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Simulated radar scans of worlds whose true surface is known.
 
-`SCENES` holds the ready-made simulations by name. `simulate` scans your own `Scene` with a `RadarSensor`.
+`SCENES` holds the ready-made simulations by name, `KINDS` those of places of many kinds. `simulate` scans your own `Scene` with a `RadarSensor`.
 
 Examples
 --------
@@ -12,6 +12,7 @@ Examples
 (2, (2, 4, 4))
 """
 
+from .kinds import KINDS
 from .materials import Material
 from .measured_motion import MeasuredMotion, measured_motion
 from .primitives import Box, CornerReflector, Pole, Primitive
@@ -22,6 +23,7 @@ from .terrain import Terrain
 from .worlds import SCENES, astyx, hugin, oculii, wall
 
 __all__ = [
+    "KINDS",
     "SCENES",
     "Box",
     "CornerReflector",

@@ -108,6 +108,22 @@ class Site:
         size = self._rng.uniform([4, 0.7, 1.0], [14, 1.2, 2.0])
         return self._block(xy, yaw + self._rng.normal(0, 0.05), size, vary(self._rng, materials.TREE))
 
+    def fence(self, xy: FloatArray, yaw: float) -> bool:
+        """A fence along a path: posts 2 m apart, and two rails."""
+        steps, height = int(self._rng.integers(3, 7)), self._rng.uniform(1.1, 1.8)
+        along = np.array([np.cos(yaw), np.sin(yaw)])
+        spots = [xy + 2.0 * (i - steps / 2) * along for i in range(steps + 1)]
+        if not self._free([(*spot, 0.5) for spot in spots]):
+            return False
+        wood = vary(self._rng, materials.TREE)
+        ground = self._terrain.height(np.array(spots))
+        for spot, base in zip(spots, ground, strict=True):
+            self.solids.append(Pole(np.array([*spot, base - _BURIED_M]), 0.05, height + _BURIED_M, wood))
+        for share in (0.4, 0.9):
+            bottom = float(ground.mean()) + share * height
+            self._add_box(xy, yaw, bottom, np.array([2.0 * steps, 0.05, 0.12]), wood)
+        return True
+
     def tree(self, xy: FloatArray, _yaw: float) -> bool:
         """A trunk, and a crown that begins 2 to 3 m above the ground."""
         radius, crown = self._rng.uniform(0.15, 0.35), self._rng.uniform([1.2, 2.0], [2.6, 5.0])
