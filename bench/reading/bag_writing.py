@@ -170,6 +170,20 @@ class BagWriter:
             "geometry_msgs/msg/PoseStamped", self.header(stamp_s, frame), self._pose(T_world_base)
         )
 
+    def imu(self, stamp_s: float, rates: ArrayLike, force: ArrayLike | None, frame: str = "imu") -> Any:
+        """An Imu, in rad/s and m/s². Without a force, it says that it has none."""
+        no_force = np.zeros(9)
+        no_force[0] = -1
+        vectors = [
+            self.make("geometry_msgs/msg/Vector3", *map(float, np.asarray(values)))
+            for values in (rates, np.zeros(3) if force is None else force)
+        ]
+        return self.make(
+            "sensor_msgs/msg/Imu", self.header(stamp_s, frame),
+            self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0), no_force,
+            vectors[0], np.zeros(9), vectors[1], no_force if force is None else np.zeros(9),
+        )  # fmt: skip
+
     def path(self, poses: Mapping[float, ArrayLike], frame: str = "map") -> Any:
         """A Path of poses by time, s."""
         stamped = [self.pose_stamped(stamp_s, pose, frame) for stamp_s, pose in poses.items()]

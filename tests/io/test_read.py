@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import radarsdf
 from numpy.testing import assert_allclose, assert_array_equal
-from radarsdf.io import Scan, Scans, read, write_scans
+from radarsdf.io import Scan, Scans, read, write_poses, write_scans
 
 from ..conftest import pose
 from .test_folders import radar_cloud, write_pcd
@@ -183,8 +183,6 @@ def test_an_npz_of_ours_loses_what_is_not_finite(tmp_path):
     assert [scan.points.tolist() for scan in again] == [[[1, 2, 3]], [[4, 5, 6]]]
     assert again.times_s.tolist() == [5, 6]
     assert again.notes == ["1 returns left out: a coordinate or the intensity is not a finite number"]
-    with pytest.raises(ValueError, match="its own poses"):
-        read(tmp_path / "scans.npz", POSES[:2])
 
 
 def test_extrinsic(tmp_path):
@@ -232,3 +230,31 @@ def test_sentences(tmp_path):
     scans = read(tmp_path)
     assert scans.notes == ["the scans have no time stamps: they are matched to the 3 poses in their order"]
     assert scans.times_s.tolist() == [0, 1, 2]
+
+
+def test_poses_that_are_given_win_over_those_of_an_npz(tmp_path):
+    points = [np.full((2, 3), float(i)) for i in range(4)]
+    times_s = np.array([0.0, 0.1, 7.0, 7.1])
+    scans = Scans(points, POSES[:4], times_s=times_s, ground_truth=np.zeros((1, 3)))
+    path = tmp_path / "scans.npz"
+    write_scans(path, scans)
+    others = np.stack([pose([0, i, 0], 0.1 * i) for i in range(3)])
+    # Of the first three, with times that are rounded, beside a gap longer than poses are interpolated over.
+    write_poses(tmp_path / "found.tum", others, times_s[:3] + 4e-4)
+    again = read(path, tmp_path / "found.tum")
+    assert_allclose(again.poses, others, rtol=0, atol=0.01)
+    assert_allclose(again.times_s, times_s[:3])
+    assert [scan.points[0, 0] for scan in again] == [0, 1, 2]
+    assert again.ground_truth is None
+    assert again.notes[:2] == [
+        f"poses: {tmp_path / 'found.tum'}, in place of those in scans.npz",
+        "the ground truth of scans.npz is left out: it lies in the world of the poses there",
+    ]
+    assert again.notes[2].startswith("1 scans left out: no poses within")
+    mounting = pose([0.5, 0, 1], np.pi / 2)
+    assert_allclose(read(path, POSES[1:5], extrinsic=mounting).poses, POSES[1:5] @ mounting)
+    assert read(path, POSES[1:5], ground_truth=np.ones((2, 3))).ground_truth.shape == (2, 3)
+    with pytest.raises(ValueError, match="there are 4 scans but 2 poses"):
+        read(path, POSES[:2])
+    with pytest.raises(ValueError, match="an extrinsic belongs to other poses"):
+        read(path, extrinsic=mounting)

@@ -12,7 +12,7 @@ from radarsdf.cli.map_in import MAP_SUFFIX
 from radarsdf.cli.options import add_config_options, add_json, config_of
 from radarsdf.cli.posing import scans_and_poses
 from radarsdf.cli.results import Results
-from radarsdf.cli.scans_in import add_scans, inputs_of
+from radarsdf.cli.scans_in import add_scans, inputs_of, words_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,12 +81,17 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _following(options: argparse.Namespace, as_scans: bool) -> str:
-    """The command that makes a map with these poses."""
+    """The command to run next: a fit with these poses."""
+    from radarsdf.io.datasets.folders import BASE_T_RADAR
+
     target = ["-o", options.out.stem + MAP_SUFFIX]
     if as_scans:
-        words = [str(options.out)]
-    elif options.scans.suffix.lower() == ".npz":  # which has its own poses
-        words = ["--refine", str(options.scans)]
+        words = ["fit", str(options.out), *target]
+    elif (options.scans / BASE_T_RADAR).is_file():  # which would be applied to the written poses, too
+        find = ["--find"] if options.find else []
+        words = ["poses", *words_of(options), *find, "-o", str(options.out.with_suffix(".npz"))]
     else:
-        words = [str(word) for word in (options.scans, options.out)]
-    return shlex.join(["radarsdf", "fit", *words, *target])
+        # The written poses are those of the radar: what leads to it from other poses has no part in them.
+        written = {"poses": options.out, "extrinsic": None, "pose_topic": None}
+        words = ["fit", *words_of(argparse.Namespace(**{**vars(options), **written})), *target]
+    return shlex.join(["radarsdf", *words])

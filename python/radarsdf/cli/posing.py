@@ -39,12 +39,12 @@ def scans_and_poses(
     from radarsdf.io.poses.reading import UNPOSED, NoPoses
 
     if find:
-        return _found(scans_of(options, UNPOSED), config, results)
+        return _found(scans_of(options, UNPOSED), config, results, options.command)
     try:
         scans = scans_of(options)
     except NoPoses as missing:
         try:
-            posed = _found(scans_of(options, UNPOSED), config, results)
+            posed = _found(scans_of(options, UNPOSED), config, results, options.command)
         except ValueError as error:
             msg = f"{missing}, but not here: {error}"
             raise NoPoses(msg) from error
@@ -70,11 +70,13 @@ def _refined(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
     return PosedScans(scans.with_poses(refined.poses), scans.poses, 1)
 
 
-def _found(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
+def _found(scans: Scans, config: FitConfig, results: Results, command: str) -> PosedScans:
     from radarsdf import odometry
 
     found = odometry(scans, config=config)
     results.add(found.report["verdict"], poses=found.report)
+    for note in found.report["notes"]:
+        complain(f"radarsdf {command}: {note}")
     if found.report["doppler_sign"] < 0:
         results.add("this radar's Doppler is positive where the sensor comes nearer")
     pieces = found.report["pieces"]

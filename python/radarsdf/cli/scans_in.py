@@ -47,6 +47,17 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--topic", metavar="NAME", help="in a bag: the topic of the scans")
     parser.add_argument("--pose-topic", metavar="NAME", help="in a bag: the topic of the poses")
     parser.add_argument(
+        "--imu-topic",
+        metavar="NAME",
+        help="in a bag: the topic of the inertial measurements, for poses that are found",
+    )
+    parser.add_argument(
+        "--imu-rotation",
+        type=Path,
+        metavar="FILE",
+        help="3 x 3 matrix from the axes of the IMU to those of the radar, R_sensor_imu; default: of the bag, or found",
+    )
+    parser.add_argument(
         "--field",
         action="append",
         default=[],
@@ -57,7 +68,11 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
 
 def inputs_of(options: argparse.Namespace) -> list[Path]:
     """The files and folders that :func:`scans_of` reads."""
-    return [path for path in (options.scans, options.poses, options.extrinsic) if path is not None]
+    return [
+        path
+        for path in (options.scans, options.poses, options.extrinsic, options.imu_rotation)
+        if path is not None
+    ]
 
 
 def scans_of(options: argparse.Namespace, poses: StampedPoses | None = None) -> Scans:
@@ -79,8 +94,20 @@ def scans_of(options: argparse.Namespace, poses: StampedPoses | None = None) -> 
         extrinsic=extrinsic,
         topic=options.topic,
         pose_topic=options.pose_topic,
+        imu_topic=options.imu_topic,
+        R_sensor_imu=None if options.imu_rotation is None else _rotation(options.imu_rotation),
         fields=dict(_field(text) for text in options.field) or None,
     )
+
+
+def _rotation(path: Path) -> Any:
+    from radarsdf.io.poses.trajectory import read_table
+
+    try:
+        return read_table(path, 3)
+    except ValueError as error:
+        msg = f"{path} is no rotation: that is a 3 x 3 matrix R_sensor_imu, three lines of three numbers"
+        raise ValueError(msg) from error
 
 
 def _field(text: str) -> tuple[str, str]:
@@ -94,7 +121,7 @@ def _field(text: str) -> tuple[str, str]:
 def words_of(options: argparse.Namespace) -> list[str]:
     """The same arguments, as one would type them again."""
     words = [options.scans, options.poses]
-    for name in ("extrinsic", "topic", "pose_topic"):
+    for name in ("extrinsic", "topic", "pose_topic", "imu_topic", "imu_rotation"):
         value = getattr(options, name)
         words += [f"--{name.replace('_', '-')}", value] if value is not None else []
     for text in options.field:

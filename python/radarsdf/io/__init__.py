@@ -4,6 +4,7 @@
 
 from radarsdf.io.clouds.reading import read_points
 from radarsdf.io.clouds.writing import write_cloud
+from radarsdf.io.imu import Imu
 from radarsdf.io.meshes import read_mesh, write_mesh
 from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.io.poses.reading import UNPOSED, NoPoses
@@ -13,6 +14,7 @@ from radarsdf.io.scans import Scan, Scans
 
 __all__ = [
     "UNPOSED",
+    "Imu",
     "NoPoses",
     "Scan",
     "Scans",

@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import instance, path_of
 from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.io.unpacking import check_unpacked
 
 __all__ = ["Scan", "Scans", "read_scans", "write_scans"]
 
+_IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu
 _ARRAYS = (
     "points",
     "frame",
@@ -32,6 +34,7 @@ _ARRAYS = (
     "times",
     "sigma",
     "simulated",
+    *_IMU,
 )
 
 
@@ -52,7 +55,9 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         - ``simulated``, optional: not 0 if the ground truth is that of a simulator;
         - ``doppler`` (N,), optional: m/s;
         - ``times`` (F,), optional: when each scan was taken, s;
-        - ``sigma`` (N, 3), optional: the sensor's own deviations of range, azimuth and elevation, m, rad, rad.
+        - ``sigma`` (N, 3), optional: the sensor's own deviations of range, azimuth and elevation, m, rad, rad;
+        - ``imu_times`` (G,), ``angular_velocity`` (G, 3), ``specific_force`` (G, 3), ``R_sensor_imu`` (3, 3), all optional: of
+          :class:`radarsdf.io.Imu`.
 
     Returns
     -------
@@ -90,6 +95,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         if array.dtype.kind not in ("biuf" if name == "static" else "iuf"):
             msg = f"{path}: {name} must be real numbers, not {array.dtype}"
             raise ValueError(msg)
+    imu = _imu(arrays, path)
     if (frame != np.floor(frame)).any():
         msg = f"{path}: frame must hold row numbers of poses"
         raise ValueError(msg)
@@ -115,7 +121,20 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         times_s=arrays["times"][frames].astype(np.float64) if "times" in arrays else None,
         sigmas=per_return["sigma"],
         truth_kind="simulated" if "simulated" in arrays and arrays["simulated"].any() else "lidar",
+        imu=imu,
     )
+
+
+def _imu(arrays: dict[str, NDArray[Any]], path: str | PathLike[str]) -> Imu | None:
+    """What the file has of an IMU; None without times or rates."""
+    times_s, rates, *others = (arrays.get(name) for name in _IMU)
+    if times_s is None or rates is None:
+        return None
+    try:
+        return Imu(times_s, rates, *others)
+    except ValueError as error:
+        msg = f"{path}: {error}"
+        raise ValueError(msg) from error
 
 
 def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:
@@ -177,6 +196,9 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
             arrays[name] = np.concatenate(values)
     if scans.times_s is not None:
         arrays["times"] = scans.times_s
+    if scans.imu is not None:
+        values_of = vars(scans.imu).values()
+        arrays |= {name: array for name, array in zip(_IMU, values_of, strict=True) if array is not None}
     if scans.ground_truth is not None:
         arrays["lidar_points"] = scans.ground_truth
         if scans.truth_kind == "simulated":

@@ -18,12 +18,22 @@ from radarsdf.io.bags.reading import bags_in, is_bag, read_bags
 from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
 from radarsdf.io.datasets import published
 from radarsdf.io.datasets.folders import base_T_radar, lidar_map
+from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.reading import FIND_POSES, POSE_FILES, UNPOSED, NoPoses, extrinsic_of, poses_of
+from radarsdf.io.poses.reading import (
+    FIND_POSES,
+    POSE_FILES,
+    UNPOSED,
+    NoPoses,
+    ScanPoses,
+    extrinsic_of,
+    poses_of,
+)
 from radarsdf.io.poses.trajectory import MAX_GAP_S
 from radarsdf.io.scans import Notes, Scan, Scans
 from radarsdf.io.sources import (
     NOT_FINITE,
+    WITHOUT_POSES,
     Request,
     cloud_files,
     files_source,
@@ -43,6 +53,8 @@ def read(
     extrinsic: ArrayLike | None = None,
     topic: str | None = None,
     pose_topic: str | None = None,
+    imu_topic: str | None = None,
+    R_sensor_imu: ArrayLike | None = None,
     world_frame: str | None = None,
     stamps: str | None = None,
     fields: Mapping[str, Any] | None = None,
@@ -68,11 +80,17 @@ def read(
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
         (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices. By
-        default what the data set says; `radarsdf.io.UNPOSED` reads scans that have none; in a folder, a file of `radarsdf.io.poses.reading.POSE_FILES`; in a bag, `pose_topic`.
+        default what the data set says, or the ``.npz`` has; in a folder, a file of `radarsdf.io.poses.reading.POSE_FILES`; in a
+        bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
     topic, pose_topic : str, optional
         In a bag, the topic of the scans, and of the poses (Odometry, PoseStamped, Path or TF). By default the only ones.
+    imu_topic : str, optional
+        In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
+    R_sensor_imu : (3, 3) array_like, optional
+        The rotation from the axes of the IMU to those of the radar. By default that of the file, or in a bag that of the
+        static transforms.
     world_frame : str, optional
         With poses of TF, the frame of the world. By default the root of its tree.
     stamps : {"header", "record"}, optional
@@ -123,6 +141,8 @@ def read(
         extrinsic=extrinsic_of(extrinsic),
         topic=topic,
         pose_topic=pose_topic,
+        imu_topic=imu_topic,
+        R_sensor_imu=None if R_sensor_imu is None else checked_rotation(R_sensor_imu, "R_sensor_imu"),
         world_frame=world_frame,
         stamps=stamps,
         fields=fields,
@@ -178,7 +198,7 @@ def _folder(folder: Path, request: Request, truth: Callable[[], NDArray[np.float
 
 def _refuse_choices_of_bags(path: Path, request: Request) -> None:
     """Raises where a choice would have no effect."""
-    for name in ("topic", "pose_topic", "world_frame", "stamps"):
+    for name in ("topic", "pose_topic", "imu_topic", "world_frame", "stamps"):
         if getattr(request, name) is not None:
             msg = f"{path} is no bag: {name} is of bags alone"
             raise ValueError(msg)
@@ -211,31 +231,53 @@ def _files(
 
 
 def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
-    if (request.poses is not None and request.poses is not UNPOSED) or request.extrinsic is not None:
-        msg = f"{path} has its own poses T_world_sensor: poses and extrinsic are not used for .npz files"
+    given = None if request.poses is UNPOSED else request.poses
+    if given is None and request.extrinsic is not None:
+        msg = f"{path} has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
         raise ValueError(msg)
     if request.fields is not None or request.columns is not None:
         msg = f"{path} has arrays of known names: fields and columns are not used for .npz files"
         raise ValueError(msg)
     _refuse_choices_of_bags(path, request)
     scans = read_scans(path)
+    matched = None if given is None else _other_poses(given, scans, path, request)
+    if matched is not None and truth is None and scans.ground_truth is not None:
+        request.notes.add(
+            f"the ground truth of {path.name} is left out: it lies in the world of the poses there"
+        )
 
     def source() -> Iterator[Scan]:
-        for scan in scans:
+        for number, scan in enumerate(scans):
+            T_world_sensor = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
+            if T_world_sensor is None:
+                request.notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s), 1)
+                continue
             finite = np.isfinite(scan.points).all(axis=1)
             if scan.intensities is not None:
                 finite &= np.isfinite(scan.intensities)
             request.notes.count(NOT_FINITE, int((~finite).sum()))
-            if finite.all():
-                yield scan
-            elif finite.any():
+            if finite.any():
+                rows = slice(None) if finite.all() else finite
                 parts = (scan.intensities, scan.doppler_mps, scan.sigma)
-                values, doppler, sigma = (None if part is None else part[finite] for part in parts)
-                yield Scan(scan.points[finite], scan.T_world_sensor, values, doppler, scan.time_s, sigma)
+                values, doppler, sigma = (None if part is None else part[rows] for part in parts)
+                yield Scan(scan.points[rows], T_world_sensor, values, doppler, scan.time_s, sigma)
 
-    found = Scans.of_source(source, request.notes, truth or (lambda: scans.ground_truth))
+    imu = scans.imu
+    if imu is not None and request.R_sensor_imu is not None:
+        imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
+    own_truth = None if matched is not None else scans.ground_truth
+    found = Scans.of_source(source, request.notes, truth or (lambda: own_truth), lambda: imu)
     found.truth_kind = scans.truth_kind
     return found
+
+
+def _other_poses(given: Any, scans: Scans, path: Path, request: Request) -> ScanPoses:
+    """Poses that are given for scans which have some."""
+    times_s = None if scans.times_s is None else scans.times_s.tolist()
+    matched, _ = scan_poses(poses_of(given, request.notes), len(scans), times_s, request.extrinsic, request)
+    of = given if isinstance(given, (str, PathLike)) else "those given"
+    request.notes.add(f"poses: {of}, in place of those in {path.name}")
+    return matched
 
 
 def _truth(ground_truth: Any) -> Callable[[], NDArray[np.float64] | None] | None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import one_for_each_scan
+from radarsdf.io.imu import Imu
 
 _LOG = logging.getLogger("radarsdf.io")
 
@@ -109,6 +110,8 @@ class Scans:
         When the scans were taken, s.
     truth_kind : {"lidar", "simulated", "given"}
         Where the ground truth comes from.
+    imu : Imu, optional
+        What an IMU measured meanwhile.
     """
 
     def __init__(
@@ -122,6 +125,7 @@ class Scans:
         times_s: NDArray[np.float64] | None = None,
         sigmas: Sequence[NDArray[Any]] | None = None,
         truth_kind: TruthKind = "lidar",
+        imu: Imu | None = None,
     ) -> None:
         self._source: Callable[[], Iterator[Scan]] | None = None
         self._notes = Notes()
@@ -136,6 +140,8 @@ class Scans:
         self.truth_kind: TruthKind = truth_kind
         """Where the ground truth comes from."""
         self._truth: NDArray[Any] | None = None
+        self._read_imu: Callable[[], Imu | None] | None = None
+        self._imu = imu
 
     @classmethod
     def of_source(
@@ -143,6 +149,7 @@ class Scans:
         source: Callable[[], Iterator[Scan]],
         notes: Notes,
         ground_truth: Callable[[], NDArray[Any] | None] = lambda: None,
+        imu: Callable[[], Imu | None] | None = None,
     ) -> Scans:
         """Scans that are read while they are iterated.
 
@@ -154,12 +161,15 @@ class Scans:
             What the source says of its files.
         ground_truth : callable
             Reads the ground truth, when it is asked for.
+        imu : callable, optional
+            Likewise, what the IMU measured.
         """
         scans = cls([], np.zeros((0, 4, 4)))
         scans._source = source
         scans._notes = notes
         scans._points = scans._poses = None
         scans._ground_truth = ground_truth
+        scans._read_imu = imu
         return scans
 
     def __iter__(self) -> Iterator[Scan]:
@@ -225,6 +235,13 @@ class Scans:
         return self._truth
 
     @property
+    def imu(self) -> Imu | None:
+        """What an inertial measurement unit measured meanwhile. None if there is none."""
+        if self._read_imu is not None:
+            self._imu, self._read_imu = self._read_imu(), None
+        return self._imu
+
+    @property
     def notes(self) -> list[str]:
         """Sentences on what was assumed, and after the files were read, on what was left out."""
         return list(self._notes.lines)
@@ -244,6 +261,7 @@ class Scans:
             times_s=None if self.times_s is None else self.times_s[frames],
             sigmas=chosen(self.sigmas),
             truth_kind=self.truth_kind,
+            imu=self.imu,
         )
 
     def select_range(self, rows: slice) -> Scans:
@@ -264,6 +282,7 @@ class Scans:
             times_s=self.times_s,
             sigmas=self.sigmas,
             truth_kind=self.truth_kind,
+            imu=self.imu,
         )
 
     def _scan(self, i: int) -> Scan:

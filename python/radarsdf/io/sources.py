@@ -29,6 +29,9 @@ SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD
 NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 """What a note says of such returns, after their number."""
 
+WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
+"""Likewise of such scans."""
+
 _NO_RETURNS = "scans left out: they hold no returns"
 _NOT_SCANS = {
     *POSE_FILES,
@@ -53,6 +56,8 @@ class Request:
     extrinsic: NDArray[np.float64] | None = None
     topic: str | None = None
     pose_topic: str | None = None
+    imu_topic: str | None = None
+    R_sensor_imu: NDArray[np.float64] | None = None
     fields: Mapping[str, Any] | None = None
     columns: int | Sequence[str] | None = None
     max_gap_s: float = MAX_GAP_S
@@ -86,9 +91,7 @@ def posed(
             T_world_sensor = poses.of(number, raw.time_s)
             if T_world_sensor is None:
                 first_s = raw.time_s if first_s is None else first_s
-                notes.count(
-                    f"scans left out: no poses within {poses.max_gap_s} s of each other around them", 1
-                )
+                notes.count(WITHOUT_POSES.format(gap_s=poses.max_gap_s), 1)
                 continue
             taken += 1
             columns = raw.read()

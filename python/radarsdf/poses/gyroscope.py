@@ -10,13 +10,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import t as student
 
 from radarsdf.poses.rates import Rate
 from radarsdf.poses.rigid import Floats
 
 # What a gyroscope begins with: the bias and the noise of cheap ones. The drive itself replaces them.
-_FIRST_BIAS_RAD_S = 0.02
+FIRST_BIAS_RAD_S = 0.02
 _FIRST_NOISE_RAD = 0.003
+# How sure it must be how a gyroscope sits on the radar.
+_LEAST_TURNS = 20
+_UNRELATED = 60  # shifts between two courses of turns that have nothing to do with each other, to see what chance explains
+_BY_CHANCE = 1e-3
+_KNOWN_RAD = 0.1  # standard deviation
 
 
 @dataclass(frozen=True)
@@ -33,8 +39,13 @@ class Gyroscope:
     """Variance of each component of a rotation over the median duration; it grows with time."""
 
     @classmethod
-    def of(cls, angular_velocity: Floats, at_s: Floats, times_s: Floats) -> Gyroscope:
-        """Of rates (G, 3), rad/s, frame of the sensor, measured at ascending times (G,), and scans at `times_s` (F,)."""
+    def of(
+        cls, angular_velocity: Floats, at_s: Floats, times_s: Floats, bias_rad_s: float = FIRST_BIAS_RAD_S
+    ) -> Gyroscope:
+        """Of rates (G, 3), rad/s, frame of the sensor, measured at ascending times (G,), and scans at `times_s` (F,).
+
+        `bias_rad_s` is the deviation of their bias.
+        """
         # Between two neighbouring times, of scans or rates, the rate is their mean (the trapezoidal rule).
         inner = at_s[(at_s > times_s[0]) & (at_s < times_s[-1])]
         edges = np.union1d(inner, times_s)
@@ -48,7 +59,7 @@ class Gyroscope:
                 for k in range(low + 1, high):
                     whole = whole * small[k]
                 turns[i] = whole.as_rotvec()
-        bias = Rate(np.zeros(3), _FIRST_BIAS_RAD_S**2 * np.eye(3))
+        bias = Rate(np.zeros(3), bias_rad_s**2 * np.eye(3))
         return cls(turns, np.diff(times_s), bias, _FIRST_NOISE_RAD**2)
 
     @property
@@ -69,13 +80,64 @@ class Gyroscope:
             return self
         duration_s = self.durations_s[known, None, None]
         off = (self.turns - turns)[known]
-        # Weighted least squares, with what is known of any gyroscope's bias.
+        # Weighted least squares, with what was known of the bias.
         of_step = covariance[known] + self.noise_rad2 * self._spans[known, None, None] * np.eye(3)
         weights = np.linalg.inv(of_step)
-        information = np.eye(3) / _FIRST_BIAS_RAD_S**2 + (weights * duration_s**2).sum(axis=0)
-        sums = np.einsum("fij,fj->i", weights * duration_s, off)
+        before = np.linalg.inv(self.bias.covariance)
+        information = before + (weights * duration_s**2).sum(axis=0)
+        sums = np.einsum("fij,fj->i", weights * duration_s, off) + np.einsum(
+            "ij,j->i", before, self.bias.mean
+        )
         bias = Rate(np.linalg.solve(information, sums), np.linalg.inv(information))
         left = off - bias.mean * self.durations_s[known, None]
         squares = left**2 - np.einsum("fii->fi", covariance[known])
         noise = np.maximum(squares / self._spans[known, None], 0.0).mean()
         return dataclasses.replace(self, bias=bias, noise_rad2=float(max(noise, 1e-10)))
+
+
+class UnknownAxesError(ValueError):
+    """The turns of a drive do not tell how a gyroscope sits on the radar."""
+
+
+@dataclass(frozen=True)
+class UnalignedGyroscope(Gyroscope):
+    """A gyroscope whose axes are not those of the radar. The drive tells how it sits there."""
+
+    def learnt(self, turns: Floats, covariance: Floats) -> Gyroscope:
+        """In the axes of the radar, as :meth:`Gyroscope.learnt`. Raises :class:`UnknownAxesError`."""
+        known = np.isfinite(turns).all(axis=1) & (self.durations_s > 0)
+        if known.sum() < _LEAST_TURNS:
+            msg = "too few turns are known"
+            raise UnknownAxesError(msg)
+        weights = 3 / (np.einsum("fii->f", covariance[known]) + 3 * self.noise_rad2 * self._spans[known])
+        measured, found, spans = self.turns[known], turns[known], self.durations_s[known]
+        R, sigma_rad, cost = _wahba(measured, found, spans, weights)
+        # What rotations explain that have nothing to do with each other.
+        count = len(found)
+        away = np.unique(np.linspace(count // 8, count - count // 8, _UNRELATED).astype(np.int64))
+        logs = np.log([_wahba(np.roll(measured, k, axis=0), found, spans, weights)[2] for k in away])
+        needed = float(student.ppf(1 - _BY_CHANCE, len(logs) - 1)) * logs.std(ddof=1)
+        if sigma_rad > _KNOWN_RAD or logs.mean() - np.log(cost) < needed:
+            msg = f"their deviation would be {np.degrees(sigma_rad):.1f} degrees, or chance explains the turns as well"
+            raise UnknownAxesError(msg)
+        in_radar = Gyroscope(
+            np.einsum("ij,fj->fi", R, self.turns), self.durations_s, self.bias, self.noise_rad2
+        )
+        return in_radar.learnt(turns, covariance)
+
+
+def _wahba(measured: Floats, found: Floats, spans: Floats, weights: Floats) -> tuple[Floats, float, float]:
+    """Rotation (3, 3) that turns the vectors `measured` (F, 3) into those `found`, but for a constant rate; its deviation, rad,
+    about the axis that is known least; and the weighted sum of squares that is left.
+
+    Kabsch's solution of Wahba's problem, weighted.
+    """
+    share = weights * spans / (weights * spans**2).sum()
+    a, b = (x - spans[:, None] * np.einsum("f,fi->i", share, x) for x in (measured, found))
+    u, _, vt = np.linalg.svd(np.einsum("f,fi,fj->ij", weights, b, a))
+    R = np.einsum("ij,j,jk->ik", u, [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))], vt)
+    off = b - np.einsum("ij,fj->fi", R, a)
+    cost = float(np.einsum("f,fi,fi->", weights, off, off))
+    information = np.einsum("f,fi,fi->", weights, a, a) * np.eye(3) - np.einsum("f,fi,fj->ij", weights, a, a)
+    variance = max(cost / (3 * len(a)), 1.0) / max(float(np.linalg.eigvalsh(information)[0]), 1e-12)
+    return R, float(np.sqrt(variance)), max(cost, 1e-12)

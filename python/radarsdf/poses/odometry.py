@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,11 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import instance, real_array
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import doppler_sign
 from radarsdf.poses.drive import Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
-from radarsdf.poses.gyroscope import Gyroscope
+from radarsdf.poses.gyroscope import Gyroscope, UnknownAxesError
+from radarsdf.poses.inertial import Inertial, levelled
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.recording import Recording
 from radarsdf.poses.rigid import Floats, steps
@@ -40,7 +43,7 @@ class Odometry:
     """Poses that were found without any being given."""
 
     poses: Floats
-    """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan."""
+    """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, turned so that z points up."""
     covariance: Floats
     """(F, 6, 6) as of :class:`RefinedPoses`, relative to the scan in the middle of each piece."""
     pieces: NDArray[np.int64]
@@ -52,7 +55,8 @@ class Odometry:
     """`verdict` in words; `length_m` of the way; `pieces`, their number; `told` and `told_turn`, the share of the variance of a
     step's translation and rotation that the returns took away, in the direction that they tell least of, median; `doppler` and
     `gyroscope`, whether they were used; `doppler_sign`, -1 if the radar's Doppler is positive as the sensor comes nearer;
-    `gyroscope_bias`, rad/s; `movers`, returns that were left out; `notes`; `scans`, `seconds`."""
+    `gyroscope_bias`, rad/s; `imu`, None or how it was found to sit: `R_sensor_imu`, its deviation `sigma_rad`, `late_s`, by which the
+    times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes; `movers`, returns that were left out; `notes`; `scans`, `seconds`."""
 
     def longest_piece(self) -> slice:
         """The scans of the piece with the most scans: those to make a map of."""
@@ -68,6 +72,7 @@ def odometry(
     times: ArrayLike | None = None,
     angular_velocity: ArrayLike | None = None,
     angular_velocity_times: ArrayLike | None = None,
+    imu: Imu | None = None,
     config: FitConfig | None = None,
 ) -> Odometry:
     """Finds the poses of scans from the radar alone.
@@ -89,6 +94,10 @@ def odometry(
         Of a gyroscope, rad/s, in the axes of the radar.
     angular_velocity_times : (G,) array_like, optional
         When it was measured, s, in the clock of `times`. Default: at the times of the scans.
+    imu : Imu, optional
+        An IMU in axes of its own, in place of `angular_velocity`; of Scans, theirs. How it sits on the radar and what time is
+        between their clocks is found, from its accelerometer and the Doppler, or from turns that the returns tell; the accelerometer
+        also tells which way is up.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
 
@@ -105,8 +114,8 @@ def odometry(
 
     Notes
     -----
-    The scale is that of the radar's ranges and, with Doppler, of its speeds. Where gravity points is not known: the first scan
-    is taken to be level.
+    The scale is that of the radar's ranges and, with Doppler, of its speeds. Without an accelerometer, where gravity points is
+    not known: the first scan is taken to be level.
 
     Examples
     --------
@@ -124,38 +133,48 @@ def odometry(
         msg = "times are missing: when each scan was taken, s"
         raise ValueError(msg)
     times_s, velocities, sign = recording.times_s, recording.velocities, 1
-    gyroscope = None
-    if angular_velocity is not None:
-        at = times_s if angular_velocity_times is None else angular_velocity_times
-        gyroscope = Gyroscope.of(*_checked_rates(angular_velocity, at, recording), times_s)
     if velocities is not None:
         sign = doppler_sign(recording.scans, velocities, times_s)
         velocities = velocities.turned if sign < 0 else velocities
+    if angular_velocity is not None:
+        at = times_s if angular_velocity_times is None else angular_velocity_times
+        inertial = Inertial(Gyroscope.of(*_checked_rates(angular_velocity, at, recording), times_s))
+    else:
+        used = points.imu if imu is None and isinstance(points, Scans) else imu
+        inertial = Inertial.of(used, velocities, times_s, recording.begin_s)
     limits = config.returns
     with Workers(config.num_threads) as workers:
         scans = [
             scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in recording.scans
         ]
-        drive = Drive(scans, times_s, velocities, gyroscope)
-        drive, tracked = followed(drive, config, workers.num_threads)
-        told = _checked_told(tracked, drive)
+        drive = Drive(scans, times_s, velocities, inertial.gyroscope)
+        try:
+            drive, tracked = followed(drive, config, workers.num_threads)
+        except UnknownAxesError as why:
+            inertial = inertial.without(why)
+            drive = dataclasses.replace(drive, gyroscope=None)
+            drive, tracked = followed(drive, config, workers.num_threads)
+        told = _checked_told(tracked, drive, inertial)
         poses, covariance = _together(drive, tracked, config, workers.num_threads)
+        if inertial.alignment is not None:
+            poses, covariance = levelled(poses, covariance, inertial.alignment.up)
     pieces = np.array([found.piece for found in tracked])
     length_m = sum(
         float(np.linalg.norm(steps(poses[rows])[:, :3, 3], axis=1).sum()) for rows in pieces_of(tracked)
     )
     report = {
-        "verdict": _words(pieces, length_m, velocities is not None, gyroscope is not None),
+        "verdict": _words(pieces, length_m, velocities is not None, inertial),
         "length_m": length_m,
         "pieces": int(pieces[-1]) + 1,
         "told": told[0],
         "told_turn": told[1],
         "doppler": velocities is not None,
         "doppler_sign": sign,
-        "gyroscope": gyroscope is not None,
+        "gyroscope": inertial.gyroscope is not None,
         "gyroscope_bias": None if drive.gyroscope is None else drive.gyroscope.bias.mean.tolist(),
+        "imu": inertial.report,
         "movers": recording.movers,
-        "notes": recording.notes,
+        "notes": [*recording.notes, *inertial.notes],
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
     }
@@ -181,7 +200,7 @@ def _together(
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance
 
 
-def _checked_told(tracked: list[Tracked], drive: Drive) -> tuple[float, float]:
+def _checked_told(tracked: list[Tracked], drive: Drive, inertial: Inertial) -> tuple[float, float]:
     """What the returns tell of translations and rotations. Raises a ValueError where nothing does."""
     if len(tracked) < 2:
         return 0.0, 0.0
@@ -195,14 +214,17 @@ def _checked_told(tracked: list[Tracked], drive: Drive) -> tuple[float, float]:
                 f"the returns alone do not tell how the sensor {moved}: of a step's variance, they take away {told:.1%}, and "
                 f"{least:.0%} is needed. Give {missing}, or poses"
             )
+            msg = ". ".join([msg, *(note.rstrip(".") for note in inertial.notes)])
             raise ValueError(msg)
     return way, turn
 
 
-def _words(pieces: NDArray[np.int64], length_m: float, doppler: bool, gyroscope: bool) -> str:
-    sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * gyroscope]
+def _words(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
+    sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
     by = " and ".join(filter(None, [", ".join(sources[:-1]), sources[-1]]))
     whole = f"{len(pieces)} scans along {length_m:.1f} m were placed by {by}."
+    if inertial.alignment is not None:
+        whole = f"{whole} {inertial.alignment.words}"
     begins = np.flatnonzero(np.diff(pieces)) + 1
     if len(begins) == 0:
         return whole

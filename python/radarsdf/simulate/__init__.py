@@ -14,6 +14,7 @@ Examples
 
 from .kinds import KINDS
 from .materials import Material
+from .measured_imu import measured_imu
 from .measured_motion import MeasuredMotion, measured_motion
 from .primitives import Box, CornerReflector, Pole, Primitive
 from .radar import Origin, RadarSensor, Scan
@@ -40,6 +41,7 @@ __all__ = [
     "Terrain",
     "astyx",
     "hugin",
+    "measured_imu",
     "measured_motion",
     "oculii",
     "simulate",

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The few ROS messages that scans and poses are in, read from their bytes.
+"""The few ROS messages that scans, poses and inertial measurements are in, read from their bytes.
 
 Without a type system: it would build Python code from the definitions in a bag, makes an object of each point, and old
 ROS 2 bags have no definitions. The definitions below have not changed for many years. Each message must be read to its
@@ -23,6 +23,7 @@ _RADAR_RETURN = np.dtype(
 )
 _CDR_HEADER = 4
 _MAX_CDR_PADDING = 7
+_NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,17 @@ class PoseMessage:
     """The frame that has the pose. Empty where the message does not say."""
     values: tuple[float, ...]
     """x, y, z, m; qx, qy, qz, qw."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImuMessage:
+    """What an inertial measurement unit (IMU) measured at one time, in its own axes."""
+
+    header: Header
+    angular_velocity: tuple[float, ...] | None
+    """rad/s. None: it does not measure it."""
+    specific_force: tuple[float, ...] | None
+    """m/s²: acceleration less that of gravity. None: likewise."""
 
 
 class _Cursor:
@@ -225,8 +237,19 @@ def _transforms(cursor: _Cursor) -> list[PoseMessage]:
     return [_transform_stamped(cursor)[0] for _ in range(cursor.take("I"))]
 
 
+def _imu(cursor: _Cursor) -> ImuMessage:
+    header = cursor.header()
+    cursor.doubles(4 + 9)  # an orientation, by a filter that nobody knows, and its covariance
+    measured = []
+    for _ in range(2):
+        values, covariance = cursor.doubles(3), cursor.doubles(9)
+        measured.append(None if covariance[0] == _NOT_MEASURED else values)
+    return ImuMessage(header, *measured)
+
+
 POINT_A_MESSAGE = "ti_mmwave_rospkg/msg/RadarScan"
 PATH = "nav_msgs/msg/Path"
+IMU = "sensor_msgs/msg/Imu"
 
 _CLOUDS: dict[str, Callable[[_Cursor], CloudMessage]] = {
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
@@ -272,6 +295,18 @@ def read_pose_messages(raw: bytes | memoryview, message_type: str, cdr: bool) ->
     """
     poses: list[PoseMessage] = _read(raw, (_POSES | _TRANSFORMS)[message_type], cdr)
     return poses
+
+
+def read_imu(raw: bytes | memoryview, cdr: bool) -> ImuMessage:
+    """A message of type `IMU`.
+
+    Raises
+    ------
+    ValueError
+        If its bytes do not have the layout of its type.
+    """
+    message: ImuMessage = _read(raw, _imu, cdr)
+    return message
 
 
 def _read(raw: bytes | memoryview, parse: Callable[[_Cursor], Any], cdr: bool) -> Any:

@@ -213,20 +213,37 @@ def _of_tree(
     return TransformChain(tuple(links)), request.extrinsic
 
 
+def static_between(
+    paths: list[Path], transforms: set[str], base: str, sensor: str
+) -> NDArray[np.float64] | None:
+    """T_base_sensor (4, 4) by the static transforms in topics of bags; None where they do not lead from one to the other."""
+    if base and base == sensor:
+        return np.eye(4)
+    return _fixed(_tree(paths, transforms), base, sensor) if base and transforms else None
+
+
+def _fixed(tree: dict[str, _Track], base: str, sensor: str) -> NDArray[np.float64] | None:
+    """T_base_sensor through frames that do not move against each other. None: there is no such way."""
+    up_base, up_sensor = _ancestors(tree, base), _ancestors(tree, sensor)
+    common = next((frame for frame in up_sensor if frame in up_base), None)
+    if common is None:
+        return None
+    down = up_sensor[: up_sensor.index(common)]
+    up = up_base[: up_base.index(common)]
+    if not all(tree[frame].is_constant() for frame in (*down, *up)):
+        return None
+    return np.linalg.inv(_product(tree, up)) @ _product(tree, down)
+
+
 def _static_extrinsic(
     tree: dict[str, _Track], base: str, sensor: str, topic: str, request: Request
 ) -> NDArray[np.float64] | None:
     """T_base_sensor by the static transforms; None where the frames are the same, or it is not known."""
     if base and base == sensor:
         return None
-    up_base, up_sensor = _ancestors(tree, base), _ancestors(tree, sensor)
-    common = next((frame for frame in up_sensor if frame in up_base), None)
-    if base and common is not None:
-        down = up_sensor[: up_sensor.index(common)]
-        up = up_base[: up_base.index(common)]
-        if all(tree[frame].is_constant() for frame in (*down, *up)):
-            request.notes.add(f"extrinsic: of the static transforms, {base} -> {sensor}")
-            return np.linalg.inv(_product(tree, up)) @ _product(tree, down)
+    if base and (extrinsic := _fixed(tree, base, sensor)) is not None:
+        request.notes.add(f"extrinsic: of the static transforms, {base} -> {sensor}")
+        return extrinsic
     request.notes.add(
         f"no extrinsic is known between the frame of {topic}, {base or '(unnamed)'}, and that of the scans, "
         f"{sensor or '(unnamed)'}: the poses are taken as those of the radar; give extrinsic if they are not"

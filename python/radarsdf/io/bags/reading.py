@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.bags.files import Message, Topic, bags_in, is_bag, messages_of, topics_of
+from radarsdf.io.bags.imu import imu_in_bags, imu_topic
 from radarsdf.io.bags.messages import CLOUD_TYPES, POINT_A_MESSAGE, CloudMessage, read_cloud
 from radarsdf.io.bags.poses import poses_in_bags
 from radarsdf.io.clouds.reading import Columns
+from radarsdf.io.imu import Imu
 from radarsdf.io.poses.reading import ScanPoses, poses_of
 from radarsdf.io.scans import Scans
 from radarsdf.io.sources import RawScan, Request, posed, scan_poses
@@ -69,7 +71,14 @@ def read_bags(
         matched, _ = scan_poses(poses, count, None, T_base_sensor, request)
     else:
         matched = ScanPoses(poses, np.eye(4) if T_base_sensor is None else T_base_sensor, request.max_gap_s)
-    return Scans.of_source(posed(raw_scans, matched, request), request.notes, truth or (lambda: None))
+    of_imu = imu_topic(topics, request)
+
+    def imu() -> Imu | None:
+        if of_imu is None:
+            return None
+        return imu_in_bags(paths, topics, of_imu, peeked[0].header.frame, by_record, request)
+
+    return Scans.of_source(posed(raw_scans, matched, request), request.notes, truth or (lambda: None), imu)
 
 
 def _is_bag_of_poses(poses: Any) -> bool:

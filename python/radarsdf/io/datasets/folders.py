@@ -20,6 +20,9 @@ from radarsdf.io.clouds.pcd import read_pcd
 from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, read_table, read_trajectory
 from radarsdf.io.scans import Scans
 
+BASE_T_RADAR = "base_T_radar.txt"
+"""A file beside scans: 4 x 4, the pose of the radar in the frame that has the poses."""
+
 INTENSITY_FIELDS = ("power", "Power", "intensity", "rcs")
 """Names of the intensity in PCD files, of which the first that is present counts. Hugin: power; Oculii: Power."""
 
@@ -76,7 +79,7 @@ def read_posed_folder(folder: Path, frames: int | None = None) -> Scans:
 
 def base_T_radar(folder: Path) -> NDArray[np.float64]:
     """T_base_radar (4, 4) of ``base_T_radar.txt`` in a folder; the identity if there is none."""
-    return read_transform(folder / "base_T_radar.txt", np.eye(4))
+    return read_transform(folder / BASE_T_RADAR, np.eye(4))
 
 
 def stamped_files(folder: Path) -> list[tuple[float, Path]]:

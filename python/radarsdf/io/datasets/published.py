@@ -21,7 +21,7 @@ from radarsdf.checks import check_poses
 from radarsdf.io.bags.files import bags_in
 from radarsdf.io.bags.reading import read_bags
 from radarsdf.io.clouds.reading import read_columns
-from radarsdf.io.datasets.folders import base_T_radar
+from radarsdf.io.datasets.folders import BASE_T_RADAR, base_T_radar
 from radarsdf.io.datasets.snail_radar import SnailRadar, is_snail_radar
 from radarsdf.io.poses.reading import ScanPoses, poses_of, read_calibration, trajectory_of
 from radarsdf.io.poses.trajectory import read_table
@@ -229,7 +229,7 @@ class VikingHill:
 
     def fits(self, folder: Path) -> bool:
         """Whether a folder has the shape of this data set."""
-        return (folder / "base_T_radar.txt").is_file() and bool(bags_in(folder))
+        return (folder / BASE_T_RADAR).is_file() and bool(bags_in(folder))
 
     def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""

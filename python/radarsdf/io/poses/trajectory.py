@@ -66,7 +66,8 @@ class Trajectory:
     def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
         """Pose T_world_base (4, 4) at one time, s. None where `poses` would raise. Fast for one time of many poses.
 
-        A millisecond before the first pose or after the last one is at that pose: times in files are rounded.
+        A millisecond before the first pose or after the last one, or beside one in a longer gap, is at that pose: times in
+        files are rounded.
         """
         nearest_s = min(max(time_s, self.times_s[0]), self.times_s[-1])
         time_s = nearest_s if abs(nearest_s - time_s) <= _ROUNDED_S else time_s
@@ -76,7 +77,10 @@ class Trajectory:
         before = after if self.times_s[after] == time_s else after - 1
         gap_s = self.times_s[after] - self.times_s[before]
         if gap_s > max_gap_s:
-            return None
+            nearest = before if time_s - self.times_s[before] < self.times_s[after] - time_s else after
+            if abs(self.times_s[nearest] - time_s) > _ROUNDED_S:
+                return None
+            before = after = nearest
         share = 0.0 if before == after else (time_s - self.times_s[before]) / gap_s
         pose = np.eye(4)
         pose[:3, :3] = _matrix(_slerp(self._quaternions[before], self._quaternions[after], share))

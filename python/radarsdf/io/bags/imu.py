@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Inertial measurements in bags, by the clock of the scans."""
+
+from __future__ import annotations
+
+from array import array
+from pathlib import Path
+
+import numpy as np
+
+from radarsdf.io.bags.files import Topic, messages_of
+from radarsdf.io.bags.messages import IMU, TRANSFORM_TYPES, Header, read_imu
+from radarsdf.io.bags.poses import static_between
+from radarsdf.io.imu import Imu
+from radarsdf.io.sources import Request
+
+__all__ = ["imu_in_bags", "imu_topic"]
+
+
+def imu_topic(topics: dict[str, Topic], request: Request) -> Topic | None:
+    """The topic of the IMU: the wanted one, or the only one. None: there is none, or nobody says which of several.
+
+    Raises
+    ------
+    ValueError
+        If the wanted one is no topic of an IMU.
+    """
+    fitting = {name: t for name, t in topics.items() if t.message_type == IMU and t.count}
+    listed = ", ".join(sorted(fitting))
+    if request.imu_topic is not None:
+        if request.imu_topic not in fitting:
+            msg = f"{request.notes.about} has no inertial measurements in {request.imu_topic}: topics that have some are {listed or 'none'}"
+            raise ValueError(msg)
+        return fitting[request.imu_topic]
+    if len(fitting) > 1:
+        request.notes.add(
+            f"there are several topics of IMUs, of which none is used: say by imu_topic which, of {listed}"
+        )
+    return next(iter(fitting.values())) if len(fitting) == 1 else None
+
+
+def imu_in_bags(
+    paths: list[Path],
+    topics: dict[str, Topic],
+    topic: Topic,
+    sensor_frame: str,
+    by_record: bool,
+    request: Request,
+) -> Imu | None:
+    """What the topic holds; None if it has no gyroscope.
+
+    `by_record`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
+    from stamp to record, because messages of an IMU are recorded several at a time.
+    """
+    stamps_s, recorded_s, rates, forces = (array("d") for _ in range(4))
+    first: Header | None = None
+    for message in messages_of(paths, {topic.name}):
+        try:
+            measured = read_imu(message.raw, message.cdr)
+        except ValueError as error:
+            msg = f"{message.bag}: a message of {topic.name} is not a whole {topic.message_type}: {error}"
+            raise ValueError(msg) from error
+        if measured.angular_velocity is None:
+            request.notes.add(f"{topic.name} has no angular velocity: it is not used")
+            return None
+        first = measured.header if first is None else first
+        stamps_s.append(measured.header.stamp_s)
+        recorded_s.append(message.recorded_s)
+        rates.extend(measured.angular_velocity)
+        forces.extend(measured.specific_force or (np.nan,) * 3)
+    stamps, recorded = np.array(stamps_s), np.array(recorded_s)
+    moving = len(np.unique(stamps)) > 1
+    if not moving and not by_record:
+        request.notes.add(
+            f"the stamps of {topic.name} are zero or stand still: the record time is used instead"
+        )
+    times_s = recorded if not moving else stamps
+    if moving and by_record:
+        times_s = stamps + np.median(recorded - stamps)
+    table = np.column_stack([np.array(rates).reshape(-1, 3), np.array(forces).reshape(-1, 3)])
+    order = np.argsort(times_s, kind="stable")
+    finite = order[np.isfinite(table[order, :3]).all(axis=1)]
+    if len(finite) == 0:
+        return None
+    table = table[finite]
+    has_force = np.isfinite(table).all() and table[:, 3:].any()
+    R_sensor_imu = request.R_sensor_imu
+    if R_sensor_imu is None and first is not None:
+        transforms = {name for name, t in topics.items() if t.message_type in TRANSFORM_TYPES and t.count}
+        T_imu_sensor = static_between(paths, transforms, first.frame, sensor_frame)
+        R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
+    return Imu(times_s[finite], table[:, :3], table[:, 3:] if has_force else None, R_sensor_imu)

@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a gyroscope or an IMU adds to a drive: its rotations, and which way is up."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from radarsdf.io.imu import Imu
+from radarsdf.poses.alignment import Alignment
+from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope
+from radarsdf.poses.rigid import Floats
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """What is used of it."""
+
+    gyroscope: Gyroscope | None
+    """None: there is none, or it is not used."""
+    alignment: Alignment | None = None
+    """How the IMU sits on the radar, by its accelerometer and Doppler. None: they do not tell."""
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, imu: Imu | None, velocities: Velocities | None, times_s: Floats, begin_s: float) -> Inertial:
+        """Of scans at `times_s` (F,) after `begin_s`, in the clock of the IMU."""
+        if imu is None:
+            return cls(None)
+        imu = dataclasses.replace(imu, times_s=imu.times_s - begin_s)
+        if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
+            note = "The IMU is not used: it measured before or after all scans. Are both times of one clock?"
+            return cls(None, notes=(note,))
+        alignment = None if velocities is None else Alignment.of(imu, velocities, times_s)
+        if alignment is not None:
+            measured = (alignment.angular_velocity, alignment.times_s)
+            return cls(Gyroscope.of(*measured, times_s, alignment.bias_rad_s), alignment)
+        R = imu.R_sensor_imu
+        rates = imu.angular_velocity if R is None else np.einsum("ij,gj->gi", R, imu.angular_velocity)
+        return cls((UnalignedGyroscope if R is None else Gyroscope).of(rates, imu.times_s, times_s))
+
+    def without(self, why: Exception) -> Inertial:
+        """Not used, and why."""
+        note = f"The IMU is not used: the drive does not tell how it sits on the radar ({why}). Give R_sensor_imu."
+        return Inertial(None, notes=(*self.notes, note))
+
+    @property
+    def report(self) -> dict[str, Any] | None:
+        """For the report of the poses. None: nothing was aligned."""
+        if self.alignment is None:
+            return None
+        names = ("R_sensor_imu", "sigma_rad", "late_s", "lever_m")
+        values = ((name, getattr(self.alignment, name)) for name in names)
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values}
+
+
+def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
+    """Poses (F, 4, 4) and covariances (F, 6, 6) in a world whose z axis points up, by `up` (F, 3) in the frame of the radar.
+
+    The first position stays at the origin; the world is turned no further than it takes.
+    """
+    now = np.einsum("fij,fj->i", poses[:, :3, :3], up)
+    turn, _ = Rotation.align_vectors([[0, 0, 1.0]], [now])
+    if now[2] < 0 and np.hypot(now[0], now[1]) < 1e-9 * -now[2]:
+        turn = Rotation.from_rotvec([np.pi, 0, 0])  # upside down: any axis would do
+    whole = np.eye(6)
+    whole[:3, :3] = whole[3:, 3:] = turn.as_matrix()
+    found = poses.copy()
+    found[:, :3] = np.einsum("ij,fjk->fik", whole[:3, :3], poses[:, :3])
+    return found, np.einsum("ij,fjk,lk->fil", whole, covariance, whole)

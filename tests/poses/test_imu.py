@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""How an IMU sits on a radar, which way is up, and what time is between their clocks: found from the drive."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf.io import UNPOSED
+from radarsdf.poses.alignment import Alignment
+from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope, UnknownAxesError
+from radarsdf.poses.inertia import cumulated
+from radarsdf.poses.inertial import levelled
+from radarsdf.poses.rigid import rotation
+from radarsdf.simulate import measured_imu
+from scipy.spatial.transform import Rotation
+
+from ..conftest import recorded_file
+
+R_SENSOR_IMU = Rotation.from_euler("ZYX", [130, -40, 75], degrees=True).as_matrix()
+LATE_S = 0.07
+LEVER_M = (0.2, -0.1, 0.3)
+
+
+@pytest.fixture(scope="module")
+def ride():
+    """A walk of 30 s that turns, tilts, and goes up and down."""
+    t = np.arange(300) * 0.1
+    xyz = np.column_stack([3 * np.sin(0.5 * t), 2 * np.cos(0.4 * t), 0.3 * np.sin(0.9 * t)])
+    turns = np.column_stack([1.5 * np.sin(0.5 * t), 0.3 * np.sin(1.1 * t), 0.3 * np.cos(1.3 * t)])
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", turns).as_matrix()
+    poses[:, :3, 3] = xyz
+    speeds = np.column_stack([1.5 * np.cos(0.5 * t), -0.8 * np.sin(0.4 * t), 0.27 * np.cos(0.9 * t)])
+    seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds)
+    seen += np.random.default_rng(1).normal(0, 1, seen.shape) * [0.02, 0.02, 0.04]
+    count = len(t)
+    velocities = Velocities(
+        seen, np.tile(np.diag([0.02, 0.02, 0.04]) ** 2, (count, 1, 1)), np.ones(3), [], np.ones(count, bool)
+    )
+    return t, poses, velocities
+
+
+@pytest.fixture(scope="module")
+def imu(ride):
+    times_s, poses, _ = ride
+    return measured_imu(poses, times_s, R_sensor_imu=R_SENSOR_IMU, lever_m=LEVER_M)
+
+
+def angle(one, other):
+    """Degrees between two rotations."""
+    return float(np.degrees(Rotation.from_matrix(one @ other.T).magnitude()))
+
+
+def tilt(poses, up):
+    """Degrees by which `up` is off, at worst."""
+    z = np.einsum("fij,fj->fi", poses[:, :3, :3], up)[:, 2]
+    return float(np.degrees(np.arccos(np.clip(z, -1, 1))).max())
+
+
+def test_velocities_tell_how_it_sits_there(ride, imu):
+    times_s, poses, velocities = ride
+    found = Alignment.of(imu, velocities, times_s + LATE_S)
+    assert angle(found.R_sensor_imu, R_SENSOR_IMU) < min(3, 3 * np.degrees(found.sigma_rad))
+    assert found.late_s == pytest.approx(LATE_S, abs=0.01)
+    np.testing.assert_allclose(found.lever_m, LEVER_M, atol=0.1)
+    assert tilt(poses, found.up) < 1.5
+    # Rates without bias lead to the last pose.
+    gyroscope = Gyroscope.of(found.angular_velocity, found.times_s, times_s + LATE_S)
+    end = poses[0, :3, :3] @ cumulated(gyroscope.turns)[-1]
+    assert angle(end, poses[-1, :3, :3]) < 3
+
+
+def test_axes_that_are_given_stay(ride, imu):
+    times_s, poses, velocities = ride
+    given = dataclasses.replace(imu, R_sensor_imu=R_SENSOR_IMU)
+    found = Alignment.of(given, velocities, times_s)
+    np.testing.assert_array_equal(found.R_sensor_imu, given.R_sensor_imu)
+    assert found.sigma_rad == 0
+    assert abs(found.late_s) < 0.01
+    assert tilt(poses, found.up) < 1.5
+
+
+def test_another_motion_tells_nothing(ride, imu):
+    times_s, _, velocities = ride
+    for other in (
+        dataclasses.replace(
+            imu, angular_velocity=imu.angular_velocity[::-1], specific_force=imu.specific_force[::-1]
+        ),
+        dataclasses.replace(imu, specific_force=imu.specific_force + np.sin(3 * imu.times_s)[:, None]),
+    ):
+        assert Alignment.of(other, velocities, times_s) is None
+
+
+def test_a_sensor_that_goes_straight_on_leaves_it_open():
+    times_s = np.arange(200) * 0.1
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[:, 0, 3] = times_s
+    rng = np.random.default_rng(2)
+    covariance = np.tile(0.02**2 * np.eye(3), (200, 1, 1))
+    velocities = Velocities(
+        [1, 0, 0] + rng.normal(0, 0.02, (200, 3)), covariance, np.ones(3), [], np.ones(200, bool)
+    )
+    assert Alignment.of(measured_imu(poses, times_s), velocities, times_s) is None
+
+
+def test_turns_tell_it_without_an_accelerometer(ride):
+    times_s, poses, _ = ride
+    steps = Rotation.from_matrix(poses[:-1, :3, :3]).inv() * Rotation.from_matrix(poses[1:, :3, :3])
+    rng = np.random.default_rng(3)
+    turns = steps.as_rotvec() + rng.normal(0, 0.005, (len(steps), 3))
+    covariance = np.tile(0.005**2 * np.eye(3), (len(steps), 1, 1))
+    bias = np.array([0.01, -0.02, 0.015])
+    rates = measured_imu(poses, times_s, R_sensor_imu=R_SENSOR_IMU, gyroscope_bias_rad_s=tuple(bias))
+    unaligned = UnalignedGyroscope.of(rates.angular_velocity, rates.times_s, times_s)
+    found = unaligned.learnt(turns, covariance)
+    off = np.degrees(np.linalg.norm(found.turns - found.bias.mean * 0.1 - steps.as_rotvec(), axis=1))
+    assert np.median(off) < 0.1
+    # Three deviations of the mean of 299 turns of 0.1 s, each known to 0.005 rad.
+    np.testing.assert_allclose(found.bias.mean, R_SENSOR_IMU @ bias, atol=3 * 0.05 / np.sqrt(299))
+    with pytest.raises(UnknownAxesError):
+        unaligned.learnt(turns[::-1], covariance)
+    with pytest.raises(UnknownAxesError):
+        unaligned.learnt(rng.normal(0, 0.005, turns.shape), covariance)
+
+
+def test_products_of_many_small_turns():
+    turns = np.random.default_rng(4).normal(0, 0.3, (101, 3))
+    found, at = cumulated(turns), np.eye(3)
+    assert len(found) == 102
+    for i, turn in enumerate(turns):
+        np.testing.assert_allclose(found[i], at, atol=1e-12)
+        at = at @ rotation(turn)
+    np.testing.assert_allclose(found[-1], at, atol=1e-12)
+
+
+@pytest.mark.parametrize("up", [(0.6, 0.0, 0.8), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
+def test_the_world_is_levelled(ride, up):
+    _, poses, _ = ride
+    up = np.array(up)
+    seen = np.einsum("fji,j->fi", poses[:, :3, :3], up)
+    covariance = np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (len(poses), 1, 1))
+    level, turned = levelled(poses, covariance, seen)
+    np.testing.assert_allclose(
+        np.einsum("fij,fj->fi", level[:, :3, :3], seen), [[0, 0, 1]] * len(poses), atol=1e-9
+    )
+    between = np.linalg.inv(level[0]) @ level[-1]
+    np.testing.assert_allclose(between, np.linalg.inv(poses[0]) @ poses[-1], atol=1e-9)
+    np.testing.assert_allclose(np.trace(turned[:, :3, :3], axis1=1, axis2=2), 6)
+
+
+def test_a_walk_ends_where_it_began():
+    pytest.importorskip("rosbags", reason="the extra ros is not installed")
+    scans = radarsdf.io.read(recorded_file("ti_iwr6843/ti_mmwave_rospkg_demo.bag"), UNPOSED)
+    scans = scans.select_range(slice(130, 360))  # before and after, it stands
+    found = radarsdf.odometry(scans)
+    way = found.poses[-1, :3, 3] - found.poses[0, :3, 3]
+    assert np.linalg.norm(way) < 0.01 * found.report["length_m"]
+    imu = found.report["imu"]
+    # The trigger of the radar says the same, which is not read: scans are recorded 0.115 s after they were taken.
+    assert imu["late_s"] == pytest.approx(0.115, abs=0.01)
