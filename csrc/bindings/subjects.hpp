@@ -25,6 +25,7 @@ void bind_soap(pybind11::module_& m);
 void bind_surfaces(pybind11::module_& m);
 void bind_cell_means(pybind11::module_& m);
 void bind_cell_sums(pybind11::module_& m);
+void bind_growing_sums(pybind11::module_& m);
 void bind_looks(pybind11::module_& m);
 void bind_poses(pybind11::module_& m);
 void bind_surface_crossings(pybind11::module_& m);

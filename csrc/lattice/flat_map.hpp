@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: MIT
 //
 // Flat open-addressing map from 64-bit keys to 32-bit values: power-of-two capacity, linear probing, at most half
-// full, no deletion. Exact: keys are compared whole, so two keys never share a value.
+// full. Exact: keys are compared whole, so two keys never share a value.
 #pragma once
 
 #include <algorithm>
@@ -47,6 +47,31 @@ class FlatMap {
   FlatMapView view() const { return {slots_.data(), slots_.size() - 1, shift_}; }
   std::int32_t find(std::uint64_t key) const { return view().find(key); }
   const LargeVector<Slot>& slots() const { return slots_; }
+
+  // Makes room for so many keys: to insert them then needs no memory.
+  void reserve(std::size_t size) {
+    while (2 * size > slots_.size()) grow();
+  }
+
+  // Keys that were moved on by the one that goes move back, so that no mark is left where it was. Returns false where
+  // it is not present.
+  bool erase(std::uint64_t key) {
+    const FlatMapView table = view();
+    std::uint64_t gap = table.home(key);
+    while (slots_[gap].key != key) {
+      if (slots_[gap].key == kEmptyKey) return false;
+      gap = (gap + 1) & table.mask;
+    }
+    for (std::uint64_t i = (gap + 1) & table.mask; slots_[i].key != kEmptyKey; i = (i + 1) & table.mask) {
+      const std::uint64_t from_home = (i - table.home(slots_[i].key)) & table.mask, from_gap = (i - gap) & table.mask;
+      if (from_home < from_gap) continue;
+      slots_[gap] = slots_[i];
+      gap = i;
+    }
+    slots_[gap] = Slot{};
+    --size_;
+    return true;
+  }
 
   // Keeps its memory.
   void clear() {

@@ -156,17 +156,9 @@ void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std
     for (std::int64_t i = 0; i < returns.count; ++i) {
       const std::int64_t cell = returns.cells[i];
       if ((cell >> 6) % threads != task) continue;
-      // Unsigned, which may wrap around.
-      std::uint64_t place[3], direction[3];
-      for (int axis = 0; axis < 3; ++axis) {
-        const std::int64_t at = std::llrint(quanta * returns.points[3 * i + axis]);
-        place[axis] = static_cast<std::uint64_t>(at - corners[3 * cell + axis]);
-        direction[axis] = static_cast<std::uint64_t>(std::llrint(kDirectionQuanta * returns.directions[3 * i + axis]));
-      }
-      const std::uint64_t x = place[0], y = place[1], z = place[2];
-      const auto range = static_cast<std::uint64_t>(std::llrint(quanta * returns.ranges_m[i]));
-      const std::uint64_t terms[kSums] = {
-          1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, direction[0], direction[1], direction[2], range};
+      std::uint64_t terms[kSums];
+      sum_terms(returns.points + 3 * i, returns.directions + 3 * i, returns.ranges_m[i], corners + 3 * cell, quanta,
+                terms);
       std::int64_t* own = sums + kSums * cell;
       for (int k = 0; k < kSums; ++k) own[k] = static_cast<std::int64_t>(static_cast<std::uint64_t>(own[k]) + terms[k]);
     }

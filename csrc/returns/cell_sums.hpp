@@ -4,6 +4,7 @@
 // Sums over the returns in a cell, and over the cells round it.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 
 #include "lattice/cell_blocks.hpp"
@@ -13,6 +14,21 @@ namespace radarsdf {
 // Of a return at (x, y, z): 1, x, y, z, xx, xy, xz, yy, yz, zz, its direction's three components, and its range.
 constexpr int kSums = 14;
 constexpr double kDirectionQuanta = 1 << 24;  // in 1
+
+// What a return adds to the sums of a cell with this corner, in quanta; quanta: in 1 m. Unsigned, which may wrap
+// around.
+inline void sum_terms(const float* point, const float* direction, float range_m, const std::int64_t* corner,
+                      double quanta, std::uint64_t* terms) {
+  std::uint64_t place[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    place[axis] = static_cast<std::uint64_t>(std::llrint(quanta * point[axis]) - corner[axis]);
+    terms[10 + axis] = static_cast<std::uint64_t>(std::llrint(kDirectionQuanta * direction[axis]));
+  }
+  const std::uint64_t x = place[0], y = place[1], z = place[2];
+  const std::uint64_t of_place[10] = {1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z};
+  for (int k = 0; k < 10; ++k) terms[k] = of_place[k];
+  terms[13] = static_cast<std::uint64_t>(std::llrint(quanta * range_m));
+}
 
 // Returns of scans, and the cell of each.
 struct ReturnsInCells {

@@ -10,15 +10,10 @@
 #include <vector>
 
 #include "lattice/cell_blocks.hpp"
-#include "lattice/cell_walk.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-// A ray is followed from its return towards the sensor, until others of its scan have passed so many cubes on end: they
-// go to the same sensor. On `hugin` this finds 99.0 % of the looks in half the time; 3 cubes find 98.1 %.
-constexpr int kPassedCubes = 4;
 
 // Calls count(begin, end, counts) for parts of the returns that hold whole scans, and adds the counts of `places` up.
 // Integers: the sums do not depend on the number of threads.
@@ -49,7 +44,8 @@ void check_scans(const std::int32_t* scans, std::int64_t count) {
   }
 }
 
-// Throws std::invalid_argument unless all rays lie within a million leaf cells of the origin, from the sensor on.
+}  // namespace
+
 void check_whole_rays(const float* points, const float* directions, const float* ranges_m, std::int64_t count,
                       double leaf_size_m) {
   const double limit_m = (kAxisBias - (1 << kMaxLevels)) * leaf_size_m;
@@ -61,12 +57,9 @@ void check_whole_rays(const float* points, const float* directions, const float*
   if (!inside) throw std::invalid_argument("rays must be finite and within a million cells of the origin");
 }
 
-}  // namespace
-
 void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double leaf_size_m, const float* points,
                  const float* directions, const float* ranges_m, const std::int32_t* scans, std::int64_t count,
                  std::uint32_t* looks, int num_threads) {
-  constexpr double kCube = 1 << kLookLevels;
   const auto cube_key = [](std::uint64_t leaf_key) { return leaf_key >> (3 * kLookLevels); };
   std::vector<std::uint64_t> keys;
   for (std::int64_t i = 0; i < num_leaves; ++i) {
@@ -81,17 +74,10 @@ void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double
     for (std::int64_t i = begin; i < end; ++i) {
       if (i % (1 << 12) == 0) check_interrupt();
       if (i > begin && scans[i] != scans[i - 1]) passed.clear();
-      const float backwards[3] = {-directions[3 * i], -directions[3 * i + 1], -directions[3 * i + 2]};
-      CellWalk cube(points + 3 * i, backwards, 0, ranges_m[i], kCube * leaf_size_m, kAxisBias >> kLookLevels);
-      for (int on_end = 0; cube.inside() && on_end < kPassedCubes; cube.next()) {
-        if (!passed.insert(cube.key(), 0)) {
-          ++on_end;
-          continue;
-        }
-        on_end = 0;
-        const std::int32_t row = rows.row(cube.key());
+      visit_looks(points + 3 * i, directions + 3 * i, ranges_m[i], leaf_size_m, passed, [&](std::uint64_t key) {
+        const std::int32_t row = rows.row(key);
         if (row >= 0) ++counts[static_cast<std::size_t>(row)];
-      }
+      });
     }
   };
   const auto counts = count_by_scans(scans, count, cubes.size(), num_threads, of_rays);

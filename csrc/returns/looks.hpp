@@ -6,11 +6,38 @@
 
 #include <cstdint>
 
+#include "lattice/cell_walk.hpp"
+#include "lattice/flat_map.hpp"
+
 namespace radarsdf {
 
 // The cubes of 2^kLookLevels leaf cells along each edge whose looks are counted. Larger than the distance between two
 // rays of a scan, so that a place between two rays counts as looked at.
 constexpr int kLookLevels = 3;
+
+// A ray is followed from its return towards the sensor, until others of its scan have passed so many cubes on end: they
+// go to the same sensor. On `hugin` this finds 99.0 % of the looks in half the time; 3 cubes find 98.1 %.
+constexpr int kPassedCubes = 4;
+
+// Calls visit(key) for each cube that a ray of a scan looks at and none before it did. passed: those cubes, so far.
+template <typename Visit>
+void visit_looks(const float* point, const float* direction, double range_m, double leaf_size_m, FlatMap& passed,
+                 const Visit& visit) {
+  const float backwards[3] = {-direction[0], -direction[1], -direction[2]};
+  CellWalk cube(point, backwards, 0, range_m, (1 << kLookLevels) * leaf_size_m, kAxisBias >> kLookLevels);
+  for (int on_end = 0; cube.inside() && on_end < kPassedCubes; cube.next()) {
+    if (!passed.insert(cube.key(), 0)) {
+      ++on_end;
+      continue;
+    }
+    on_end = 0;
+    visit(cube.key());
+  }
+}
+
+// Throws std::invalid_argument unless all rays lie within a million leaf cells of the origin, from the sensor on.
+void check_whole_rays(const float* points, const float* directions, const float* ranges_m, std::int64_t count,
+                      double leaf_size_m);
 
 // looks: (num_leaves), for each leaf cell the number of scans with a ray that goes through its cube or ends there. The
 // rays of a scan begin at one sensor: of those that come together on the way there, one is followed on.

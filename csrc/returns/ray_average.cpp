@@ -16,9 +16,11 @@ namespace {
 
 constexpr std::int64_t kRaysOfGroup = 1 << 13, kMaxGroups = 8;
 
+// In integers, whose sum does not depend on the order, and not on rays that are far away.
 struct Sum {
-  float weight = 0, distance_m = 0;
+  std::int64_t weight = 0, distance = 0;
 };
+constexpr float kQuanta = 1 << 23;  // in the truncated distance: as many as a float tells apart
 
 }  // namespace
 
@@ -27,11 +29,13 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   if (table.encoding() != Encoding::kOctree) throw std::invalid_argument("only an octree has vertices in space");
   check_rays(rays.points, rays.directions, rays.count, table.leaf_size_m(), truncation_m);
   const CellBlocks leaves(table.leaf_keys().data(), static_cast<std::int64_t>(table.leaf_keys().size()));
-  const auto size_m = static_cast<float>(table.leaf_size_m()), limit_m = static_cast<float>(truncation_m);
+  const auto size_m = static_cast<float>(table.leaf_size_m()), limit_m = static_cast<float>(truncation_m),
+             quanta = kQuanta / limit_m;  // in 1 m
 
   const auto add_ray = [&](std::int64_t i, std::vector<Sum>& sums) {
     NearbyRows leaf_rows(leaves);
-    const float *n = rays.normals + 3 * i, *p = rays.points + 3 * i, weight = rays.weights[i];
+    const float *n = rays.normals + 3 * i, *p = rays.points + 3 * i;
+    const auto weight = static_cast<std::int64_t>(rays.weights[i]);
     const float dx = size_m * n[0], dy = size_m * n[1], dz = size_m * n[2];
     CellWalk cell(p, rays.directions + 3 * i, -truncation_m, truncation_m, table.leaf_size_m());
     for (; cell.inside(); cell.next()) {
@@ -43,14 +47,15 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
         lower += n[axis] * (static_cast<float>(cell.coordinate(axis)) * size_m - p[axis]);
       for (int c = 0; c < 8; ++c) {
         const float distance_m = lower + (c & 1 ? dx : 0) + (c & 2 ? dy : 0) + (c & 4 ? dz : 0);
+        const float cut_m = std::min(std::max(distance_m, -limit_m), limit_m);
         Sum& sum = sums[static_cast<std::size_t>(rows[c])];
         sum.weight += weight;
-        sum.distance_m += weight * std::min(std::max(distance_m, -limit_m), limit_m);
+        sum.distance += weight * static_cast<std::int32_t>(quanta * cut_m);
       }
     }
   };
 
-  // Groups of rays have sums of their own, which are added up in the groups' order.
+  // Groups of rays have sums of their own.
   const auto num_rows = static_cast<std::size_t>(table.num_rows());
   const std::int64_t num_groups = std::clamp<std::int64_t>(rays.count / kRaysOfGroup, 1, kMaxGroups);
   std::vector<std::vector<Sum>> groups(static_cast<std::size_t>(num_groups));
@@ -64,9 +69,10 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
       Sum total;
       for (const std::vector<Sum>& sums : groups) {
         total.weight += sums[row].weight;
-        total.distance_m += sums[row].distance_m;
+        total.distance += sums[row].distance;
       }
-      distances_m[row] = total.weight > 0 ? total.distance_m / total.weight : 0;
+      const double weight = static_cast<double>(total.weight) * static_cast<double>(quanta);
+      distances_m[row] = total.weight > 0 ? static_cast<float>(static_cast<double>(total.distance) / weight) : 0;
     }
   });
 }

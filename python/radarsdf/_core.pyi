@@ -19,6 +19,7 @@ __all__: list[str] = [
     "Encoding",
     "FEATURE_DIM",
     "FieldLoss",
+    "GrowingSums",
     "LocalPlanes",
     "MAX_FREQUENCIES",
     "MAX_LEVELS",
@@ -28,6 +29,7 @@ __all__: list[str] = [
     "RAY_INTENSITY",
     "RAY_POINT",
     "RAY_RANGE",
+    "SumsChange",
     "SurfaceTracer",
     "SurfelMap",
     "VertexTable",
@@ -649,6 +651,79 @@ class CellBlocks:
         """
         For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that shares a face counts `weight` times, an edge its square, a corner its cube.
         """
+
+class SumsChange:
+    """
+    What changes in `GrowingSums` if scans come or go.
+    """
+    def __init__(
+        self,
+        leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
+        quantum_m: typing.SupportsFloat | typing.SupportsIndex,
+    ) -> None: ...
+    def collect(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        directions: numpy.typing.NDArray[numpy.float32],
+        ranges_m: numpy.typing.NDArray[numpy.float32],
+        sign: typing.SupportsInt | typing.SupportsIndex,
+    ) -> None:
+        """
+        One scan comes (1) or goes (-1): `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.
+        """
+
+class GrowingSums:
+    """
+    Sums over scans in cells, and looks at blocks of 8 x 8 x 8 cells, in a table that grows.
+    """
+    def __init__(self) -> None: ...
+    def apply(
+        self, change: SumsChange
+    ) -> tuple[numpy.typing.NDArray[numpy.uint64], numpy.typing.NDArray[numpy.uint64]]:
+        """
+        Makes a change, whole or not at all. Gives the keys of the blocks whose sums and whose looks are others: two uint64 arrays, ascending.
+        """
+    def block_keys(self) -> numpy.typing.NDArray[numpy.uint64]:
+        """
+        Keys of all blocks, uint64, ascending.
+        """
+    def erase(self, block_keys: numpy.typing.NDArray[numpy.uint64]) -> None:
+        """
+        Takes blocks away, with their sums and looks.
+        """
+    def insert(
+        self,
+        keys: numpy.typing.NDArray[numpy.uint64],
+        sums: numpy.typing.NDArray[numpy.int64],
+        scans: numpy.typing.NDArray[numpy.uint32],
+        look_keys: numpy.typing.NDArray[numpy.uint64],
+        looks: numpy.typing.NDArray[numpy.uint32],
+    ) -> None:
+        """
+        Puts in what `sums_of` and `looks_of` gave.
+        """
+    def looks_of(
+        self, block_keys: numpy.typing.NDArray[numpy.uint64]
+    ) -> tuple[numpy.typing.NDArray[numpy.uint64], numpy.typing.NDArray[numpy.uint32]]:
+        """
+        Of those of the blocks with these keys (B,), ascending, that are there: keys, and numbers of scans that looked, uint32.
+        """
+    def sums_of(
+        self, block_keys: numpy.typing.NDArray[numpy.uint64]
+    ) -> tuple[
+        numpy.typing.NDArray[numpy.uint64],
+        numpy.typing.NDArray[numpy.int64],
+        numpy.typing.NDArray[numpy.uint32],
+    ]:
+        """
+        Of the blocks with these keys (B,), ascending: Morton keys (C,) of the leaf cells with returns, their sums (C, 14) int64, and numbers of scans (C,) uint32.
+        """
+    @property
+    def num_blocks(self) -> int: ...
+    @property
+    def num_bytes(self) -> int: ...
+    @property
+    def num_cells(self) -> int: ...
 
 class LocalPlanes:
     """

@@ -11,13 +11,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf._core import CellSet, count_scans
+from radarsdf._core import CellSet, VertexTable, count_scans
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.groups import ReturnsConfig
 from radarsdf.field.field import Field
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.evidence import ReturnsOfCells
 from radarsdf.returns.mean_rays import MeanRays
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
@@ -82,12 +84,7 @@ class FromAverage(Start):
         average_rays(field, self._means, self._surface.surfels, self._config, self._num_threads)
 
     def returns_of_cells(self) -> ReturnsOfCells:
-        # The returns of a cell are at nearly the same range if they are of the same sensor position.
-        means = self._means
-        information = means.counts / self._surface.noise.variances_m2(means.ranges_m)
-        counts = means.counts.astype(np.float64)
-        found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans, counts)
-        return found.with_uncertain_poses(means.ranges_m, self._config.returns)
+        return told_by(self._means, self._surface.noise, self._config.returns)
 
     @property
     def _means(self) -> MeanRays:
@@ -121,13 +118,26 @@ def average_rays(field: Field, rays: MeanRays, surfels: Surfels, config: FitConf
     return. Its value there is the vertex's distance to a plane through its return: parallel to the surfel
     there, or, if there is none, perpendicular to the ray.
     """
+    normals = normals_at(rays, surfels, num_threads)
+    distances_m = average_at_vertices(field.cells.table, rays, normals, config, num_threads)
+    with torch.no_grad():
+        field.cells.features[:, 0] = torch.from_numpy(distances_m) / config.sigma_m
+    field.sdf_network.start_as_input(0)
+
+
+def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> NDArray[np.float32]:
+    """(M, 3) of the planes at the ends of rays: of the surfel there if it is flat, else towards the sensor."""
     plane = surfels.flat_planes_of_leaves(rays.keys, num_threads)
-    normals = np.where(
-        plane[:, None] >= 0,
-        surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0,
-        -rays.directions,
-    )
-    distances_m = field.cells.table.average_rays(
+    of_planes = surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0
+    normals: NDArray[np.float32] = np.where(plane[:, None] >= 0, of_planes, -rays.directions)
+    return normals
+
+
+def average_at_vertices(
+    table: VertexTable, rays: MeanRays, normals: NDArray[np.float32], config: FitConfig, num_threads: int
+) -> NDArray[np.float32]:
+    """(V,) the average of :func:`average_rays` at the vertices of an octree's `table`, m."""
+    distances_m: NDArray[np.float32] = table.average_rays(
         rays.points,
         rays.directions,
         np.ascontiguousarray(normals, np.float32),
@@ -135,6 +145,13 @@ def average_rays(field: Field, rays: MeanRays, surfels: Surfels, config: FitConf
         config.truncation_m,
         num_threads,
     )
-    with torch.no_grad():
-        field.cells.features[:, 0] = torch.from_numpy(distances_m) / config.sigma_m
-    field.sdf_network.start_as_input(0)
+    return distances_m
+
+
+def told_by(means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> ReturnsOfCells:
+    """What the returns of each leaf cell tell, by their mean rays."""
+    # The returns of a cell are at nearly the same range if they are of the same sensor position.
+    information = means.counts / noise.variances_m2(means.ranges_m)
+    counts = means.counts.astype(np.float64)
+    found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans, counts)
+    return found.with_uncertain_poses(means.ranges_m, config)

@@ -30,7 +30,7 @@ from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.evidence import Evidence, ReturnsOfCells
+from radarsdf.returns.evidence import Evidence, Looks, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.scan_sums import ScanSums
@@ -61,6 +61,8 @@ class FitInput:
     """The radar. None: as these rays and poses show it."""
     sums: ScanSums | None = None
     """Over the scans of the rays, if they were kept up scan by scan. None: made here, of all at once."""
+    looks: Looks | None = None
+    """Likewise."""
 
 
 def fit_rays(
@@ -193,7 +195,7 @@ def _learn_directly(
     leaf_keys = field.cells.table.leaf_keys()
     clock.lap("occupied_cells_s")
     _initialise(field, start, config)
-    evidence = Evidence.of(returns, rays, leaf_keys, config.leaf_size_m, num_threads)
+    evidence = Evidence.of(returns, rays, leaf_keys, config.leaf_size_m, num_threads, given.looks)
     clock.lap("start_s")
     schedule = Schedule.of(
         config,

@@ -19,24 +19,30 @@ from radarsdf.returns.sensor import Sensor
 
 
 @dataclass(frozen=True)
-class MapContents:
+class Scene:
+    """What evidence depends on besides the returns at a place."""
+
+    origin: NDArray[np.float64]
+    """(3,) origin of the local frame in world coordinates, m."""
+    config: FitConfig
+    """Settings of the fit."""
+    rough_share: float
+    """Share of the returns that lie on no thin surface, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class MapContents(Scene):
     """The parts of a map."""
 
     field: Field
     """The learnt field, in the local frame."""
-    origin: NDArray[np.float64]
-    """(3,) origin of the local frame in world coordinates, m."""
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
     reflectance: Reflectance | None
     """Intensities in closed form, or what the network leaves of them. None: the network alone answers, or there are
     no intensities."""
-    config: FitConfig
-    """Settings of the fit."""
     evidence: Evidence
     """What the returns tell of each leaf cell."""
-    rough_share: float
-    """Share of the returns that lie on no thin surface, in [0, 1]."""
     sensor: Sensor
     """The radar, as the scans of the fit show it."""
     report: dict[str, Any]

@@ -15,7 +15,7 @@ from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
-from radarsdf.map.contents import MapContents
+from radarsdf.map.contents import MapContents, Scene
 from radarsdf.map.isosurface import extract_cells, mesh_components
 from radarsdf.map.voxels import sample_lattice
 
@@ -58,14 +58,26 @@ class Surface:
             num_threads=torch.get_num_threads(),
         )
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
-        evidence = queries.evidence(contents, _local(contents, vertices + contents.origin))
+        evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
+        return cls.told_by(contents, vertices, faces, evidence, lattice.cells_searched)
+
+    @classmethod
+    def told_by(
+        cls,
+        scene: Scene,
+        vertices: NDArray[np.float64],
+        faces: NDArray[np.int32],
+        evidence: queries.EvidenceAt,
+        cells_searched: int,
+    ) -> Surface:
+        """Triangles with the evidence of their vertices; all as of the fields."""
         return cls(
             vertices,
             faces,
             evidence,
-            queries.confidence(contents, evidence).numpy(),
-            queries.uncertainty(contents, evidence).numpy(),
-            lattice.cells_searched,
+            queries.confidence(scene, evidence).numpy(),
+            queries.uncertainty(scene, evidence).numpy(),
+            cells_searched,
         )
 
     def kept(
@@ -86,6 +98,15 @@ class Surface:
             labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
             kept[rows] = sizes[labels] >= min_component_triangles
         return kept
+
+    def mesh(self, origin: NDArray[np.float64], kept: NDArray[np.bool_], leaf_cells: int) -> trimesh.Trimesh:
+        """The faces that are `kept` (F,), in the world; `leaf_cells` of the whole map."""
+        used, faces = renumbered(len(self.vertices), self.faces[kept])
+        mesh = trimesh.Trimesh(self.vertices[used] + origin, faces, process=False)
+        mesh.metadata |= {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
+        mesh.vertex_attributes["confidence"] = self.confidence[used]
+        mesh.vertex_attributes["uncertainty_m"] = self.uncertainty_m[used]
+        return mesh
 
 
 def extract_mesh(
@@ -110,25 +131,18 @@ def extract_mesh(
     sensor_position = None if viewpoint is None else check_viewpoint(contents.intensity_scale, viewpoint)
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)
-    faces = surface.faces[surface.kept(*limits, min_component_triangles)]
-    kept, faces = renumbered(len(surface.vertices), faces)
-    mesh = trimesh.Trimesh(surface.vertices[kept] + contents.origin, faces, process=False)
-    mesh.metadata |= {
-        "leaf_cells": len(contents.evidence.looks),
-        "leaf_cells_searched": surface.cells_searched,
-    }
-    mesh.vertex_attributes["confidence"] = surface.confidence[kept]
-    mesh.vertex_attributes["uncertainty_m"] = surface.uncertainty_m[kept]
+    kept = surface.kept(*limits, min_component_triangles)
+    mesh = surface.mesh(contents.origin, kept, len(contents.evidence.looks))
     if sensor_position is not None:
-        local, _ = queries.into_cells(contents, _local(contents, np.array(mesh.vertices, np.float64)))
-        sensors = _local(contents, np.array(sensor_position[None])).expand(len(local), 3)
+        points, _ = queries.into_cells(contents, local(contents, np.array(mesh.vertices, np.float64)))
+        sensors = local(contents, np.array(sensor_position[None])).expand(len(points), 3)
         assert contents.intensity_scale is not None
-        add_intensity(mesh, queries.intensity(contents, local, sensors).numpy(), contents.intensity_scale)
+        add_intensity(mesh, queries.intensity(contents, points, sensors).numpy(), contents.intensity_scale)
     return mesh
 
 
 def check_limits(
-    contents: MapContents, min_confidence: float, max_uncertainty: float | None, min_detection_rate: float
+    contents: Scene, min_confidence: float, max_uncertainty: float | None, min_detection_rate: float
 ) -> tuple[float, float, float]:
     """These arguments of :meth:`Map.mesh` as numbers. Raises a ValueError if they are out of range."""
     min_confidence = number(min_confidence, "min_confidence")
@@ -144,7 +158,8 @@ def check_limits(
     return min_confidence, max_uncertainty, not_negative(min_detection_rate, "min_detection_rate")
 
 
-def _local(contents: MapContents, world: NDArray[np.float64]) -> torch.Tensor:
+def local(contents: Scene, world: NDArray[np.float64]) -> torch.Tensor:
+    """Positions (N, 3) in the world, m, in the local frame, float32."""
     return queries.to_local(contents, torch.from_numpy(world))
 
 

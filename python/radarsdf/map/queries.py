@@ -12,14 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf._core import CellBlocks
-from radarsdf.map.contents import MapContents
+from radarsdf.map.contents import MapContents, Scene
 from radarsdf.progress import hides_bar
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
-from radarsdf.returns.evidence import CELLS_OF_SURFACE
+from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence
 from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
 # From this share of rough returns on, the errors are those of a rough scene. Measured: 0 to 0.07 on simulated scenes
@@ -50,7 +51,7 @@ _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor
 
 
 @torch.inference_mode(mode=False)  # gradients, of which normals are made, need ordinary tensors
-def to_local(contents: MapContents, world: Tensor) -> Tensor:
+def to_local(contents: Scene, world: Tensor) -> Tensor:
     """World positions (N, 3), m, in the local frame, float32. The origin is subtracted in float64."""
     return (world.double() - torch.from_numpy(contents.origin)).float()
 
@@ -153,25 +154,30 @@ class EvidenceAt(NamedTuple):
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
     """The evidence at each point."""
-    found, table = contents.evidence, contents.field.cells.table
+    table = contents.field.cells.table
+    return interpolated(contents.evidence, table.leaf_keys(), table.leaf_size_m, points)
+
+
+def interpolated(
+    found: Evidence, leaf_keys: NDArray[np.uint64], leaf_size_m: float, points: Tensor
+) -> EvidenceAt:
+    """The evidence of leaf cells with these keys (C,), ascending, at each point (N, 3), local frame, m."""
     of_cells = np.stack([found.information, found.detections, found.looks], 1, dtype=np.float32)
     # Points that are too far away for a key are moved to the limit, where there are no cells.
-    limit_m = MAX_CELLS_FROM_ORIGIN * table.leaf_size_m
+    limit_m = MAX_CELLS_FROM_ORIGIN * leaf_size_m
     near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
     # Trilinearly, because a vertex of a mesh may be on the face of two cells.
-    at_points = CellBlocks(table.leaf_keys()).interpolate(
-        table.leaf_size_m, of_cells, near.numpy(), resolve_num_threads(0)
-    )
+    at_points = CellBlocks(leaf_keys).interpolate(leaf_size_m, of_cells, near.numpy(), resolve_num_threads(0))
     return EvidenceAt(*torch.from_numpy(at_points).unbind(1))
 
 
-def uncertainty(contents: MapContents, evidence: EvidenceAt) -> Tensor:
+def uncertainty(contents: Scene, evidence: EvidenceAt) -> Tensor:
     """(N,) standard error of the surface's position, m. NaN where there are no returns."""
     variance_m2 = 1 / evidence.information + _floor_m(contents) ** 2
     return variance_m2.sqrt().masked_fill(evidence.information <= 0, torch.nan)
 
 
-def max_uncertainty_m(contents: MapContents) -> float:
+def max_uncertainty_m(contents: Scene) -> float:
     """The uncertainty up to which a surface is meshed by default, m. The rougher a scene, the more evidence it takes."""
     error_cells = _ROUGH_MAX_ERROR_CELLS / max(
         contents.rough_share, _ROUGH_MAX_ERROR_CELLS / _MAX_ERROR_CELLS
@@ -179,18 +185,18 @@ def max_uncertainty_m(contents: MapContents) -> float:
     return math.hypot(error_cells * contents.config.leaf_size_m, _floor_m(contents))
 
 
-def roughness(contents: MapContents) -> float:
+def roughness(contents: Scene) -> float:
     """From 0, where all returns lie on thin surfaces, to 1, of a scene as rough as real drives."""
     share: float = contents.rough_share / _ROUGH_SHARE
     return min(share, 1.0)
 
 
-def _floor_m(contents: MapContents) -> float:
+def _floor_m(contents: Scene) -> float:
     cells: float = _FLOOR_CELLS + _ROUGH_FLOOR_CELLS * roughness(contents) ** 1.5
     return cells * contents.config.leaf_size_m
 
 
-def confidence(contents: MapContents, evidence: EvidenceAt) -> Tensor:
+def confidence(contents: Scene, evidence: EvidenceAt) -> Tensor:
     """(N,) probability that a surface is within a leaf cell's edge. 0 where there are no returns."""
     start_vector_library()
     terms = confidence_terms(contents, evidence)
@@ -200,7 +206,7 @@ def confidence(contents: MapContents, evidence: EvidenceAt) -> Tensor:
     return probability.minimum(torch.erf(math.sqrt(0.5) / error_cells)).float()
 
 
-def confidence_terms(contents: MapContents, evidence: EvidenceAt) -> Tensor:
+def confidence_terms(contents: Scene, evidence: EvidenceAt) -> Tensor:
     """(N, 4) float64: 1, and the logarithms of what the confidence depends on. Infinite without returns."""
     error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
     rate = (evidence.detections + 0.5) / (evidence.looks + 2)  # finite and positive, whatever the counts

@@ -17,6 +17,9 @@ from radarsdf.returns.rays import Rays
 CELLS_OF_SURFACE = 9
 """A plane crosses about so many of a cell and the 26 cells round it."""
 
+BLOCK_BITS = np.uint64(9)
+"""Bits by which the key of a leaf cell is longer than that of the block whose looks are counted."""
+
 _CELLS_AT_ONCE = 1 << 21  # of which there are sums in float64
 
 
@@ -43,6 +46,7 @@ class Evidence:
         leaf_keys: NDArray[np.uint64],
         leaf_size_m: float,
         num_threads: int = 0,
+        looks: Looks | None = None,
     ) -> Evidence:
         """Evidence in the leaf cells with these Morton keys (C,), ascending.
 
@@ -58,17 +62,14 @@ class Evidence:
             Edge of a leaf cell, m.
         num_threads : int
             0: as many as OpenMP uses.
+        looks : Looks, optional
+            If they were counted scan by scan. Default: counted here, along all rays.
         """
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
-        columns = np.stack([returns.information[near], returns.scans[near]], 1).astype(np.float64)
-        cells = CellBlocks(returns.keys[near])
-        information = np.empty(len(leaf_keys), np.float32)
-        detections = np.empty(len(leaf_keys), np.uint32)
-        for first in range(0, len(leaf_keys), _CELLS_AT_ONCE):
-            part = slice(first, first + _CELLS_AT_ONCE)
-            sums = cells.sum_round(leaf_keys[part], columns, 1.0, num_threads)
-            information[part], detections[part] = sums.T
-        looks = count_looks(
+        information, detections = sums_round(returns.select(near), leaf_keys, num_threads)
+        if looks is not None:
+            return cls(information, detections, looks.at(leaf_keys))
+        counted = count_looks(
             leaf_keys,
             leaf_size_m,
             np.ascontiguousarray(rays.points),
@@ -77,7 +78,7 @@ class Evidence:
             rays.scans,
             num_threads,
         )
-        return cls(information, detections, looks)
+        return cls(information, detections, counted)
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,10 @@ class ReturnsOfCells:
     counts: NDArray[np.float64]
     """(M,) number of returns."""
 
+    def select(self, part: NDArray[np.bool_]) -> ReturnsOfCells:
+        """The cells of a mask (M,)."""
+        return ReturnsOfCells(self.keys[part], self.information[part], self.scans[part], self.counts[part])
+
     def with_uncertain_poses(self, ranges_m: NDArray[np.float32], config: ReturnsConfig) -> ReturnsOfCells:
         """The same with the errors of the poses in `config`. `ranges_m` (M,): of a return in each cell, m.
 
@@ -104,3 +109,36 @@ class ReturnsOfCells:
         pose_m2 = config.pose_sigma_m**2 + np.square(np.float32(config.pose_sigma_rad) * ranges_m)
         variances_m2 = 1 / self.information + CELLS_OF_SURFACE * pose_m2 / self.scans
         return dataclasses.replace(self, information=(1 / variances_m2).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Looks:
+    """How many scans looked at each block of 8 × 8 × 8 leaf cells."""
+
+    keys: NDArray[np.uint64]
+    """(B,) Morton keys of leaf cells without their last nine bits, ascending."""
+    scans: NDArray[np.uint32]
+    """(B,) number of scans with a ray through each block, or to there."""
+
+    def at(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint32]:
+        """(C,) of the blocks that leaf cells with these Morton keys (C,), ascending, are in."""
+        blocks = leaf_keys >> BLOCK_BITS
+        rows = np.minimum(np.searchsorted(self.keys, blocks), max(len(self.keys) - 1, 0))
+        if len(self.keys) == 0:
+            return np.zeros(len(leaf_keys), np.uint32)
+        return np.where(self.keys[rows] == blocks, self.scans[rows], np.uint32(0))
+
+
+def sums_round(
+    returns: ReturnsOfCells, leaf_keys: NDArray[np.uint64], num_threads: int = 0
+) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """`information` and `detections` of :class:`Evidence`, (C,), in the leaf cells with these keys (C,), ascending."""
+    columns = np.stack([returns.information, returns.scans], 1).astype(np.float64)
+    cells = CellBlocks(returns.keys)
+    information = np.empty(len(leaf_keys), np.float32)
+    detections = np.empty(len(leaf_keys), np.uint32)
+    for first in range(0, len(leaf_keys), _CELLS_AT_ONCE):
+        part = slice(first, first + _CELLS_AT_ONCE)
+        sums = cells.sum_round(leaf_keys[part], columns, 1.0, num_threads)
+        information[part], detections[part] = sums.T
+    return information, detections

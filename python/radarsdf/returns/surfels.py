@@ -19,7 +19,7 @@ LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m wit
 # Weight of a cell that shares a face. One that shares an edge has its square, a corner its cube.
 NEIGHBOUR_WEIGHT = 0.7
 MAX_FLATNESS = 0.5  # smallest variance over the middle one. A surfel with more is not flat.
-_MIN_RETURNS = 12.0  # weighted returns in the 27 cells of a surfel
+MIN_SUPPORT = 12.0  # weighted returns in the 27 cells of a surfel
 
 
 @dataclass(frozen=True)
@@ -56,31 +56,23 @@ class Surfels:
         """Surfels of the returns of scans that are known by their `sums`."""
         cell_size_m = LEAVES_PER_SURFEL * sums.leaf_size_m
         keys, of_cells = sums.merged_moments()
-        blocks, counts = CellBlocks(keys), of_cells[:, 0].copy()
-        support = blocks.sum_round(keys, counts[:, None], NEIGHBOUR_WEIGHT, num_threads)[:, 0]
+        blocks = CellBlocks(keys)
+        support = support_round(blocks, keys, of_cells, num_threads)
         # Most cells have few returns. Surfels for all of them would take most of the time and the memory.
-        cell_of_plane = np.flatnonzero(support >= _MIN_RETURNS)
-        moments = blocks.sum_round(keys[cell_of_plane], of_cells, NEIGHBOUR_WEIGHT, num_threads)
-        means = moments[:, 1:10] / moments[:, :1]
-        centres = means[:, :3].copy()
-        covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
-        for mean, (i, j) in zip(means[:, 3:].T, UPPER, strict=True):
-            covariance[:, i, j] = covariance[:, j, i] = mean - centres[:, i] * centres[:, j]
-        variances, axes = principal_axes(covariance, num_threads)
-        normals = axes[:, :, 0]
-        normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
+        cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
+        centres, normals, variances = planes_round(
+            blocks, keys[cell_of_plane], of_cells, cell_size_m, num_threads
+        )
         return cls(
             cell_size_m=cell_size_m,
             keys=keys,
             blocks=blocks,
-            counts=counts,
+            counts=of_cells[:, 0].copy(),
             support=support,
             cell_of_plane=cell_of_plane,
             centres=centres,
             normals=normals,
-            variances=np.maximum(
-                variances, (0.0025 * cell_size_m) ** 2
-            ),  # the resolution of float32 coordinates
+            variances=variances,
         )
 
     def is_flat(self, max_flatness: float = MAX_FLATNESS) -> NDArray[np.bool_]:
@@ -124,3 +116,36 @@ class Surfels:
     def _flat_planes(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
         planes = self.plane_of_cell(np.flatnonzero(self.is_flat()))
         return np.append(planes, np.int32(-1))[cells]  # the row -1, of no cell, is that of the last number
+
+
+def support_round(
+    blocks: CellBlocks, keys: NDArray[np.uint64], of_cells: NDArray[np.float64], num_threads: int = 0
+) -> NDArray[np.float64]:
+    """(K,) weighted number of returns in and round each of the cells with these `keys` (K,).
+
+    `of_cells`: as of :meth:`ScanSums.merged_moments`, of the cells of `blocks`.
+    """
+    counts = np.ascontiguousarray(of_cells[:, :1])
+    support: NDArray[np.float64] = blocks.sum_round(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
+    return support
+
+
+def planes_round(
+    blocks: CellBlocks,
+    keys: NDArray[np.uint64],
+    of_cells: NDArray[np.float64],
+    cell_size_m: float,
+    num_threads: int = 0,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Centres, normals and variances (K, 3) of the surfels of the cells with these `keys` (K,); see :func:`support_round`."""
+    moments = blocks.sum_round(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
+    means = moments[:, 1:10] / moments[:, :1]
+    centres = means[:, :3].copy()
+    covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
+    for mean, (i, j) in zip(means[:, 3:].T, UPPER, strict=True):
+        covariance[:, i, j] = covariance[:, j, i] = mean - centres[:, i] * centres[:, j]
+    variances, axes = principal_axes(covariance, num_threads)
+    normals = axes[:, :, 0]
+    normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
+    # The least is the resolution of float32 coordinates.
+    return centres, normals, np.maximum(variances, (0.0025 * cell_size_m) ** 2)

@@ -1,0 +1,115 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+#include <memory>
+#include <utility>
+
+#include "bindings/arrays.hpp"
+#include "bindings/subjects.hpp"
+#include "returns/growing_sums.hpp"
+
+namespace radarsdf {
+namespace {
+
+RaysOfScan check_scan(const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m) {
+  const std::int64_t count = check_points(points);
+  check_shape(directions, count, 3, "directions");
+  if (check_column(ranges_m, "ranges_m") != count) throw std::invalid_argument("ranges_m must be one for each point");
+  return {points.data(), directions.data(), ranges_m.data(), count};
+}
+
+py::array_t<std::int64_t> matrix(std::vector<std::int64_t> values) {
+  const auto rows = static_cast<py::ssize_t>(values.size()) / kSums;
+  return to_array(std::move(values)).reshape({rows, py::ssize_t{kSums}});
+}
+
+}  // namespace
+
+void bind_growing_sums(py::module_& m) {
+  using namespace py::literals;
+  py::class_<SumsChange>(m, "SumsChange", "What changes in `GrowingSums` if scans come or go.")
+      .def(py::init<double, double>(), "leaf_size_m"_a, "quantum_m"_a)
+      .def(
+          "collect",
+          [](SumsChange& change, const Array<float>& points, const Array<float>& directions,
+             const Array<float>& ranges_m, int sign) {
+            const RaysOfScan rays = check_scan(points, directions, ranges_m);
+            if (sign != 1 && sign != -1) throw std::invalid_argument("sign must be 1 or -1");
+            const py::gil_scoped_release release;
+            change.collect(rays, sign);
+          },
+          "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "sign"_a,
+          "One scan comes (1) or goes (-1): `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.");
+  py::class_<GrowingSums>(m, "GrowingSums",
+                          "Sums over scans in cells, and looks at blocks of 8 x 8 x 8 cells, in a table that grows.")
+      .def(py::init<>())
+      .def_property_readonly("num_cells", &GrowingSums::num_cells)
+      .def_property_readonly("num_blocks", &GrowingSums::num_blocks)
+      .def_property_readonly("num_bytes", &GrowingSums::num_bytes)
+      .def(
+          "apply",
+          [](GrowingSums& sums, const SumsChange& change) {
+            ChangedBlocks changed;
+            {
+              const py::gil_scoped_release release;
+              changed = sums.apply(change);
+            }
+            return py::make_tuple(to_array(std::move(changed.returns)), to_array(std::move(changed.looks)));
+          },
+          "change"_a,
+          "Makes a change, whole or not at all. Gives the keys of the blocks whose sums and whose looks are others: "
+          "two "
+          "uint64 arrays, ascending.")
+      .def(
+          "block_keys", [](const GrowingSums& sums) { return to_array(sums.block_keys()); },
+          "Keys of all blocks, uint64, ascending.")
+      .def(
+          "sums_of",
+          [](const GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
+            const std::int64_t count = check_column(block_keys, "block_keys");
+            const std::uint64_t* keys = block_keys.data();
+            SumsOfCells found;
+            {
+              const py::gil_scoped_release release;
+              found = sums.sums_of(keys, count);
+            }
+            return py::make_tuple(to_array(std::move(found.keys)), matrix(std::move(found.sums)),
+                                  to_array(std::move(found.scans)));
+          },
+          "block_keys"_a.noconvert(),
+          "Of the blocks with these keys (B,), ascending: Morton keys (C,) of the leaf cells with returns, their sums "
+          "(C, 14) int64, and numbers of scans (C,) uint32.")
+      .def(
+          "looks_of",
+          [](const GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
+            LooksOfBlocks found = sums.looks_of(block_keys.data(), check_column(block_keys, "block_keys"));
+            return py::make_tuple(to_array(std::move(found.keys)), to_array(std::move(found.looks)));
+          },
+          "block_keys"_a.noconvert(),
+          "Of those of the blocks with these keys (B,), ascending, that are there: keys, and numbers of scans that "
+          "looked, uint32.")
+      .def(
+          "insert",
+          [](GrowingSums& sums, const Array<std::uint64_t>& keys, const Array<std::int64_t>& of_cells,
+             const Array<std::uint32_t>& scans, const Array<std::uint64_t>& look_keys,
+             const Array<std::uint32_t>& looks) {
+            const std::int64_t cells = check_column(keys, "keys"), blocks = check_column(look_keys, "look_keys");
+            check_shape(of_cells, cells, kSums, "sums");
+            if (check_column(scans, "scans") != cells || check_column(looks, "looks") != blocks) {
+              throw std::invalid_argument("scans must be one for each cell, looks one for each block");
+            }
+            sums.insert({{keys.data(), keys.data() + cells},
+                         {of_cells.data(), of_cells.data() + kSums * cells},
+                         {scans.data(), scans.data() + cells}},
+                        {{look_keys.data(), look_keys.data() + blocks}, {looks.data(), looks.data() + blocks}});
+          },
+          "keys"_a.noconvert(), "sums"_a.noconvert(), "scans"_a.noconvert(), "look_keys"_a.noconvert(),
+          "looks"_a.noconvert(), "Puts in what `sums_of` and `looks_of` gave.")
+      .def(
+          "erase",
+          [](GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
+            sums.erase(block_keys.data(), check_column(block_keys, "block_keys"));
+          },
+          "block_keys"_a.noconvert(), "Takes blocks away, with their sums and looks.");
+}
+
+}  // namespace radarsdf

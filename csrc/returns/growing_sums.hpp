@@ -1,0 +1,117 @@
+// SPDX-FileCopyrightText: 2026 the radarsdf authors
+// SPDX-License-Identifier: MIT
+//
+// Sums over scans in a table that grows in place: a scan is added, or taken out again, in time that depends on its
+// returns alone. All numbers are integers, so that a scan that was taken out leaves nothing, whatever the order.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <vector>
+
+#include "lattice/flat_map.hpp"
+#include "returns/cell_sums.hpp"
+#include "returns/looks.hpp"
+
+namespace radarsdf {
+
+// The rays of one scan.
+struct RaysOfScan {
+  const float* points;      // (count, 3), local frame, m
+  const float* directions;  // (count, 3), unit vectors
+  const float* ranges_m;    // (count,)
+  std::int64_t count;
+};
+
+// A block has 8 x 8 x 8 leaf cells: the cube in which looks are counted.
+constexpr int kCellsOfBlock = 1 << (3 * kLookLevels);
+
+// The contents of blocks, in Morton order.
+struct SumsOfCells {
+  std::vector<std::uint64_t> keys;   // of leaf cells with returns
+  std::vector<std::int64_t> sums;    // (keys.size(), kSums), as of sum_returns
+  std::vector<std::uint32_t> scans;  // that have returns in each
+};
+struct LooksOfBlocks {
+  std::vector<std::uint64_t> keys;   // of blocks
+  std::vector<std::uint32_t> looks;  // numbers of scans with a ray through each, or to there
+};
+
+// What changes if scans come or go.
+class SumsChange {
+ public:
+  SumsChange(double leaf_size_m, double quantum_m) : leaf_size_m_(leaf_size_m), quantum_m_(quantum_m) {}
+
+  // sign: 1 adds the scan, -1 takes it out. Throws std::invalid_argument for rays without keys.
+  void collect(const RaysOfScan& rays, std::int64_t sign);
+
+ private:
+  friend class GrowingSums;
+  struct Cell {
+    std::uint64_t key;
+    std::int64_t sums[kSums], scans, last;  // last: the scan of this change that was counted
+  };
+  struct Look {
+    std::uint64_t key;
+    std::int64_t looks;
+  };
+
+  double leaf_size_m_, quantum_m_;
+  std::int64_t collected_ = 0;
+  FlatMap number_of_cell_, number_of_look_;
+  std::vector<Cell> cells_;
+  std::vector<Look> looks_;
+};
+
+// Which blocks a change concerns, ascending.
+struct ChangedBlocks {
+  std::vector<std::uint64_t> returns, looks;
+};
+
+class GrowingSums {
+ public:
+  // Throws std::invalid_argument, and changes nothing, if a scan that was never added would be taken out.
+  ChangedBlocks apply(const SumsChange& change);
+
+  std::int64_t num_cells() const { return static_cast<std::int64_t>(number_of_cell_.size()); }
+  std::int64_t num_blocks() const { return static_cast<std::int64_t>(number_of_block_.size()); }
+  std::int64_t num_bytes() const;
+
+  std::vector<std::uint64_t> block_keys() const;  // ascending
+
+  // Of the blocks with these keys, ascending. Those that are not there have nothing.
+  SumsOfCells sums_of(const std::uint64_t* block_keys, std::int64_t count) const;
+  LooksOfBlocks looks_of(const std::uint64_t* block_keys, std::int64_t count) const;
+
+  // Puts contents in that are not there yet, and takes blocks away with their contents. Throws std::invalid_argument,
+  // and changes nothing, if a cell or a block is there already.
+  void insert(const SumsOfCells& cells, const LooksOfBlocks& looks);
+  void erase(const std::uint64_t* block_keys, std::int64_t count);
+
+ private:
+  struct Cell {
+    std::int64_t sums[kSums];
+    std::uint32_t scans;
+  };
+  struct Block {
+    std::array<std::uint64_t, kCellsOfBlock / 64> mask{};  // which of its cells have returns, in Morton order
+    std::uint32_t looks = 0;
+
+    bool is_empty() const;
+  };
+
+  template <typename Visit>
+  void for_each_cell(std::uint64_t block_key, const Block& block, const Visit& visit) const;
+
+  Block& block_at(std::uint64_t key);  // made if it is not there
+  void drop_cell(std::uint64_t key, Block& block);
+  void drop_if_empty(std::uint64_t block_key);
+  void reserve(std::int64_t cells, std::int64_t blocks);
+
+  FlatMap number_of_cell_, number_of_block_;
+  std::vector<Cell> cells_;
+  std::vector<Block> blocks_;
+  std::vector<std::int32_t> free_cells_, free_blocks_;
+};
+
+}  // namespace radarsdf
