@@ -37,6 +37,7 @@ ROOMS = (
     ("checking",),
     ("map",),
     ("fitting",),
+    ("live",),
     ("tiles",),
     ("render",),
     ("view",),

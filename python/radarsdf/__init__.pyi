@@ -13,6 +13,7 @@ from .config.fit_config import FitConfig as FitConfig
 from .fitting.fit import fit as fit
 from .fitting.stopping import Diverged as Diverged
 from .fitting.stopping import Interrupted as Interrupted
+from .live.live_map import LiveMap as LiveMap
 from .map.isosurface import marching_cubes as marching_cubes
 from .map.map import Map as Map
 from .map.radar_map import RadarMap as RadarMap

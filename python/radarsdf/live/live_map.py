@@ -1,0 +1,374 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The map that a robot grows while it drives."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf._core import GrowingSums, SumsChange
+from radarsdf.checks import check_poses, instance, path_of, positions, real_array, whole_number
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.live.learning import finished, known_now, noise_of, quick_of
+from radarsdf.live.scan_log import LoggedScan, ScanId, ScanLog
+from radarsdf.live.scans import checked_scan, rays_of
+from radarsdf.live.surface import Changes, GrowingSurface
+from radarsdf.map import queries
+from radarsdf.returns.evidence import Looks
+from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.scan_sums import QUANTA, ScanSums
+from radarsdf.threads import resolve_num_threads
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from radarsdf.map.radar_map import RadarMap
+
+Keys = NDArray[np.uint64]
+_NONE = np.zeros(0, np.uint64)
+_UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
+
+
+@dataclass(frozen=True)
+class Integrated:
+    """What became of a scan."""
+
+    scan_id: ScanId
+    """That it can be moved and taken out by."""
+    pose: NDArray[np.float64]
+    """(4, 4) T_world_sensor, m: where it was put."""
+    blocks: NDArray[np.uint64]
+    """(B,) keys of the blocks of 8 × 8 × 8 leaf cells whose returns changed, ascending."""
+    movers: int
+    """Number of its returns that were left out, because they move."""
+
+
+class LiveMap:
+    """A map that grows scan by scan. Scans can be moved, and taken out again, without a trace.
+
+    What a scan adds are integers that depend on the scan, its pose and the settings alone. So a map that a scan was taken
+    out of has the bits of one that never saw it, in any order. All methods may be called from any thread; those that
+    change the map wait for each other, and readers see it before a change or after it.
+
+    Parameters
+    ----------
+    config : FitConfig, optional
+        Settings. :meth:`mesh` and :meth:`map` are those of :meth:`FitConfig.quick` with the same cells and returns;
+        :meth:`finish` fits with all of them.
+    origin : (3,) array_like, optional
+        Origin of the local frame, world, m. By default the first sensor position, moved to the next corner of a block of
+        ``config.lattice``.
+    max_bytes : int, optional
+        Memory that the map may take, bytes. Beyond it, the oldest scans are let go: they stay in the map, but can no
+        longer be moved or taken out. None: all are kept.
+    folder : path-like, optional
+        An empty or new folder, to which scans are written instead of being let go.
+
+    Raises
+    ------
+    ValueError
+        If a setting is out of range, or several scans are to be accumulated.
+
+    Examples
+    --------
+    >>> import radarsdf
+    >>> scans = radarsdf.simulate.wall(frames=8)
+    >>> live = radarsdf.LiveMap()
+    >>> for points, pose in zip(scans.points, scans.poses):
+    ...     done = live.integrate(points, pose)
+    >>> mesh = live.mesh()
+    >>> blocks = live.remove(done.scan_id)
+    >>> len(live), len(live.mesh().faces) < len(mesh.faces)
+    (7, True)
+    """
+
+    def __init__(
+        self,
+        config: FitConfig | None = None,
+        *,
+        origin: ArrayLike | None = None,
+        max_bytes: int | None = None,
+        folder: str | PathLike[str] | None = None,
+    ) -> None:
+        self._config = FitConfig() if config is None else instance(config, FitConfig, "config")
+        if self._config.returns.accumulate_scans != 1:
+            msg = "returns.accumulate_scans must be 1: a live map gets scans one after another"
+            raise ValueError(msg)
+        self._quick = quick_of(self._config)
+        self._origin = None if origin is None else positions([np.asarray(origin)], "origin")[0]
+        self._max_bytes = None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1)
+        place = None if folder is None else path_of(folder, "folder")
+        if place is not None:
+            place.mkdir(exist_ok=True)
+        self._log = ScanLog(place)
+        self._sums = GrowingSums()
+        self._noise = _UNKNOWN
+        self._noise_of = 0  # number of scans that it was estimated from
+        self._returns_dirty: list[Keys] = []
+        self._looks_dirty: list[Keys] = []
+        self._surface: GrowingSurface | None = None
+        self._with_intensities: bool | None = None
+        self._next_id = 0
+        self._lock = threading.RLock()  # of the state
+        self._reading = threading.Lock()  # of the surface, taken first
+
+    def __len__(self) -> int:
+        return len(self._log)
+
+    def __repr__(self) -> str:
+        return f"LiveMap({len(self)} scans, {self._sums.num_cells} cells, {self.num_bytes / 1e6:.1f} MB)"
+
+    @property
+    def config(self) -> FitConfig:
+        """Settings."""
+        return self._config
+
+    @property
+    def origin(self) -> NDArray[np.float64] | None:
+        """(3,) origin of the local frame, world, m. None: there was no scan yet."""
+        return self._origin
+
+    @property
+    def scan_ids(self) -> list[ScanId]:
+        """Of the scans that can be moved or taken out, in the order in which they came."""
+        with self._lock:
+            return self._log.ids
+
+    @property
+    def sealed_scans(self) -> int:
+        """Number of scans that can no longer be moved or taken out."""
+        return self._log.sealed
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that the map takes, bytes."""
+        surface = 0 if self._surface is None else self._surface.num_bytes
+        return self._sums.num_bytes + self._log.num_bytes + surface
+
+    def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
+        """(4, 4) T_world_sensor of a scan, m. Raises a KeyError if it cannot be taken out."""
+        with self._lock:
+            return self._log.pose(scan_id).copy()
+
+    def integrate(
+        self,
+        points: ArrayLike,
+        pose: ArrayLike,
+        intensities: ArrayLike | None = None,
+        *,
+        doppler_mps: ArrayLike | None = None,
+        scan_id: ScanId | None = None,
+    ) -> Integrated:
+        """Adds a scan.
+
+        Parameters
+        ----------
+        points : (N, 3) array_like
+            Returns, sensor frame, m.
+        pose : (4, 4) array_like
+            T_world_sensor, m.
+        intensities : (N,) array_like, optional
+            Sensor units. All scans have them, or none has.
+        doppler_mps : (N,) array_like, optional
+            Speed along the ray, m/s; NaN where it was not measured. Returns that move are left out.
+        scan_id : hashable, optional
+            By which the scan is known. By default a number that counts on.
+
+        Raises
+        ------
+        ValueError
+            If something is invalid, or the map has a scan of this id. The map is then as before.
+        """
+        scan = checked_scan(points, pose, intensities, doppler_mps, self._config.returns)
+        with self._lock:
+            if scan_id is None:
+                scan_id = self._next_id
+            if scan_id in self._log:
+                msg = f"the map has a scan {scan_id!r} already: remove or move it"
+                raise ValueError(msg)
+            with_intensities = scan.intensities is not None
+            if with_intensities != (
+                with_intensities if self._with_intensities is None else self._with_intensities
+            ):
+                msg = "either all scans have intensities, or none has"
+                raise ValueError(msg)
+            origin = self._origin
+            if origin is None:
+                lattice = self._config.lattice
+                origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
+            change = self._change()
+            self._collect(change, scan, 1, origin)
+            blocks = self._apply(change)
+            self._origin, self._with_intensities = origin, with_intensities
+            self._log.put(scan_id, scan)
+            if isinstance(scan_id, int):
+                self._next_id = max(self._next_id, scan_id + 1)
+            self._bound()
+        movers = 0 if scan.standing is None else int((~scan.standing).sum())
+        return Integrated(scan_id, scan.pose.copy(), blocks, movers)
+
+    def remove(self, scan_id: ScanId) -> Keys:
+        """Takes a scan out. The map then has the bits of one that never saw it.
+
+        Returns
+        -------
+        (B,) ndarray
+            Keys of the blocks whose returns changed, uint64.
+
+        Raises
+        ------
+        KeyError
+            If there is no scan of this id.
+        ValueError
+            If it was let go to bound the memory.
+        """
+        with self._lock:
+            change = self._change()
+            self._collect(change, self._log.get(scan_id), -1)
+            blocks = self._apply(change)
+            self._log.drop(scan_id)
+            return blocks
+
+    def move(self, scan_id: ScanId, pose: ArrayLike) -> Keys:
+        """Moves a scan to another `pose` (4, 4). Returns and raises as :meth:`remove`."""
+        return self.move_all({scan_id: pose})
+
+    def move_all(self, poses: Mapping[ScanId, ArrayLike]) -> Keys:
+        """Moves scans to other poses, (4, 4) each: after a closed loop. All of them, or none if one cannot be moved.
+
+        Readers see the map before, or with all scans moved. Returns and raises as :meth:`remove`.
+        """
+        ids = list(poses)
+        given = [real_array(pose, "pose") for pose in poses.values()]
+        checked = check_poses(given, len(given)) if given else np.zeros((0, 4, 4))
+        with self._lock:
+            change, moved = self._change(), []
+            for scan_id, pose in zip(ids, checked, strict=True):
+                scan = self._log.get(scan_id)
+                if (pose == scan.pose).all():
+                    continue
+                moved.append((scan_id, scan.at(pose)))
+                self._collect(change, scan, -1)
+                self._collect(change, moved[-1][1], 1)
+            blocks = self._apply(change)
+            for scan_id, scan in moved:
+                self._log.put(scan_id, scan)
+            self._bound()
+            return blocks
+
+    def mesh(
+        self,
+        *,
+        min_confidence: float = 0.0,
+        max_uncertainty: float | None = None,
+        min_detection_rate: float = queries.MIN_DETECTION_RATE,
+        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
+    ) -> trimesh.Trimesh:
+        """The surface as triangles, in voxels of the size of leaf cells. Only what changed is made anew.
+
+        The arguments and the result are those of :meth:`Map.mesh`. The mesh is empty if there is no surface.
+        """
+        from radarsdf.map.meshing import check_limits  # noqa: PLC0415 - trimesh is slow to import
+
+        with self._reading:
+            num_threads = resolve_num_threads(self._config.num_threads)
+            surface, changes, noise = self._begin_reading()
+            surface.update(changes, noise, num_threads)
+            found = surface.triangles(num_threads)
+        limits = check_limits(found.scene, min_confidence, max_uncertainty, min_detection_rate)
+        whole_number(min_component_triangles, "min_component_triangles", 0)
+        kept = found.surface.kept(*limits, min_component_triangles)
+        return found.surface.mesh(found.scene.origin, kept, found.leaf_cells)
+
+    def map(self) -> RadarMap:
+        """What is known now, as a map that does not grow: the quick fit of all scans. Intensities are in closed form.
+
+        Raises
+        ------
+        ValueError
+            If there is no scan that could be taken out.
+        """
+        with self._lock:
+            scans, sums = list(self._log.scans()), self._all_sums()
+            looks = Looks(*self._sums.looks_of(self._sums.block_keys()))
+        return known_now(scans, sums, looks, self._quick, self._origin)
+
+    def finish(self, *, progress: bool | None = None) -> RadarMap:
+        """The fit of all scans with all settings, as :func:`radarsdf.fit` makes it with this `origin`.
+
+        Raises
+        ------
+        ValueError
+            If scans were let go, or there are none.
+        """
+        with self._lock:
+            if self._log.sealed:
+                msg = f"{self._log.sealed} scans were let go to bound the memory, so that they cannot be fitted: give the map a folder to keep scans in"
+                raise ValueError(msg)
+            scans = list(self._log.scans())
+        return finished(scans, self._config, self._origin, progress)
+
+    def _change(self) -> SumsChange:
+        return SumsChange(self._config.leaf_size_m, self._config.leaf_size_m / QUANTA)
+
+    def _collect(
+        self, change: SumsChange, scan: LoggedScan, sign: int, origin: NDArray[np.float64] | None = None
+    ) -> None:
+        rays = rays_of(scan, self._config, self._origin if origin is None else origin)
+        change.collect(rays.points, rays.directions, rays.ranges_m, sign)
+
+    def _apply(self, change: SumsChange) -> Keys:
+        returns, looks = self._sums.apply(change)
+        self._returns_dirty.append(returns)
+        self._looks_dirty.append(looks)
+        return returns
+
+    def _bound(self) -> None:
+        """Lets scans go where memory is short."""
+        if self._max_bytes is not None and self.num_bytes > self._max_bytes:
+            if self._noise_of == 0:  # the scans that tell it may go
+                self._settle_noise()
+            self._log.shrink(max(0, self._max_bytes - (self.num_bytes - self._log.num_bytes)))
+
+    def _all_sums(self) -> ScanSums:
+        return ScanSums(self._config.leaf_size_m, *self._sums.sums_of(self._sums.block_keys()))
+
+    def _begin_reading(self) -> tuple[GrowingSurface, Changes, SensorNoise]:
+        """The surface, and what changed since it was derived. The map may change again meanwhile."""
+        with self._lock:
+            if self._surface is None:
+                origin = np.zeros(3) if self._origin is None else self._origin
+                surface = GrowingSurface(self._quick, origin)
+                self._surface = surface if self._origin is not None else None
+                self._returns_dirty = self._looks_dirty = [self._sums.block_keys()]
+            else:
+                surface = self._surface
+            returns, looked = (
+                np.unique(np.concatenate([_NONE, *keys])) for keys in (self._returns_dirty, self._looks_dirty)
+            )
+            changes = Changes(
+                returns,
+                ScanSums(self._config.leaf_size_m, *self._sums.sums_of(returns)),
+                looked,
+                Looks(*self._sums.looks_of(looked)),
+            )
+            self._returns_dirty, self._looks_dirty = [], []
+            self._settle_noise()
+            return surface, changes, self._noise
+
+    def _settle_noise(self) -> None:
+        """Estimates the sensor's noise, if there are twice or half as many scans as there were then."""
+        scans = len(self)
+        if self._noise_of / 2 < scans < 2 * self._noise_of:
+            return
+        num_threads = resolve_num_threads(self._config.num_threads)
+        found = noise_of(self._log, self._all_sums(), self._quick, self._origin, num_threads)
+        if found is not None:
+            self._noise, self._noise_of = found, scans

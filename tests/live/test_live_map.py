@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A map that grows is a function of the scans that are in it, however they came, moved and went."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig, LiveMap
+from radarsdf.live.scan_log import SealedScan
+
+from ..conftest import ground_and_wall, pose
+
+ORIGIN = (2.0, 0.0, 1.0)
+KNOWN = {"range_noise_m": 0.02, "azimuth_noise_rad": 1e-3, "elevation_noise_rad": 1e-3}
+SETTINGS = FitConfig(num_threads=1, returns=KNOWN)  # a given noise does not depend on what was there before
+SCENE = ground_and_wall(scans=8, returns_per_scan=800)
+
+
+def map_of(numbers, config=SETTINGS, poses=SCENE.poses, **arguments):
+    live = LiveMap(config, origin=ORIGIN, **arguments)
+    for i in numbers:
+        live.integrate(SCENE.points[i], poses[i], SCENE.intensities[i], scan_id=int(i))
+    return live
+
+
+def state(live):
+    """The bits of all sums."""
+    keys = live._sums.block_keys()
+    return [array.tobytes() for array in (*live._sums.sums_of(keys), *live._sums.looks_of(keys))]
+
+
+def mesh_bits(mesh):
+    parts = (mesh.vertices, mesh.faces, *mesh.vertex_attributes.values())
+    return [np.ascontiguousarray(part).tobytes() for part in parts]
+
+
+def map_bits(radar_map):
+    found = radar_map.evidence
+    arrays = [parameter.detach().numpy() for parameter in radar_map.field.parameters()]
+    return [array.tobytes() for array in [*arrays, found.information, found.detections, found.looks]]
+
+
+def test_random_operations_leave_a_map_of_what_is_in_it():
+    rng = np.random.default_rng(5)
+    live, inside, poses = map_of([]), {}, SCENE.poses.copy()
+    for _ in range(60):
+        i = int(rng.integers(len(SCENE.points)))
+        action = rng.choice(["toggle", "move", "mesh"], p=[0.6, 0.25, 0.15])
+        if action == "toggle" and i in inside:
+            live.remove(i)
+            del inside[i]
+        elif action == "toggle":
+            live.integrate(SCENE.points[i], poses[i], SCENE.intensities[i], scan_id=i)
+            inside[i] = True
+        elif action == "move" and i in inside:
+            poses[i] = pose(rng.uniform(-1, 1, 3) + [i, 0, 1.5], rng.uniform(-0.1, 0.1))
+            live.move(i, poses[i])
+        elif inside:
+            live.mesh()  # what it keeps must not show later
+    assert 2 < len(inside) < len(SCENE.points)
+    fresh = map_of(rng.permutation(sorted(inside)), poses=poses)
+    assert state(live) == state(fresh)
+    assert mesh_bits(live.mesh()) == mesh_bits(fresh.mesh())
+    for i in list(inside):
+        live.remove(i)
+    assert (live._sums.num_cells, live._sums.num_blocks, len(live)) == (0, 0, 0)
+    assert len(live.mesh().faces) == 0
+
+
+def test_a_mesh_that_grows_is_that_of_a_quick_fit():
+    live = map_of([])
+    for i in range(6):
+        live.integrate(SCENE.points[i], SCENE.poses[i], SCENE.intensities[i])
+        grown = live.mesh()
+        assert mesh_bits(grown) == mesh_bits(map_of(range(i + 1)).mesh())
+    quick = FitConfig.quick(num_threads=1, returns=KNOWN)
+    batch = radarsdf.fit(SCENE.points[:6], SCENE.poses[:6], config=quick, origin=ORIGIN, progress=False)
+    whole = batch.mesh(quick.leaf_size_m)
+    assert len(whole.faces) == len(grown.faces) > 1000
+
+    def triangles(mesh):
+        corners = np.concatenate([mesh.vertices, mesh.vertex_attributes["confidence"][:, None]], axis=1)
+        return np.unique(corners[mesh.faces].reshape(len(mesh.faces), -1), axis=0)
+
+    assert triangles(whole).tobytes() == triangles(grown).tobytes()
+
+
+def test_map_and_finish_are_fits_of_all_scans():
+    config = FitConfig(num_threads=1, training={"sdf_iterations": 3, "intensity_iterations": 3})
+    live = map_of([3, 0, 2, 1, 4], config)
+    live.remove(3)
+    numbers = [0, 2, 1, 4]
+    scans = ([given[i] for i in numbers] for given in (SCENE.points, SCENE.poses, SCENE.intensities))
+    points, poses, intensities = scans
+    for found, settings in (
+        (live.finish(progress=False), config),
+        (live.map(), FitConfig.quick(num_threads=1)),
+    ):
+        fitted = radarsdf.fit(
+            points, np.stack(poses), intensities, config=settings, origin=ORIGIN, progress=False
+        )
+        assert map_bits(found) == map_bits(fitted)
+        mesh = found.mesh(0.2)
+        at = mesh.vertices[:50], poses[0][:3, 3]
+        assert found.intensity(*at).tobytes() == fitted.intensity(*at).tobytes()
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    one, three = (map_of(range(6), SETTINGS.override(num_threads=n)) for n in (1, 3))
+    assert state(one) == state(three)
+    assert mesh_bits(one.mesh()) == mesh_bits(three.mesh())
+
+
+def test_readers_see_the_map_before_or_after_a_scan():
+    known = {tuple(mesh_bits(map_of(range(i)).mesh())) for i in range(1, 7)}
+    live, seen, done = map_of([0]), [], threading.Event()
+
+    def read():
+        while not done.is_set():
+            seen.append(tuple(mesh_bits(live.mesh())))
+
+    readers = [threading.Thread(target=read) for _ in range(2)]
+    for reader in readers:
+        reader.start()
+    for i in range(1, 6):
+        live.integrate(SCENE.points[i], SCENE.poses[i], SCENE.intensities[i])
+    done.set()
+    for reader in readers:
+        reader.join()
+    assert seen
+    assert set(seen) <= known
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scan_id": 2}, "already"),
+        ({"points": np.zeros((0, 3))}, "empty"),
+        ({"points": np.full((800, 3), np.nan)}, "not finite"),
+        ({"points": np.full((800, 3), 1e7)}, "million cells"),
+        ({"points": np.zeros((800, 2))}, "shape"),
+        ({"pose": 2 * np.eye(4)}, "rigid"),
+        ({"intensities": None}, "intensities"),
+        ({"intensities": np.zeros(3)}, "shape"),
+        ({"doppler_mps": np.zeros(3)}, "shape"),
+    ],
+)
+def test_a_bad_scan_leaves_the_map_as_it_was(change, words):
+    live = map_of(range(3))
+    before, mesh = state(live), mesh_bits(live.mesh())
+    scan = {"points": SCENE.points[3], "pose": SCENE.poses[3], "intensities": SCENE.intensities[3]}
+    with pytest.raises(ValueError, match=words):
+        live.integrate(**scan | change)
+    assert (state(live), mesh_bits(live.mesh()), len(live)) == (before, mesh, 3)
+    live.integrate(**scan)
+    assert state(live) == state(map_of(range(4)))
+
+
+def test_scans_move_together_or_not_at_all():
+    live = map_of(range(4))
+    before = state(live)
+    moved = SCENE.poses.copy()
+    moved[:, :3, 3] += [0.3, -0.2, 0.1]
+    with pytest.raises(KeyError, match="no scan 9"):
+        live.move_all({0: moved[0], 9: moved[1]})
+    assert state(live) == before
+    changed = live.move_all(dict(enumerate(moved[:4])))
+    assert state(live) == state(map_of(range(4), poses=moved))
+    assert len(changed) > 10
+    assert len(live.move_all(dict(enumerate(moved[:4])))) == 0  # nothing changes
+
+
+def test_old_scans_go_to_the_disk_or_are_sealed(tmp_path):
+    needed = map_of(range(8)).num_bytes
+    spilled = map_of(range(8), max_bytes=needed - 60_000, folder=tmp_path / "scans")
+    files = list((tmp_path / "scans").iterdir())
+    assert 0 < len(files) < 8
+    assert spilled.num_bytes <= needed - 60_000
+    spilled.remove(0)
+    assert len(list((tmp_path / "scans").iterdir())) == len(files) - 1
+    assert state(spilled) == state(map_of(range(1, 8)))
+    sealed = map_of(range(8), max_bytes=needed - 60_000)
+    assert sealed.sealed_scans == len(files)
+    with pytest.raises(SealedScan, match="let go"):
+        sealed.remove(0)
+    with pytest.raises(ValueError, match="let go"):
+        sealed.finish()
+    assert state(sealed) == state(map_of(range(8)))
+    assert len(sealed.map().mesh(0.2).faces) > 100
