@@ -1,0 +1,38 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What of `bench.live` is measured, as a table and, of circles, a plot. Times are those of the processor unless named."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from bench.live import accuracy, circles, rates, removal
+
+_COMMANDS = {"rates": rates, "accuracy": accuracy, "removal": removal, "circles": circles}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m bench.live", description=__doc__)
+    parser.add_argument("what", choices=_COMMANDS)
+    parser.add_argument("cases", nargs="*", help="scenes, of circles a number of scans; default: all")
+    parser.add_argument("--seed", type=int, default=0, help="of the scenes")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--quick", action="store_true", help="only show that it runs")
+    parser.add_argument("--out", type=Path, default=Path("bench_results"))
+    options = parser.parse_intermixed_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    for row in _COMMANDS[options.what].rows(options):
+        if not rows:
+            print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
+        print("| " + " | ".join(str(value) for value in row.values()) + " |", flush=True)
+        rows.append(row)
+    (options.out / f"live-{options.what}.json").write_text(json.dumps(rows, indent=1))
+    if options.what == "circles":
+        circles.plot(rows, options.out / "live-circles.png")
+
+
+main()

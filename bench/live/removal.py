@@ -1,0 +1,75 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans that are taken out, or moved, in random order: bits and time."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+import radarsdf
+from radarsdf import FitConfig, LiveMap
+
+_SCANS = 1000
+
+
+def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A row for each scene and operation."""
+    count = 40 if options.quick else _SCANS
+    for name in options.cases or ["hugin", "oculii"]:
+        yield from _rows(name, count, options)
+
+
+def _rows(name: str, count: int, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    scans = radarsdf.simulate.SCENES[name](seed=options.seed, frames=count)
+    rng = np.random.default_rng(options.seed)
+    chosen = rng.permutation(count)[: count // 10].tolist()
+    moved = scans.poses.copy()
+    moved[:, :3, 3] += rng.normal(0, 0.1, (count, 3))
+    poses = scans.poses.copy()
+    poses[chosen] = moved[chosen]
+
+    def grown(numbers: Iterable[int], poses: Any) -> tuple[LiveMap, list[float]]:
+        live = LiveMap(FitConfig(num_threads=options.threads), origin=np.zeros(3))
+        return live, _times(
+            numbers,
+            lambda i: live.integrate(scans.points[i], poses[i], scans.intensities[i], scan_id=i),
+        )
+
+    live, integrate_ms = grown(range(count), scans.poses)
+    move_ms = _times(chosen, lambda i: live.move(i, moved[i]))
+    other, _ = grown(rng.permutation(count).tolist(), poses)
+    yield _row(name, "move", move_ms, integrate_ms, _state(live) == _state(other))
+    rng.shuffle(chosen)
+    remove_ms = _times(chosen, live.remove)
+    other, _ = grown(sorted(set(range(count)) - set(chosen)), poses)
+    yield _row(name, "remove", remove_ms, integrate_ms, _state(live) == _state(other))
+
+
+def _row(name: str, what: str, ms: list[float], integrate_ms: list[float], equal: bool) -> dict[str, Any]:
+    return {
+        "scene": name,
+        "operation": what,
+        "times": len(ms),
+        "p50, ms": round(float(np.median(ms)), 2),
+        "worst, ms": round(max(ms), 2),
+        "times that of integrate": round(float(np.median(ms) / np.median(integrate_ms)), 2),
+        "bits of a map that never saw them": "equal" if equal else "NOT EQUAL",
+    }
+
+
+def _times(items: Iterable[int], act: Callable[[int], Any]) -> list[float]:
+    found = []
+    for i in items:
+        begin = time.process_time()
+        act(i)
+        found.append(1e3 * (time.process_time() - begin))
+    return found
+
+
+def _state(live: LiveMap) -> list[bytes]:
+    keys = live._sums.block_keys()
+    return [array.tobytes() for array in (*live._sums.sums_of(keys), *live._sums.looks_of(keys))]
