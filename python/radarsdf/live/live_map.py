@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import GrowingSums, SumsChange
-from radarsdf.checks import check_poses, instance, path_of, positions, real_array, whole_number
+from radarsdf.checks import check_poses, instance, number, path_of, positions, real_array, whole_number
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.live.following import Follower
 from radarsdf.live.learning import finished, known_now, noise_of, quick_of
 from radarsdf.live.scan_log import LoggedScan, ScanId, ScanLog
 from radarsdf.live.scans import checked_scan, rays_of
@@ -109,6 +110,7 @@ class LiveMap:
             place.mkdir(exist_ok=True)
         self._log = ScanLog(place)
         self._sums = GrowingSums()
+        self._follower = Follower(self._config, self._config.num_threads)
         self._noise = _UNKNOWN
         self._noise_of = 0  # number of scans that it was estimated from
         self._returns_dirty: list[Keys] = []
@@ -160,33 +162,48 @@ class LiveMap:
     def integrate(
         self,
         points: ArrayLike,
-        pose: ArrayLike,
+        pose: ArrayLike | None = None,
         intensities: ArrayLike | None = None,
         *,
         doppler_mps: ArrayLike | None = None,
+        time: float | None = None,
         scan_id: ScanId | None = None,
     ) -> Integrated:
         """Adds a scan.
+
+        Without its pose, it is put where its returns agree with the last scans, near where its Doppler, or the motion so far,
+        lead. The world is then the frame of the first scan. Where many scans drift, :func:`radarsdf.refine_poses` and
+        :meth:`move_all` mend them.
 
         Parameters
         ----------
         points : (N, 3) array_like
             Returns, sensor frame, m.
-        pose : (4, 4) array_like
-            T_world_sensor, m.
+        pose : (4, 4) array_like, optional
+            T_world_sensor, m. Without it, the scan needs a time after that of the scan before.
         intensities : (N,) array_like, optional
             Sensor units. All scans have them, or none has.
         doppler_mps : (N,) array_like, optional
             Speed along the ray, m/s; NaN where it was not measured. Returns that move are left out.
+        time : float, optional
+            When the scan was taken, s. Only scans without a pose need it.
         scan_id : hashable, optional
             By which the scan is known. By default a number that counts on.
 
         Raises
         ------
         ValueError
-            If something is invalid, or the map has a scan of this id. The map is then as before.
+            If something is invalid, the map has a scan of this id, or a scan without a pose is late.
+        Lost
+            A ValueError, if a scan without a pose agrees with the last ones nowhere near. After any error, the map is as
+            before.
         """
-        scan = checked_scan(points, pose, intensities, doppler_mps, self._config.returns)
+        scan = checked_scan(points, intensities, doppler_mps, self._config.returns)
+        given = None if pose is None else check_poses([real_array(pose, "pose")], 1)[0].copy()
+        time_s = None if time is None else _finite(time)
+        if given is None and time_s is None:
+            msg = "a scan needs a pose, or a time"
+            raise ValueError(msg)
         with self._lock:
             if scan_id is None:
                 scan_id = self._next_id
@@ -199,6 +216,12 @@ class LiveMap:
             ):
                 msg = "either all scans have intensities, or none has"
                 raise ValueError(msg)
+            step = None
+            if given is None:
+                assert time_s is not None
+                step = self._follower.seek(scan, time_s)
+                given = step.found.pose
+            scan = scan.at(given)
             origin = self._origin
             if origin is None:
                 lattice = self._config.lattice
@@ -208,6 +231,7 @@ class LiveMap:
             blocks = self._apply(change)
             self._origin, self._with_intensities = origin, with_intensities
             self._log.put(scan_id, scan)
+            self._follower.keep(scan, time_s, step)
             if isinstance(scan_id, int):
                 self._next_id = max(self._next_id, scan_id + 1)
             self._bound()
@@ -372,3 +396,11 @@ class LiveMap:
         found = noise_of(self._log, self._all_sums(), self._quick, self._origin, num_threads)
         if found is not None:
             self._noise, self._noise_of = found, scans
+
+
+def _finite(time: float) -> float:
+    time_s = number(time, "time")
+    if not np.isfinite(time_s):
+        msg = f"time must be finite, not {time_s}"
+        raise ValueError(msg)
+    return time_s

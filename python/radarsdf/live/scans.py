@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import check_poses, check_values_of_scan, real_array
+from radarsdf.checks import check_values_of_scan, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.live.scan_log import LoggedScan, compact
@@ -22,15 +22,13 @@ from radarsdf.returns.rays import Rays, check_scans, prepare
 
 def checked_scan(
     points: ArrayLike,
-    pose: ArrayLike,
     intensities: ArrayLike | None,
     doppler_mps: ArrayLike | None,
     config: ReturnsConfig,
 ) -> LoggedScan:
-    """A scan (N, 3) with what was measured of its returns (N,) and a pose (4, 4). Raises a ValueError if it is none."""
+    """A scan (N, 3) with what was measured of its returns (N,). Raises a ValueError if it is none. Its pose is not known yet."""
     scans, values = check_scans([points], None if intensities is None else [intensities])
     scan = scans[0].copy()
-    (checked_pose,) = check_poses([real_array(pose, "pose")], 1)
     speeds, standing = None, None
     if doppler_mps is not None:
         speeds = compact(real_array(doppler_mps, "doppler_mps"))
@@ -39,7 +37,7 @@ def checked_scan(
             moving = Movers.of([scan], [speeds]).masks[0]
             standing = ~moving if moving.any() else None
     return LoggedScan(
-        checked_pose.copy(),
+        np.eye(4),
         compact(scan),
         None if values is None else values[0].copy(),
         speeds,

@@ -23,7 +23,7 @@ _PAIRS = 40  # pairs of neighbouring scans, that tell the sign
 _ERRORS = 3.0  # standard errors of a difference that is no chance
 # Measured (Astyx drives): a velocity is off by more than its returns say, since they are not independent. So is one of
 # elevations that all have the same error.
-_LEAST_MPS = 0.02
+LEAST_MPS = 0.02
 _LEAST_STEP_M = 1e-4  # deviation of a step, to divide by
 
 
@@ -52,7 +52,7 @@ class Velocities:
         if 2 * found.sum() < max(len(found), 2):
             return None
         mean = np.stack([velocity.velocity_mps for velocity in each])
-        covariance = np.stack([velocity.covariance for velocity in each]) + _LEAST_MPS**2 * np.eye(3)
+        covariance = np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3)
         static = [
             velocity.static if velocity.found else np.ones(len(scan), bool)
             for velocity, scan in zip(each, scans, strict=True)
@@ -62,7 +62,7 @@ class Velocities:
         usual = (durations > 0) & (durations <= 2 * np.median(durations))
         # With the noise of the velocities in it: rather too much.
         squares = np.diff(mean[found], axis=0)[usual] ** 2
-        change = squares.sum(axis=0) / max(durations[usual].sum(), 1e-9) + _LEAST_MPS**2
+        change = squares.sum(axis=0) / max(durations[usual].sum(), 1e-9) + LEAST_MPS**2
         for i in np.flatnonzero(~found):
             mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
             away_s = np.abs(at - times_s[i]).min()

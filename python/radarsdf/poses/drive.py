@@ -115,7 +115,7 @@ class _Pass:
             now = tracker.follow(drive.scans[i], expected)
             turn = move = None
             if now.piece == before.piece and expected.duration_s > 0:
-                turn, move = _rates(before.pose, now, expected.duration_s)
+                turn, move = rates_of(before.pose, now, expected.duration_s)
             found.turns.append(turn)
             found.moves.append(move)
             found.tracked.append(now)
@@ -132,7 +132,7 @@ class _Pass:
         return turns, covariance
 
 
-def _rates(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rate]:
+def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rate]:
     """Of turning and moving, in the frame of the sensor."""
     back = before[:3, :3].T
     half = rotation(0.5 * now.turn).T @ back

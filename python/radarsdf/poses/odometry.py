@@ -32,7 +32,7 @@ from radarsdf.threads import Workers
 
 # Of a step's variance, that the returns must take away where nothing else measures the way. Below a half, the motion before
 # says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
-_LEAST_TOLD = 0.5
+LEAST_TOLD = 0.5
 # Likewise of its rotation. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
 # which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_TOLD_TURN = 1 / WINDOW
@@ -206,7 +206,7 @@ def _checked_told(tracked: list[Tracked], drive: Drive, inertial: Inertial) -> t
         return 0.0, 0.0
     way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
     for told, least, measured, moved, missing in (
-        (way, _LEAST_TOLD, drive.velocities is not None, "moved", "their Doppler (doppler_mps)"),
+        (way, LEAST_TOLD, drive.velocities is not None, "moved", "their Doppler (doppler_mps)"),
         (turn, _LEAST_TOLD_TURN, drive.gyroscope is not None, "turned", "its angular_velocity"),
     ):
         if not measured and told < least:

@@ -82,24 +82,23 @@ class Tracker:
 
     def follow(self, scan: Floats, expected: ExpectedStep | None) -> Tracked:
         """The next scan (N, 3), sensor frame, m, is where its returns agree, near `expected`. None: it is the first."""
+        found = self.seek(scan, expected)
+        self.keep(scan, found)
+        return found
+
+    def seek(self, scan: Floats, expected: ExpectedStep | None) -> Tracked:
+        """Where :meth:`follow` would put a scan. Nothing changes."""
         if expected is None or self.last is None:
-            return self._begin(scan, np.eye(4), 0)
-        found = self._sought(scan, expected)
-        if found is None:
-            # Where a drive was lost, what was mapped before and after cannot be joined.
-            return self._begin(scan, self.last.pose @ expected.pose(), self.last.piece + 1)
-        self._keep(scan, found)
-        return found
+            return begun(np.eye(4))
+        # Where a drive was lost, what was mapped before and after cannot be joined.
+        return self._sought(scan, expected) or begun(self.last.pose @ expected.pose(), self.last.piece + 1)
 
-    def _begin(self, scan: Floats, pose: Floats, piece: int) -> Tracked:
-        self._planes = [LocalPlanes(cells * self.cell_size_m) for cells in _CELLS]
-        self._recent.clear()
-        self._scans = 0
-        found = Tracked(pose, np.zeros((6, 6)), np.nan, piece, np.zeros(3))
-        self._keep(scan, found)
-        return found
-
-    def _keep(self, scan: Floats, found: Tracked) -> None:
+    def keep(self, scan: Floats, found: Tracked) -> None:
+        """The scan was there. The next ones are held against its planes, too."""
+        if self.last is None or found.piece != self.last.piece:
+            self._planes = [LocalPlanes(cells * self.cell_size_m) for cells in _CELLS]
+            self._recent.clear()
+            self._scans = 0
         points = np.ascontiguousarray(np.einsum("ij,nj->ni", found.pose[:3, :3], scan) + found.pose[:3, 3])
         gone = self._recent.popleft() if len(self._recent) == WINDOW else None
         for planes in self._planes:
@@ -217,6 +216,11 @@ class Tracker:
         assert self._noise is not None
         found: list[float] = np.square(dataclasses.astuple(self._noise)).tolist()
         return found
+
+
+def begun(pose: Floats, piece: int = 0) -> Tracked:
+    """A scan that a piece of the drive begins with, at this pose (4, 4)."""
+    return Tracked(pose, np.zeros((6, 6)), np.nan, piece, np.zeros(3))
 
 
 def _taken_away(prior: Floats, covariance: Floats) -> float:
