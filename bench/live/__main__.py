@@ -9,9 +9,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-from bench.live import accuracy, circles, rates, removal
+from bench.live import accuracy, circles, kills, rates, removal
 
-_COMMANDS = {"rates": rates, "accuracy": accuracy, "removal": removal, "circles": circles}
+_COMMANDS = {
+    "rates": rates,
+    "accuracy": accuracy,
+    "removal": removal,
+    "circles": circles,
+    "kills": kills,
+}
 
 
 def main() -> None:

@@ -71,5 +71,5 @@ def _times(items: Iterable[int], act: Callable[[int], Any]) -> list[float]:
 
 
 def _state(live: LiveMap) -> list[bytes]:
-    keys = live._sums.block_keys()
-    return [array.tobytes() for array in (*live._sums.sums_of(keys), *live._sums.looks_of(keys))]
+    keys = live._state.sums.block_keys()
+    return [array.tobytes() for array in (*live._state.sums.sums_of(keys), *live._state.sums.looks_of(keys))]

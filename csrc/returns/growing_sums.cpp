@@ -86,6 +86,7 @@ ChangedBlocks GrowingSums::apply(const SumsChange& change) {
     if (there.sums[0] + cell.sums[0] < 0 || scans < 0) throw std::invalid_argument(kNeverAdded);
     if (scans > std::numeric_limits<std::uint32_t>::max()) throw std::invalid_argument("too many scans");
     new_cells += place < 0 ? 1 : 0;
+    new_blocks += place < 0 && number_of_block_.find(block_of(cell.key)) < 0 ? 1 : 0;
   }
   for (const SumsChange::Look& look : change.looks_) {
     const std::int32_t place = number_of_block_.find(look.key);
@@ -97,7 +98,7 @@ ChangedBlocks GrowingSums::apply(const SumsChange& change) {
   ChangedBlocks changed;
   changed.returns.reserve(change.cells_.size());
   changed.looks.reserve(change.looks_.size());
-  reserve(new_cells, new_blocks + new_cells);
+  reserve(new_cells, new_blocks);
   for (const SumsChange::Cell& cell : change.cells_) {
     if (cell.scans == 0 && std::all_of(cell.sums, cell.sums + kSums, [](std::int64_t sum) { return sum == 0; }))
       continue;
@@ -181,8 +182,11 @@ void GrowingSums::insert(const SumsOfCells& cells, const LooksOfBlocks& looks) {
   if (there_already(number_of_cell_, cells.keys) || there_already(number_of_block_, looks.keys)) {
     throw std::invalid_argument("there are sums of these cells already");
   }
-  reserve(static_cast<std::int64_t>(cells.keys.size()),
-          static_cast<std::int64_t>(cells.keys.size() + looks.keys.size()));
+  auto blocks = static_cast<std::int64_t>(looks.keys.size());
+  for (std::size_t i = 0; i < cells.keys.size(); ++i) {
+    blocks += i == 0 || block_of(cells.keys[i]) != block_of(cells.keys[i - 1]) ? 1 : 0;
+  }
+  reserve(static_cast<std::int64_t>(cells.keys.size()), blocks);
   for (std::size_t i = 0; i < cells.keys.size(); ++i) {
     const std::uint64_t key = cells.keys[i];
     const std::int32_t place = place_for(cells_, free_cells_);

@@ -19,6 +19,7 @@ WRITES = {
     "folder": {"drive", "poses.tum", "map.safetensors"},
     "ros_bag": {"drive_bag", "map.safetensors"},
     "novel_views": {"view.png", "aside.ply"},
+    "live": set(),
     "tiles": {"city", "city.ply"},
     "uncertainty_for_planning": set(),
     "rerun_logging": {"drive.rrd"},

@@ -29,8 +29,8 @@ def map_of(numbers, config=SETTINGS, poses=SCENE.poses, **arguments):
 
 def state(live):
     """The bits of all sums."""
-    keys = live._sums.block_keys()
-    return [array.tobytes() for array in (*live._sums.sums_of(keys), *live._sums.looks_of(keys))]
+    keys = live._state.sums.block_keys()
+    return [array.tobytes() for array in (*live._state.sums.sums_of(keys), *live._state.sums.looks_of(keys))]
 
 
 def mesh_bits(mesh):
@@ -67,7 +67,7 @@ def test_random_operations_leave_a_map_of_what_is_in_it():
     assert mesh_bits(live.mesh()) == mesh_bits(fresh.mesh())
     for i in list(inside):
         live.remove(i)
-    assert (live._sums.num_cells, live._sums.num_blocks, len(live)) == (0, 0, 0)
+    assert (live._state.sums.num_cells, live._state.sums.num_blocks, len(live)) == (0, 0, 0)
     assert len(live.mesh().faces) == 0
 
 
@@ -191,3 +191,20 @@ def test_old_scans_go_to_the_disk_or_are_sealed(tmp_path):
         sealed.finish()
     assert state(sealed) == state(map_of(range(8)))
     assert len(sealed.map().mesh(0.2).faces) > 100
+
+
+def test_what_is_far_away_is_forgotten():
+    live = map_of(range(8))
+    live.mesh()
+    keys = live._state.sums.block_keys()
+    gone = live.clear_outside([20.0, 0.0, 1.0], 9.0)
+    assert 0 < len(gone) < len(keys)
+    mesh = live.mesh()
+    assert np.linalg.norm(mesh.vertices - [20.0, 0.0, 1.0], axis=1).max() < 9.0 + 1.6 * np.sqrt(3)
+    live._state.forget_surface()
+    assert mesh_bits(mesh) == mesh_bits(live.mesh())
+    assert live.sealed_scans == 8  # all were taken farther away
+    with pytest.raises(SealedScan):
+        live.remove(3)
+    live.integrate(SCENE.points[0], SCENE.poses[0], SCENE.intensities[0], scan_id="again")
+    live.remove("again")

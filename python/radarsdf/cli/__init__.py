@@ -24,6 +24,7 @@ COMMANDS = {
     "check": "say what is wrong with scans and poses, before a fit",
     "poses": "mend the poses of scans by their returns, or find them from the radar alone",
     "fit": "fit a map to scans",
+    "live": "give a recording to a map that grows, as a driver would, and say how it keeps up",
     "tiles": "fit a map that does not fit into memory, in tiles, here or on a cluster",
     "mesh": "extract the surface of a map as a triangle mesh",
     "view": "show a map in the browser, with a sensor that can be dragged",

@@ -13,18 +13,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import GrowingSums, SumsChange
-from radarsdf.checks import check_poses, instance, number, path_of, positions, real_array, whole_number
+from radarsdf.checks import (
+    check_poses,
+    instance,
+    not_negative,
+    number,
+    path_of,
+    positions,
+    real_array,
+    whole_number,
+)
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.following import Follower
-from radarsdf.live.learning import finished, known_now, noise_of, quick_of
-from radarsdf.live.scan_log import LoggedScan, ScanId, ScanLog
-from radarsdf.live.scans import checked_scan, rays_of
-from radarsdf.live.surface import Changes, GrowingSurface
+from radarsdf.live.learning import finished, known_now
+from radarsdf.live.scan_log import ScanId, ScanLog
+from radarsdf.live.scans import checked_scan
+from radarsdf.live.state import GrowingState
+from radarsdf.live.storage import load_state, save_state
 from radarsdf.map import queries
 from radarsdf.returns.evidence import Looks
-from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.scan_sums import QUANTA, ScanSums
 from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
@@ -33,8 +40,6 @@ if TYPE_CHECKING:
     from radarsdf.map.radar_map import RadarMap
 
 Keys = NDArray[np.uint64]
-_NONE = np.zeros(0, np.uint64)
-_UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
 
 
 @dataclass(frozen=True)
@@ -98,66 +103,61 @@ class LiveMap:
         max_bytes: int | None = None,
         folder: str | PathLike[str] | None = None,
     ) -> None:
-        self._config = FitConfig() if config is None else instance(config, FitConfig, "config")
-        if self._config.returns.accumulate_scans != 1:
+        config = FitConfig() if config is None else instance(config, FitConfig, "config")
+        if config.returns.accumulate_scans != 1:
             msg = "returns.accumulate_scans must be 1: a live map gets scans one after another"
             raise ValueError(msg)
-        self._quick = quick_of(self._config)
-        self._origin = None if origin is None else positions([np.asarray(origin)], "origin")[0]
-        self._max_bytes = None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1)
         place = None if folder is None else path_of(folder, "folder")
         if place is not None:
             place.mkdir(exist_ok=True)
-        self._log = ScanLog(place)
-        self._sums = GrowingSums()
-        self._follower = Follower(self._config, self._config.num_threads)
-        self._noise = _UNKNOWN
-        self._noise_of = 0  # number of scans that it was estimated from
-        self._returns_dirty: list[Keys] = []
-        self._looks_dirty: list[Keys] = []
-        self._surface: GrowingSurface | None = None
-        self._with_intensities: bool | None = None
-        self._next_id = 0
+        self._state = GrowingState(
+            config,
+            None if origin is None else positions([np.asarray(origin)], "origin")[0],
+            None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1),
+            ScanLog(place),
+        )
+        self._follower = Follower(config, config.num_threads)
         self._lock = threading.RLock()  # of the state
-        self._reading = threading.Lock()  # of the surface, taken first
+        self._reading = threading.Lock()  # of its surface, taken first
 
     def __len__(self) -> int:
-        return len(self._log)
+        return len(self._state.log)
 
     def __repr__(self) -> str:
-        return f"LiveMap({len(self)} scans, {self._sums.num_cells} cells, {self.num_bytes / 1e6:.1f} MB)"
+        return (
+            f"LiveMap({len(self)} scans, {self._state.sums.num_cells} cells, {self.num_bytes / 1e6:.1f} MB)"
+        )
 
     @property
     def config(self) -> FitConfig:
         """Settings."""
-        return self._config
+        return self._state.config
 
     @property
     def origin(self) -> NDArray[np.float64] | None:
         """(3,) origin of the local frame, world, m. None: there was no scan yet."""
-        return self._origin
+        return self._state.origin
 
     @property
     def scan_ids(self) -> list[ScanId]:
         """Of the scans that can be moved or taken out, in the order in which they came."""
         with self._lock:
-            return self._log.ids
+            return self._state.log.ids
 
     @property
     def sealed_scans(self) -> int:
         """Number of scans that can no longer be moved or taken out."""
-        return self._log.sealed
+        return self._state.log.sealed
 
     @property
     def num_bytes(self) -> int:
         """Memory that the map takes, bytes."""
-        surface = 0 if self._surface is None else self._surface.num_bytes
-        return self._sums.num_bytes + self._log.num_bytes + surface
+        return self._state.num_bytes
 
     def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
         """(4, 4) T_world_sensor of a scan, m. Raises a KeyError if it cannot be taken out."""
         with self._lock:
-            return self._log.pose(scan_id).copy()
+            return self._state.log.pose(scan_id).copy()
 
     def integrate(
         self,
@@ -198,7 +198,7 @@ class LiveMap:
             A ValueError, if a scan without a pose agrees with the last ones nowhere near. After any error, the map is as
             before.
         """
-        scan = checked_scan(points, intensities, doppler_mps, self._config.returns)
+        scan = checked_scan(points, intensities, doppler_mps, self._state.config.returns)
         given = None if pose is None else check_poses([real_array(pose, "pose")], 1)[0].copy()
         time_s = None if time is None else _finite(time)
         if given is None and time_s is None:
@@ -206,13 +206,13 @@ class LiveMap:
             raise ValueError(msg)
         with self._lock:
             if scan_id is None:
-                scan_id = self._next_id
-            if scan_id in self._log:
+                scan_id = self._state.next_id
+            if scan_id in self._state.log:
                 msg = f"the map has a scan {scan_id!r} already: remove or move it"
                 raise ValueError(msg)
             with_intensities = scan.intensities is not None
             if with_intensities != (
-                with_intensities if self._with_intensities is None else self._with_intensities
+                with_intensities if self._state.with_intensities is None else self._state.with_intensities
             ):
                 msg = "either all scans have intensities, or none has"
                 raise ValueError(msg)
@@ -222,19 +222,19 @@ class LiveMap:
                 step = self._follower.seek(scan, time_s)
                 given = step.found.pose
             scan = scan.at(given)
-            origin = self._origin
+            origin = self._state.origin
             if origin is None:
-                lattice = self._config.lattice
+                lattice = self._state.config.lattice
                 origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
-            change = self._change()
-            self._collect(change, scan, 1, origin)
-            blocks = self._apply(change)
-            self._origin, self._with_intensities = origin, with_intensities
-            self._log.put(scan_id, scan)
+            change = self._state.change()
+            self._state.collect(change, scan, 1, origin)
+            blocks = self._state.apply(change)
+            self._state.origin, self._state.with_intensities = origin, with_intensities
+            self._state.log.put(scan_id, scan)
             self._follower.keep(scan, time_s, step)
             if isinstance(scan_id, int):
-                self._next_id = max(self._next_id, scan_id + 1)
-            self._bound()
+                self._state.next_id = max(self._state.next_id, scan_id + 1)
+            self._state.bound()
         movers = 0 if scan.standing is None else int((~scan.standing).sum())
         return Integrated(scan_id, scan.pose.copy(), blocks, movers)
 
@@ -254,10 +254,10 @@ class LiveMap:
             If it was let go to bound the memory.
         """
         with self._lock:
-            change = self._change()
-            self._collect(change, self._log.get(scan_id), -1)
-            blocks = self._apply(change)
-            self._log.drop(scan_id)
+            change = self._state.change()
+            self._state.collect(change, self._state.log.get(scan_id), -1)
+            blocks = self._state.apply(change)
+            self._state.log.drop(scan_id)
             return blocks
 
     def move(self, scan_id: ScanId, pose: ArrayLike) -> Keys:
@@ -273,19 +273,75 @@ class LiveMap:
         given = [real_array(pose, "pose") for pose in poses.values()]
         checked = check_poses(given, len(given)) if given else np.zeros((0, 4, 4))
         with self._lock:
-            change, moved = self._change(), []
+            change, moved = self._state.change(), []
             for scan_id, pose in zip(ids, checked, strict=True):
-                scan = self._log.get(scan_id)
+                scan = self._state.log.get(scan_id)
                 if (pose == scan.pose).all():
                     continue
                 moved.append((scan_id, scan.at(pose)))
-                self._collect(change, scan, -1)
-                self._collect(change, moved[-1][1], 1)
-            blocks = self._apply(change)
+                self._state.collect(change, scan, -1)
+                self._state.collect(change, moved[-1][1], 1)
+            blocks = self._state.apply(change)
             for scan_id, scan in moved:
-                self._log.put(scan_id, scan)
-            self._bound()
+                self._state.log.put(scan_id, scan)
+            self._state.bound()
             return blocks
+
+    def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
+        """Forgets the map beyond a ball. Scans that reach beyond it can then be neither moved nor taken out.
+
+        Parameters
+        ----------
+        centre : (3,) array_like
+            World, m.
+        radius_m : float
+            Blocks with their middle farther away are forgotten.
+
+        Returns
+        -------
+        (B,) ndarray
+            Keys of these blocks, uint64.
+        """
+        middle, radius = positions([np.asarray(centre)], "centre")[0], not_negative(radius_m, "radius_m")
+        with self._lock:
+            return self._state.clear_outside(middle, radius)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes the state to a file, from which :meth:`load` goes on. An old file is replaced once the new one is complete.
+
+        Raises
+        ------
+        ValueError
+            If an id of a scan is neither a whole number nor a string.
+        OSError
+            If the file cannot be written.
+        """
+        with self._lock:
+            state = self._state.stored()
+        save_state(state, path)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> LiveMap:
+        """A map as it was saved. Scans without poses go on from a scan that is given with its pose and time.
+
+        Parameters
+        ----------
+        path : path-like
+            A file that :meth:`save` wrote.
+        folder : path-like, optional
+            Where scans are to be written if memory is short, as of the constructor.
+
+        Raises
+        ------
+        ValueError
+            If the file is none, is damaged, or comes from another version.
+        OSError
+            If it cannot be read.
+        """
+        stored = load_state(path)
+        live = cls(stored.config, origin=stored.origin, max_bytes=stored.max_bytes, folder=folder)
+        live._state.restore(stored)
+        return live
 
     def mesh(
         self,
@@ -302,10 +358,15 @@ class LiveMap:
         from radarsdf.map.meshing import check_limits  # noqa: PLC0415 - trimesh is slow to import
 
         with self._reading:
-            num_threads = resolve_num_threads(self._config.num_threads)
-            surface, changes, noise = self._begin_reading()
-            surface.update(changes, noise, num_threads)
-            found = surface.triangles(num_threads)
+            num_threads = resolve_num_threads(self._state.config.num_threads)
+            with self._lock:
+                surface, changes, noise = self._state.changes()
+            try:
+                surface.update(changes, noise, num_threads)
+                found = surface.triangles(num_threads)
+            except BaseException:  # Ctrl-C, say: half of it would be wrong from now on
+                self._state.forget_surface()
+                raise
         limits = check_limits(found.scene, min_confidence, max_uncertainty, min_detection_rate)
         whole_number(min_component_triangles, "min_component_triangles", 0)
         kept = found.surface.kept(*limits, min_component_triangles)
@@ -320,9 +381,9 @@ class LiveMap:
             If there is no scan that could be taken out.
         """
         with self._lock:
-            scans, sums = list(self._log.scans()), self._all_sums()
-            looks = Looks(*self._sums.looks_of(self._sums.block_keys()))
-        return known_now(scans, sums, looks, self._quick, self._origin)
+            scans, sums = list(self._state.log.scans()), self._state.all_sums()
+            looks = Looks(*self._state.sums.looks_of(self._state.sums.block_keys()))
+        return known_now(scans, sums, looks, self._state.quick, self._state.origin)
 
     def finish(self, *, progress: bool | None = None) -> RadarMap:
         """The fit of all scans with all settings, as :func:`radarsdf.fit` makes it with this `origin`.
@@ -333,69 +394,11 @@ class LiveMap:
             If scans were let go, or there are none.
         """
         with self._lock:
-            if self._log.sealed:
-                msg = f"{self._log.sealed} scans were let go to bound the memory, so that they cannot be fitted: give the map a folder to keep scans in"
+            if self._state.log.sealed:
+                msg = f"{self._state.log.sealed} scans were let go to bound the memory, so that they cannot be fitted: give the map a folder to keep scans in"
                 raise ValueError(msg)
-            scans = list(self._log.scans())
-        return finished(scans, self._config, self._origin, progress)
-
-    def _change(self) -> SumsChange:
-        return SumsChange(self._config.leaf_size_m, self._config.leaf_size_m / QUANTA)
-
-    def _collect(
-        self, change: SumsChange, scan: LoggedScan, sign: int, origin: NDArray[np.float64] | None = None
-    ) -> None:
-        rays = rays_of(scan, self._config, self._origin if origin is None else origin)
-        change.collect(rays.points, rays.directions, rays.ranges_m, sign)
-
-    def _apply(self, change: SumsChange) -> Keys:
-        returns, looks = self._sums.apply(change)
-        self._returns_dirty.append(returns)
-        self._looks_dirty.append(looks)
-        return returns
-
-    def _bound(self) -> None:
-        """Lets scans go where memory is short."""
-        if self._max_bytes is not None and self.num_bytes > self._max_bytes:
-            if self._noise_of == 0:  # the scans that tell it may go
-                self._settle_noise()
-            self._log.shrink(max(0, self._max_bytes - (self.num_bytes - self._log.num_bytes)))
-
-    def _all_sums(self) -> ScanSums:
-        return ScanSums(self._config.leaf_size_m, *self._sums.sums_of(self._sums.block_keys()))
-
-    def _begin_reading(self) -> tuple[GrowingSurface, Changes, SensorNoise]:
-        """The surface, and what changed since it was derived. The map may change again meanwhile."""
-        with self._lock:
-            if self._surface is None:
-                origin = np.zeros(3) if self._origin is None else self._origin
-                surface = GrowingSurface(self._quick, origin)
-                self._surface = surface if self._origin is not None else None
-                self._returns_dirty = self._looks_dirty = [self._sums.block_keys()]
-            else:
-                surface = self._surface
-            returns, looked = (
-                np.unique(np.concatenate([_NONE, *keys])) for keys in (self._returns_dirty, self._looks_dirty)
-            )
-            changes = Changes(
-                returns,
-                ScanSums(self._config.leaf_size_m, *self._sums.sums_of(returns)),
-                looked,
-                Looks(*self._sums.looks_of(looked)),
-            )
-            self._returns_dirty, self._looks_dirty = [], []
-            self._settle_noise()
-            return surface, changes, self._noise
-
-    def _settle_noise(self) -> None:
-        """Estimates the sensor's noise, if there are twice or half as many scans as there were then."""
-        scans = len(self)
-        if self._noise_of / 2 < scans < 2 * self._noise_of:
-            return
-        num_threads = resolve_num_threads(self._config.num_threads)
-        found = noise_of(self._log, self._all_sums(), self._quick, self._origin, num_threads)
-        if found is not None:
-            self._noise, self._noise_of = found, scans
+            scans = list(self._state.log.scans())
+        return finished(scans, self._state.config, self._state.origin, progress)
 
 
 def _finite(time: float) -> float:

@@ -42,6 +42,11 @@ class LoggedScan:
         held: int = sum(array.nbytes for array in arrays if array is not None)
         return held + _BYTES_OF_SCAN
 
+    @property
+    def reach_m(self) -> float:
+        """Range of the farthest return, m."""
+        return float(np.sqrt(np.square(self.points, dtype=np.float64).sum(axis=1).max()))
+
     def at(self, pose: NDArray[np.float64]) -> LoggedScan:
         """The same from another pose (4, 4)."""
         return replace(self, pose=pose)
@@ -59,6 +64,7 @@ class SealedScan(ValueError):
 class _OnDisk:
     pose: NDArray[np.float64]
     path: Path
+    reach_m: float
 
 
 class ScanLog:
@@ -155,14 +161,24 @@ class ScanLog:
         write_whole(path, data.getvalue())
         self._written += 1
         self._forget(scan_id)
-        self._scans[scan_id] = _OnDisk(scan.pose, path)
+        self._scans[scan_id] = _OnDisk(scan.pose, path, scan.reach_m)
         self.num_bytes += _BYTES_ON_DISK
 
-    def seal(self, scan_ids: list[ScanId]) -> None:
-        """Lets these go for good: a part of what they gave the map was forgotten."""
-        for scan_id in scan_ids:
-            self.drop(scan_id)
-            self._sealed.add(scan_id)
+    def seal_beyond(self, centre: NDArray[np.float64], radius_m: float) -> None:
+        """Lets those go for good that reach beyond a ball round `centre` (3,), world, m: a part of what they gave is forgotten."""
+        for scan_id, scan in list(self._scans.items()):
+            if float(np.linalg.norm(scan.pose[:3, 3] - centre)) + scan.reach_m > radius_m:
+                self.drop(scan_id)
+                self._sealed.add(scan_id)
+
+    @property
+    def sealed_ids(self) -> list[ScanId]:
+        """Of the scans that cannot be taken out."""
+        return list(self._sealed)
+
+    def restore_sealed(self, scan_ids: list[ScanId]) -> None:
+        """Of a map that is read again."""
+        self._sealed |= set(scan_ids)
 
 
 def _arrays(scan: LoggedScan) -> dict[str, NDArray[Any]]:

@@ -1,0 +1,58 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A map that grows in the callback of a driver, while another thread reads it.
+
+With ROS 2, the callback is that of a subscription; nothing else changes:
+
+    class Mapper(rclpy.node.Node):
+        def __init__(self):
+            super().__init__("mapper")
+            self.live = radarsdf.LiveMap()
+            self.create_subscription(PointCloud2, "/radar/points", self.on_scan, 10)
+
+        def on_scan(self, message):
+            fields = point_cloud2.read_points(message, ["x", "y", "z", "power", "doppler"])
+            points = np.stack([fields[name] for name in "xyz"], axis=1)
+            stamp = message.header.stamp
+            self.live.integrate(points, self.pose_at(stamp), fields["power"], doppler_mps=fields["doppler"])
+"""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import radarsdf
+
+drive = radarsdf.simulate.oculii(seed=5, frames=40)
+given = drive.poses.copy()
+given[:, :3, 3] += 0.02 * np.arange(len(given))[:, None] * [0.2, 1.0, 0.5]  # as of poses that drift
+live = radarsdf.LiveMap()
+done = threading.Event()
+
+
+def on_scan(i: int) -> None:
+    """What a driver calls with each scan."""
+    integrated = live.integrate(drive.points[i], given[i], drive.intensities[i])
+    if i % 10 == 0:
+        print(f"scan {integrated.scan_id}: {len(integrated.blocks)} blocks changed")
+
+
+def watch() -> None:
+    """A planner, or a viewer: it never sees half a scan, and the driver does not wait for it."""
+    while not done.wait(0.2):
+        print(f"{len(live.mesh().faces)} triangles of {len(live)} scans")
+
+
+watcher = threading.Thread(target=watch)
+watcher.start()
+for i in range(len(drive)):
+    on_scan(i)
+
+# A loop closed: scans move to better poses, all at once.
+refined = radarsdf.refine_poses(drive.points, given)
+changed = live.move_all(dict(zip(live.scan_ids, refined.poses, strict=True)))
+done.set()
+watcher.join()
+print(f"{len(changed)} blocks changed with the poses: {refined.report['verdict']}")
+print(f"{len(live.mesh().faces)} triangles in the end; as a map that does not grow: {live.map()}")

@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a map that grows consists of, and how it changes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf._core import GrowingSums, SumsChange
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.live.learning import noise_of, quick_of
+from radarsdf.live.scan_log import LoggedScan, ScanLog
+from radarsdf.live.scans import rays_of
+from radarsdf.live.storage import Stored
+from radarsdf.live.surface import Changes, GrowingSurface
+from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.evidence import BLOCK_BITS, Looks
+from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.scan_sums import QUANTA, ScanSums
+from radarsdf.threads import resolve_num_threads
+
+Keys = NDArray[np.uint64]
+_NONE = np.zeros(0, np.uint64)
+_MARKS = 64  # lists of changed blocks, before they are joined
+_UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
+
+
+class GrowingState:
+    """Sums over scans, the scans themselves, and the surface that follows. One thread at a time.
+
+    Parameters
+    ----------
+    config : FitConfig
+        Settings.
+    origin : ndarray or None
+        (3,) of the local frame, world, m. None: it follows from the first scan.
+    max_bytes : int or None
+        Memory beyond which scans are let go, bytes.
+    log : ScanLog
+        An empty one.
+    """
+
+    def __init__(
+        self, config: FitConfig, origin: NDArray[np.float64] | None, max_bytes: int | None, log: ScanLog
+    ) -> None:
+        self.config, self.quick = config, quick_of(config)
+        self.origin = origin
+        self.max_bytes = max_bytes
+        self.log = log
+        self.sums = GrowingSums()
+        self.noise = _UNKNOWN
+        self.with_intensities: bool | None = None
+        self.next_id = 0
+        self._noise_of = 0  # number of scans that the noise was estimated from
+        self._returns_changed: list[Keys] = []
+        self._looks_changed: list[Keys] = []
+        self._surface: GrowingSurface | None = None
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that all takes, bytes."""
+        surface = 0 if self._surface is None else self._surface.num_bytes
+        return self.sums.num_bytes + self.log.num_bytes + surface
+
+    def change(self) -> SumsChange:
+        """No change yet."""
+        return SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
+
+    def collect(
+        self, change: SumsChange, scan: LoggedScan, sign: int, origin: NDArray[np.float64] | None = None
+    ) -> None:
+        """A scan comes (1) or goes (-1), once the change is applied. `origin`: of a map that has none yet."""
+        rays = rays_of(scan, self.config, self.origin if origin is None else origin)
+        change.collect(rays.points, rays.directions, rays.ranges_m, sign)
+
+    def apply(self, change: SumsChange) -> Keys:
+        """Makes a change. Gives the keys of the blocks whose returns changed. An error leaves all as it was."""
+        returns, looks = self.sums.apply(change)
+        self._mark(returns, looks)
+        return returns
+
+    def bound(self) -> None:
+        """Lets scans go where memory is short."""
+        if self.max_bytes is not None and self.num_bytes > self.max_bytes:
+            if self._noise_of == 0:  # the scans that tell it may go
+                self._settle_noise()
+            self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
+
+    def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
+        """Forgets blocks beyond a ball. Gives their keys."""
+        keys = self.sums.block_keys()
+        if self.origin is None:
+            return keys
+        middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
+        gone: Keys = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
+        self.sums.erase(gone)
+        self.log.seal_beyond(centre, radius_m)
+        self._mark(gone, gone)
+        return gone
+
+    def all_sums(self) -> ScanSums:
+        """Of all cells."""
+        return ScanSums(self.config.leaf_size_m, *self.sums.sums_of(self.sums.block_keys()))
+
+    def changes(self) -> tuple[GrowingSurface, Changes, SensorNoise]:
+        """The surface as it was derived last, and what it has to take in."""
+        if self._surface is None:
+            origin = np.zeros(3) if self.origin is None else self.origin
+            surface = GrowingSurface(self.quick, origin)
+            self._surface = None if self.origin is None else surface
+            self._returns_changed = self._looks_changed = [self.sums.block_keys()]
+        else:
+            surface = self._surface
+        returns, looked = (
+            np.unique(np.concatenate([_NONE, *keys])) for keys in (self._returns_changed, self._looks_changed)
+        )
+        changes = Changes(
+            returns,
+            ScanSums(self.config.leaf_size_m, *self.sums.sums_of(returns)),
+            looked,
+            Looks(*self.sums.looks_of(looked)),
+        )
+        self._returns_changed, self._looks_changed = [], []
+        self._settle_noise()
+        return surface, changes, self.noise
+
+    def forget_surface(self) -> None:
+        """The surface is derived anew from all sums."""
+        self._surface = None
+
+    def stored(self) -> Stored:
+        """All that a file has to hold."""
+        keys = self.sums.block_keys()
+        return Stored(
+            self.config,
+            self.origin,
+            self.noise,
+            self._noise_of,
+            self.next_id,
+            self.with_intensities,
+            self.max_bytes,
+            self.log.sealed_ids,
+            dict(zip(self.log.ids, self.log.scans(), strict=True)),
+            *self.sums.sums_of(keys),
+            *self.sums.looks_of(keys),
+        )
+
+    def restore(self, stored: Stored) -> None:
+        """Of a new state: what was stored."""
+        self.sums.insert(stored.keys, stored.sums, stored.scans_of_cells, stored.look_keys, stored.looks)
+        self.noise, self._noise_of = stored.noise, stored.noise_of
+        self.next_id, self.with_intensities = stored.next_id, stored.with_intensities
+        for scan_id, scan in stored.scans.items():
+            self.log.put(scan_id, scan)
+        self.log.restore_sealed(stored.sealed)
+        self.bound()
+
+    def _mark(self, returns: Keys, looks: Keys) -> None:
+        """The surface has to take in these blocks. Of very many scans, the list must not grow without end."""
+        for marked, keys in ((self._returns_changed, returns), (self._looks_changed, looks)):
+            marked.append(keys)
+            if len(marked) > _MARKS:
+                marked[:] = [np.unique(np.concatenate(marked))]
+
+    def _settle_noise(self) -> None:
+        """Estimates the sensor's noise, if there are twice or half as many scans as there were then."""
+        scans = len(self.log)
+        if self._noise_of / 2 < scans < 2 * self._noise_of:
+            return
+        num_threads = resolve_num_threads(self.config.num_threads)
+        found = noise_of(self.log, self.all_sums(), self.quick, self.origin, num_threads)
+        if found is not None:
+            self.noise, self._noise_of = found, scans

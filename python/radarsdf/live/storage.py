@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The state of a map that grows, in one file. Nothing in it is executed."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.checks import check_poses
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.io.files import write_whole
+from radarsdf.io.npz import arrays_of
+from radarsdf.live.scan_log import LoggedScan, ScanId
+from radarsdf.returns.noise import SensorNoise
+
+_FORMAT = 1
+_COLUMNS = ("points", "intensities", "doppler_mps", "standing")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What is kept of a map."""
+
+    config: FitConfig
+    origin: NDArray[np.float64] | None
+    noise: SensorNoise
+    noise_of: int
+    next_id: int
+    with_intensities: bool | None
+    max_bytes: int | None
+    sealed: list[ScanId]
+    scans: dict[ScanId, LoggedScan]
+    keys: NDArray[np.uint64]
+    sums: NDArray[np.int64]
+    scans_of_cells: NDArray[np.uint32]
+    look_keys: NDArray[np.uint64]
+    looks: NDArray[np.uint32]
+
+
+_SUMS: dict[str, tuple[Any, tuple[int | None, ...]]] = {
+    "keys": (np.uint64, (None,)),
+    "sums": (np.int64, (None, 14)),
+    "scans_of_cells": (np.uint32, (None,)),
+    "look_keys": (np.uint64, (None,)),
+    "looks": (np.uint32, (None,)),
+}
+
+
+def save_state(stored: Stored, path: str | PathLike[str]) -> None:
+    """Writes a state whole or not at all. Raises a ValueError for ids that are neither numbers nor words."""
+    ids = [*stored.scans, *stored.sealed]
+    if not all(type(scan_id) in (int, str) for scan_id in ids):
+        msg = "a map can be saved only if the ids of its scans are whole numbers or strings"
+        raise ValueError(msg)
+    described = {
+        "format": _FORMAT,
+        "config": stored.config.to_dict(),
+        "origin": None if stored.origin is None else stored.origin.tolist(),
+        "noise": dataclasses.astuple(stored.noise),
+        "noise_of": stored.noise_of,
+        "next_id": stored.next_id,
+        "with_intensities": stored.with_intensities,
+        "max_bytes": stored.max_bytes,
+        "sealed": stored.sealed,
+        "ids": list(stored.scans),
+        "held": [
+            [name for name in _COLUMNS if getattr(scan, name) is not None] for scan in stored.scans.values()
+        ],
+    }
+    scans = list(stored.scans.values())
+    arrays: dict[str, NDArray[Any]] = {name: getattr(stored, name) for name in _SUMS}
+    arrays["poses"] = np.stack([scan.pose for scan in scans]) if scans else np.zeros((0, 4, 4))
+    arrays["counts"] = np.array([len(scan.points) for scan in scans], np.int64)
+    for name in _COLUMNS:
+        held = [array for array in (getattr(scan, name) for scan in scans) if array is not None]
+        if held:
+            arrays[name] = np.concatenate(held)
+            # Some scans may be in float32, others not.
+            arrays[f"{name}_single"] = np.array([array.dtype == np.float32 for array in held])
+    data = io.BytesIO()
+    np.savez(
+        data,
+        allow_pickle=False,
+        described=np.frombuffer(json.dumps(described).encode(), np.uint8),
+        **arrays,
+    )
+    write_whole(path, data.getvalue())
+
+
+def load_state(path: str | PathLike[str]) -> Stored:
+    """The state that :func:`save_state` wrote. Raises a ValueError if the file is none, or damaged."""
+    names = ("described", "poses", "counts", *_SUMS, *_COLUMNS, *(f"{name}_single" for name in _COLUMNS))
+    arrays = arrays_of(Path(path), names)
+    try:
+        return _state_of(arrays)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        msg = f"{path} is not the state of a live map of this version, or it is damaged: {error}"
+        raise ValueError(msg) from error
+
+
+def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
+    described = json.loads(arrays["described"].tobytes())
+    if described["format"] != _FORMAT:
+        msg = f"format {described['format']!r:.20}"
+        raise ValueError(msg)
+    sums = {}
+    for name, (dtype, shape) in _SUMS.items():
+        array = sums[name] = np.ascontiguousarray(arrays[name])
+        fits = array.ndim == len(shape) and all(
+            n in (None, m) for m, n in zip(array.shape, shape, strict=True)
+        )
+        if array.dtype != dtype or not fits:
+            msg = f"{name} is of another type or shape"
+            raise ValueError(msg)
+    if (np.diff(sums["keys"].astype(np.float64)) < 0).any() or (sums["sums"][:, 0] < 1).any():
+        msg = "its sums are none"
+        raise ValueError(msg)
+    ids, held, counts = described["ids"], described["held"], arrays["counts"].tolist()
+    poses = check_poses(arrays["poses"], len(ids)) if ids else np.zeros((0, 4, 4))
+    columns = {name: _parts(arrays, name, held, counts) for name in _COLUMNS}
+    scans = {
+        scan_id: LoggedScan(poses[i].copy(), *(columns[name][i] for name in _COLUMNS))
+        for i, scan_id in enumerate(ids)
+    }
+    if any(scan.points is None or scan.points.shape[1:] != (3,) for scan in scans.values()):
+        msg = "a scan has no points"
+        raise ValueError(msg)
+    origin = described["origin"]
+    return Stored(
+        config=FitConfig.from_dict(described["config"]),
+        origin=None if origin is None else np.array(origin, np.float64),
+        noise=SensorNoise(*map(float, described["noise"])),
+        noise_of=int(described["noise_of"]),
+        next_id=int(described["next_id"]),
+        with_intensities=described["with_intensities"],
+        max_bytes=described["max_bytes"],
+        sealed=described["sealed"],
+        scans=scans,
+        **sums,
+    )
+
+
+def _parts(arrays: dict[str, NDArray[Any]], name: str, held: list[list[str]], counts: list[int]) -> list[Any]:
+    """A column of each scan. None: the scan has none."""
+    has = [name in names for names in held]
+    if not any(has):
+        return [None] * len(held)
+    lengths = [count for count, own in zip(counts, has, strict=True) if own]
+    whole, single = arrays[name], arrays[f"{name}_single"]
+    if sum(lengths) != len(whole):
+        msg = f"{name} are of another number"
+        raise ValueError(msg)
+    parts = iter(zip(np.split(whole, np.cumsum(lengths)[:-1]), single, strict=True))
+    found: list[Any] = []
+    for own in has:
+        if not own:
+            found.append(None)
+            continue
+        part, is_single = next(parts)
+        found.append(part.astype(np.float32) if is_single else part.copy())
+    return found

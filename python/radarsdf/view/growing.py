@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A page that shows a surface while it grows."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.view.framing import FOV_RAD, look_at_all
+from radarsdf.view.serving import free_port, require_viser, start_server, stop_server
+
+if TYPE_CHECKING:
+    import trimesh
+    from typing_extensions import Self
+
+_TO_EYE = np.array([-0.33, -0.57, 0.5])  # of the first view
+_ASPECT = 1.3
+_SURFACE_COLOR, _PATH_COLOR = (150, 160, 170), (0, 190, 255)
+
+
+class GrowingView:
+    """Serves the surface and the way of the sensor, whatever they are now, until it is stopped.
+
+    Parameters
+    ----------
+    host : str
+        Address to listen on.
+    port : int, optional
+        Port to listen on. None: 8080, or the next that is free.
+
+    Raises
+    ------
+    ImportError
+        If viser is missing.
+    OSError
+        If host and port cannot be listened on.
+    """
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
+        require_viser()
+        self.host = host
+        self.port = free_port(host, 8080 if port is None else port, exactly=port is not None)
+        self._server: Any = start_server(host, self.port)
+        self._origin: NDArray[np.float64] | None = None
+
+    def show(self, mesh: trimesh.Trimesh, path: NDArray[np.float64]) -> None:
+        """Replaces what is shown: a mesh, and the positions (F, 3) of the sensor, world, m."""
+        if len(mesh.faces) == 0:
+            return
+        vertices = np.asarray(mesh.vertices, np.float64)
+        server = self._server
+        if self._origin is None:  # of the page, which is in float32
+            self._origin = path[0].copy()
+            look = look_at_all(vertices - self._origin, _TO_EYE, _ASPECT)
+            server.initial_camera.fov = FOV_RAD
+            server.initial_camera.position, server.initial_camera.look_at = map(tuple, look)
+        with server.atomic():
+            server.scene.add_mesh_simple(
+                "/surface",
+                (vertices - self._origin).astype(np.float32),
+                np.asarray(mesh.faces, np.uint32),
+                color=_SURFACE_COLOR,
+                side="double",
+                flat_shading=True,
+            )
+            if len(path) > 1:
+                way = (path - self._origin).astype(np.float32)
+                server.scene.add_line_segments(
+                    "/path", np.stack([way[:-1], way[1:]], axis=1), colors=_PATH_COLOR, line_width=3.0
+                )
+
+    def stop(self) -> None:
+        """Close the page and end all threads."""
+        stop_server(self._server)
+
+    def __enter__(self) -> Self:
+        """The view, which the end of the block stops."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Stop."""
+        self.stop()
