@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from bench.live import accuracy, circles, kills, rates, removal
+from bench.live import accuracy, circles, kills, loops, rates, removal
 
 _COMMANDS = {
     "rates": rates,
@@ -17,6 +17,7 @@ _COMMANDS = {
     "removal": removal,
     "circles": circles,
     "kills": kills,
+    "loops": loops,
 }
 
 

@@ -80,6 +80,19 @@ TEST_CASE("the flat map is a map") {
     const auto found = expected.find(key);
     REQUIRE(map.find(key) == (found == expected.end() ? -1 : found->second));
   }
+  for (std::int32_t i = 0; i < 40000; ++i) {  // comes and goes: what is left is found, wherever it was moved to
+    const std::uint64_t key = generator() % 15000;
+    if (generator() % 3 == 0) {
+      CHECK(map.insert(key, i) == expected.insert({key, i}).second);
+    } else {
+      CHECK(map.erase(key) == (expected.erase(key) == 1));
+    }
+  }
+  CHECK(map.size() == expected.size());
+  for (std::uint64_t key = 0; key < 16000; ++key) {
+    const auto found = expected.find(key);
+    REQUIRE(map.find(key) == (found == expected.end() ? -1 : found->second));
+  }
 }
 
 TEST_CASE_TEMPLATE("the cell set is the set of the points' cells", T, float, double) {

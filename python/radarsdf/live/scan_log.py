@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import io
+from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -78,7 +79,8 @@ class ScanLog:
         self._folder = folder
         self._scans: dict[ScanId, LoggedScan | _OnDisk] = {}
         self._sealed: set[ScanId] = set()
-        self._in_memory = 0
+        # Ids of those in memory, the oldest first. A list of all for each scan would wake Python's collector of garbage.
+        self._in_memory: OrderedDict[ScanId, None] = OrderedDict()
         self._written = 0
         self.num_bytes = 0
         """Memory of what is held, bytes."""
@@ -122,7 +124,7 @@ class ScanLog:
         """Adds a scan, or changes one in its place."""
         self._forget(scan_id)
         self._scans[scan_id] = scan
-        self._in_memory += 1
+        self._in_memory[scan_id] = None
         self.num_bytes += scan.num_bytes
 
     def drop(self, scan_id: ScanId) -> None:
@@ -137,18 +139,16 @@ class ScanLog:
             there.path.unlink(missing_ok=True)
             self.num_bytes -= _BYTES_ON_DISK
         elif there is not None:
-            self._in_memory -= 1
+            del self._in_memory[scan_id]
             self.num_bytes -= there.num_bytes
 
     def shrink(self, max_bytes: int) -> None:
         """Lets the oldest scans in memory go, to the disk if there is a folder, until all take at most so much."""
-        if self.num_bytes <= max_bytes:
-            return
-        for scan_id, scan in list(self._scans.items()):
-            if self.num_bytes <= max_bytes or self._in_memory == 0:
-                return
-            if isinstance(scan, LoggedScan):
-                self._let_go(scan_id, scan)
+        while self.num_bytes > max_bytes and self._in_memory:
+            scan_id = next(iter(self._in_memory))
+            scan = self._scans[scan_id]
+            assert isinstance(scan, LoggedScan)
+            self._let_go(scan_id, scan)
 
     def _let_go(self, scan_id: ScanId, scan: LoggedScan) -> None:
         if self._folder is None:
