@@ -104,9 +104,23 @@ def test_a_fit_mends_the_poses(drive, drifted_file, tmp_path, capsys):
     )
     assert mended["improved"]
     assert "poses" not in plain
+    maps = [radarsdf.load(tmp_path / f"{i}.safetensors") for i in range(2)]
+    assert "poses" not in maps[0].report
+    assert maps[1].report["poses"]["verdict"] == mended["poses"]["verdict"]
+    sigmas_m = [m.config.returns.pose_sigma_m for m in maps]
+    assert sigmas_m[0] == 0
+    assert 0.001 < sigmas_m[1] < 0.1
     assert mended["poses"]["moved_m"] == pytest.approx(
         position_error_m(read_scans(drifted_file).poses, drive.poses), rel=0.9
     )
+
+
+def test_the_poses_that_were_written_are_those_of_the_next_command(drive, drifted_file, tmp_path, capsys):
+    out = tmp_path / "mended.tum"
+    following = values(capsys, "poses", drifted_file, "-o", out)["next"]
+    assert following == f"radarsdf fit {drifted_file} {out} -o mended.safetensors"
+    scans = radarsdf.io.read(drifted_file, out)
+    assert errors(scans.poses, drive.poses)[0] < 0.5 * errors(read_scans(drifted_file).poses, drive.poses)[0]
 
 
 def test_pieces_are_not_joined(drive, motion, tmp_path, capsys):

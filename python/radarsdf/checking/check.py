@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checking import before_fit, frames, trajectory
 from radarsdf.checking.doppler import check_doppler
+from radarsdf.checking.drift import check_drift
 from radarsdf.checking.finding import SEVERITIES, Finding
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
@@ -116,6 +117,8 @@ def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort)
     found += wrong
     if config is not None and not any(finding.severity == "error" for finding in found):
         found += before_fit.check_fit(recording, config)
+        if not any(finding.severity == "error" for finding in found):
+            found += check_drift(recording, config)
     return found
 
 

@@ -75,7 +75,9 @@ def run(options: argparse.Namespace) -> None:
         msg = f"{options.out}: a map is written as {MAP_SUFFIX}, by which the other commands know it"
         raise ValueError(msg)
     results = Results(options)
-    every_scan = scans = scans_and_poses(options, config, results, refine=options.refine).scans
+    posed = scans_and_poses(options, config, results, refine=options.refine)
+    every_scan = scans = posed.scans
+    config = posed.config(config)
     held_out = None
     if options.holdout is not None:
         from radarsdf.evaluation import holdout
@@ -109,6 +111,8 @@ def run(options: argparse.Namespace) -> None:
             except OSError as error:
                 stop.args = (f"{stop}; {error}",)
         raise
+    if posed.way is not None:
+        radar_map.report["poses"] = posed.way
     save_map(radar_map, options.out)
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)

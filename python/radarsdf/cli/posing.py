@@ -5,9 +5,10 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
@@ -30,6 +31,18 @@ class PosedScans:
     given: NDArray[np.float64] | None
     """(F, 4, 4) poses of these scans before. None: there were none."""
     pieces: int
+    way: dict[str, Any] | None = None
+    """What the report of a fit keeps of them. None: they are as given."""
+    sigmas: tuple[float, float] | None = None
+    """Standard deviations of a pose, m and rad. None: they are not known."""
+
+    def config(self, config: FitConfig) -> FitConfig:
+        """With the errors of the poses, unless it states some itself."""
+        stated = config.returns.pose_sigma_m or config.returns.pose_sigma_rad
+        if self.sigmas is None or stated:
+            return config
+        sigma_m, sigma_rad = self.sigmas
+        return config.override(returns={"pose_sigma_m": sigma_m, "pose_sigma_rad": min(sigma_rad, 1.0)})
 
 
 def scans_and_poses(
@@ -55,6 +68,7 @@ def scans_and_poses(
 
 def _refined(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
     from radarsdf import refine_poses
+    from radarsdf.poses.way import pose_sigmas, way_of
 
     refined = refine_poses(scans, config=config)
     results.add(refined.report["verdict"], poses=refined.report, improved=refined.improved)
@@ -67,11 +81,14 @@ def _refined(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
                 **refined.report,
             )
         )
-    return PosedScans(scans.with_poses(refined.poses), scans.poses, 1)
+    posed = PosedScans(scans.with_poses(refined.poses), scans.poses, 1, way_of(refined, scans.poses))
+    # The covariance is that of the refined poses.
+    return dataclasses.replace(posed, sigmas=pose_sigmas(refined.covariance)) if refined.improved else posed
 
 
 def _found(scans: Scans, config: FitConfig, results: Results, command: str) -> PosedScans:
     from radarsdf import odometry
+    from radarsdf.poses.way import pose_sigmas, way_of
 
     found = odometry(scans, config=config)
     results.add(found.report["verdict"], poses=found.report)
@@ -79,10 +96,10 @@ def _found(scans: Scans, config: FitConfig, results: Results, command: str) -> P
         complain(f"radarsdf {command}: {note}")
     if found.report["doppler_sign"] < 0:
         results.add("this radar's Doppler is positive where the sensor comes nearer")
-    pieces = found.report["pieces"]
+    pieces, rows = found.report["pieces"], found.longest_piece()
     posed = scans.with_poses(found.poses, other_world=True)
     if pieces > 1:
-        rows = found.longest_piece()
         results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest piece")
         posed = posed.select_range(rows)
-    return PosedScans(posed, None, pieces)
+    sigmas = pose_sigmas(found.covariance[rows])
+    return PosedScans(posed, None, pieces, way_of(found, None, rows), sigmas)

@@ -13,6 +13,7 @@ from radarsdf.settings import by_name, first_wrong
 
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Finite = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Position = Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_length=3, max_length=3)]
 _RULES = ConfigDict(strict=True, extra="allow")
 
 
@@ -26,6 +27,20 @@ class _History(TypedDict):
     iterations: list[_Count]
     losses: list[float]  # of a fit that diverged, not all are finite
     seconds: list[_Finite]
+
+
+class _Poses(TypedDict):
+    """What :func:`radarsdf.poses.way.way_of` writes."""
+
+    verdict: str
+    improved: bool | None
+    step_m: _Finite | None
+    step_rad: _Finite | None
+    scans: list[_Count]
+    before: list[_Position] | None
+    after: list[_Position]
+    sigma_m: list[_Finite]
+    sigma_rad: list[_Finite]
 
 
 class _Report(TypedDict, total=False):
@@ -49,6 +64,7 @@ class _Report(TypedDict, total=False):
     skipped: list[str]
     skipped_s: list[Annotated[float, Field(allow_inf_nan=False)] | None]
     plan: str
+    poses: _Poses
 
 
 _REPORT: TypeAdapter[Any] = TypeAdapter(_Report)
@@ -74,11 +90,14 @@ def checked_report(report: Any) -> dict[str, Any]:
         ):
             msg = f"report.{name:.50} must be seconds, not {value!r:.50}"
             raise ValueError(msg)
+    way = checked.get("poses")
+    lists = [] if way is None else [value for value in way.values() if isinstance(value, list)]
     histories = checked.get("loss_history", {}).values()
     if (
         len(checked.get("skipped", [])) != len(checked.get("skipped_s", []))
         or not checked.get("iterations_done", {}).keys() <= checked.get("iterations", {}).keys()
         or any(len({len(part) for part in history.values()}) != 1 for history in histories)
+        or (way is not None and (len({len(part) for part in lists}) != 1 or not lists[0]))
     ):
         msg = "parts of the report do not fit together"
         raise ValueError(msg)

@@ -124,3 +124,35 @@ def by_bins(
     above.set(ylabel=f"median, {unit}")
     below.set(xlabel=label, ylabel="mean error", xlim=(edges[0], edges[-1]))
     return _png(figure)
+
+
+def trajectory(before: _Floats | None, after: _Floats) -> bytes:
+    """Positions (N, 3) from above, and their height over the way. `before`: the same scans where they were."""
+    figure = new_figure(figsize=(4.4, 5.2), dpi=_DPI, layout="constrained", facecolor="white")
+    above, height = figure.subplots(2, 1, height_ratios=[3, 1])
+    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(after, axis=0), axis=1))])
+    ways = [("after", after, FIRST, 1.5)]
+    if before is not None:
+        ways.insert(0, ("before", before, SECOND, 2.5))
+    for name, way, color, width in ways:
+        above.plot(way[:, 0], way[:, 1], color=color, linewidth=width, label=name)
+        above.plot(*way[0, :2], "o", color=color, markersize=4)
+        height.plot(along_m, way[:, 2], color=color, linewidth=width)
+    above.set(xlabel="x, m", ylabel="y, m")
+    above.set_aspect("equal", adjustable="datalim")
+    height.set(xlabel="along the way, m", ylabel="z, m")
+    if before is not None:
+        above.legend(frameon=False)
+    return _png(figure)
+
+
+def along_scans(scans: NDArray[Any], values: Mapping[str, _Floats]) -> bytes:
+    """Values (N,) by what they are, each with axes of its own, over the numbers of scans (N,)."""
+    figure = new_figure(figsize=(4.4, 5.2), dpi=_DPI, layout="constrained", facecolor="white")
+    axes = figure.subplots(len(values), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (name, shown), color in zip(axes, values.items(), (FIRST, SECOND), strict=False):
+        ax.plot(scans, shown, color=color, linewidth=1.5)
+        ax.set(ylabel=name)
+        ax.set_ylim(bottom=0)
+    axes[-1].set(xlabel="scan")
+    return _png(figure)

@@ -21,6 +21,7 @@ from radarsdf.report.training import (
     training_section,
     versions_section,
 )
+from radarsdf.report.trajectory import trajectory_section
 from radarsdf.report.truth import truth_section, uncertainty_section
 
 
@@ -54,9 +55,11 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
     errors, error_facts, of_surface = truth_section(subject)
     uncertainty, of_uncertainty = uncertainty_section(subject)
     intensity, intensity_facts, of_intensity = intensity_section(subject)
+    poses, of_poses = trajectory_section(subject)
     sections = [
-        conclusion_section(subject, [*of_surface, *of_uncertainty, *of_intensity]),
+        conclusion_section(subject, [*of_poses, *of_surface, *of_uncertainty, *of_intensity]),
         findings_section(subject),
+        *poses,
         surface_section(subject),
         errors,
         uncertainty,

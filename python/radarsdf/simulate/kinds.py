@@ -192,7 +192,11 @@ def _facade(rng: np.random.Generator, length_m: float) -> list[Box]:
     """A front along x with windows set back from it, balconies and a roof's edge; 15 m to the left of the path."""
     brick, glass, y = vary(rng, materials.BRICK), vary(rng, materials.GLASS), 15.0
     height, middle = rng.uniform(9, 14), length_m / 2
-    boxes = [Box(np.array([middle, y + 4, height / 2 - 0.5]), np.array([middle, 4.0, height / 2 + 0.5]), 0.0, brick)]
+    boxes = [
+        Box(
+            np.array([middle, y + 4, height / 2 - 0.5]), np.array([middle, 4.0, height / 2 + 0.5]), 0.0, brick
+        )
+    ]
     for x in np.arange(2.0, length_m - 1, rng.uniform(3, 4.5)):
         for z in np.arange(2.0, height - 1, 3.0):
             boxes.append(Box(np.array([x, y, z]), np.array([0.6, 0.05, 0.8]), 0.0, glass))
@@ -204,7 +208,9 @@ def _facade(rng: np.random.Generator, length_m: float) -> list[Box]:
 def _simulation(kind: Kind, name: str, seed: int = 0, frames: int | None = None) -> Simulation:
     rng = generator(seed, _LAYOUT)
     terrain, path = _ground(kind, rng), _path(kind, rng)
-    way = path(np.linspace(*_BEYOND, 200) if kind.drive == "ahead" else np.linspace(0, 1, 100, endpoint=False))
+    way = path(
+        np.linspace(*_BEYOND, 200) if kind.drive == "ahead" else np.linspace(0, 1, 100, endpoint=False)
+    )
     site = Site(rng, terrain, taken=[(x, y, 1.5) for x, y in way])
     site.solids += _enclosed(kind, way, rng)
     if kind.drive == "places":
