@@ -13,6 +13,7 @@ Examples
 """
 
 from .kinds import KINDS
+from .legs import Leg, LegDrive, drive_legs
 from .materials import Material
 from .measured_imu import measured_imu
 from .measured_motion import MeasuredMotion, measured_motion
@@ -29,6 +30,8 @@ __all__ = [
     "Box",
     "CornerReflector",
     "Hits",
+    "Leg",
+    "LegDrive",
     "Material",
     "MeasuredMotion",
     "Origin",
@@ -40,6 +43,7 @@ __all__ = [
     "Simulation",
     "Terrain",
     "astyx",
+    "drive_legs",
     "hugin",
     "measured_imu",
     "measured_motion",

@@ -41,6 +41,7 @@ def measured_motion(
     *,
     rate_hz: float = 10.0,
     times_s: FloatArray | None = None,
+    way: tuple[FloatArray, FloatArray] | None = None,
     doppler_noise_mps: float = 0.1,
     interval_mps: float | None = None,
     movers: float = 0.1,
@@ -58,6 +59,8 @@ def measured_motion(
         Scans in a second.
     times_s : (F,) float64, optional
         Of the scans, ascending. Default: by `rate_hz`.
+    way : (K,) and (K, 4, 4) float64, optional
+        Times and poses of the whole way, such as those of a :class:`LegDrive`, where scans are too far apart for a curve.
     doppler_noise_mps : float
         Standard deviation.
     interval_mps : float, optional
@@ -96,10 +99,11 @@ def measured_motion(
         times_s = np.arange(len(simulation), dtype=np.float64) / positive(rate_hz, "rate_hz")
     not_negative(movers, "movers")
     poses = simulation.poses
-    velocities = CubicSpline(times_s, poses[:, :3, 3])(times_s, 1)
+    at_s, on_way = (times_s, poses) if way is None else way
+    velocities = CubicSpline(at_s, on_way[:, :3, 3])(times_s, 1)
     in_sensor = np.einsum("fji,fj->fi", poses[:, :3, :3], velocities)
     # SciPy's rates are in the frame of the turned body.
-    rates = RotationSpline(times_s, Rotation.from_matrix(poses[:, :3, :3]))(times_s, 1)
+    rates = RotationSpline(at_s, Rotation.from_matrix(on_way[:, :3, :3]))(times_s, 1)
     doppler_mps = []
     for i, points in enumerate(simulation.points):
         rng = generator(seed, _MOTION_STREAM, i)
