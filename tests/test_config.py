@@ -67,6 +67,7 @@ REAL = {
 TRUTH = [
     "returns.drop_movers",
     "returns.drop_ghosts",
+    "returns.passages",
     "returns.onto_planes",
     "networks.normals",
     "networks.sdf_input",
@@ -365,6 +366,7 @@ PUBLISHED = {
         "accumulate_scans": 5,
         "drop_movers": False,
         "drop_ghosts": False,
+        "passages": False,
         "range_noise_m": None,
         "azimuth_noise_rad": None,
         "elevation_noise_rad": None,

@@ -35,6 +35,7 @@ ROOMS = (
     ("field",),
     ("budget",),
     ("checking",),
+    ("grids",),
     ("map",),
     ("fitting",),
     ("live",),

@@ -27,6 +27,7 @@ void bind_cell_means(pybind11::module_& m);
 void bind_cell_sums(pybind11::module_& m);
 void bind_growing_sums(pybind11::module_& m);
 void bind_looks(pybind11::module_& m);
+void bind_passages(pybind11::module_& m);
 void bind_poses(pybind11::module_& m);
 void bind_surface_crossings(pybind11::module_& m);
 void bind_ray_tracing(pybind11::module_& m);

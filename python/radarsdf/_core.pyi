@@ -40,6 +40,7 @@ __all__: list[str] = [
     "compiler",
     "count_looks",
     "count_scans",
+    "find_passages",
     "fit_cell_means",
     "fourier",
     "gather_rows",
@@ -958,6 +959,25 @@ def count_scans(
 ) -> numpy.typing.NDArray[numpy.uint32]:
     """
     Number of different scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each return's cell; `scans` (N,) int32, ascending.
+    """
+
+def find_passages(
+    points: numpy.typing.NDArray[numpy.float32],
+    directions: numpy.typing.NDArray[numpy.float32],
+    ranges_m: numpy.typing.NDArray[numpy.float32],
+    passed_m: numpy.typing.NDArray[numpy.float32],
+    scans: numpy.typing.NDArray[numpy.int32],
+    leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
+    lower: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    upper: typing.Annotated[
+        collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], "FixedSize(3)"
+    ],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> tuple[numpy.typing.NDArray[numpy.uint64], numpy.typing.NDArray[numpy.uint64]]:
+    """
+    Which leaf cells rays passed, from their sensor to `passed_m` along them, and in which there are returns: keys (B,) uint64 of blocks of 8 x 8 x 8 leaf cells, ascending, and their bit planes (B, 4, 8) uint64. Three planes are the number of scans that passed, up to 7. `points`, `directions` (N, 3), `ranges_m`, `passed_m` (N,) float32, local frame, m; `scans` (N,) int32, ascending; blocks outside leaf cells [`lower`, `upper`) (3,) are left out.
     """
 
 def fit_cell_means(

@@ -112,7 +112,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "8"
+    assert metadata["format_version"] == "9"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:

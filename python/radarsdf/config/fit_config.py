@@ -169,9 +169,11 @@ class FitConfig:
 
         The fit takes a fraction of the time; the surface is rougher and the map larger. Mesh it with voxels of the
         size of its leaf cells, since smaller ones show no more detail. Intensities are in closed form, and take a
-        quarter to a half of the time without them. `changes`: as for :meth:`override`.
+        quarter to a half of the time without them. Free space is not kept: for that, change ``returns.passages``.
+        `changes`: as for :meth:`override`.
         """
         return cls(
+            returns=ReturnsConfig(passages=False),
             encoding=EncodingConfig(kind="octree", num_levels=1, fourier_count=0, bridge_cells=0),
             networks=NetworksConfig(sdf_hidden=(2,), reflectance="closed-form"),
             sampling=SamplingConfig(near_band_cells=2.0),
@@ -186,7 +188,7 @@ class FitConfig:
         """
         return cls(
             returns=ReturnsConfig(
-                accumulate_scans=5, drop_movers=False, drop_ghosts=False, onto_planes=False
+                accumulate_scans=5, drop_movers=False, drop_ghosts=False, onto_planes=False, passages=False
             ),
             encoding=EncodingConfig(bridge_cells=0, fourier_count=16),
             networks=NetworksConfig(

@@ -74,6 +74,10 @@ class ReturnsConfig:
     is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones;
     up to 1 % more error of intensities."""
 
+    passages: bool = True
+    """Whether the map keeps which cells rays passed, for :meth:`radarsdf.Map.grid` and :func:`radarsdf.compare`. It takes
+    about 1 µs of a processor for each return, and 0.3 kB for each block of 8 × 8 × 8 leaf cells that rays went through."""
+
     def __post_init__(self) -> None:
         if self.max_range_m is not None and self.max_range_m <= self.min_range_m:
             msg = f"returns.max_range_m must exceed min_range_m, {self.min_range_m}, not {self.max_range_m}"

@@ -32,6 +32,7 @@ from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, Looks, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
+from radarsdf.returns.passages import Passages
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.scan_sums import ScanSums
 from radarsdf.returns.sensor import Sensor
@@ -59,6 +60,8 @@ class FitInput:
     """Share of the returns that lie on no thin surface. None: of these returns."""
     sensor: Sensor | None = None
     """The radar. None: as these rays and poses show it."""
+    box_cells: NDArray[np.int64] | None = None
+    """(2, 3) leaf cells from the origin of the rays; what they passed outside [lower, upper) is not kept. None: all is."""
     sums: ScanSums | None = None
     """Over the scans of the rays, if they were kept up scan by scan. None: made here, of all at once."""
     looks: Looks | None = None
@@ -196,6 +199,7 @@ def _learn_directly(
     clock.lap("occupied_cells_s")
     _initialise(field, start, config)
     evidence = Evidence.of(returns, rays, leaf_keys, config.leaf_size_m, num_threads, given.looks)
+    passages = _passages(given, surface, config, num_threads)
     clock.lap("start_s")
     schedule = Schedule.of(
         config,
@@ -217,6 +221,7 @@ def _learn_directly(
         reflectance=None,
         config=config,
         evidence=evidence,
+        passages=passages,
         rough_share=rough_share,
         sensor=sensor,
         report=_report(given, learnt, surface, field, schedule, config, num_threads),
@@ -232,6 +237,14 @@ def _open_cells(
     leaf_keys = bridged(leaf_keys, returns.keys, returns.counts, config.encoding.bridge_cells, num_threads)
     with_intensity = rays.intensities is not None and config.trains_intensity
     return Field(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
+
+
+def _passages(given: FitInput, surface: SurfaceReturns, config: FitConfig, num_threads: int) -> Passages:
+    """What the rays passed, of those that end at no ghost."""
+    if not config.returns.passages:
+        return Passages.none()
+    rays = given.rays if surface.true is None else given.rays.select(surface.true)
+    return Passages.of(rays, surface.noise, config.leaf_size_m, given.box_cells, num_threads)
 
 
 def _initialise(field: Field, start: Start, config: FitConfig) -> None:

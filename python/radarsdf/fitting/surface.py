@@ -32,6 +32,8 @@ class SurfaceReturns:
     """Noise of the returns."""
     means: MeanRays | None
     """Mean rays of the leaf cells, without ghosts. None if the training does not start from an average."""
+    true: NDArray[np.bool_] | None
+    """(N,) which of all rays end at no ghost. None: it was not asked."""
 
     @classmethod
     def of(
@@ -51,7 +53,7 @@ class SurfaceReturns:
         means = MeanRays.of_sums(sums) if averages else None
         del sums  # frees memory: a hundred bytes a cell
         noise = sensor_noise(surfels, rays, config.returns, num_threads)
-        kept = inside
+        kept, true = inside, None
         if means is not None and inside is not None:
             leaf_cells = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
             means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
@@ -63,4 +65,4 @@ class SurfaceReturns:
                 means = means.select(~of_ghosts[surfels.cells_of_leaves(means.keys, num_threads)])
         if onto_planes:
             rays = onto_surfels(surfels, rays, noise, num_threads)
-        return cls(rays if kept is None else rays.select(kept), surfels, noise, means)
+        return cls(rays if kept is None else rays.select(kept), surfels, noise, means, true)

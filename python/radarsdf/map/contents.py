@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.passages import Passages
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 
@@ -47,3 +49,5 @@ class MapContents(Scene):
     """The radar, as the scans of the fit show it."""
     report: dict[str, Any]
     """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
+    passages: Passages = dataclasses.field(default_factory=Passages.none)
+    """What rays passed. Empty if the map keeps none."""

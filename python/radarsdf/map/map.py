@@ -21,7 +21,14 @@ from radarsdf.returns.sensor import Sensor
 if TYPE_CHECKING:
     import trimesh
 
+    from radarsdf.grids.grid import Grid
+    from radarsdf.map.gridding import CellsInBox
     from radarsdf.map.views import View
+
+
+GRID_VOXEL_M = 0.2
+# More likely than not; and passed seven times as often as what is behind a surface.
+OCCUPIED_FROM, FREE_TO = 0.5, 0.125
 
 
 class Map(ABC):
@@ -246,6 +253,64 @@ class Map(ABC):
         MemoryError
             If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
+
+    def grid(
+        self,
+        box: ArrayLike,
+        voxel_size: float = GRID_VOXEL_M,
+        *,
+        occupied_from: float = OCCUPIED_FROM,
+        free_to: float = FREE_TO,
+    ) -> Grid:
+        """What is occupied, free and unknown in the voxels of a box, for planners.
+
+        A voxel is occupied where a surface probably is: by its signed distance, with :meth:`uncertainty` and
+        :meth:`confidence`. It is free only where rays passed it on the way to their returns, where no return is in it, and
+        where all that is round it is known, too: next to the unknown there may be a surface that was not seen. All else is
+        unknown. How much rays tell is asked of the map itself: how often they pass what is behind its surfaces.
+
+        What a radar does not see is not free. It sees nothing in its blind cone, outside of its field of view, nor nearer
+        than its minimum range (``returns.min_range_m``): the ground under the sensor is unknown until it drove on. Smooth
+        ground sends nothing back at flat angles and stays unknown. Glass and thin wires may send nothing back and be
+        called free if rays to what is behind them passed often. Rays to ghosts do not count where they were found to be
+        such; those that were not found may free a place behind a mirror.
+
+        Parameters
+        ----------
+        box : (2, 3) array_like
+            Lower and upper corner, world, m. The grid begins at the lower one, and ends at or behind the upper one.
+        voxel_size : float
+            Edge of a voxel, m. Below that of a leaf cell, voxels are not better known. Above it, a voxel is occupied if a
+            part of it is, and free only if it is throughout.
+        occupied_from, free_to : float
+            From which probability of a surface on a voxel is occupied, and up to which it may be free; ascending, in
+            (0, 1). By default, scans must have passed it seven times as often as what is behind surfaces.
+
+        Returns
+        -------
+        Grid
+            Of the places on true surfaces that are known, 0.04 % were called free on a simulated street, 0.2 to 0.8 % on
+            other kinds of places, most on slopes; a voxel deep in the surface, 0.01 to 0.3 %.
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range, or the fit did not keep what rays passed (``returns.passages``).
+        MemoryError
+            If the box has more than 2²⁸ voxels.
+        """
+        from radarsdf.map.gridding import make_grid  # noqa: PLC0415 - it imports trimesh, which is slow
+
+        return make_grid(self, box, voxel_size, occupied_from, free_to)
+
+    @abstractmethod
+    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellsInBox:
+        """What is known of the leaf cells that lie between two corners (3,), world, m, wholly or in part."""
+
+    @property
+    @abstractmethod
+    def passage_odds(self) -> NDArray[np.float64]:
+        """(8,) how much more often 0 to 7 or more scans pass a leaf cell behind a surface than one before it."""
 
     @abstractmethod
     def render(

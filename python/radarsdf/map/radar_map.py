@@ -26,6 +26,7 @@ from radarsdf.returns.sensor import Sensor
 if TYPE_CHECKING:
     import trimesh
 
+    from radarsdf.map.gridding import CellsInBox
     from radarsdf.map.traced_surface import TracedSurface
     from radarsdf.map.views import View
 
@@ -92,6 +93,21 @@ class RadarMap(Map):
             min_component_triangles=min_component_triangles,
             progress=progress,
         )
+
+    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellsInBox:
+        from radarsdf.map.gridding import CellsInBox, cells_of  # noqa: PLC0415 - it imports trimesh, which is slow
+
+        leaf_m = self.config.leaf_size_m
+        first = np.floor((lower - self.origin) / leaf_m).astype(np.int64)
+        count = np.floor((upper - self.origin) / leaf_m).astype(np.int64) - first + 1
+        x, y, z = count.tolist()
+        return CellsInBox(self.origin + first * leaf_m, *cells_of(self._contents, first, (x, y, z)))
+
+    @cached_property
+    def passage_odds(self) -> NDArray[np.float64]:
+        from radarsdf.map.gridding import passage_odds  # noqa: PLC0415 - as above
+
+        return passage_odds(self._contents)
 
     def render(
         self,

@@ -25,15 +25,17 @@ from radarsdf.io.tensors import open_tensors
 from radarsdf.map.contents import MapContents
 from radarsdf.map.fit_report import checked_report
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.passages import Passages
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 _FEATURES = "field.cells.features"
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
+_PASSAGES = ("keys", "planes")  # bits, stored as int64, which all readers of safetensors have
 # Types and numbers of dimensions of the arrays of `Reflectance`. Keys have at most 63 bits, as those of leaf cells.
 _REFLECTANCE = {
     "coefficients": (torch.float64, 2),
@@ -99,6 +101,10 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     # Morton keys have 63 bits, so they fit into int64, which all readers of safetensors have.
     tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
+    tensors |= {
+        f"passages.{name}": torch.from_numpy(getattr(contents.passages, name).view(np.int64))
+        for name in _PASSAGES
+    }
     if contents.reflectance is not None:
         tensors |= _tensors_of(contents.reflectance)
     scale = contents.intensity_scale
@@ -153,6 +159,17 @@ def _reflectance_of(tensors: dict[str, Tensor], leaf_size_m: float, network_shar
     reflectance = Reflectance(leaf_size_m, **arrays, network_share=network_share)
     reflectance.check()
     return reflectance
+
+
+def _passages_of(tensors: dict[str, Tensor]) -> Passages:
+    """Takes its part of the tensors."""
+    arrays = [tensors.pop(f"passages.{name}") for name in _PASSAGES]
+    if any(array.dtype != torch.int64 for array in arrays):
+        msg = "the passages are not of 64 bits"
+        raise ValueError(msg)
+    passages = Passages(*(array.numpy().copy().view(np.uint64) for array in arrays))
+    passages.check()
+    return passages
 
 
 @torch.inference_mode(mode=False)  # or the map could not give gradients
@@ -241,6 +258,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     if not (evidence["information"].isfinite() & (evidence["information"] >= 0)).all():
         msg = "information holds something other than finite numbers of at least 0"
         raise ValueError(msg)
+    passages = _passages_of(tensors)
     scale = None
     if description["intensity_scale"] is not None:
         scale = IntensityScale.between(description["intensity_scale"])
@@ -282,6 +300,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         config=config,
         report=checked_report(description["report"]),
         evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
+        passages=passages,
         rough_share=rough_share,
         sensor=Sensor.from_dict(description["sensor"]),
     )

@@ -21,6 +21,7 @@ from radarsdf.checks import MAX_POSITION_M
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.sensor import Sensor
 from radarsdf.settings import by_name, settings
 from radarsdf.tiles.grid import Tile, TileGrid
@@ -141,6 +142,12 @@ class Plan:
     def origin_cells(self, tile: Tile) -> np.ndarray[Any, np.dtype[np.int64]]:
         """(3,) origin of a tile's map, leaf cells of the lattice."""
         return np.array(self.by_tile[tile].origin_cells, np.int64)
+
+    def box_cells(self, tile: Tile) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """(2, 3) first leaf cell of a tile, and the one after the last, from the origin of its map. Of any height."""
+        first = np.array([*(np.array(tile) * self.tile_cells), -MAX_CELLS_FROM_ORIGIN])
+        first[:2] -= self.origin_cells(tile)[:2]
+        return np.stack([first, [*(first[:2] + self.tile_cells), MAX_CELLS_FROM_ORIGIN]])
 
     @cached_property
     def digest(self) -> str:

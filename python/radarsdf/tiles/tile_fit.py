@@ -61,7 +61,14 @@ def fit_tile(folder: str, name: str, run: str = "") -> str:
 def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
     def read() -> FitInput:
         rays, inside = read_rays(root, plan, tile)
-        return FitInput(rays, plan.scale, inside=inside, rough_share=plan.rough_share, sensor=plan.sensor)
+        return FitInput(
+            rays,
+            plan.scale,
+            inside=inside,
+            rough_share=plan.rough_share,
+            sensor=plan.sensor,
+            box_cells=plan.box_cells(tile.tile),
+        )
 
     radar_map = fit_rays(read, plan.config, progress=False)
     radar_map.report["plan"] = plan.digest

@@ -28,6 +28,7 @@ from radarsdf.tiles.tile_fit import report_of
 if TYPE_CHECKING:
     import trimesh
 
+    from radarsdf.map.gridding import CellsInBox
     from radarsdf.map.views import View, ViewedMap
     from radarsdf.tiles.grid import Tile
 
@@ -145,6 +146,17 @@ class TiledMap(TileBlend, Map):
             values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position, extrapolate=True)
             add_intensity(mesh, values.astype(np.float32), self.intensity_scale)
         return mesh
+
+    def cells_round(self, lower: _Floats, upper: _Floats) -> CellsInBox:
+        from radarsdf.tiles.gridding import cells_of_tiles  # noqa: PLC0415 - it imports trimesh, which is slow
+
+        return cells_of_tiles(self, lower, upper)
+
+    @cached_property
+    def passage_odds(self) -> _Floats:
+        from radarsdf.map.gridding import passage_odds  # noqa: PLC0415 - as above
+
+        return passage_odds(self.any_contents)
 
     def render(
         self,

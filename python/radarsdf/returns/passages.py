@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Passages: which leaf cells rays passed on the way to their returns. All that a map knows of free space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from radarsdf._core import find_passages
+from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN, lattice_of
+from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.rays import Rays
+
+BLOCK_CELLS = 8
+"""Edge of a block, leaf cells."""
+MOST_SCANS = 7
+"""The number of scans that passed a cell is counted up to here."""
+
+_LEVELS = 3  # of a block: 2³ cells an edge
+_PLANES, _WORDS = 4, 8
+_SIGMAS = 2.0  # a ray tells what it passed up to so many standard deviations of its return before it
+_INSIDE = np.arange(BLOCK_CELLS**3, dtype=np.uint64)
+
+
+@dataclass(frozen=True)
+class Passages:
+    """The leaf cells that rays passed, in blocks of 8 × 8 × 8."""
+
+    keys: NDArray[np.uint64]
+    """(B,) Morton keys of the blocks' leaf cells without the last 9 bits, ascending."""
+    planes: NDArray[np.uint64]
+    """(B, 4, 8) a bit for each of the 512 leaf cells of a block, in Morton order. Planes 0 to 2: the bits of the number of
+    scans with a ray through the cell, up to 7. Plane 3: whether there are returns in it."""
+
+    @classmethod
+    def of(
+        cls,
+        rays: Rays,
+        noise: SensorNoise,
+        leaf_size_m: float,
+        box_cells: NDArray[np.int64] | None = None,
+        num_threads: int = 0,
+    ) -> Passages:
+        """What `rays` passed.
+
+        A ray tells of cells up to two standard deviations of its return before it, and only where the angles of a return
+        are known to one cell: beyond that it cannot be said which cell a ray passed.
+
+        Parameters
+        ----------
+        rays : Rays
+            Without those to returns that are known to be false.
+        noise : SensorNoise
+            Of the returns.
+        leaf_size_m : float
+            Edge of a leaf cell, m.
+        box_cells : ndarray, optional
+            (2, 3) leaf cells; blocks outside [lower, upper) are left out. None: all are kept.
+        num_threads : int
+            0: as many as OpenMP uses.
+        """
+        before_m = rays.ranges_m - np.float32(_SIGMAS) * np.sqrt(noise.variances_m2(rays.ranges_m))
+        known_m = np.float32(leaf_size_m / noise.angle_rad)
+        limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
+        lower, upper = (limit if box_cells is None else np.asarray(box_cells)).__iter__()
+        keys, planes = find_passages(
+            np.ascontiguousarray(rays.points),
+            np.ascontiguousarray(rays.directions),
+            np.ascontiguousarray(rays.ranges_m),
+            np.minimum(before_m, known_m),
+            np.ascontiguousarray(rays.scans),
+            leaf_size_m,
+            [int(cell) for cell in lower],
+            [int(cell) for cell in upper],
+            num_threads,
+        )
+        return cls(keys, planes)
+
+    @classmethod
+    def none(cls) -> Passages:
+        """Those of a map that keeps none."""
+        return cls(np.zeros(0, np.uint64), np.zeros((0, _PLANES, _WORDS), np.uint64))
+
+    def check(self) -> None:
+        """Raises a ValueError unless arrays of a file are what they should be."""
+        if (
+            self.keys.ndim != 1
+            or self.planes.shape != (len(self.keys), _PLANES, _WORDS)
+            or not (np.diff(self.keys.astype(np.int64), prepend=-1) > 0).all()
+        ):
+            msg = "the passages are not planes of 512 cells for ascending keys"
+            raise ValueError(msg)
+
+    def dense(
+        self, lower: ArrayLike, shape: tuple[int, int, int]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Passages as arrays of leaf cells, of which the first is `lower` (3,).
+
+        Returns
+        -------
+        tuple
+            Number of scans that passed each cell, up to 7, and whether it holds returns; both of this shape.
+        """
+        first = np.asarray(lower, np.int64)
+        last = first + np.asarray(shape)
+        begin, end = first // BLOCK_CELLS, -(-last // BLOCK_CELLS)  # blocks that the box touches
+        blocks = block_numbers(self.keys)
+        rows = np.flatnonzero(((blocks >= begin) & (blocks < end)).all(axis=1))
+        whole = tuple((end - begin).tolist())
+        found = np.zeros((*whole, BLOCK_CELLS, BLOCK_CELLS, BLOCK_CELLS), np.uint8)
+        found[tuple((blocks[rows] - begin).T)] = unpacked(self.planes[rows])
+        cells = found.transpose(0, 3, 1, 4, 2, 5).reshape([BLOCK_CELLS * n for n in whole])
+        offset = first - begin * BLOCK_CELLS
+        inside = cells[tuple(slice(o, o + n) for o, n in zip(offset, shape, strict=True))]
+        return inside & np.uint8(MOST_SCANS), inside > MOST_SCANS
+
+    def at(self, cells: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """(N,) number of scans that passed leaf cells (N, 3), up to 7."""
+        if len(self.keys) == 0 or len(cells) == 0:
+            return np.zeros(len(cells), np.uint8)
+        blocks = block_numbers(self.keys)
+        begin = blocks.min(axis=0)
+        span = blocks.max(axis=0) - begin + 1
+        wanted = cells // BLOCK_CELLS - begin
+        inside = ((wanted >= 0) & (wanted < span)).all(axis=1)
+        numbers = np.ravel_multi_index(tuple((blocks - begin).T), tuple(span))
+        order = np.argsort(numbers)
+        asked = np.ravel_multi_index(tuple(np.where(inside[:, None], wanted, 0).T), tuple(span))
+        place = np.minimum(np.searchsorted(numbers[order], asked), len(order) - 1)
+        rows = order[place]
+        inside &= numbers[rows] == asked
+        bit = _MORTON[tuple((cells % BLOCK_CELLS).T)].astype(np.uint64)
+        words = self.planes[rows, :, bit >> np.uint64(6)] >> (bit & np.uint64(63))[:, None] & np.uint64(1)
+        scans = (words[:, 0] + 2 * words[:, 1] + 4 * words[:, 2]).astype(np.uint8)
+        return np.where(inside, scans, np.uint8(0))
+
+
+def block_numbers(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """(B, 3) numbers of blocks with these keys (B,): block i begins at leaf cell 8 i."""
+    numbers: NDArray[np.int64] = lattice_of(keys << np.uint64(3 * _LEVELS)) // BLOCK_CELLS
+    return numbers
+
+
+def unpacked(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """(B, 8, 8, 8) of the cells of blocks: the number of scans that passed, and 8 more where there are returns."""
+    bits = np.unpackbits(planes.astype("<u8").view(np.uint8), axis=-1, bitorder="little")
+    weights = np.array([1, 2, 4, 8], np.uint8)[:, None]
+    cells: NDArray[np.uint8] = (bits * weights).sum(axis=1, dtype=np.uint8)
+    return cells[:, _MORTON]
+
+
+def _morton_table() -> NDArray[np.int64]:
+    """(8, 8, 8) place of each leaf cell of a block in Morton order."""
+    table = np.zeros((BLOCK_CELLS,) * 3, np.int64)
+    cells = lattice_of(_INSIDE) % BLOCK_CELLS
+    table[tuple(cells.T)] = _INSIDE
+    return table
+
+
+_MORTON = _morton_table()
