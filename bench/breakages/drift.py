@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 import radarsdf
+from numpy.typing import NDArray
 from radarsdf.checking.drift import check_drift
 from radarsdf.checking.recording import Recording
 from radarsdf.simulate import measured_motion
@@ -31,7 +32,9 @@ def main() -> None:
     options = parser.parse_args()
     config = radarsdf.FitConfig(num_threads=1)
     scenes = dict(radarsdf.simulate.SCENES) | dict(radarsdf.simulate.KINDS)
-    found = {name: np.zeros((3, 2), int) for name in scenes}  # found and tried: good, and each walk
+    found: dict[str, NDArray[np.int64]] = {
+        name: np.zeros((3, 2), np.int64) for name in scenes
+    }  # found and tried: good, and each walk
     seconds = []
     turn = itertools.cycle(scenes.items())
     for i in range(options.count):
@@ -53,7 +56,7 @@ def main() -> None:
             found[name][row] += (bool(findings), 1)
     heads = ["good", *(f"{m} m, {degrees}° a step" for m, degrees in _WALKS)]
     print("| scenes | " + " | ".join(heads) + " |\n" + "|---" * 4 + "|")
-    for name, counts in [*found.items(), ("all", sum(found.values()))]:
+    for name, counts in [*found.items(), ("all", np.sum(list(found.values()), axis=0))]:
         print(f"| {name} | " + " | ".join(f"{count} of {tried}" for count, tried in counts.tolist()) + " |")
     print(
         f"\nprocessor seconds of a recording of {_FRAMES} scans: median {np.median(seconds):.2f}, most {max(seconds):.2f}"

@@ -100,7 +100,9 @@ def table(rows: list[Row]) -> str:
     )
     judged = groups([row for row in rows if "worst_gap" in row], "scene")
     if judged:
-        parts.append("Confidence of the whole surface: share of true surface, worst tenth, mean gap, and AUC.")
+        parts.append(
+            "Confidence of the whole surface: share of true surface, worst tenth, mean gap, and AUC."
+        )
         body = [
             [scene, *(_calibration([r for r in own if r["method"] == f"{n}, confidence"]) for n in _OURS)]
             for (scene,), own in judged.items()
@@ -128,9 +130,7 @@ def plot(rows: list[Row], path: Path) -> None:
                     if p is not None
                 ]
                 ax.plot(*zip(*known, strict=True), "o-", ms=3, label=row["method"])
-            ax.set(
-                title=scene, xlabel="confidence", ylabel="share of true surface", xlim=(0, 1), ylim=(0, 1)
-            )
+            ax.set(title=scene, xlabel="confidence", ylabel="share of true surface", xlim=(0, 1), ylim=(0, 1))
 
 
 EXPERIMENT = Experiment(

@@ -16,7 +16,7 @@ __all__ = ["peers"]
 @pytest.mark.usefixtures("peers")
 def test_each_kind_has_scores_and_a_calibration(tmp_path):
     written, values = run(tmp_path, "kinds", "wall", "--peers", "BPA", "Poisson", "--repetitions", "1")
-    ball, poisson, *judged = values["rows"]
+    ball, _, *judged = values["rows"]
     assert 0 <= ball["f_score_all"] <= 1
     assert "- wall, Poisson: Open3D is not here" in written
     assert [row["method"] for row in judged] == ["radarsdf, confidence", "radarsdf, quick, confidence"]

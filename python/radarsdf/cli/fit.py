@@ -20,6 +20,7 @@ from radarsdf.cli.scans_in import add_scans, inputs_of, words_of
 
 if TYPE_CHECKING:
     from radarsdf import RadarMap
+    from radarsdf.io.scans import Scans
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -118,20 +119,25 @@ def run(options: argparse.Namespace) -> None:
         options.checkpoint.unlink(missing_ok=True)
     _say(results, radar_map, options, len(scans), time.perf_counter() - started_s)
     if options.report is not None:
-        from radarsdf.cli.check import findings_of
-        from radarsdf.cli.report import add_report
-        from radarsdf.report.subject import Subject
-
-        subject = Subject(
-            radar_map,
-            options.out.name,
-            scans,
-            held_out,
-            findings_of(every_scan, config),
-            progress=progress_of(options),
-        )
-        add_report(results, options.report, subject)
+        _report(results, radar_map, options, every_scan, (scans, held_out))
     results.end()
+
+
+def _report(
+    results: Results,
+    radar_map: RadarMap,
+    options: argparse.Namespace,
+    every_scan: Scans,
+    parts: tuple[Scans, Scans | None],
+) -> None:
+    """Writes the page. `parts`: the scans of the fit, and those that were held out."""
+    from radarsdf.cli.check import findings_of
+    from radarsdf.cli.report import add_report
+    from radarsdf.report.subject import Subject
+
+    findings = findings_of(every_scan, radar_map.config)
+    subject = Subject(radar_map, options.out.name, *parts, findings, progress=progress_of(options))
+    add_report(results, options.report, subject)
 
 
 def _check_report(options: argparse.Namespace) -> None:

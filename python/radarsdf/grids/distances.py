@@ -28,8 +28,9 @@ class DistanceField:
     unknown: NDArray[np.bool_]
     """(X, Y, Z) voxels that are unknown."""
     error_m: float
-    """`occupied_m` differs from the distance to the true surface of what is occupied by at most so much, m, with 95 %
-    confidence: half a diagonal of a voxel, and the error of the surface's position."""
+    """Half a diagonal of a voxel, and the error of the surface's position, m: what voxels and noise add where the map has the
+    surface right. It is no bound on the distance to the truth: false returns that are called occupied make `occupied_m` too
+    small, and surface that the map does not have makes it too large."""
 
 
 def distance_field(grid: Grid) -> DistanceField:

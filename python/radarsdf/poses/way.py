@@ -55,4 +55,5 @@ def way_of(found: RefinedPoses | Odometry, given: Floats | None, rows: slice = s
 def _sigmas(covariance: Floats) -> Floats:
     """(F, 2) of positions, m, and rotations, rad, root mean square of the three axes."""
     variances = np.einsum("fii->fi", covariance).reshape(-1, 2, 3).mean(axis=2)
-    return np.sqrt(np.maximum(variances, 0.0))
+    sigmas: Floats = np.sqrt(np.maximum(variances, 0.0))
+    return sigmas

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ def trajectory_section(subject: Subject) -> tuple[list[Section], list[Verdict]]:
             )
         )
     body = [paragraph(way["verdict"]), grid(*pictures), table("", (), _facts(way, before, after))]
-    mark = "warning" if way["improved"] is False else "good"
+    mark: Literal["warning", "good"] = "warning" if way["improved"] is False else "good"
     return [Section("poses", "Poses", body)], [Verdict(mark, "Poses", way["verdict"])]
 
 
