@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from radarsdf.poses.motion import Motion
+from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.rigid import aligned, moved, steps, turned_by
 
 from .drift import drifted, trajectory
@@ -60,12 +60,46 @@ def test_deviations_and_bias_are_learnt_from_poses_that_are_known():
     true = trajectory(400)
     given = drifted(true, 0.03, 0.004, 3, yaw_rad=0.01)
     nothing = np.zeros((400, 6, 6)), np.zeros((399, 6, 6))
-    learnt = Motion.of(given, 0.1, 0.01).learnt(true, *nothing)
+    learnt = Motion.of(given, 0.1, 0.01).learnt(true, true, *nothing)
     assert learnt.sigma_m == pytest.approx(0.03, rel=0.1)
     assert learnt.sigma_rad == pytest.approx(0.004, rel=0.1)
     assert learnt.bias[5] == pytest.approx(-0.01, abs=5e-4)
-    kept = Motion.of(given, 0.1, 0.01, known=(True, True)).learnt(true, *nothing)
+    kept = Motion.of(given, 0.1, 0.01, known=(True, True)).learnt(true, true, *nothing)
     assert (kept.sigma_m, kept.sigma_rad) == pytest.approx((0.1, 0.01))
+
+
+def test_where_the_whole_is_counts_as_no_error_of_steps():
+    before, given = trajectory(30), drifted(trajectory(30), 0.03, 0.004, 3)
+    # All sensors turn round the origin together, by any angle.
+    whole = np.concatenate([np.cross([0, 0, 1], before[:, :3, 3]), np.tile([0, 0, 1.0], (30, 1))], 1)
+    free = 1e4 * np.einsum("fi,fj->fij", whole, whole), 1e4 * np.einsum("fi,fj->fij", whole[1:], whole[:-1])
+    nothing = np.zeros((30, 6, 6)), np.zeros((29, 6, 6))
+    after = drifted(before, 0.01, 0.001, 4)
+    motion = Motion.of(given, 0.1, 0.01)
+    some, none = (motion.learnt(after, before, *covariance) for covariance in (free, nothing))
+    assert some.sigma_m == pytest.approx(none.sigma_m, rel=1e-3)
+    assert some.bias == pytest.approx(none.bias, abs=1e-3)
+
+
+def test_a_bias_that_is_not_told_is_not_learnt():
+    poses, given = trajectory(30), drifted(trajectory(30), 0.03, 0.004, 3, yaw_rad=0.01)
+    motion = Motion.of(given, 0.1, 0.01)
+    # As much is unknown of each step as before, in all its components but the rotations.
+    loose = np.zeros((30, 6, 6))
+    loose[:, :3, :3] = 0.1**2 / 2 * np.eye(3)
+    learnt = motion.learnt(poses, poses, loose, np.zeros((29, 6, 6)))
+    assert learnt.bias[:3] == pytest.approx(0, abs=1e-9)
+    assert learnt.bias[5] == pytest.approx(-0.01, rel=0.2)
+
+
+def test_steps_of_a_slow_source_are_unsteady():
+    poses = trajectory(60)
+    stale = poses[np.arange(60) // 2 * 2]
+    assert unsteadiness(poses, None)[0] < 0.05
+    assert unsteadiness(stale, None)[0] > 0.2
+    assert unsteadiness(poses[:2], None) == (0, 0)
+    with_a_gap = np.arange(60.0) + 30 * (np.arange(60) > 30)
+    assert unsteadiness(poses, with_a_gap)[0] < 0.05
 
 
 def test_a_step_over_a_gap_may_have_larger_errors():
@@ -85,7 +119,8 @@ def test_what_a_source_does_not_tell_is_left_to_others():
     assert np.abs(below[:, :3]).max() == 0
     assert np.abs(gradient[:, :3]).max() == 0
     assert np.abs(gradient[:, 3:]).max() > 0
-    learnt = turns.learnt(drifted(poses, 0.1, 0.01, 5), np.zeros((8, 6, 6)), np.zeros((7, 6, 6)))
+    others = drifted(poses, 0.1, 0.01, 5)
+    learnt = turns.learnt(others, others, np.zeros((8, 6, 6)), np.zeros((7, 6, 6)))
     assert learnt.sigma_m == turns.sigma_m
     assert learnt.sigma_rad != turns.sigma_rad
     assert learnt.bias[:3].tolist() == [0, 0, 0]

@@ -110,6 +110,28 @@ def test_a_plane_tells_heights_and_says_that_it_tells_no_more():
     assert (along > 30 * across).all()
 
 
+def test_along_a_corridor_poses_stay():
+    rng = np.random.default_rng(0)
+    true = np.tile(np.eye(4), (20, 1, 1))
+    true[:, 0, 3] = 0.4 * np.arange(20)
+    scans = []
+    for _ in true:
+        along, other = rng.uniform(3, 15, 900), rng.uniform(-1, 1, 900)
+        walls = np.column_stack([along, np.sign(other) * 3, rng.uniform(-1, 2, 900)])
+        floor = np.column_stack([along, 3 * other, np.full(900, -1.2)])
+        scans.append(np.concatenate([walls, floor]) + rng.normal(0, 0.05, (1800, 3)))
+    found = radarsdf.refine_poses(scans, true)
+    assert not found.improved
+    given = drifted(true, 0.03, 0.002, 4)
+    mended = radarsdf.refine_poses(scans, given)
+    assert mended.improved
+    off = (aligned(mended.poses, true) - true)[:, :3, 3]
+    assert np.abs(off[:, 1:]).max() < 0.03
+    along_given, along = ((aligned(p, true) - true)[:, 0, 3] for p in (given, mended.poses))
+    # Turned steps lead elsewhere, along the corridor, too.
+    assert np.abs(along - along_given).max() < 0.05
+
+
 def test_scans_that_share_nothing_keep_their_poses():
     rng = np.random.default_rng(0)
     scans = [rng.normal(0, 1, (200, 3)) + [5, 0, 0] for _ in range(3)]

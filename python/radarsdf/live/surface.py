@@ -176,10 +176,10 @@ class GrowingSurface:
         self._support[rows] = support_round(blocks, self._keys[rows], self._moments, num_threads)
         self._planes[rows] = np.nan
         rows = rows[self._support[rows] >= MIN_SUPPORT]
-        planes = planes_round(
+        centres, normals, _, variances = planes_round(
             blocks, self._keys[rows], self._moments, LEAVES_PER_SURFEL * self._config.leaf_size_m, num_threads
         )
-        self._planes[rows] = np.concatenate(planes, axis=1)
+        self._planes[rows] = np.concatenate([centres, normals, variances], axis=1)
 
     def _surfels(self) -> Surfels:
         cell_of_plane = np.flatnonzero(self._support >= MIN_SUPPORT)

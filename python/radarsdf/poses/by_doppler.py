@@ -120,7 +120,7 @@ class DopplerMotion(Motion):
             nothing, np.zeros(6), np.ones(2), shares, (True, True), spans, velocities, durations_s, turns
         ).at(poses)
 
-    def learnt(self, poses: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002
+    def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002
         """As it is: the velocities' own covariances are known. If they were learnt, real drives ended four times as far off."""
         return self
 

@@ -62,8 +62,8 @@ class PosesEstimate:
             increments, inverse, inverse_below, decrement = planes.solve(
                 diagonal, below, gradient, _TOLERANCE, _MOST_ITERATIONS, True, num_threads
             )
-            poses = aligned(moved(poses, increments), given)
-            motions = [motion.at(poses).learnt(poses, inverse, inverse_below) for motion in motions]
+            before, poses = poses, aligned(moved(poses, increments), given)
+            motions = [motion.at(poses).learnt(poses, before, inverse, inverse_below) for motion in motions]
             rounds += 1
             finest = grid.window == len(given) and grid.cell_m == cell_m
             if finest and decrement < _SETTLED**2 * increments.size:

@@ -103,13 +103,15 @@ class Motion:
             gradient[rows] += np.einsum("fki,fk->fi", jacobian, errors)
         return diagonal, np.einsum("fki,fk,fkj->fij", second, information, first), gradient
 
-    def learnt(self, poses: Floats, diagonal: Floats, below: Floats) -> Motion:
-        """With the bias and the deviations that `poses` show, whose covariance has blocks (F, 6, 6) and (F - 1, 6, 6).
+    def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> Motion:
+        """With the bias and the deviations that `poses` show.
 
+        Their covariance has blocks (F, 6, 6) and (F - 1, 6, 6), of increments of the poses `before`. Where the whole is, these
+        hardly know: only there does it cost nothing, and at other poses, it would seem errors of steps of half a metre.
         A step of expectation maximisation (Dempster et al. 1977): the square of an error is that of its estimate and its
         variance.
         """
-        first, second = self._jacobians(poses)
+        first, second = self._jacobians(before)
         crossed = np.einsum("fai,fij,faj->fa", second, below, first)
         variances = (
             np.einsum("fai,fij,faj->fa", first, diagonal[:-1], first)
@@ -120,12 +122,42 @@ class Motion:
         told = np.isfinite(self.shares)
         weights = 1 / self.shares
         bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)
+        bias *= self._told(bias, (weights * variances).sum(axis=0) / np.maximum(told.sum(axis=0), 1))
         squares = ((errors - bias * spans) ** 2 + variances) * weights
         floors, found = (_LEAST_M**2, _LEAST_RAD**2), self.variances.copy()
         for k, rows in enumerate((slice(0, 3), slice(3, 6))):
             if not self.known[k] and told[:, rows].any():
                 found[k] = max(squares[:, rows].sum() / told[:, rows].sum(), floors[k])
         return dataclasses.replace(self, bias=bias, variances=found)
+
+    def _told(self, bias: Floats, left: Floats) -> Floats:
+        """(6,) share of a bias (6,) that is believed, if returns and steps together leave a variance `left` (6,) of a step.
+
+        The returns alone leave more. Where that is more than the bias, along a corridor say, it would follow the poses, and
+        these the bias, for ever: a straight corridor was drawn together by 3 cm a step.
+        """
+        before = np.repeat(self.variances, 3)
+        gained = bias**2 * np.maximum(before - left, 0.0)
+        found: Floats = gained / np.maximum(gained + left * before, 1e-30)
+        return found
+
+
+def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
+    """Deviation by which steps of poses (F, 4, 4) differ from the one before, as if it were noise: m, rad.
+
+    Errors of poses that are repeated, or from another clock, are as large as the steps. An estimate that begins with less takes
+    returns that are so far off for wrong ones.
+    """
+    if len(poses) < 3:
+        return 0.0, 0.0
+    between, spans = steps(poses), spans_of(times_s, len(poses))
+    rates = (
+        np.concatenate([between[:, :3, 3], Rotation.from_matrix(between[:, :3, :3]).as_rotvec()], 1)
+        / spans[:, None]
+    )
+    squares = np.diff(rates, axis=0) ** 2 / (1 / spans[1:] + 1 / spans[:-1])[:, None]
+    sigma_m, sigma_rad = np.sqrt(np.median(squares.reshape(-1, 2, 3).mean(axis=2), axis=0)).tolist()
+    return sigma_m, sigma_rad
 
 
 def spans_of(times_s: Floats | None, num_scans: int) -> Floats:

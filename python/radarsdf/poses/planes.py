@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CommonPlanes
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.poses.normals import told_normals
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.rays import Rays
@@ -106,10 +107,10 @@ def common_planes(
         rows = slice(*np.searchsorted(rays.scans, [low, high]).tolist())
         part = rays.select(rows)
         surfels = Surfels.of(part, grid.cell_m / LEAVES_PER_SURFEL, num_threads)
-        found = surfels.flat_planes_at(part.points, num_threads)
+        found = _planes_of(part.points, surfels, num_threads)
         planes[rows] = np.where(found >= 0, found + np.int32(total), np.int32(-1))
         centres.append(surfels.centres)
-        normals.append(surfels.normals)
+        normals.append(told_normals(surfels, num_threads))
         total += len(surfels.centres)
         if noise is None:
             noises.append(dataclasses.astuple(sensor_noise(surfels, part, config, num_threads)))
@@ -130,3 +131,19 @@ def common_planes(
         num_threads,
     )
     return common, known
+
+
+def _planes_of(points: NDArray[np.float32], surfels: Surfels, num_threads: int) -> NDArray[np.int32]:
+    """(N,) the flat surfel of each point (N, 3), local, m: that of the cell in which its foot on the surface lies. -1: none.
+
+    Noise moves returns across surfaces, into cells beyond them. By the cells that they lie in themselves, it would be cut where
+    cells end, unlike for near and far returns, and turn poses.
+    """
+    planes = surfels.flat_planes_at(points, num_threads)
+    on = np.flatnonzero(planes >= 0)
+    normals = surfels.normals[planes[on]]
+    off = np.einsum("ni,ni->n", points[on] - surfels.centres[planes[on]], normals)
+    feet = np.ascontiguousarray(points[on] - (off[:, None] * normals).astype(np.float32))
+    beneath = surfels.flat_planes_at(feet, num_threads)
+    planes[on] = np.where(beneath >= 0, beneath, planes[on])
+    return planes

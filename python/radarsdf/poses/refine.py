@@ -17,7 +17,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import DopplerMotion
 from radarsdf.poses.estimate import PosesEstimate
-from radarsdf.poses.motion import Motion
+from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.recording import Recording
 from radarsdf.poses.rigid import Floats, steps, turned_by
@@ -25,8 +25,8 @@ from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 from radarsdf.threads import Workers
 
-# The errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees end
-# with the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
+# The least errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees
+# end with the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
 _FIRST_SIGMA_M, _FIRST_SIGMA_RAD = 0.1, 0.01
 
 
@@ -114,8 +114,11 @@ def refine_poses(
     scans, times_s, velocities = recording.scans, recording.times_s, recording.velocities
     given = check_poses(poses, len(scans))
     known = sigma_m is not None, sigma_rad is not None
-    sigma_m = _FIRST_SIGMA_M if sigma_m is None else not_negative(sigma_m, "sigma_m")
-    sigma_rad = _FIRST_SIGMA_RAD if sigma_rad is None else not_negative(sigma_rad, "sigma_rad")
+    unsteady_m, unsteady_rad = unsteadiness(given, times_s)
+    sigma_m = max(_FIRST_SIGMA_M, unsteady_m) if sigma_m is None else not_negative(sigma_m, "sigma_m")
+    sigma_rad = (
+        max(_FIRST_SIGMA_RAD, unsteady_rad) if sigma_rad is None else not_negative(sigma_rad, "sigma_rad")
+    )
     limits = config.returns
     returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m)
     if len(scans) < 2 or len(returns) == 0:

@@ -45,6 +45,8 @@ class Surfels:
     variances: NDArray[np.float64]
     """(P, 3) variances of the returns along the principal axes, ascending, m². The first is across the
     plane."""
+    widest: NDArray[np.float32] | None = None
+    """(P, 3) unit vectors in the planes, along which the returns spread most. None: not kept, in maps that grow."""
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
@@ -60,7 +62,7 @@ class Surfels:
         support = support_round(blocks, keys, of_cells, num_threads)
         # Most cells have few returns. Surfels for all of them would take most of the time and the memory.
         cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
-        centres, normals, variances = planes_round(
+        centres, normals, widest, variances = planes_round(
             blocks, keys[cell_of_plane], of_cells, cell_size_m, num_threads
         )
         return cls(
@@ -72,6 +74,7 @@ class Surfels:
             cell_of_plane=cell_of_plane,
             centres=centres,
             normals=normals,
+            widest=widest,
             variances=variances,
         )
 
@@ -136,8 +139,8 @@ def planes_round(
     of_cells: NDArray[np.float64],
     cell_size_m: float,
     num_threads: int = 0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Centres, normals and variances (K, 3) of the surfels of the cells with these `keys` (K,); see :func:`support_round`."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
+    """Centres, normals, widest directions and variances (K, 3) of the surfels of the cells with these `keys` (K,); see :func:`support_round`."""
     moments = blocks.sum_round(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
     means = moments[:, 1:10] / moments[:, :1]
     centres = means[:, :3].copy()
@@ -148,4 +151,5 @@ def planes_round(
     normals = axes[:, :, 0]
     normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
     # The least is the resolution of float32 coordinates.
-    return centres, normals, np.maximum(variances, (0.0025 * cell_size_m) ** 2)
+    widest = axes[:, :, 2].astype(np.float32)
+    return centres, normals, widest, np.maximum(variances, (0.0025 * cell_size_m) ** 2)
