@@ -5,11 +5,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from typing import Any
 
 from bench.live import accuracy, circles, kills, loops, rates, removal
+from bench.rows import kept
 
 _COMMANDS = {
     "rates": rates,
@@ -31,13 +30,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("bench_results"))
     options = parser.parse_intermixed_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
-    for row in _COMMANDS[options.what].rows(options):
-        if not rows:
-            print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
-        print("| " + " | ".join(str(value) for value in row.values()) + " |", flush=True)
-        rows.append(row)
-    (options.out / f"live-{options.what}.json").write_text(json.dumps(rows, indent=1))
+    made = _COMMANDS[options.what].rows(options)
+    rows = kept(made, "bench.live", options.out / f"live-{options.what}.json")
     if options.what == "circles":
         circles.plot(rows, options.out / "live-circles.png")
 

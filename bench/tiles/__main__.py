@@ -5,10 +5,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from typing import Any
 
+from bench.rows import kept
 from bench.tiles import growth, kills, seams
 
 _COMMANDS = {"seams": seams, "growth": growth, "kills": kills}
@@ -25,13 +24,8 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     module = _COMMANDS[options.what]
-    rows: list[dict[str, Any]] = []
-    for row in module.rows(options.cases, options.quick, options.out):
-        if not rows:
-            print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
-        print("| " + " | ".join(str(value) for value in row.values()) + " |", flush=True)
-        rows.append(row)
-    (options.out / f"tiles-{options.what}.json").write_text(json.dumps(rows, indent=1))
+    made = module.rows(options.cases, options.quick, options.out)
+    rows = kept(made, "bench.tiles", options.out / f"tiles-{options.what}.json")
     if options.what == "growth":
         growth.plot(rows, options.out / "tiles-growth.png")
 
