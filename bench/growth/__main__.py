@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Growth of time and memory: `python -m bench.growth fits|surfels`, on Linux.
+"""Growth of time and memory: `python -m bench.growth fits|poses|surfels`, on Linux.
 
 Each row runs in its own process. The table is printed row by row, and written with all numbers to
-`bench_results/growth_fits.md` and `.json`, or `growth_surfels`.
+`bench_results/growth_fits.md` and `.json`, or `growth_poses`, `growth_surfels`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Any
 from bench.paper.report import ROOT, provenance, write_json
 from bench.peers.interface import failure
 
-from . import fits, surfels
+from . import fits, poses, surfels
 
-TABLES = {"fits": fits, "surfels": surfels}
+TABLES = {"fits": fits, "poses": poses, "surfels": surfels}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> None:
             every=words.every,
         )
     else:
-        cases = surfels.cases(quick=words.quick)
+        cases = (poses if words.table == "poses" else surfels).cases(quick=words.quick)
     columns = TABLES[words.table].COLUMNS
     lines = [f"| {' | '.join(heading for _, heading, _ in columns)} |", "|" + "---|" * len(columns)]
     print("\n".join(lines), flush=True)

@@ -56,6 +56,15 @@ def test_quick_fits_give_a_table(tmp_path, capsys):
     assert table.count("\n") == 4
 
 
+def test_refined_poses_give_a_table(tmp_path, capsys):
+    command.main(["poses", "--quick", "--out", str(tmp_path)])
+    (row,) = json.loads((tmp_path / "growth_poses.json").read_text())["rows"]
+    assert row["found_deg"] < row["given_deg"]
+    assert row["returns"] > 1000 * row["scans"]
+    assert row["peak_mb"] > 0
+    assert "| 40 |" in capsys.readouterr().out
+
+
 def test_a_row_that_fails_says_why(tmp_path, capsys):
     with pytest.raises(SystemExit, match="2 of 2 rows failed"):
         command.main(["fits", "--quick", "--returns", "0", "--out", str(tmp_path)])
