@@ -4,8 +4,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
+import radarsdf
+from radarsdf.io import Scans
 from radarsdf.poses.rigid import moved, steps
+from radarsdf.simulate import measured_motion
 from scipy.spatial.transform import Rotation
 
 
@@ -33,3 +38,14 @@ def drifted(poses, sigma_m, sigma_rad, seed, yaw_rad=0.0):
 def position_error_m(poses, true):
     """Root mean square, m."""
     return float(np.sqrt(((poses - true)[:, :3, 3] ** 2).sum(axis=1).mean()))
+
+
+@functools.cache
+def drifting_drive():
+    """48 scans with Doppler and times, and poses that drift; and the true poses."""
+    street = radarsdf.simulate.oculii(seed=64, frames=48)
+    motion = measured_motion(street)
+    given = drifted(street.poses, 0.05, 0.004, 1)
+    return Scans(
+        street.points, given, doppler_mps=motion.doppler_mps, times_s=100 + motion.times_s
+    ), street.poses

@@ -76,8 +76,8 @@ def run(options: argparse.Namespace) -> None:
         msg = f"{options.out}: a map is written as {MAP_SUFFIX}, by which the other commands know it"
         raise ValueError(msg)
     results = Results(options)
-    posed = scans_and_poses(options, config, results, refine=options.refine)
-    every_scan = scans = posed.scans
+    scans, posed = scans_and_poses(options, config, results, refine=options.refine)
+    every_scan = scans
     config = posed.config(config)
     held_out = None
     if options.holdout is not None:

@@ -56,8 +56,7 @@ def run(options: argparse.Namespace) -> None:
 
         require("matplotlib", what="pictures need")
     results = Results(options)
-    posed = scans_and_poses(options, config, results, refine=True, find=options.find)
-    scans = posed.scans
+    scans, posed = scans_and_poses(options, config, results, refine=True, find=options.find)
     timed = options.out.suffix.lower() == ".tum"
     if as_scans:
         write_scans(options.out, scans)

@@ -5,70 +5,66 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
 from radarsdf.cli.scans_in import scans_of
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from radarsdf import FitConfig
+    from radarsdf.io.poses.reading import NoPoses
     from radarsdf.io.scans import Scans
-
-
-@dataclass(frozen=True)
-class PosedScans:
-    """Scans with their new poses, and what was given."""
-
-    scans: Scans
-    """Of the longest piece, if the poses were found in several."""
-    given: NDArray[np.float64] | None
-    """(F, 4, 4) poses of these scans before. None: there were none."""
-    pieces: int
-    way: dict[str, Any] | None = None
-    """What the report of a fit keeps of them. None: they are as given."""
-    sigmas: tuple[float, float] | None = None
-    """Standard deviations of a pose, m and rad. None: they are not known."""
-
-    def config(self, config: FitConfig) -> FitConfig:
-        """With the errors of the poses, unless it states some itself."""
-        stated = config.returns.pose_sigma_m or config.returns.pose_sigma_rad
-        if self.sigmas is None or stated:
-            return config
-        sigma_m, sigma_rad = self.sigmas
-        return config.override(returns={"pose_sigma_m": sigma_m, "pose_sigma_rad": min(sigma_rad, 1.0)})
+    from radarsdf.poses.posed import Posed
 
 
 def scans_and_poses(
     options: argparse.Namespace, config: FitConfig, results: Results, *, refine: bool, find: bool = False
-) -> PosedScans:
-    """The scans of a command. Their poses are refined, if that is wanted, or found, if there are none or `find` says so."""
+) -> tuple[Scans, Posed]:
+    """The scans of a command, those of the longest piece if there are several. Their poses are refined, if that is wanted, or found, if there are none or `find` says so."""
+    from radarsdf.poses.posed import Posed
+
+    scans, missing = scans_or_unposed(options, find=find)
+    if find or missing is not None:
+        with finding(options, missing):
+            return _found(scans, config, results, options.command)
+    return _refined(scans, config, results) if refine else (scans, Posed.as_given(scans.poses))
+
+
+def scans_or_unposed(options: argparse.Namespace, *, find: bool = False) -> tuple[Scans, NoPoses | None]:
+    """The scans of a command, and why they have no poses. `find`: theirs are not used."""
     from radarsdf.io.poses.reading import UNPOSED, NoPoses
 
     if find:
-        return _found(scans_of(options, UNPOSED), config, results, options.command)
+        return scans_of(options, UNPOSED), None
     try:
-        scans = scans_of(options)
+        return scans_of(options), None
     except NoPoses as missing:
-        try:
-            posed = _found(scans_of(options, UNPOSED), config, results, options.command)
-        except ValueError as error:
-            msg = f"{missing}, but not here: {error}"
-            raise NoPoses(msg) from error
+        return scans_of(options, UNPOSED), missing
+
+
+@contextmanager
+def finding(options: argparse.Namespace, missing: NoPoses | None) -> Iterator[None]:
+    """A block in which poses are found. If they are `missing`, that is said, or why they cannot be found."""
+    from radarsdf.io.poses.reading import NoPoses
+
+    try:
+        yield
+    except ValueError as error:
+        if missing is None:
+            raise
+        msg = f"{missing}, but not here: {error}"
+        raise NoPoses(msg) from error
+    if missing is not None:
         complain(f"radarsdf {options.command}: there are no poses: they were found from the radar alone")
-        return posed
-    return _refined(scans, config, results) if refine else PosedScans(scans, scans.poses, 1)
 
 
-def _refined(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
+def _refined(scans: Scans, config: FitConfig, results: Results) -> tuple[Scans, Posed]:
     from radarsdf import refine_poses
-    from radarsdf.poses.way import pose_sigmas, way_of
+    from radarsdf.poses.posed import Posed
 
     refined = refine_poses(scans, config=config)
     results.add(refined.report["verdict"], poses=refined.report, improved=refined.improved)
@@ -81,14 +77,12 @@ def _refined(scans: Scans, config: FitConfig, results: Results) -> PosedScans:
                 **refined.report,
             )
         )
-    posed = PosedScans(scans.with_poses(refined.poses), scans.poses, 1, way_of(refined, scans.poses))
-    # The covariance is that of the refined poses.
-    return dataclasses.replace(posed, sigmas=pose_sigmas(refined.covariance)) if refined.improved else posed
+    return scans.with_poses(refined.poses), Posed.refined(refined, scans.poses)
 
 
-def _found(scans: Scans, config: FitConfig, results: Results, command: str) -> PosedScans:
+def _found(scans: Scans, config: FitConfig, results: Results, command: str) -> tuple[Scans, Posed]:
     from radarsdf import odometry
-    from radarsdf.poses.way import pose_sigmas, way_of
+    from radarsdf.poses.posed import Posed
 
     found = odometry(scans, config=config)
     results.add(found.report["verdict"], poses=found.report)
@@ -96,10 +90,9 @@ def _found(scans: Scans, config: FitConfig, results: Results, command: str) -> P
         complain(f"radarsdf {command}: {note}")
     if found.report["doppler_sign"] < 0:
         results.add("this radar's Doppler is positive where the sensor comes nearer")
-    pieces, rows = found.report["pieces"], found.longest_piece()
-    posed = scans.with_poses(found.poses, other_world=True)
-    if pieces > 1:
+    posed, placed = Posed.found(found), scans.with_poses(found.poses, other_world=True)
+    if posed.pieces > 1:
+        rows = posed.rows
         results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest piece")
-        posed = posed.select_range(rows)
-    sigmas = pose_sigmas(found.covariance[rows])
-    return PosedScans(posed, None, pieces, way_of(found, None, rows), sigmas)
+        placed = placed.select_range(rows)
+    return placed, posed

@@ -18,9 +18,10 @@ from radarsdf.cli.options import (
     limits_of,
     progress_of,
 )
+from radarsdf.cli.posing import finding, scans_or_unposed
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import complain
-from radarsdf.cli.scans_in import add_scans, scans_of
+from radarsdf.cli.scans_in import add_scans
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -80,6 +81,11 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
         "--tile-size", type=float, metavar="M", help="edge of a tile, m; default: 512 leaf cells"
     )
     parser.add_argument("--halo", type=float, metavar="M", help="what a tile knows beyond its edges, m")
+    parser.add_argument(
+        "--refine",
+        action="store_true",
+        help="mend the poses by the returns before the plan is made; they are written into the folder, poses.tum",
+    )
     parser.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
     parser.add_argument("--no-check", action="store_true", help="do not check the first scans")
     add_config_options(parser)
@@ -114,21 +120,32 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _plan(options: argparse.Namespace) -> Plan:
+    from radarsdf.io.scans import Notes, Scans
     from radarsdf.tiles.fit_tiles import plan_tiles
 
-    scans = scans_of(options)
-    if not options.no_check:
+    scans, missing = scans_or_unposed(options)
+    if not options.no_check and missing is None:
         _check_first(scans)
-    given: Any = (_without_intensities(scan) for scan in scans) if options.geometry_only else scans
+    given = scans
+    if options.geometry_only:
+        given = Scans.of_source(
+            lambda: (_without_intensities(scan) for scan in scans),
+            Notes(str(options.scans)),
+            imu=lambda: scans.imu,
+        )
     alone = options.processes is None and options.cluster is None
-    return plan_tiles(
-        given,
-        options.out,
-        tile_size=options.tile_size,
-        halo=options.halo,
-        config=config_of(options),
-        threads=None if alone else 1,
-    )
+    with finding(options, missing):
+        return plan_tiles(
+            given,
+            options.out,
+            tile_size=options.tile_size,
+            halo=options.halo,
+            config=config_of(options),
+            threads=None if alone else 1,
+            refine=options.refine,
+            find=missing is not None,
+            progress=progress_of(options),
+        )
 
 
 def _check_first(scans: Any) -> None:
@@ -212,6 +229,15 @@ def _clean(results: Results, folder: Path) -> None:
 
 
 def _say_plan(results: Results, plan: Plan, folder: Path) -> None:
+    from radarsdf.tiles.drive_poses import TRAJECTORY, DrivePoses
+
+    if (poses := DrivePoses.load(folder)) is not None:
+        way, rows = poses.posed.way or {}, poses.posed.rows
+        results.add(way["verdict"], poses=folder / TRAJECTORY, improved=way["improved"])
+        for note in poses.posed.notes:
+            complain(f"radarsdf tiles: {note}")
+        if poses.posed.pieces > 1:
+            results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest piece")
     returns, rays = (sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays"))
     most, seconds = max(tile.memory_bytes for tile in plan.tiles), sum(tile.seconds for tile in plan.tiles)
     results.add(

@@ -26,6 +26,7 @@ from radarsdf.io.poses.reading import (
     UNPOSED,
     NoPoses,
     ScanPoses,
+    StampedPoses,
     extrinsic_of,
     poses_of,
 )
@@ -48,7 +49,7 @@ _CALIBRATIONS = ("calib.txt", "calibration.txt")
 
 def read(
     path: str | PathLike[str] | Sequence[str | PathLike[str]],
-    poses: str | PathLike[str] | ArrayLike | None = None,
+    poses: str | PathLike[str] | ArrayLike | StampedPoses | None = None,
     *,
     extrinsic: ArrayLike | None = None,
     topic: str | None = None,

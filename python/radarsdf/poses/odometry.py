@@ -38,6 +38,10 @@ LEAST_TOLD = 0.5
 _LEAST_TOLD_TURN = 1 / WINDOW
 
 
+class NotToldError(ValueError):
+    """Neither the returns nor anything else tells how the sensor moved."""
+
+
 @dataclass(frozen=True)
 class Odometry:
     """Poses that were found without any being given."""
@@ -201,7 +205,7 @@ def _together(
 
 
 def _checked_told(tracked: list[Tracked], drive: Drive, inertial: Inertial) -> tuple[float, float]:
-    """What the returns tell of translations and rotations. Raises a ValueError where nothing does."""
+    """What the returns tell of translations and rotations. Raises a NotToldError where nothing does."""
     if len(tracked) < 2:
         return 0.0, 0.0
     way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
@@ -215,7 +219,7 @@ def _checked_told(tracked: list[Tracked], drive: Drive, inertial: Inertial) -> t
                 f"{least:.0%} is needed. Give {missing}, or poses"
             )
             msg = ". ".join([msg, *(note.rstrip(".") for note in inertial.notes)])
-            raise ValueError(msg)
+            raise NotToldError(msg)
     return way, turn
 
 

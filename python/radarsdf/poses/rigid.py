@@ -34,14 +34,25 @@ def between(first: Floats, second: Floats) -> Floats:
     return found
 
 
-def aligned(poses: Floats, reference: Floats) -> Floats:
-    """The poses (F, 4, 4), as a whole moved and turned so that their mean position and mean rotation are those of `reference`."""
+def alignment(poses: Floats, reference: Floats) -> Floats:
+    """(4, 4) motion that brings the mean position and the mean rotation of poses (F, 4, 4) to those of `reference`."""
     turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
     whole = np.eye(4)
     whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
+    return placed(whole, poses, reference)
+
+
+def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
+    """(4, 4) motion with the rotation of `turn` that brings the mean position of poses (F, 4, 4) to that of `reference`."""
+    whole = turn.copy()
     middle = poses[:, :3, 3].mean(axis=0)
     whole[:3, 3] = reference[:, :3, 3].mean(axis=0) - np.einsum("ij,j->i", whole[:3, :3], middle)
-    found: Floats = np.einsum("ij,fjk->fik", whole, poses)
+    return whole
+
+
+def aligned(poses: Floats, reference: Floats) -> Floats:
+    """The poses (F, 4, 4), as a whole moved and turned so that their mean position and mean rotation are those of `reference`."""
+    found: Floats = np.einsum("ij,fjk->fik", alignment(poses, reference), poses)
     return found
 
 

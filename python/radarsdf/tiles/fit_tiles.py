@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor
 from contextlib import suppress
 from os import PathLike
@@ -16,22 +16,25 @@ from typing import Any
 import numpy as np
 import torch
 
-from radarsdf.checks import instance, one_for_each_scan, path_of, positive
+from radarsdf.checks import flag, instance, one_for_each_scan, path_of, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.files import write_whole
+from radarsdf.io.poses.reading import UNPOSED, NoPoses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
+from radarsdf.tiles.drive_poses import POSES, TRAJECTORY, Drive, DrivePoses
 from radarsdf.tiles.grid import TileGrid
+from radarsdf.tiles.input_digest import InputDigest
 from radarsdf.tiles.locking import LOCK, only_planner
 from radarsdf.tiles.plan import PLAN, Plan, failure_path
-from radarsdf.tiles.planning import InputDigest, make_plan
+from radarsdf.tiles.planning import make_plan
 from radarsdf.tiles.running import run_tasks
 from radarsdf.tiles.tile_fit import fit_tile, is_done
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
-_OURS = {PLAN, LOCK, "tiles", "scans.npy"}
+_OURS = {PLAN, LOCK, POSES, TRAJECTORY, "tiles", "scans.npy"}
 _NOT_COMPARED = ("num_threads", "max_memory_bytes")
 
 
@@ -43,6 +46,8 @@ def fit_tiles(
     halo: float | None = None,
     executor: Executor | None = None,
     config: FitConfig | None = None,
+    refine: bool = False,
+    find: bool = False,
     progress: bool | None = None,
 ) -> TiledMap:
     """Fits a map in tiles. Neither all returns nor all of the map are ever in memory.
@@ -53,7 +58,8 @@ def fit_tiles(
     Parameters
     ----------
     scans : path-like, Scans, or iterable of Scan
-        A path is read by :func:`radarsdf.io.read`. Scans may come one after another; they are read once.
+        A path is read by :func:`radarsdf.io.read`. Scans may come one after another; they are read once, unless poses are
+        refined or found.
     out : path-like
         A folder, which is made.
     tile_size : float, optional
@@ -66,6 +72,13 @@ def fit_tiles(
         By default one after another in this process.
     config : FitConfig, optional
         Settings of the fits. With an executor, each has one thread unless ``num_threads`` says otherwise.
+    refine : bool
+        Whether the returns mend the poses before the plan is made, as :func:`radarsdf.refine_poses` does, window by window of
+        some hundred scans. The poses used are kept in the folder, ``poses.tum``, and their deviations become
+        ``pose_sigma_m`` and ``pose_sigma_rad`` of the maps, unless `config` states some.
+    find : bool
+        Whether poses are found from the radar alone, as by :func:`radarsdf.odometry`. Those of the scans are not used. Scans
+        in a path that have no poses get some in any case. Of a drive in several pieces, the longest is used.
     progress : bool, optional
         Whether to show progress bars. By default only on a terminal.
 
@@ -82,7 +95,15 @@ def fit_tiles(
         If `out` cannot be written, or another process makes its plan.
     """
     plan_tiles(
-        scans, out, tile_size=tile_size, halo=halo, config=config, threads=None if executor is None else 1
+        scans,
+        out,
+        tile_size=tile_size,
+        halo=halo,
+        config=config,
+        threads=None if executor is None else 1,
+        refine=refine,
+        find=find,
+        progress=progress,
     )
     return run_fits(out, executor=executor, progress=progress)
 
@@ -95,15 +116,20 @@ def plan_tiles(
     halo: float | None = None,
     config: FitConfig | None = None,
     threads: int | None = None,
+    refine: bool = False,
+    find: bool = False,
+    progress: bool | None = None,
 ) -> Plan:
     """The first step of :func:`fit_tiles`: one pass over the scans, which writes the plan and the rays of each tile.
+
+    If poses are refined or found, that is a pass before it.
 
     `threads`: of each fit, if the configuration does not say. Default: as many as PyTorch uses.
     """
     folder = path_of(out, "out")
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     grid = _grid(config, tile_size, halo)
-    given = read(scans) if isinstance(scans, (str, PathLike)) else scans
+    drive, given = _given(scans, refine=refine, find=find)
     if not (folder / PLAN).is_file():
         if folder.is_dir() and not {path.name for path in folder.iterdir()} <= _OURS:
             msg = f"{folder} holds other files: give a new folder"
@@ -112,13 +138,48 @@ def plan_tiles(
         with only_planner(folder):
             if not (folder / PLAN).is_file():  # another process may just have made it
                 shutil.rmtree(folder / "tiles", ignore_errors=True)  # of a plan that was not finished
-                threads = config.num_threads or threads or torch.get_num_threads()
-                plan = make_plan(_checked(given), folder, config.override(num_threads=threads), grid)
+                config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
+                if drive is not None:
+                    poses = DrivePoses.of(drive, config, folder, progress)
+                    given, config = poses.scans(given), poses.posed.config(config)
+                else:
+                    for name in (POSES, TRAJECTORY):  # likewise
+                        (folder / name).unlink(missing_ok=True)
+                plan = make_plan(given, folder, config, grid)
                 plan.save(folder)
                 return plan
     plan = Plan.load(folder)
-    _check_same(folder, plan, config, grid, InputDigest.of(_checked(given)))
+    planned = DrivePoses.load(folder)
+    if (planned is None) != (drive is None):
+        msg = f"{folder} holds another plan, of poses {'as given' if planned is None else 'that were refined or found'}: give a new folder"
+        raise ValueError(msg)
+    if planned is None or drive is None:
+        _check_same(folder, plan, config, grid, InputDigest.of(given))
+    else:
+        same = planned.key == drive.key(config)
+        config = planned.posed.config(config)
+        _check_same(folder, plan, config, grid, InputDigest.of(planned.scans(given)) if same else "")
     return plan
+
+
+def _given(
+    scans: str | PathLike[str] | Scans | Iterable[Scan], *, refine: bool, find: bool
+) -> tuple[Drive | None, Iterable[Scan]]:
+    """The scans, checked one after another as they are read, and how their poses are made. None: they are as given."""
+    refine, find = flag(refine, "refine"), flag(find, "find")
+    if isinstance(scans, (str, PathLike)):
+        path = scans
+        try:
+            scans = read(path, UNPOSED if find else None)
+        except NoPoses:
+            scans, find = read(path, UNPOSED), True
+    if not (refine or find):
+        return None, _checked(scans)
+    if iter(scans) is scans:
+        msg = "poses can be refined or found of scans that can be read again: give a path, Scans or a list"
+        raise ValueError(msg)
+    again = _Checked(scans)
+    return Drive(again, scans.imu if isinstance(scans, Scans) else None, find), again
 
 
 def run_fits(
@@ -168,7 +229,17 @@ def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> Til
     return grid
 
 
-def _checked(scans: Iterable[Any]) -> Iterable[Scan]:
+class _Checked:
+    """Scans that can be read again."""
+
+    def __init__(self, scans: Iterable[Any]) -> None:
+        self._scans = scans
+
+    def __iter__(self) -> Iterator[Scan]:
+        return _checked(self._scans)
+
+
+def _checked(scans: Iterable[Any]) -> Iterator[Scan]:
     for i, scan in enumerate(one_for_each_scan(scans, "scans")):
         if not isinstance(scan, Scan):
             msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"

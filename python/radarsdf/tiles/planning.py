@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import math
 from collections.abc import Iterable, Iterator
@@ -26,6 +25,7 @@ from radarsdf.returns.rays import Rays, check_range, middle_scan, prepare
 from radarsdf.returns.sensor import Sensor
 from radarsdf.threads import Workers
 from radarsdf.tiles.grid import Tile, TileGrid
+from radarsdf.tiles.input_digest import InputDigest
 from radarsdf.tiles.plan import Plan, TilePlan
 from radarsdf.tiles.ray_files import RayFiles, read_intensities, read_rays, write_scans
 
@@ -266,30 +266,6 @@ def make_plan(scans: Iterable[Scan], folder: Path, config: FitConfig, grid: Tile
         msg = "there are no scans"
         raise ValueError(msg)
     return planner.plan(digest.hex())
-
-
-class InputDigest:
-    """Tells whether scans are those of a plan."""
-
-    def __init__(self) -> None:
-        self._digest = hashlib.blake2b(digest_size=16)
-
-    def add(self, scan: Scan) -> None:
-        """The next scan."""
-        for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
-            self._digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
-
-    def hex(self) -> str:
-        """The digest of all scans so far."""
-        return self._digest.hexdigest()
-
-    @classmethod
-    def of(cls, scans: Iterable[Scan]) -> str:
-        """The digest of all scans."""
-        digest = cls()
-        for scan in scans:
-            digest.add(scan)
-        return digest.hex()
 
 
 def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:

@@ -21,6 +21,7 @@ from radarsdf.map import queries, storage
 from radarsdf.map.map import Map
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.blend import Share, TileBlend, averages, distance
+from radarsdf.tiles.drive_poses import DrivePoses
 from radarsdf.tiles.plan import map_path
 from radarsdf.tiles.ray_files import rays_path
 from radarsdf.tiles.tile_fit import report_of
@@ -278,6 +279,7 @@ class TiledMap(TileBlend, Map):
         `missing_tiles`: names.
         """
         reports = [report_of(self.folder, tile) for tile in self.tiles]
+        poses = DrivePoses.load(self.folder)
         skipped: dict[str, float | None] = {}
         for report in reports:
             for words, seconds in zip(report.get("skipped", []), report.get("skipped_s", []), strict=True):
@@ -288,6 +290,7 @@ class TiledMap(TileBlend, Map):
             "scans": self.plan.scans,
             "returns": sum(tile.returns for tile in self.plan.tiles),
             "leaf_cells": self.num_cells,
+            **({} if poses is None else {"poses": poses.posed.way}),
             **{name: value for name, value in reports[0].items() if name == "noise"},
             "skipped": list(skipped),
             "skipped_s": list(skipped.values()),
