@@ -88,9 +88,11 @@ class Velocities:
 
 
 def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
-    """(3,) of a sensor that turns evenly by the rotation vector `turn` while its velocity changes evenly, in its first frame, m."""
-    middle = rotation(0.5 * turn) @ (0.5 * (begin_mps + end_mps))
-    found: Floats = duration_s / 6 * (begin_mps + 4 * middle + rotation(turn) @ end_mps)
+    """(..., 3) of a sensor that turns evenly by the rotation vectors `turn` (..., 3) while its velocity changes evenly, in its
+    first frame, m."""
+    middle = np.einsum("...ij,j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
+    end = np.einsum("...ij,j->...i", rotation(turn), end_mps)
+    found: Floats = duration_s / 6 * (begin_mps + 4 * middle + end)
     return found
 
 

@@ -33,7 +33,7 @@ class ExpectedStep:
     duration_s: float
 
     def pose(self, turn: Floats | None = None) -> Floats:
-        """(4, 4) of a sensor that turned by the rotation vector `turn`. None: as is expected."""
+        """(..., 4, 4) of a sensor that turned by the rotation vectors `turn` (..., 3). None: as is expected."""
         turn = self.turn.mean if turn is None else turn
         return transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s))
 
@@ -64,6 +64,6 @@ class ExpectedStep:
         draws = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(count) * deviations
         drawn = self.turn.mean + draws[:, :3] @ turn_axes.T
         shifts: NDArray[np.float64] = draws[:, 3:] @ way_axes.T
-        poses = np.stack([self.pose(turn) for turn in drawn])
+        poses = self.pose(drawn)
         poses[:, :3, 3] += shifts
         return drawn, poses

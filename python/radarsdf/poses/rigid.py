@@ -71,16 +71,17 @@ def skew(vectors: Floats) -> Floats:
 
 
 def rotation(vector: Floats) -> Floats:
-    """(3, 3) rotation by a rotation vector (3,), rad."""
+    """(..., 3, 3) rotations by rotation vectors (..., 3), rad. There are no dimensions before the last, or one."""
     found: Floats = Rotation.from_rotvec(vector).as_matrix()
     return found
 
 
 def transform(turn: Floats, translation: Floats) -> Floats:
-    """(4, 4) of a rotation vector, rad, and a translation, m."""
-    found = np.eye(4)
-    found[:3, :3] = rotation(turn)
-    found[:3, 3] = translation
+    """(..., 4, 4) of rotation vectors (..., 3), rad, and translations (..., 3), m."""
+    found = np.zeros((*turn.shape[:-1], 4, 4))
+    found[..., :3, :3] = rotation(turn)
+    found[..., :3, 3] = translation
+    found[..., 3, 3] = 1
     return found
 
 
