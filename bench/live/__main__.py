@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.live import accuracy, circles, kills, loops, rates, removal
+from bench.live import accuracy, circles, kills, loops, rates, removal, tracking
 from bench.rows import kept
 
 _COMMANDS = {
@@ -17,6 +17,7 @@ _COMMANDS = {
     "circles": circles,
     "kills": kills,
     "loops": loops,
+    "tracking": tracking,
 }
 
 

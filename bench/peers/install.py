@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Install VDBFusion in its own environment: `python -m bench.peers.install [PYTHON]`.
+"""Install peers in environments of their own: `python -m bench.peers.install [PYTHON]` or `... install odometry`.
 
-Its wheels (0.1.6) need CPython 3.8 to 3.10 and NumPy below 2. PYTHON names the interpreter; the default is the first
-suitable one on the path or of pyenv. Open3D comes with the extra `peers` instead.
+The first is VDBFusion. Its wheels (0.1.6) need CPython 3.8 to 3.10 and NumPy below 2. PYTHON names the interpreter; the
+default is the first suitable one on the path or of pyenv. `odometry` is kiss-icp and small_gicp, for this interpreter. Open3D
+comes with the extra `peers` instead.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from .interface import VDBFUSION_ENVIRONMENT
+from .interface import ODOMETRY_ENVIRONMENT, VDBFUSION_ENVIRONMENT
 
 _VERSIONS = ("3.10", "3.9", "3.8")
 
@@ -38,14 +39,21 @@ def _runs(python: str) -> bool:
         return False
 
 
+def _install(python: str, environment: Path, *packages: str) -> None:
+    subprocess.run([python, "-m", "venv", "--clear", str(environment)], check=True)
+    pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "--quiet"]
+    subprocess.run([*pip, *packages], check=True)
+    print(f"{', '.join(packages)}: in {environment}")
+
+
 def main() -> None:
+    if sys.argv[1:] == ["odometry"]:
+        _install(sys.executable, ODOMETRY_ENVIRONMENT, "kiss-icp==1.3.0", "small_gicp==1.0.1")
+        return
     python = next(filter(_runs, _candidates()), None)
     if python is None:
         sys.exit(f"VDBFusion needs CPython {', '.join(_VERSIONS)}: give its command as the argument")
-    subprocess.run([python, "-m", "venv", "--clear", str(VDBFUSION_ENVIRONMENT)], check=True)
-    pip = [str(VDBFUSION_ENVIRONMENT / "bin" / "python"), "-m", "pip", "install", "--quiet"]
-    subprocess.run([*pip, "vdbfusion==0.1.6", "numpy<2"], check=True)
-    print(f"VDBFusion is in {VDBFUSION_ENVIRONMENT}")
+    _install(python, VDBFUSION_ENVIRONMENT, "vdbfusion==0.1.6", "numpy<2")
 
 
 if __name__ == "__main__":

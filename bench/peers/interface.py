@@ -25,6 +25,7 @@ from bench.settings import Changes, merged
 
 ROOT = Path(__file__).resolve().parents[2]
 VDBFUSION_ENVIRONMENT = ROOT / "build" / "peers" / "vdbfusion"
+ODOMETRY_ENVIRONMENT = ROOT / "build" / "peers" / "odometry"
 INSTALL = {
     "open3d": "pip install '.[peers]', on Debian after apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1",
     "vdbfusion": "python -m bench.peers.install, which needs CPython 3.8 to 3.10",

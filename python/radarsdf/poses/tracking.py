@@ -31,6 +31,9 @@ _FOLLOWED = 12  # best poses of a search
 _ELSEWHERE = 500  # poses that tell what agrees by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
 _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimated anew
+# Of the last scans, that it is estimated from: so many tell a deviation to a percent. With all 25 scans of 2,000 returns, it took
+# three times as long as a scan.
+_NOISE_RETURNS = 10_000
 _LEAST_VARIANCE = 1e-12
 _PARTS = slice(0, 3), slice(3, 6)  # of an increment: translation, rotation
 
@@ -112,7 +115,9 @@ class Tracker:
             self._noise = self._estimated_noise()
 
     def _estimated_noise(self) -> SensorNoise:
-        scans, poses = [kept.scan for kept in self._recent], [kept.pose for kept in self._recent]
+        counts = np.cumsum([len(kept.scan) for kept in reversed(self._recent)])
+        last = list(self._recent)[-max(2, int(np.searchsorted(counts, _NOISE_RETURNS, side="right"))) :]
+        scans, poses = [kept.scan for kept in last], [kept.pose for kept in last]
         rays = SensorReturns.of(scans, 0.0, None).posed(np.stack(poses))
         surfels = Surfels.of(rays, self.cell_size_m / LEAVES_PER_SURFEL, self.num_threads)
         return sensor_noise(surfels, rays, self.config, self.num_threads)

@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Time in which `odometry` places a scan of 2,000 returns on those before it."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Iterator
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.poses import drive
+from radarsdf.poses.expected import ExpectedStep
+from radarsdf.poses.rigid import Floats
+from radarsdf.poses.tracking import Tracked, Tracker
+from radarsdf.simulate import measured_motion
+from radarsdf.simulate.worlds import HUGIN_A3, OCULII_EAGLE
+
+_RETURNS = 2000  # of a scan
+_SENSORS = {"hugin": HUGIN_A3, "oculii": OCULII_EAGLE}
+
+
+def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A row for each scene, without Doppler and with it."""
+    for name in options.cases or _SENSORS:
+        scans = radarsdf.simulate.SCENES[name](seed=options.seed, frames=12 if options.quick else 120)
+        more = _RETURNS / float(np.median([len(scan) for scan in scans.points]))
+        sensor = _SENSORS[name]
+        sensor = dataclasses.replace(sensor, beams=round(more * sensor.beams))
+        scans = radarsdf.simulate.simulate(scans.scene, sensor, scans.poses, name=name, seed=options.seed)
+        motion = measured_motion(scans, seed=options.seed)
+        for given, doppler in (("returns", None), ("returns and Doppler", motion.doppler_mps)):
+            took: list[tuple[float, float]] = []
+
+            class Timed(Tracker):
+                """Keeps what each scan takes, by the processor and by the clock, ms."""
+
+                def follow(self, scan: Floats, expected: ExpectedStep | None, took: Any = took) -> Tracked:
+                    begin, begin_wall = time.process_time(), time.perf_counter()
+                    found = super().follow(scan, expected)
+                    took.append((time.process_time() - begin, time.perf_counter() - begin_wall))
+                    return found
+
+            with mock.patch.object(drive, "Tracker", Timed):
+                radarsdf.odometry(
+                    scans.points,
+                    doppler_mps=doppler,
+                    times=motion.times_s,
+                    config=FitConfig(num_threads=options.threads),
+                )
+            processor_ms, wall_ms = 1e3 * np.array(took).T
+            yield {
+                "scene": name,
+                "returns a scan": int(np.median([len(scan) for scan in scans.points])),
+                "tracked by": given,
+                "p50, ms": _said(np.median(processor_ms)),
+                "p99": _said(np.percentile(processor_ms, 99)),
+                "worst": _said(processor_ms.max()),
+                "p50 by the clock": _said(np.median(wall_ms)),
+                "p99 by the clock": _said(np.percentile(wall_ms, 99)),
+                "worst by the clock": _said(wall_ms.max()),
+            }
+
+
+def _said(value: Any) -> float:
+    return round(float(value), 1)

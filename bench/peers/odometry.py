@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Odometry beside that of others on the same scans: `python -m bench.peers.odometry`.
+
+`kiss-icp` and `small_gicp` come from their wheels (`python -m bench.peers.install odometry`). Both are made for lidars, so that
+each has several edges of voxels; the best of each drive counts, which is chosen by the true poses: a favour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import radarsdf
+from numpy.typing import NDArray
+from radarsdf.evaluation import trajectory_metrics
+from radarsdf.simulate import SCENES, measured_motion
+
+from bench.rows import kept
+
+from .interface import ODOMETRY_ENVIRONMENT, ROOT, failure
+
+_VOXELS_M = (0.5, 1.0, 2.0)
+_PEERS = ("kiss-icp", "small_gicp")
+_KINDS = ("hugin", "oculii", "wall", "astyx")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Scans with true poses, and what was measured of the motion."""
+
+    name: str
+    points: Sequence[NDArray[Any]]
+    poses: NDArray[np.float64]
+    times_s: NDArray[np.float64]
+    doppler_mps: Sequence[NDArray[Any]]
+    rates: NDArray[np.float64] | None
+    """(F, 3) of a gyroscope, rad/s. None: there is none."""
+
+
+def simulated(seeds: Iterable[int]) -> Iterator[Drive]:
+    """Of each kind and seed."""
+    for kind in _KINDS:
+        for seed in seeds:
+            drive = SCENES[kind](seed=seed)
+            motion = measured_motion(drive, seed=seed)
+            yield Drive(
+                f"{kind} {seed}",
+                drive.points,
+                drive.poses,
+                motion.times_s,
+                motion.doppler_mps,
+                motion.angular_velocity,
+            )
+
+
+def recorded(folder: Path) -> Iterator[Drive]:
+    """Of each .npz with times and Doppler. Their poses are those of a lidar."""
+    for path in sorted(folder.glob("*.npz")):
+        scans = radarsdf.io.read_scans(path)
+        if scans.times_s is not None and scans.doppler_mps is not None:
+            yield Drive(path.stem, scans.points, scans.poses, scans.times_s, scans.doppler_mps, None)
+
+
+def rows(drives: Iterable[Drive]) -> Iterator[dict[str, str]]:
+    """A row for each drive: positions in % of the way, steps of 10 to 50 % of the way in % of them, and degrees per metre."""
+    for drive in drives:
+        row = {"drive": drive.name, "scans": str(len(drive.points))}
+        for name, given in _OURS.items():
+            row[name] = _ours(drive, **given)
+        for name in _PEERS:
+            row[name] = _best([_peer(name, drive, voxel_m) for voxel_m in _VOXELS_M])
+        yield row
+
+
+_OURS: dict[str, dict[str, bool]] = {
+    "radarsdf, Doppler": {"doppler": True, "gyroscope": False},
+    "radarsdf, Doppler, gyroscope": {"doppler": True, "gyroscope": True},
+    "radarsdf, returns alone": {"doppler": False, "gyroscope": False},
+}
+
+
+def _ours(drive: Drive, *, doppler: bool, gyroscope: bool) -> str:
+    if gyroscope and drive.rates is None:
+        return "–"
+    try:
+        found = radarsdf.odometry(
+            drive.points,
+            times=drive.times_s,
+            doppler_mps=drive.doppler_mps if doppler else None,
+            angular_velocity=drive.rates if gyroscope else None,
+        )
+    except ValueError:
+        return "refused"
+    part = found.longest_piece()
+    words = _words(_errors(found.poses[part], drive.poses[part]))
+    count = part.stop - part.start
+    return words if count == len(drive.points) else f"{words} ({count} scans in one piece)"
+
+
+def _peer(name: str, drive: Drive, voxel_m: float) -> tuple[float, float, float] | str:
+    """Its errors, or why there are none."""
+    python = ODOMETRY_ENVIRONMENT / "bin" / "python"
+    if not python.exists():
+        return "not installed"
+    with tempfile.TemporaryDirectory() as folder:
+        scans, poses = Path(folder) / "scans.npz", Path(folder) / "poses.npy"
+        np.savez(scans, points=np.concatenate(drive.points), counts=[len(scan) for scan in drive.points])
+        command = [str(python), "-m", "bench.peers.odometry_child", name, str(voxel_m), str(scans), str(poses)]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            return failure(done)
+        return _errors(np.load(poses), drive.poses)
+
+
+def _errors(poses: NDArray[np.float64], true: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Of all positions, % of the way; of motions along 10 to 50 % of it, % of them and degrees per metre."""
+    metrics = trajectory_metrics(poses, true)
+    ratio, rad_per_m = metrics["relative_ratio"], metrics["relative_rad_per_m"]
+    assert ratio is not None
+    assert rad_per_m is not None
+    return 100 * metrics["absolute_m"] / metrics["length_m"], 100 * ratio, float(np.degrees(rad_per_m))
+
+
+def _best(found: list[tuple[float, float, float] | str]) -> str:
+    told = [errors for errors in found if not isinstance(errors, str)]
+    return _words(min(told)) if told else str(found[0])
+
+
+def _words(errors: tuple[float, float, float]) -> str:
+    return f"{errors[0]:.2f}; {errors[1]:.2f}; {errors[2]:.3f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[91, 92, 93], help="of the simulated drives")
+    parser.add_argument(
+        "--recorded",
+        type=Path,
+        default=Path(os.environ.get("RADARSDF_DATA", ".")) / "astyx",
+        metavar="FOLDER",
+        help="recorded drives, .npz; default: astyx in $RADARSDF_DATA",
+    )
+    parser.add_argument("-o", "--out", type=Path, default=ROOT / "build" / "odometry_peers.json")
+    options = parser.parse_args()
+
+    def drives() -> Iterator[Drive]:
+        yield from recorded(options.recorded)
+        yield from simulated(options.seeds)
+
+    kept(rows(drives()), "bench.peers.odometry", options.out)
+
+
+if __name__ == "__main__":
+    main()

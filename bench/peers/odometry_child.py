@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Odometry of a peer in its own environment: `python -m bench.peers.odometry_child NAME VOXEL_M SCANS POSES`.
+
+SCANS is an .npz of `points` (N, 3), sensor frame, m, and `counts` (F,) of the returns of each scan; POSES will be a .npy of
+(F, 4, 4). Besides NumPy, only the peer's package is needed.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+
+def kiss_icp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> list[np.ndarray]:
+    """KISS-ICP: points to the points of a map of voxels, a threshold that adapts."""
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
+
+    config = KISSConfig()
+    config.data.deskew = False  # returns have no times of their own
+    config.data.max_range = max_range_m
+    config.mapping.voxel_size = voxel_m
+    odometry, poses = KissICP(config), []
+    for scan in scans:
+        odometry.register_frame(scan, np.zeros(len(scan)))
+        poses.append(np.array(odometry.last_pose))
+    return poses
+
+
+def small_gicp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> list[np.ndarray]:
+    """GICP of each scan on a map of Gaussians in voxels, which begins where a steady motion leads."""
+    import small_gicp as peer
+
+    target, T, step, poses = peer.GaussianVoxelMap(voxel_m), np.eye(4), np.eye(4), []
+    for number, scan in enumerate(scans):
+        near = scan[np.linalg.norm(scan, axis=1) <= max_range_m]
+        source, _ = peer.preprocess_points(near, downsampling_resolution=voxel_m / 4)
+        if number:
+            found = peer.align(target, source, T @ step, max_correspondence_distance=3 * voxel_m)
+            before, T = T, found.T_target_source
+            step = np.linalg.inv(before) @ T
+        target.insert(source, T)
+        poses.append(np.array(T))
+    return poses
+
+
+PEERS = {"kiss-icp": kiss_icp, "small_gicp": small_gicp}
+"""By name."""
+
+
+def main() -> None:
+    name, voxel_m, scans_path, poses_path = sys.argv[1:]
+    with np.load(scans_path) as file:
+        points, counts = file["points"].astype(np.float64), file["counts"]
+    scans = np.split(points, np.cumsum(counts)[:-1])
+    farthest_m = float(np.linalg.norm(points, axis=1).max())
+    np.save(poses_path, PEERS[name](scans, float(voxel_m), farthest_m))
+
+
+if __name__ == "__main__":
+    main()
