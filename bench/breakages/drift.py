@@ -18,7 +18,7 @@ from radarsdf.checking.drift import check_drift
 from radarsdf.checking.recording import Recording
 from radarsdf.simulate import measured_motion
 
-from bench.paper.broken_poses import drifted
+from bench.paper.broken_poses import walked
 
 _FRAMES = 24
 _WALKS = ((0.02, 0.1), (0.05, 0.25))  # of a step, m and degrees
@@ -49,7 +49,7 @@ def main() -> None:
             times_s = max(0.1, step_m / 10) * np.arange(_FRAMES)
             doppler_mps = measured_motion(scans, times_s=times_s, seed=seed).doppler_mps
         walk = number // 2 % 2
-        for row, poses in ((0, scans.poses), (1 + walk, drifted(scans.poses, *_WALKS[walk], seed))):
+        for row, poses in ((0, scans.poses), (1 + walk, walked(scans.poses, *_WALKS[walk], seed))):
             begin_s = time.process_time()
             findings = check_drift(Recording.of(scans.points, poses, None, doppler_mps, times_s), config)
             seconds.append(time.process_time() - begin_s)

@@ -15,7 +15,7 @@ from radarsdf import FitConfig
 from radarsdf.poses.rigid import steps, turned_by
 
 from bench.memory import memory_bytes
-from bench.paper.broken_poses import drifted
+from bench.paper.broken_poses import walked
 
 _APART_M = 500.0  # from a copy to the next: they have no returns in common
 _WALK = 0.02, 0.1  # m and degrees a step
@@ -51,7 +51,7 @@ def row(scans: int, threads: int) -> dict[str, Any]:
     points = (drive.points * copies)[:scans]
     true = np.tile(drive.poses, (copies, 1, 1))[:scans]
     true[:, 0, 3] += _APART_M * (np.arange(scans) // len(drive.poses))
-    given, config = drifted(true, *_WALK, 0), FitConfig(num_threads=threads)
+    given, config = walked(true, *_WALK, 0), FitConfig(num_threads=threads)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
     before, wall_s, processor_s = memory_bytes("VmRSS"), time.perf_counter(), time.process_time()
     refined = radarsdf.refine_poses(points, given, config=config)

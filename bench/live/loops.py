@@ -15,7 +15,7 @@ from radarsdf import FitConfig, LiveMap
 from radarsdf.evaluation import surface_metrics
 from radarsdf.poses.rigid import aligned
 
-from bench.paper.broken_poses import drifted
+from bench.paper.broken_poses import walked
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -24,7 +24,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     config = FitConfig(num_threads=options.threads)
     for name in options.cases or ["hugin", "oculii", "wall"]:
         scans = radarsdf.simulate.SCENES[name](seed=options.seed, frames=12 if options.quick else None)
-        given = drifted(scans.poses, 0.02, 0.1, options.seed)
+        given = walked(scans.poses, 0.02, 0.1, options.seed)
 
         def score(live: LiveMap, truth: Any = scans.ground_truth) -> float:
             samples = 20_000 if options.quick else 1_000_000

@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from radarsdf.poses.rigid import moved, steps
+from radarsdf.poses.rigid import moved
+from radarsdf.simulate import drifted
 from scipy.spatial.transform import Rotation, Slerp
 
 Poses = NDArray[np.float64]
@@ -16,17 +17,9 @@ Poses = NDArray[np.float64]
 _STEP_S = 0.1  # between two scans, for what is late
 
 
-def drifted(poses: Poses, sigma_m: float, sigma_deg: float, seed: int, yaw_deg: float = 0.0) -> Poses:
-    """A random walk: each step (F - 1) has errors of its own, and a bias in yaw."""
-    rng = np.random.default_rng(seed)
-    sigmas = np.repeat([sigma_m, np.radians(sigma_deg)], 3)
-    errors = rng.normal(0, 1, (len(poses) - 1, 6)) * sigmas
-    errors[:, 5] += np.radians(yaw_deg)
-    wrong = moved(np.tile(np.eye(4), (len(errors), 1, 1)), errors)
-    found = [poses[0]]
-    for step, error in zip(steps(poses), wrong, strict=True):
-        found.append(found[-1] @ step @ error)
-    return np.stack(found)
+def walked(poses: Poses, sigma_m: float, sigma_deg: float, seed: int, yaw_deg: float = 0.0) -> Poses:
+    """A random walk, with a bias in yaw."""
+    return drifted(poses, sigma_m, np.radians(sigma_deg), seed, np.radians(yaw_deg))
 
 
 def jumped(poses: Poses, jump_m: float, jump_deg: float, seed: int) -> Poses:
@@ -60,10 +53,10 @@ def late(poses: Poses, late_s: float) -> Poses:
 
 BREAKAGES: dict[str, Callable[[Poses, int], Poses]] = {
     "none": lambda poses, _: poses,
-    "walk of 0.01 m, 0.05°": lambda poses, seed: drifted(poses, 0.01, 0.05, seed),
-    "walk of 0.02 m, 0.1°": lambda poses, seed: drifted(poses, 0.02, 0.1, seed),
-    "walk of 0.05 m, 0.25°": lambda poses, seed: drifted(poses, 0.05, 0.25, seed),
-    "walk of 0.02 m, 0.05°, yaw 0.2° a step": lambda poses, seed: drifted(poses, 0.02, 0.05, seed, 0.2),
+    "walk of 0.01 m, 0.05°": lambda poses, seed: walked(poses, 0.01, 0.05, seed),
+    "walk of 0.02 m, 0.1°": lambda poses, seed: walked(poses, 0.02, 0.1, seed),
+    "walk of 0.05 m, 0.25°": lambda poses, seed: walked(poses, 0.05, 0.25, seed),
+    "walk of 0.02 m, 0.05°, yaw 0.2° a step": lambda poses, seed: walked(poses, 0.02, 0.05, seed, 0.2),
     "a jump of 0.5 m, 2°": lambda poses, seed: jumped(poses, 0.5, 2.0, seed),
     "every second pose stale": lambda poses, _: stale(poses),
     "0.05 s late": lambda poses, _: late(poses, 0.05),

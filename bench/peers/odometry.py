@@ -113,7 +113,15 @@ def _peer(name: str, drive: Drive, voxel_m: float) -> tuple[float, float, float]
     with tempfile.TemporaryDirectory() as folder:
         scans, poses = Path(folder) / "scans.npz", Path(folder) / "poses.npy"
         np.savez(scans, points=np.concatenate(drive.points), counts=[len(scan) for scan in drive.points])
-        command = [str(python), "-m", "bench.peers.odometry_child", name, str(voxel_m), str(scans), str(poses)]
+        command = [
+            str(python),
+            "-m",
+            "bench.peers.odometry_child",
+            name,
+            str(voxel_m),
+            str(scans),
+            str(poses),
+        ]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             return failure(done)

@@ -11,8 +11,7 @@ from radarsdf.checking import drift
 from radarsdf.checking.drift import check_drift
 from radarsdf.checking.recording import Recording
 from radarsdf.io import Scans
-
-from ..poses.drift import drifted
+from radarsdf.simulate import drifted
 
 SCANS = 36
 CONFIG = radarsdf.FitConfig(num_threads=1)

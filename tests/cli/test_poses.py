@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io.npz import Scans, read_scans, write_scans
-from radarsdf.simulate import MeasuredMotion, measured_motion
+from radarsdf.simulate import MeasuredMotion, drifted, measured_motion
 
-from ..poses.drift import drifted, position_error_m
+from ..poses.drift import position_error_m
 from ..poses.test_odometry import errors
 from .calls import call, refusal, values
 

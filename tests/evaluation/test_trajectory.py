@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from radarsdf.evaluation import trajectory_metrics
 from radarsdf.poses.rigid import moved
+from radarsdf.simulate import drifted
 
-from ..poses.drift import drifted, trajectory
+from ..poses.drift import trajectory
 
 WHOLE = moved(np.eye(4)[None], np.array([[30.0, -20, 10, 0.4, -0.3, 2.1]]))[0]
 

@@ -9,8 +9,7 @@ import functools
 import numpy as np
 import radarsdf
 from radarsdf.io import Scans
-from radarsdf.poses.rigid import moved, steps
-from radarsdf.simulate import measured_motion
+from radarsdf.simulate import drifted, measured_motion
 from scipy.spatial.transform import Rotation
 
 
@@ -23,16 +22,6 @@ def trajectory(count):
     ).as_matrix()
     poses[:, :3, 3] = np.stack([0.5 * k, 2 * np.sin(0.1 * k), 0.1 * np.cos(k)], 1)
     return poses
-
-
-def drifted(poses, sigma_m, sigma_rad, seed, yaw_rad=0.0):
-    """The poses with errors in each step, which all have `yaw_rad` in common."""
-    rng = np.random.default_rng(seed)
-    found = [poses[0]]
-    for step in steps(poses):
-        error = np.concatenate([rng.normal(0, sigma_m, 3), rng.normal(0, sigma_rad, 3) + [0, 0, yaw_rad]])
-        found.append(found[-1] @ step @ moved(np.eye(4)[None], error[None])[0])
-    return np.stack(found)
 
 
 def position_error_m(poses, true):

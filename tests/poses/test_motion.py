@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.rigid import aligned, moved, steps, turned_by
+from radarsdf.simulate import drifted
 
-from .drift import drifted, trajectory
+from .drift import trajectory
 
 
 def test_steps_lead_from_pose_to_pose():

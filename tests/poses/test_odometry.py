@@ -10,9 +10,9 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Scans
 from radarsdf.poses.rigid import aligned, turned_by
-from radarsdf.simulate import Simulation, measured_motion
+from radarsdf.simulate import Simulation, drifted, measured_motion
 
-from .drift import drifted, position_error_m
+from .drift import position_error_m
 
 BIAS_RAD_S = (0.01, -0.02, 0.03)
 

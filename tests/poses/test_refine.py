@@ -10,8 +10,9 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Scans
 from radarsdf.poses.rigid import aligned, turned_by
+from radarsdf.simulate import drifted
 
-from .drift import drifted, position_error_m
+from .drift import position_error_m
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf.view import growing
+from radarsdf.view import page as served
 
 
 class Scene:
@@ -27,9 +28,9 @@ class Scene:
 @pytest.fixture
 def page(monkeypatch):
     server = SimpleNamespace(scene=Scene(), initial_camera=SimpleNamespace(), atomic=nullcontext)
-    monkeypatch.setattr(growing, "require_viser", lambda: None)
-    monkeypatch.setattr(growing, "start_server", lambda *_: server)
-    monkeypatch.setattr(growing, "stop_server", lambda server: server.scene.shown.clear())
+    monkeypatch.setattr(served, "require_viser", lambda: None)
+    monkeypatch.setattr(served, "start_server", lambda *_: server)
+    monkeypatch.setattr(served, "stop_server", lambda server: server.scene.shown.clear())
     return server
 
 

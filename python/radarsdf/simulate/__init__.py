@@ -12,6 +12,7 @@ Examples
 (2, (2, 4, 4))
 """
 
+from .drift import drifted
 from .kinds import KINDS
 from .legs import Leg, LegDrive, drive_legs
 from .materials import Material
@@ -43,6 +44,7 @@ __all__ = [
     "Simulation",
     "Terrain",
     "astyx",
+    "drifted",
     "drive_legs",
     "hugin",
     "measured_imu",

@@ -4,25 +4,23 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.view.framing import FOV_RAD, look_at_all
-from radarsdf.view.serving import free_port, require_viser, start_server, stop_server
+from radarsdf.view.page import Page
 
 if TYPE_CHECKING:
     import trimesh
-    from typing_extensions import Self
 
 _TO_EYE = np.array([-0.33, -0.57, 0.5])  # of the first view
 _ASPECT = 1.3
 _SURFACE_COLOR, _PATH_COLOR = (150, 160, 170), (0, 190, 255)
 
 
-class GrowingView:
+class GrowingView(Page):
     """Serves the surface and the way of the sensor, whatever they are now, until it is stopped.
 
     Parameters
@@ -41,10 +39,8 @@ class GrowingView:
     """
 
     def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
-        require_viser()
-        self.host = host
-        self.port = free_port(host, 8080 if port is None else port, exactly=port is not None)
-        self._server: Any = start_server(host, self.port)
+        super().__init__(host, port)
+        self._start()
         self._origin: NDArray[np.float64] | None = None
 
     def show(self, mesh: trimesh.Trimesh, path: NDArray[np.float64]) -> None:
@@ -72,17 +68,3 @@ class GrowingView:
                 server.scene.add_line_segments(
                     "/path", np.stack([way[:-1], way[1:]], axis=1), colors=_PATH_COLOR, line_width=3.0
                 )
-
-    def stop(self) -> None:
-        """Close the page and end all threads."""
-        stop_server(self._server)
-
-    def __enter__(self) -> Self:
-        """The view, which the end of the block stops."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Stop."""
-        self.stop()

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,15 +14,12 @@ from radarsdf.map.map import Map
 from radarsdf.view.canvas import SurfaceCanvas
 from radarsdf.view.controls import Controls
 from radarsdf.view.framing import FOV_RAD, Look, look_at_all
+from radarsdf.view.page import Page
 from radarsdf.view.painter import HELD_S, SLID_S, Painter, Wish
 from radarsdf.view.picking import first_hit
 from radarsdf.view.quantities import Colors, quantities_of
-from radarsdf.view.serving import free_port, require_viser, start_server, stop_server
 from radarsdf.view.surface import ShownSurface
 from radarsdf.view.walk import Walk
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 _TO_EYE = np.array([-0.33, -0.57, 0.5])  # of the first view
 _ASPECT = 1.3  # of the frame until a page tells its own
@@ -33,7 +29,7 @@ _MARK_COLOR = (0, 190, 255)  # not one of a scale
 _CLICKED = "/clicked"
 
 
-class Viewer:
+class Viewer(Page):
     """Serves a map in the browser until it is stopped.
 
     While the sensor is dragged, at most 30,000 vertices are recoloured, spread evenly over the surface: intensities of
@@ -87,19 +83,17 @@ class Viewer:
         progress: bool | None = None,
         **limits: Any,
     ) -> None:
-        require_viser()
-        self.host = host
-        self.port = free_port(host, 8080 if port is None else port, exactly=port is not None)
+        super().__init__(host, port)
         self._map = radar_map
         self.surface = ShownSurface.of(
             radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
         )
         """What is shown."""
-        self._server: Any = start_server(host, self.port)
+        self._start()
         try:
             self._fill(scans)
         except BaseException:
-            stop_server(self._server)
+            super().stop()
             raise
         self.notes = self._notes(voxel_size)
         """Sentences on what is shown coarser or thinner than it is."""
@@ -111,17 +105,7 @@ class Viewer:
     def stop(self) -> None:
         """Close the page and end all threads."""
         self._painter.stop()
-        stop_server(self._server)
-
-    def __enter__(self) -> Self:
-        """The viewer, which the end of the block stops."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Stop."""
-        self.stop()
+        super().stop()
 
     def _fill(self, scans: Scans | None) -> None:
         origin, vertices = self._map.origin, self.surface.vertices
