@@ -20,6 +20,7 @@ _BY_CHANCE = (
     1e-3  # probability that true poses seem improved. Of 48 simulated drives, seeds 101 to 112, none were
 )
 _HELD_OUT = 0.2  # of the returns
+_PLACE = 0.25  # edge of a place, in median ranges: what is seen as one thing from near and far is smaller
 
 
 def held_out(count: int, seed: int) -> NDArray[np.bool_]:
@@ -36,13 +37,13 @@ class Verdict:
     less the same after."""
     error: float
     """Its standard error."""
-    scans: int
-    """Number of scans that tell it."""
+    parts: int
+    """Number of scans that tell it, or of places, if these are fewer."""
 
     @property
     def needed(self) -> float:
-        """The gain that is no chance: Student's t. With few scans, the standard error is uncertain, too."""
-        return float(student.ppf(1 - _BY_CHANCE, self.scans - 1)) * self.error if self.scans > 1 else np.inf
+        """The gain that is no chance: Student's t. With few scans or places, the standard error is uncertain, too."""
+        return float(student.ppf(1 - _BY_CHANCE, self.parts - 1)) * self.error if self.parts > 1 else np.inf
 
     @property
     def improved(self) -> bool:
@@ -61,17 +62,41 @@ class Verdict:
     def of(cls, held: SensorReturns, used: SensorReturns, before: Floats, after: Floats) -> Verdict:
         """Of the returns `held` that took no part, beside those that were `used`.
 
-        Returns of a scan have errors in common, so that scans are counted. Blocks of them gave true poses no other
-        errors, but hid what a single jump costs, which only the scans near it tell.
+        Returns do not judge one by one. Those of a scan have the errors of its pose in common, and so have neighbouring scans,
+        since errors of poses last. Those of a place may lie on one thing that moved, or that looks different from everywhere.
+        The standard error is the largest that one of these gives.
         """
+        if len(held) == 0:
+            return cls(0.0, np.inf, 0)
         step = max(1, len(held) // _MOST_RETURNS)
         asked = held.select(np.arange(len(held)) % step == 0)
         gains = np.log(_distances(asked, used, before) / _distances(asked, used, after))
+        edge_m = _PLACE * float(np.median(asked.ranges_m))
+        cells = np.floor(asked.posed(before).points / edge_m)
+        places = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
         counts = np.bincount(asked.scans)
         means = np.bincount(asked.scans, gains)[counts > 0] / counts[counts > 0]
-        if len(means) < 2:
-            return cls(0.0, np.inf, len(means))
-        return cls(float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means))), len(means))
+        parts = min(len(means), int(places.max()) + 1)
+        if parts < 2:
+            return cls(0.0, np.inf, parts)
+        return cls(float(means.mean()), max(_error_of_scans(means), _error_of_places(gains, places)), parts)
+
+
+def _error_of_scans(means: Floats) -> float:
+    """Standard error of the mean of those of scans (F,), in which neighbours are alike (Newey and West 1987, with their lags of
+    1994)."""
+    count, off = len(means), means - means.mean()
+    lags = min(int(4 * (count / 100) ** (2 / 9)), count - 1)
+    alone = (off**2).sum()
+    alike = [(1 - lag / (lags + 1)) * (off[lag:] * off[:-lag]).sum() for lag in range(1, lags + 1)]
+    together = alone + 2 * sum(alike)
+    return float(np.sqrt(max(alone, together) / (count * (count - 1))))
+
+
+def _error_of_places(gains: Floats, places: NDArray[np.int64]) -> float:
+    """Standard error of the mean of gains (N,) of which those of a place (N,) may all be wrong together."""
+    sums = np.bincount(places, gains - gains.mean())
+    return float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1)) / len(gains))
 
 
 def _distances(asked: SensorReturns, used: SensorReturns, poses: Floats) -> NDArray[np.float64]:
