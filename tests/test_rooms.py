@@ -40,6 +40,7 @@ ROOMS = (
     ("fitting",),
     ("live",),
     ("tiles",),
+    ("changes",),
     ("render",),
     ("view",),
     ("evaluation", "simulate"),

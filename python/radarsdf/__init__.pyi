@@ -7,6 +7,8 @@ from . import io as io
 from . import simulate as simulate
 from .budget.estimate import Estimate as Estimate
 from .budget.estimate import estimate as estimate
+from .changes.changes import Changes as Changes
+from .changes.compare import compare as compare
 from .checking.check import check as check
 from .checking.finding import Finding as Finding
 from .config.fit_config import FitConfig as FitConfig

@@ -307,6 +307,10 @@ class Map(ABC):
     def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellsInBox:
         """What is known of the leaf cells that lie between two corners (3,), world, m, wholly or in part."""
 
+    @abstractmethod
+    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+        """What the returns round positions (N, 3), world, m, tell of a surface there."""
+
     @property
     @abstractmethod
     def passage_odds(self) -> NDArray[np.float64]:

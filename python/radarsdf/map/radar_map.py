@@ -54,12 +54,10 @@ class RadarMap(Map):
         return queries.observed(self._contents, queries.to_local(self._contents, world))
 
     def _uncertainty(self, world: Tensor) -> Tensor:
-        points = queries.to_local(self._contents, world)
-        return queries.uncertainty(self._contents, queries.evidence(self._contents, points))
+        return queries.uncertainty(self._contents, self.evidence_at(world))
 
     def _confidence(self, world: Tensor) -> Tensor:
-        points = queries.to_local(self._contents, world)
-        return queries.confidence(self._contents, queries.evidence(self._contents, points))
+        return queries.confidence(self._contents, self.evidence_at(world))
 
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         return self._answers_at(queries.intensity, world, sensors, extrapolate=extrapolate)
@@ -102,6 +100,9 @@ class RadarMap(Map):
         count = np.floor((upper - self.origin) / leaf_m).astype(np.int64) - first + 1
         x, y, z = count.tolist()
         return CellsInBox(self.origin + first * leaf_m, *cells_of(self._contents, first, (x, y, z)))
+
+    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+        return queries.evidence(self._contents, queries.to_local(self._contents, world))
 
     @cached_property
     def passage_odds(self) -> NDArray[np.float64]:

@@ -95,10 +95,10 @@ class TiledMap(TileBlend, Map):
         return torch.from_numpy(self.seen(_contiguous(world)))
 
     def _uncertainty(self, world: Tensor) -> Tensor:
-        return queries.uncertainty(self.any_contents, self.evidence(_contiguous(world)))
+        return queries.uncertainty(self.any_contents, self.evidence_at(world))
 
     def _confidence(self, world: Tensor) -> Tensor:
-        return queries.confidence(self.any_contents, self.evidence(_contiguous(world)))
+        return queries.confidence(self.any_contents, self.evidence_at(world))
 
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         positions, places = _contiguous(world), _contiguous(sensors)
@@ -152,6 +152,9 @@ class TiledMap(TileBlend, Map):
         from radarsdf.tiles.gridding import cells_of_tiles  # noqa: PLC0415 - it imports trimesh, which is slow
 
         return cells_of_tiles(self, lower, upper)
+
+    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+        return self.evidence(_contiguous(world))
 
     @cached_property
     def passage_odds(self) -> _Floats:

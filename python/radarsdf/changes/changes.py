@@ -1,0 +1,167 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What changed between two maps, as coloured surfaces."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from radarsdf.changes.placed import Floats
+from radarsdf.checks import path_of
+from radarsdf.io.files import write_whole
+
+if TYPE_CHECKING:
+    import trimesh
+
+UNSEEN, SAME, GONE, APPEARED, MOVED = -1, 0, 1, 2, 3
+NAMES = {UNSEEN: "unseen", SAME: "same", GONE: "gone", APPEARED: "appeared", MOVED: "moved"}
+CHANGED = (APPEARED, GONE, MOVED)
+# Told from each other by colour-blind people, too (Okabe and Ito 2008).
+COLORS = {
+    UNSEEN: (225, 225, 225), SAME: (165, 165, 165), GONE: (213, 94, 0), APPEARED: (0, 158, 115),
+    MOVED: (230, 159, 0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ChangedSurface:
+    """The surface of one map, and what became of it in the other."""
+
+    vertices: Floats
+    """(V, 3) world of the earlier map, m."""
+    faces: NDArray[np.int32]
+    """(F, 3) rows of vertices. They face free space."""
+    kind: NDArray[np.int8]
+    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved. Unseen: the other map does not tell."""
+    probability: NDArray[np.float32]
+    """(V,) of that change; of the likeliest one where it is the same or unseen."""
+    moved_m: NDArray[np.float32]
+    """(V,) how far the surface moved along its normal towards free space, m. NaN where it did not."""
+    intensity_change: NDArray[np.float32]
+    """(V,) later less earlier reflectance, sensor units, without what all places have in common. NaN where it is unknown."""
+
+    def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
+        """(F,) kind of each face, that of most of its vertices, or the first; and areas, m²."""
+        kinds = self.kind[self.faces]
+        a, b, c = self.vertices[self.faces].transpose(1, 0, 2)
+        areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return np.where(kinds[:, 1] == kinds[:, 2], kinds[:, 1], kinds[:, 0]), areas
+
+
+@dataclass(frozen=True)
+class Region:
+    """Faces of one change that hang together."""
+
+    kind: str
+    """``appeared``, ``gone`` or ``moved``."""
+    box: Floats
+    """(2, 3) lower and upper corner, world of the earlier map, m."""
+    area_m2: float
+    """Area, m²."""
+    probability: float
+    """Mean over its vertices."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What :func:`radarsdf.compare` found."""
+
+    before: ChangedSurface
+    """The earlier surface: what is gone, and what moved."""
+    after: ChangedSurface
+    """The later surface: what appeared, and what moved."""
+    T_before_after: Floats
+    """(4, 4) from the later map's world to that of the earlier one, m."""
+    report: dict[str, Any]
+    """`alignment` in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map tells of; `changed_share`, the
+    probable share of it that changed; `scale`, by which the maps are further apart than their uncertainty says;
+    `intensity_offset`, by which all intensities changed, sensor units."""
+
+    def regions(self, min_area_m2: float = 0.0) -> list[Region]:
+        """Changes that hang together, the largest first; without those of a smaller area, m²."""
+        found = []
+        for surface, kinds in ((self.before, (GONE, MOVED)), (self.after, (APPEARED, MOVED))):
+            of_faces, areas = surface.of_faces()
+            for kind in kinds:
+                rows = np.flatnonzero(of_faces == kind)
+                for part in _connected(surface.faces[rows], len(surface.vertices)):
+                    faces = rows[part]
+                    vertices = np.unique(surface.faces[faces])
+                    x = surface.vertices[vertices]
+                    found.append(
+                        Region(
+                            NAMES[kind], np.stack([x.min(axis=0), x.max(axis=0)]), float(areas[faces].sum()),
+                            float(surface.probability[vertices].mean()),
+                        )
+                    )  # fmt: skip
+        found.sort(key=lambda region: -region.area_m2)
+        return [region for region in found if region.area_m2 >= min_area_m2]
+
+    def mesh(self) -> trimesh.Trimesh:
+        """The later surface, and of the earlier one what is gone or moved, in colours.
+
+        Green appeared, vermilion is gone, orange moved, grey is the same, and light grey was
+        not seen before. `kind`, `probability`, `moved_m` and `intensity_change` are attributes of the vertices.
+        """
+        import trimesh  # noqa: PLC0415 - slow to import
+
+        of_faces, _ = self.before.of_faces()
+        lost = self.before.faces[(of_faces == GONE) | (of_faces == MOVED)]
+        used, rows = np.unique(lost, return_inverse=True)
+        vertices = np.concatenate([self.after.vertices, self.before.vertices[used]])
+        faces = np.concatenate([self.after.faces, rows.reshape(-1, 3) + len(self.after.vertices)])
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        for name in ("kind", "probability", "moved_m", "intensity_change"):
+            mesh.vertex_attributes[name] = np.concatenate(
+                [getattr(self.after, name), getattr(self.before, name)[used]]
+            )
+        table = np.array([COLORS[kind] for kind in sorted(COLORS)], np.uint8)
+        colors = table[np.asarray(mesh.vertex_attributes["kind"], np.int64) + 1]
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
+        return mesh
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes the changes to a file. An old one is replaced only once the new one is complete.
+
+        Parameters
+        ----------
+        path : path-like
+            A mesh as of :meth:`mesh`, by its suffix; or ``.npz``: all arrays, those of the surfaces as ``before_NAME`` and
+            ``after_NAME``.
+
+        Raises
+        ------
+        ValueError
+            For another suffix.
+        OSError
+            If the file cannot be written.
+        """
+        from radarsdf.io.meshes import write_mesh  # noqa: PLC0415 - as above
+
+        target = path_of(path, "path")
+        if target.suffix != ".npz":
+            write_mesh(target, self.mesh())
+            return
+        buffer = io.BytesIO()
+        arrays = {f"{side}_{name}": value for side in ("before", "after") for name, value in vars(getattr(self, side)).items()}  # fmt: skip
+        np.savez_compressed(buffer, T_before_after=self.T_before_after, **arrays)
+        write_whole(target, buffer.getvalue())
+
+
+def _connected(faces: NDArray[np.int32], num_vertices: int) -> list[NDArray[np.int64]]:
+    """Rows of the faces (F, 3) that hang together by vertices."""
+    if len(faces) == 0:
+        return []
+    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), (num_vertices, num_vertices))
+    labels = connected_components(graph, directed=False)[1][faces[:, 0]]
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)

@@ -1,0 +1,241 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Compares two maps of one place, or a map and new scans."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from radarsdf.changes.alignment import Alignment, align, unaligned
+from radarsdf.changes.changes import (
+    APPEARED,
+    CHANGED,
+    GONE,
+    MOVED,
+    NAMES,
+    SAME,
+    UNSEEN,
+    ChangedSurface,
+    Changes,
+)
+from radarsdf.changes.placed import Floats, PlacedMap, Told
+from radarsdf.changes.probability import (
+    Absence,
+    absence,
+    posterior,
+    share_of_changes,
+)
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.fitting.fit import fit
+from radarsdf.io.scans import Scans
+from radarsdf.map.map import Map
+from radarsdf.map.meshing import check_box
+from radarsdf.returns.evidence import CELLS_OF_SURFACE
+
+_PROBABLE = 0.5  # more likely than not
+_PARALLEL = np.cos(np.pi / 4)  # a surface that moved is still about parallel
+
+
+def compare(
+    before: Map,
+    after: Map | Iterable[ArrayLike] | Scans,
+    poses: ArrayLike | None = None,
+    intensities: Iterable[ArrayLike] | None = None,
+    *,
+    align_frames: bool = True,
+    box: ArrayLike | None = None,
+) -> Changes:
+    """What appeared, what is gone and what moved its surface between two maps, and how their reflectance differs.
+
+    "Not seen" is not "gone". A surface is gone only where rays of the later drive passed the place, and it appeared only where
+    those of the earlier drive did. A place that the other drive did not see through is unseen. How likely a change is follows
+    from both maps: from their distance beside their uncertainty, from how many scans hit the place and passed it on both
+    days, and from the confidence of the surface that changed. How much changes at all is found from all places together.
+
+    Parameters
+    ----------
+    before : Map
+        The earlier map, fitted with ``returns.passages``, which is the default of :class:`FitConfig`.
+    after : Map, iterable of F arrays, or Scans
+        The later map, likewise; or new scans as :func:`fit` takes them, of which a quick map is made first, with the ranges,
+        errors of poses and leaf cells of `before`.
+    poses, intensities
+        Of new scans, as :func:`fit` takes them.
+    align_frames : bool
+        Whether the later map may be moved as a whole. It is if its surface is then nearer to the earlier one, by more than
+        chance gives one of a thousand; frames may be some metres and some degrees apart.
+    box : (2, 3) array_like, optional
+        Lower and upper corner, world of the earlier map, m: nothing outside is looked at.
+
+    Returns
+    -------
+    Changes
+        Surfaces of both maps, in the world of the earlier one, with the kind and the probability of their changes.
+
+    Raises
+    ------
+    ValueError
+        If a map does not keep what rays passed, or for wrong arguments.
+    TypeError
+        If `before` is no map.
+
+    Notes
+    -----
+    A thing that stood on the ground is "moved" where its top was about parallel to the ground and within two leaf cells of it.
+    Reflectance is compared as from the middle of the earlier drive, and only where the surface is the same. A box of 2 m
+    repainted by 10 dB shows 7 to 10 dB. But where nothing changed, 5 % of the places differ by 2 to 10 dB, too, so that
+    `intensity_change` is no change of its own, and has no probability.
+    """
+    if not isinstance(before, Map):
+        msg = f"before must be a map, not {type(before).__name__}"
+        raise TypeError(msg)
+    if not isinstance(after, Map):
+        after = fit(after, poses, intensities, config=_quick(before.config), progress=False)
+    elif poses is not None or intensities is not None:
+        msg = "poses and intensities belong to new scans: a map has its own"
+        raise ValueError(msg)
+    for name, radar_map in (("before", before), ("after", after)):
+        if not radar_map.config.returns.passages:
+            msg = f"{name} does not keep what rays passed: fit it with returns.passages, which FitConfig() has and quick() has not"
+            raise ValueError(msg)
+    corners = None if box is None else check_box(box)
+    alignment = align(before, after) if align_frames else unaligned()
+    earlier, later = PlacedMap(before, np.eye(4)), PlacedMap(after, alignment.T_before_after)
+    of_before, of_after = (
+        _Side.of(earlier, later, alignment, corners),
+        _Side.of(later, earlier, alignment, corners),
+    )
+    absent = np.concatenate([of_before.absence.absent, of_after.absence.absent])
+    share = share_of_changes(absent)
+    surfaces, offset = [], None
+    for side, kind in ((of_before, GONE), (of_after, APPEARED)):
+        kinds, probability, moved_m = side.kinds(share, kind)
+        change = np.full(len(kinds), np.nan)
+        if kind == APPEARED and before.has_intensity and after.has_intensity:
+            change, offset = side.reflectance(kinds)
+        surfaces.append(
+            ChangedSurface(
+                side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m.astype(np.float32),
+                change.astype(np.float32),
+            )
+        )  # fmt: skip
+    scales = [of_before.absence.scale, of_after.absence.scale]
+    return _summed(surfaces[0], surfaces[1], alignment, share, max(scales), offset)
+
+
+def _quick(config: FitConfig) -> FitConfig:
+    """Settings of the quick map of new scans."""
+    old = config.returns
+    return FitConfig.quick(
+        leaf_size_m=config.leaf_size_m,
+        returns={
+            "passages": True,
+            "min_range_m": old.min_range_m,
+            "max_range_m": old.max_range_m,
+            "pose_sigma_m": old.pose_sigma_m,
+            "pose_sigma_rad": old.pose_sigma_rad,
+        },
+    )
+
+
+@dataclass(frozen=True)
+class _Side:
+    """The surface of one map, beside the other map."""
+
+    vertices: Floats
+    faces: NDArray[np.int32]
+    own_map: PlacedMap
+    other_map: PlacedMap
+    own: Told
+    other: Told
+    absence: Absence
+
+    @classmethod
+    def of(cls, own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment, box: Floats | None) -> _Side:
+        vertices, faces = own_map.surface(box)
+        own, other = own_map.told(vertices), other_map.told(vertices)
+        sigma_m = np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals))
+        found = absence(own, other, other_map.leaf_m, sigma_m)
+        return cls(vertices, faces, own_map, other_map, own, other, found)
+
+    def kinds(self, share: float, lost: int) -> tuple[NDArray[np.int8], Floats, Floats]:
+        """(V,) kinds, probabilities and movements. `lost`: what a surface is that the other map has not."""
+        exists = self.own.confidence
+        absent = exists * posterior(self.absence.absent, share)
+        parallel = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= _PARALLEL
+        shifted = np.where(
+            parallel, exists * self.other.confidence * posterior(self.absence.shifted, share), 0.0
+        )
+        seen = np.isfinite(self.other.distance_m)
+        behind = seen & (self.other.distance_m < 0)
+        kinds = np.where(seen, SAME, UNSEEN).astype(np.int8)
+        kinds[behind & (shifted > _PROBABLE)] = MOVED
+        # What lies deep behind the other surface is hidden by it.
+        deep = exists * posterior(self.absence.shifted, share) > _PROBABLE
+        kinds[behind & ~parallel & deep] = UNSEEN
+        gone = ~behind & (absent > _PROBABLE)
+        kinds[gone] = lost
+        kinds[gone & seen & (shifted > _PROBABLE)] = MOVED
+        probability = np.where(kinds == MOVED, np.maximum(shifted, np.where(behind, 0, absent)), absent)
+        # Along the normal: the earlier surface moved to where the later one is.
+        towards = -self.other.distance_m if lost == GONE else self.other.distance_m
+        return kinds, probability, np.where(kinds == MOVED, towards, np.nan)
+
+    def reflectance(self, kinds: NDArray[np.int8]) -> tuple[Floats, float | None]:
+        """Differences of intensities (V,), later less earlier, without their median, and this."""
+        x, maps = self.vertices, (self.other_map, self.own_map)
+        earlier = maps[0]
+        # As from the middle of the earlier drive, at a range that both sensors measured.
+        towards = earlier.to_common(earlier.radar_map.origin[None]) - x
+        away_m = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
+        sensors = x + towards / away_m * np.sqrt(np.prod(earlier.radar_map.sensor.range_m))
+        first, second = (
+            placed.radar_map.intensity(placed.to_own(x), placed.to_own(sensors)) for placed in maps
+        )
+        scales = [scale for placed in maps if (scale := placed.radar_map.intensity_scale) is not None]
+        low, high = max(scale.low for scale in scales), min(scale.high for scale in scales)
+        margin = 1e-4 * (high - low)
+        # At the ends of a scale it may be anything beyond.
+        with np.errstate(invalid="ignore"):
+            known = (np.minimum(first, second) > low + margin) & (np.maximum(first, second) < high - margin)
+        change = _smoothed(x, np.where(known & (kinds == SAME), second - first, np.nan))
+        if np.isnan(change).all():
+            return change, None
+        offset = float(np.nanmedian(change))
+        return change - offset, offset
+
+
+def _smoothed(x: Floats, values: Floats) -> Floats:
+    """(N,) medians over as many places as a surface has cells round each: single ones are off by 10 dB at edges."""
+    found = np.full(len(x), np.nan)
+    rows = np.flatnonzero(np.isfinite(values))
+    if len(rows) >= CELLS_OF_SURFACE:
+        _, near = cKDTree(x[rows]).query(x[rows], CELLS_OF_SURFACE)
+        found[rows] = np.median(values[rows][near], axis=1)
+    return found
+
+
+def _summed(
+    before: ChangedSurface, after: ChangedSurface, alignment: Alignment, share: float, scale: float, offset: float | None
+) -> Changes:  # fmt: skip
+    areas = dict.fromkeys((NAMES[kind] for kind in CHANGED), 0.0)
+    compared = 0.0
+    for surface in (before, after):
+        of_faces, face_m2 = surface.of_faces()
+        compared += float(face_m2[of_faces != UNSEEN].sum())
+        for kind in CHANGED:
+            areas[NAMES[kind]] += float(face_m2[of_faces == kind].sum())
+    report = {
+        "alignment": alignment.words,
+        "areas_m2": areas,
+        "compared_m2": compared,
+        "changed_share": share,
+        "scale": scale,
+        "intensity_offset": offset,
+    }
+    return Changes(before, after, alignment.T_before_after, report)

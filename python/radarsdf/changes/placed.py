@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""A map in the frame of another one, and what it tells of places there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import uniform_filter
+
+from radarsdf.map.map import Map
+from radarsdf.products import turned
+
+Floats = NDArray[np.float64]
+
+_BLOCK_M = 32.0  # cells are looked up in blocks, so that few are in memory
+_CELLS_ALONG_RAY = 3.0  # of the 27 round a place that one ray passes, on average about
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a map tells of N places."""
+
+    distance_m: Floats
+    """(N,) from the surface along its normal, positive in free space. NaN where it was not observed."""
+    normals: Floats
+    """(N, 3) of that surface, towards free space, in the common frame."""
+    sigma_m: Floats
+    """(N,) standard error of the surface's position. NaN where there are no returns."""
+    confidence: Floats
+    """(N,) probability of a surface there."""
+    hits: Floats
+    """(N,) scans with returns in the 27 leaf cells round the place, added up over the cells."""
+    passes: Floats
+    """(N,) scans with rays through these cells, likewise, a ray counted once."""
+
+
+@dataclass(frozen=True)
+class PlacedMap:
+    """A map, and where it lies in the common frame."""
+
+    radar_map: Map
+    T_common_map: Floats
+    """(4, 4) from the map's world to the common frame, m."""
+
+    @property
+    def leaf_m(self) -> float:
+        """Edge of a leaf cell, m."""
+        return self.radar_map.config.leaf_size_m
+
+    def to_own(self, x: Floats) -> Floats:
+        """Places (N, 3) of the common frame in the world of the map."""
+        return turned(x - self.T_common_map[:3, 3], self.T_common_map[:3, :3].T)
+
+    def to_common(self, x: Floats) -> Floats:
+        """Places (N, 3) of the map's world in the common frame."""
+        return turned(x, self.T_common_map[:3, :3]) + self.T_common_map[:3, 3]
+
+    def surface(self, box: ArrayLike | None) -> tuple[Floats, NDArray[np.int32]]:
+        """Vertices (V, 3), common frame, and faces (F, 3) of the mesh that the map keeps by default, in leaf cells.
+
+        `box` (2, 3): in the common frame.
+        """
+        mesh = self.radar_map.mesh(self.leaf_m, progress=False)
+        vertices = self.to_common(np.asarray(mesh.vertices, np.float64))
+        faces = np.asarray(mesh.faces, np.int32)
+        if box is None:
+            return vertices, faces
+        lower, upper = np.asarray(box, np.float64)
+        inside = ((vertices >= lower) & (vertices <= upper)).all(axis=1)
+        faces = faces[inside[faces].all(axis=1)]
+        used, rows = np.unique(faces, return_inverse=True)
+        return vertices[used], rows.reshape(-1, 3).astype(np.int32)
+
+    def distance(self, x: Floats) -> tuple[Floats, Floats]:
+        """`distance_m` and `normals` of :class:`Told` at places (N, 3)."""
+        own = self.to_own(x)
+        gradient = self.radar_map.gradient(own)
+        length = np.sqrt(np.einsum("ni,ni->n", gradient, gradient))
+        # Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
+        distance_m = self.radar_map.sdf(own) / np.maximum(length, 1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return distance_m, turned(gradient / length[:, None], self.T_common_map[:3, :3])
+
+    def told(self, x: Floats) -> Told:
+        """All that the map tells of places (N, 3)."""
+        own = self.to_own(x)
+        evidence = self.radar_map.evidence_at(torch.from_numpy(np.ascontiguousarray(own)))
+        return Told(
+            *self.distance(x),
+            self.radar_map.uncertainty(own),
+            self.radar_map.confidence(own),
+            evidence.detections.numpy().astype(np.float64),
+            self._passes(own),
+        )
+
+    def _passes(self, own: Floats) -> Floats:
+        found = np.zeros(len(own))
+        leaf_m = self.leaf_m
+        blocks = np.floor(own / _BLOCK_M).astype(np.int64)
+        order = np.lexsort(blocks.T)
+        edges = np.flatnonzero((np.diff(blocks[order], axis=0) != 0).any(axis=1)) + 1
+        for rows in np.split(order, edges):
+            if len(rows) == 0:
+                continue
+            x = own[rows]
+            cells = self.radar_map.cells_round(x.min(axis=0) - 2 * leaf_m, x.max(axis=0) + 2 * leaf_m)
+            # The core counts up to seven scans for a cell.
+            round_cell = 27 * uniform_filter(cells.passed.astype(np.float32), 3, mode="constant")
+            places = np.floor((x - cells.corner) / leaf_m).astype(np.int64)
+            found[rows] = np.rint(round_cell[tuple(places.T)]) / _CELLS_ALONG_RAY
+        return found

@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Two drives through one place, between which a box goes and another one comes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import radarsdf
+import trimesh
+from radarsdf.changes.changes import APPEARED, GONE, UNSEEN
+from radarsdf.changes.probability import share_of_changes
+from radarsdf.cli import main
+from radarsdf.poses.rigid import transform
+from radarsdf.simulate import Box, Scene, simulate
+from radarsdf.simulate.materials import CONCRETE
+
+TAKEN, PUT = np.array([2.5, 2.5, 0.5]), np.array([2.5, -3.0, 0.5])
+QUICK = radarsdf.FitConfig.quick(returns={"passages": True})
+
+
+def box(center):
+    return Box(center, np.full(3, 0.5), 0.3, CONCRETE)
+
+
+@pytest.fixture(scope="module")
+def drives():
+    """A drive past a wall, one without changes, and one after them."""
+    drive = radarsdf.simulate.wall(frames=24)
+    other = drive.poses.copy()
+    other[:, 1, 3] += 0.3
+    before, after = (
+        Scene([*drive.scene.solids, *extra], drive.scene.terrain) for extra in ([box(TAKEN)], [box(PUT)])
+    )
+    return [
+        simulate(scene, drive.sensor, poses, name="wall", seed=seed, lidar_rays=1)
+        for scene, poses, seed in ((before, drive.poses, 1), (before, other, 2), (after, other, 3))
+    ]
+
+
+@pytest.fixture(scope="module")
+def maps(drives):
+    return [radarsdf.fit(drive.points, drive.poses, drive.intensities, config=QUICK) for drive in drives]
+
+
+@pytest.fixture(scope="module")
+def changes(maps):
+    return radarsdf.compare(maps[0], maps[2])
+
+
+def shares(surface, kind, center):
+    """Share of the area on a box that is of a kind, and area of that kind elsewhere, m²."""
+    kinds, areas = surface.of_faces()
+    away = np.linalg.norm(surface.vertices[surface.faces].mean(axis=1)[:, :2] - center[:2], axis=1)
+    on = away < 1.0
+    raised = surface.vertices[surface.faces].mean(axis=1)[:, 2] > 0.35
+    there = on & raised
+    return areas[there & (kinds == kind)].sum() / areas[there].sum(), areas[~on & (kinds > 0)].sum()
+
+
+def test_what_went_is_gone_what_came_appeared_and_nothing_else_did(changes):
+    gone, beside = shares(changes.before, GONE, TAKEN)
+    appeared, beside_after = shares(changes.after, APPEARED, PUT)
+    assert gone > 0.6
+    assert appeared > 0.6
+    assert beside + beside_after < 0.005 * changes.report["compared_m2"]
+    first = changes.regions()[:2]
+    assert {region.kind for region in first} == {"gone", "appeared"}
+
+
+def test_nothing_changed_between_two_drives_through_one_scene(maps):
+    same = radarsdf.compare(maps[0], maps[1])
+    assert sum(same.report["areas_m2"].values()) < 0.005 * same.report["compared_m2"]
+
+
+def test_what_the_later_drive_did_not_see_is_not_gone(drives, maps):
+    # The drive after the change, without any ray that comes near the place of the box.
+    drive = drives[2]
+    scans = [
+        scan[_clear_of(TAKEN, T, scan @ T[:3, :3].T + T[:3, 3])]
+        for scan, T in zip(drive.points, drive.poses, strict=True)
+    ]
+    found = radarsdf.compare(maps[0], scans, drive.poses)
+    kinds, areas = found.before.of_faces()
+    away = np.linalg.norm(found.before.vertices[found.before.faces].mean(axis=1) - TAKEN, axis=1)
+    hidden = away < 0.9
+    assert areas[hidden].sum() > 2
+    assert areas[hidden & (kinds == GONE)].sum() < 0.02 * areas[hidden].sum()
+    assert areas[hidden & (kinds == UNSEEN)].sum() > 0.8 * areas[hidden].sum()
+
+
+def _clear_of(center, T, ends):
+    """Which rays keep 1.3 m away from a place."""
+    rays, to_center = ends - T[:3, 3], center - T[:3, 3]
+    share = np.clip(rays @ to_center / (rays**2).sum(axis=1), 0, 1)
+    return np.linalg.norm(share[:, None] * rays - to_center, axis=1) > 1.3
+
+
+def test_maps_of_different_frames_are_aligned_first(drives, maps):
+    apart = transform(np.array([0.0, 0.0, 0.03]), np.array([0.4, -0.3, 0.1]))
+    drive = drives[2]
+    found = radarsdf.compare(maps[0], drive.points, apart @ drive.poses, drive.intensities)
+    assert "moved" in found.report["alignment"]
+    x = np.append(PUT, 1)
+    # The wall tells nothing along itself.
+    assert np.abs(found.T_before_after @ apart @ x - x)[[0, 2]].max() < 0.1
+
+
+def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
+    for number, name in ((0, "a"), (2, "b")):
+        maps[number].save(tmp_path / f"{name}.safetensors")
+    out = tmp_path / "changes.ply"
+    arguments = ["compare", *(str(tmp_path / f"{n}.safetensors") for n in "ab"), "-o", str(out)]
+    assert main(arguments) == 0
+    assert "gone" in capsys.readouterr().out
+    mesh, expected = trimesh.load(out, process=False), changes.mesh()
+    np.testing.assert_array_equal(mesh.visual.vertex_colors, expected.visual.vertex_colors)
+    assert len(np.unique(mesh.visual.vertex_colors, axis=0)) >= 3
+    changes.save(tmp_path / "changes.npz")
+    with np.load(tmp_path / "changes.npz") as arrays:
+        np.testing.assert_array_equal(arrays["before_kind"], changes.before.kind)
+
+
+def test_maps_without_passages_and_poses_of_maps_are_refused(maps, drives):
+    drive = drives[0]
+    blind = radarsdf.fit(drive.points[:4], drive.poses[:4], config=radarsdf.FitConfig.quick())
+    with pytest.raises(ValueError, match="after does not keep what rays passed"):
+        radarsdf.compare(maps[0], blind)
+    with pytest.raises(ValueError, match="a map has its own"):
+        radarsdf.compare(maps[0], maps[1], drive.poses)
+
+
+def test_the_share_of_changes_is_found_and_chance_makes_none():
+    rng = np.random.default_rng(0)
+    none = -0.5 * rng.normal(size=20_000) ** 2 + np.log(
+        3
+    )  # what is seen of nothing, a little likelier by change
+    assert share_of_changes(np.where(none > 1, -0.1, none - 2)) < 1e-3
+    mixed = np.where(rng.random(20_000) < 0.1, 8.0, -8.0)
+    assert abs(share_of_changes(mixed) - (mixed > 0).mean()) < 0.005
