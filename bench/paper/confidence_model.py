@@ -48,7 +48,7 @@ def main() -> None:
     columns = np.concatenate([columns for columns, _ in found])
     is_true = np.concatenate([is_true for _, is_true in found])
     weights = np.concatenate([np.full(len(is_true), 1 / len(is_true)) for _, is_true in found])
-    numbers = logistic_regression(columns, is_true, weights)
+    numbers = logistic_regression(columns, is_true.astype(np.float64), weights)
     names = ("constant", "log error in leaf cells", "log detection rate", "log rough share")
     print(markdown(["of", "number"], [[name, f"{x:.2f}"] for name, x in zip(names, numbers, strict=True)]))
 
@@ -70,15 +70,15 @@ def evidence_and_truth(scene: Scene) -> tuple[FloatArray, NDArray[np.bool_]]:
     return queries.confidence_terms(contents, evidence).numpy()[known], is_true[known]
 
 
-def logistic_regression(columns: FloatArray, is_true: NDArray[np.bool_], weights: FloatArray) -> FloatArray:
+def logistic_regression(columns: FloatArray, shares: FloatArray, weights: FloatArray) -> FloatArray:
     """Weighted maximum likelihood, by Newton's method.
 
     Parameters
     ----------
     columns : (N, K) float64
         Regressors. One of them is constant.
-    is_true : (N,) bool
-        What is to be predicted.
+    shares : (N,) float64
+        What is to be predicted, in [0, 1].
     weights : (N,) float64
         Weight of each row.
 
@@ -90,7 +90,7 @@ def logistic_regression(columns: FloatArray, is_true: NDArray[np.bool_], weights
     numbers = np.zeros(columns.shape[1])
     for _ in range(_STEPS):
         p = 1 / (1 + np.exp(-(columns @ numbers)))
-        gradient = columns.T @ (weights * (is_true - p))
+        gradient = columns.T @ (weights * (shares - p))
         hessian = (columns * (weights * p * (1 - p))[:, None]).T @ columns
         step = np.linalg.solve(hessian, gradient)
         numbers += step
