@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``python -m bench.changes [KIND ...]``: what is found of cubes that come, go and move between two simulated drives.
+
+The second day has other noise and another way: half a metre beside, between the scans, and a little turned. Area within half
+a metre of a cube is no false one. Recall is the share of a cube's area on its map that is called gone, appeared or moved.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import radarsdf
+from numpy.typing import NDArray
+from radarsdf.changes.changes import UNSEEN, Changes
+from radarsdf.simulate import KINDS, Box, Scene, Simulation, drifted, materials, simulate
+from scipy.spatial.transform import Rotation
+
+Floats = NDArray[np.float64]
+
+_SIZES_M = (0.3, 0.6, 1.0, 2.0, 3.0)
+_CHANGES = ("put in", "taken out", "moved")
+_ON_M, _NEAR_M = 0.2, 0.5
+_TRIES = 20
+
+
+@dataclass(frozen=True)
+class Change:
+    """A cube that is in one of two scenes, or elsewhere in the second."""
+
+    kind: str
+    size_m: float
+    before: Box | None
+    after: Box | None
+
+
+def main() -> None:
+    """Print a row for each kind of scene, and recall by size and change."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kinds", nargs="*", default=list(KINDS), metavar="KIND")
+    parser.add_argument("--seed", type=int, default=31)
+    parser.add_argument(
+        "--drift",
+        type=float,
+        nargs=2,
+        default=(0.0, 0.0),
+        metavar=("M", "DEG"),
+        help="walk of a step's poses",
+    )
+    options = parser.parse_args()
+    found: dict[tuple[str, float], list[float]] = {}
+    for kind in options.kinds:
+        first = KINDS[kind](seed=options.seed)
+        rng = np.random.default_rng([options.seed, len(kind)])
+        ways = first.poses, other_way(first.poses, rng)
+        for changes in ([], cubes(first, rng)):
+            compared = compare(first, ways, changes, options.drift, options.seed)
+            words = (
+                f"{kind:10} {len(changes):2d} cubes: false area {100 * false_share(compared, changes):.3f} %"
+            )
+            print(f"{words}; {compared.report['alignment'][:60]}", flush=True)
+            for change in changes:
+                found.setdefault((change.kind, change.size_m), []).extend(recalls(compared, change))
+    for (kind, size_m), shares in sorted(found.items()):
+        told = f"mean recall {np.mean(shares):.2f}, found {np.mean(np.array(shares) > 0.2):.2f}"
+        print(f"{kind:10} {size_m:3.1f} m: {told} of {len(shares)} surfaces")
+
+
+def other_way(poses: Floats, rng: np.random.Generator) -> Floats:
+    """Poses (F, 4, 4) of a second day."""
+    count = len(poses)
+    step = np.arange(count)
+    first = np.minimum(step, count - 2)
+    share = rng.uniform(0.2, 0.8)
+    found = poses.copy()
+    found[:, :3, 3] = (1 - share) * poses[first, :3, 3] + share * poses[first + 1, :3, 3]
+    turns = 2 * np.pi * step / count
+    side = 0.6 * np.sin(turns * rng.uniform(0.7, 2) + rng.uniform(0, 2 * np.pi))
+    found[:, :3, 3] += side[:, None] * poses[:, :3, 1]
+    yaw = 0.06 * np.sin(turns * rng.uniform(1, 3) + rng.uniform(0, 2 * np.pi))
+    turned = Rotation.from_rotvec(yaw[:, None] * [0, 0, 1.0]).as_matrix()
+    found[:, :3, :3] = turned @ poses[first, :3, :3]
+    return found
+
+
+def cubes(drive: Simulation, rng: np.random.Generator) -> list[Change]:
+    """One cube of each size and change, on the ground beside the way where there is room."""
+    found: list[Change] = []
+    centres: list[tuple[Floats, float]] = []
+    for size in _SIZES_M:
+        for kind in _CHANGES:
+            for _ in range(_TRIES):
+                pose = drive.poses[rng.integers(len(drive.poses))]
+                angle = 0.4 * rng.uniform(-1, 1) * drive.sensor.azimuth_fov_rad
+                ahead = pose[:3, :3] @ [np.cos(angle), np.sin(angle), 0.0]
+                xy = pose[:2, 3] + rng.uniform(4, 12) * ahead[:2] / np.linalg.norm(ahead[:2])
+                terrain = drive.scene.terrain
+                ground = 0.0 if terrain is None else float(terrain.height(xy[None])[0])
+                room = drive.scene.signed_distance(np.array([[*xy, ground + size]]))[0]
+                clear = np.linalg.norm(drive.poses[:, :2, 3] - xy, axis=1).min() > size + 1.2
+                alone = all(np.linalg.norm(at[:2] - xy) > other + size + 2.2 for at, other in centres)
+                if room < min(size / 2, 0.9) or not clear or not alone:
+                    continue
+                centre = np.array([*xy, ground + 0.45 * size])
+                cube = Box(centre, np.full(3, size / 2), rng.uniform(0, np.pi), materials.CONCRETE)
+                angle, way = rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 2.0)
+                elsewhere = centre + way * np.array([np.cos(angle), np.sin(angle), 0.0])
+                moved = Box(elsewhere, cube.half_extents, cube.yaw_rad, cube.material)
+                pair = {"put in": (None, cube), "taken out": (cube, None), "moved": (cube, moved)}[kind]
+                centres.append((centre, size))
+                found.append(Change(kind, size, *pair))
+                break
+    return found
+
+
+def compare(
+    drive: Simulation, ways: tuple[Floats, Floats], changes: list[Change], drift: Any, seed: int
+) -> Changes:
+    """Two quick maps of scenes before and after the changes, compared."""
+    maps = []
+    for day, poses in enumerate(ways):
+        boxes = [change.after if day else change.before for change in changes]
+        solids = [*drive.scene.solids, *(box for box in boxes if box is not None)]
+        scene = Scene(solids, drive.scene.terrain)
+        scans = simulate(scene, drive.sensor, poses, name=drive.name, seed=seed + 1000 * day, lidar_rays=1)
+        given = drifted(poses, drift[0], np.deg2rad(drift[1]), seed + day) if any(drift) else poses
+        config = radarsdf.FitConfig.quick(returns={"passages": True})
+        maps.append(radarsdf.fit(scans.points, given, scans.intensities, config=config))
+    return radarsdf.compare(*maps)
+
+
+def false_share(found: Changes, changes: list[Change]) -> float:
+    """Area that is called changed, over that which both drives saw; away from the cubes."""
+    false = seen = 0.0
+    for surface in (found.before, found.after):
+        kinds, areas = surface.of_faces()
+        middle = surface.vertices[surface.faces].mean(axis=1)
+        boxes = [box for change in changes for box in (change.before, change.after) if box is not None]
+        away = np.ones(len(middle), bool)
+        for box in boxes:
+            away &= box.signed_distance(middle) > _NEAR_M
+        seen += float(areas[away & (kinds != UNSEEN)].sum())
+        false += float(areas[away & (kinds > 0)].sum())
+    return false / seen
+
+
+def recalls(found: Changes, change: Change) -> list[float]:
+    """Share of the area on the cube that is called changed, on each day that it is mapped; 0 if it is not mapped."""
+    shares = []
+    for surface, box in ((found.before, change.before), (found.after, change.after)):
+        if box is None:
+            continue
+        kinds, areas = surface.of_faces()
+        on = np.abs(box.signed_distance(surface.vertices[surface.faces].mean(axis=1))) < _ON_M
+        shares.append(float(areas[on & (kinds > 0)].sum() / areas[on].sum()) if on.any() else 0.0)
+    return shares
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The bench of changes counts what it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import radarsdf
+from radarsdf.changes.changes import GONE, SAME, ChangedSurface, Changes
+from radarsdf.simulate import Box
+from radarsdf.simulate.materials import CONCRETE
+
+from bench.changes import Change, cubes, false_share, other_way, recalls
+
+
+def surface(places, kinds):
+    """A small triangle at each place."""
+    corner = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    vertices = (np.array(places, float)[:, None] + corner).reshape(-1, 3)
+    count = len(vertices)
+    faces = np.arange(count, dtype=np.int32).reshape(-1, 3)
+    nothing = np.zeros(count, np.float32)
+    return ChangedSurface(vertices, faces, np.repeat(np.array(kinds, np.int8), 3), nothing, nothing, nothing)
+
+
+def test_recall_is_on_the_cube_and_false_area_away_from_it():
+    cube = Change("taken out", 1.0, Box(np.zeros(3), np.full(3, 0.5), 0.0, CONCRETE), None)
+    before = surface([[0.5, 0, 0], [-0.5, 0, 0], [0.7, 0, 0], [5, 0, 0]], [GONE, SAME, GONE, SAME])
+    after = surface([[9, 0, 0], [8, 0, 0], [7, 0, 0]], [2, SAME, SAME])
+    found = Changes(before, after, np.eye(4), {})
+    np.testing.assert_allclose(recalls(found, cube), [1 / 2], rtol=1e-5)
+    np.testing.assert_allclose(false_share(found, [cube]), 1 / 4, rtol=1e-5)
+
+
+def test_the_second_way_and_the_cubes_are_elsewhere():
+    drive = radarsdf.simulate.KINDS["slope"](frames=8)
+    rng = np.random.default_rng(1)
+    way = other_way(drive.poses, rng)
+    off_m = np.linalg.norm(way[:, :3, 3] - drive.poses[:, :3, 3], axis=1)
+    assert off_m.min() > 0.01
+    np.testing.assert_allclose(np.linalg.det(way[:, :3, :3]), 1)
+    changes = cubes(drive, rng)
+    assert {change.kind for change in changes} <= {"put in", "taken out", "moved"}
+    assert len(changes) > 3
+    for change in changes:
+        box = change.before or change.after
+        assert np.linalg.norm(drive.poses[:, :2, 3] - box.center[:2], axis=1).min() > change.size_m
