@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.io.npz import Scans, read_scans, write_scans
+from radarsdf.io.npz import Scans, arrays_of, read_scans, write_arrays, write_scans
 
 from ..conftest import pose
 
@@ -130,3 +130,14 @@ def test_other_files(tmp_path):
         read_scans(tmp_path / "scans.bag")
     with pytest.raises(FileNotFoundError):
         read_scans(tmp_path / "absent.npz")
+
+
+def test_arrays_of_objects_are_not_written(tmp_path):
+    path = tmp_path / "arrays.npz"
+    write_arrays(path, {"numbers": np.arange(3), "none": np.zeros((0, 2))})
+    found = arrays_of(path, ["none", "numbers"])
+    assert found["numbers"].tolist() == [0, 1, 2]
+    assert found["none"].shape == (0, 2)
+    with pytest.raises(ValueError, match="words has objects of Python"):
+        write_arrays(path, {"words": np.array(["a", None])})
+    assert list(arrays_of(path, ["numbers", "words"])) == ["numbers"]

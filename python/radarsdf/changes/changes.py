@@ -4,19 +4,17 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from radarsdf.changes.placed import Floats
 from radarsdf.checks import path_of
-from radarsdf.io.files import write_whole
+from radarsdf.io.npz import write_arrays
+from radarsdf.map.isosurface import mesh_components
 
 if TYPE_CHECKING:
     import trimesh
@@ -92,8 +90,9 @@ class Changes:
             of_faces, areas = surface.of_faces()
             for kind in kinds:
                 rows = np.flatnonzero(of_faces == kind)
-                for part in _connected(surface.faces[rows], len(surface.vertices)):
-                    faces = rows[part]
+                labels, sizes = mesh_components(surface.faces[rows], len(surface.vertices))
+                order = np.argsort(labels, kind="stable")
+                for faces in np.split(rows[order], np.cumsum(sizes)[:-1]) if len(rows) else []:
                     vertices = np.unique(surface.faces[faces])
                     x = surface.vertices[vertices]
                     found.append(
@@ -150,18 +149,5 @@ class Changes:
         if target.suffix != ".npz":
             write_mesh(target, self.mesh())
             return
-        buffer = io.BytesIO()
         arrays = {f"{side}_{name}": value for side in ("before", "after") for name, value in vars(getattr(self, side)).items()}  # fmt: skip
-        np.savez_compressed(buffer, T_before_after=self.T_before_after, **arrays)
-        write_whole(target, buffer.getvalue())
-
-
-def _connected(faces: NDArray[np.int32], num_vertices: int) -> list[NDArray[np.int64]]:
-    """Rows of the faces (F, 3) that hang together by vertices."""
-    if len(faces) == 0:
-        return []
-    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), (num_vertices, num_vertices))
-    labels = connected_components(graph, directed=False)[1][faces[:, 0]]
-    order = np.argsort(labels, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
+        write_arrays(target, {"T_before_after": self.T_before_after} | arrays, compressed=True)

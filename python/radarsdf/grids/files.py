@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from radarsdf.checks import path_of
 from radarsdf.grids.octree import octree_bytes
 from radarsdf.io.files import write_whole
+from radarsdf.io.npz import write_arrays
 
 if TYPE_CHECKING:
     from radarsdf.grids.costmap import Costmap
@@ -48,10 +50,9 @@ def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | Distance
     """Writes what was found of a grid to an ``.npz``, by name, with the grid's `origin` and `voxel_size`."""
     target = path_of(path, "path")
     check_arrays_path(target)
-    buffer = io.BytesIO()
-    arrays = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
-    np.savez_compressed(buffer, origin=grid.origin, voxel_size=grid.voxel_size, **arrays)
-    write_whole(target, buffer.getvalue())
+    arrays: dict[str, ArrayLike] = {"origin": grid.origin, "voxel_size": grid.voxel_size}
+    arrays |= {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+    write_arrays(target, arrays, compressed=True)
 
 
 def _npz(grid: Grid) -> bytes:

@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import instance, path_of
 from radarsdf.io.files import check_regular_file, write_whole
@@ -150,6 +150,28 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
         raise ValueError(msg) from error
 
 
+def write_arrays(
+    path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
+) -> None:
+    """Writes the ``.npz`` that :func:`arrays_of` reads, whole or not at all.
+
+    Raises
+    ------
+    ValueError
+        If an array has Python's objects: they are pickled, and would not be read.
+    OSError
+        If the file cannot be written.
+    """
+    for name, array in arrays.items():
+        if np.asarray(array).dtype.hasobject:
+            msg = f"{name} has objects of Python, which are not written"
+            raise ValueError(msg)
+    file = io.BytesIO()
+    save: Callable[..., None] = np.savez_compressed if compressed else np.savez
+    save(file, **arrays)
+    write_whole(path, file.getvalue())
+
+
 def holds_scans(path: str | PathLike[str]) -> bool:
     """Whether an ``.npz`` file has poses. Raises as :func:`read_scans`."""
     return bool(arrays_of(path, ["poses"]))
@@ -203,9 +225,6 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
         arrays["lidar_points"] = scans.ground_truth
         if scans.truth_kind == "simulated":
             arrays["simulated"] = np.array(1, np.uint8)
-    file = io.BytesIO()
-    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     target = path_of(path, "path")
-    write_whole(
-        target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz"), file.getvalue()
-    )
+    named = target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz")
+    write_arrays(named, arrays, compressed=True)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import io
 from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, replace
@@ -14,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.files import write_whole
-from radarsdf.io.npz import arrays_of
+from radarsdf.io.npz import arrays_of, write_arrays
 
 ScanId = Hashable
 _FIELDS = ("points", "intensities", "doppler_mps", "standing")
@@ -156,9 +154,7 @@ class ScanLog:
             self._sealed.add(scan_id)
             return
         path = self._folder / f"scan-{self._written:09d}.npz"
-        data = io.BytesIO()
-        np.savez(data, allow_pickle=False, **_arrays(scan))
-        write_whole(path, data.getvalue())
+        write_arrays(path, _arrays(scan))
         self._written += 1
         self._forget(scan_id)
         self._scans[scan_id] = _OnDisk(scan.pose, path, scan.reach_m)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 from dataclasses import dataclass
 from os import PathLike
@@ -17,8 +16,7 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import check_poses
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.io.files import write_whole
-from radarsdf.io.npz import arrays_of
+from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.live.scan_log import LoggedScan, ScanId
 from radarsdf.returns.noise import SensorNoise
 
@@ -86,14 +84,8 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
             arrays[name] = np.concatenate(held)
             # Some scans may be in float32, others not.
             arrays[f"{name}_single"] = np.array([array.dtype == np.float32 for array in held])
-    data = io.BytesIO()
-    np.savez(
-        data,
-        allow_pickle=False,
-        described=np.frombuffer(json.dumps(described).encode(), np.uint8),
-        **arrays,
-    )
-    write_whole(path, data.getvalue())
+    arrays["described"] = np.frombuffer(json.dumps(described).encode(), np.uint8)
+    write_arrays(path, arrays)
 
 
 def load_state(path: str | PathLike[str]) -> Stored:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -17,8 +16,8 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import check_poses
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.imu import Imu
+from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.io.poses.writing import write_poses
 from radarsdf.io.scans import Scan
 from radarsdf.map.fit_report import checked_report
@@ -129,13 +128,8 @@ class DrivePoses:
             "way": self.posed.way,
             "notes": self.posed.notes,
         }
-        file = io.BytesIO()
-        np.savez(
-            file,
-            poses=self.posed.poses,
-            described=np.frombuffer(json.dumps(described, allow_nan=False).encode(), np.uint8),
-        )
-        write_whole(within(folder, folder / POSES), file.getvalue())
+        text = np.frombuffer(json.dumps(described, allow_nan=False).encode(), np.uint8)
+        write_arrays(within(folder, folder / POSES), {"poses": self.posed.poses, "described": text})
 
     @classmethod
     def load(cls, folder: Path) -> DrivePoses | None:
@@ -151,10 +145,9 @@ class DrivePoses:
         path = within(folder, folder / POSES)
         if not path.exists():
             return None
-        check_regular_file(path)
         try:
-            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-                poses, described = file["poses"], json.loads(file["described"].tobytes())
+            arrays = arrays_of(path, ("poses", "described"))
+            poses, described = arrays["poses"], json.loads(arrays["described"].tobytes())
             return cls(_posed(check_poses(poses, len(poses)), described), str(described["key"]))
         except Exception as error:  # damaged files raise exceptions of many kinds
             msg = f"{path} does not hold the poses of a plan: {error}"

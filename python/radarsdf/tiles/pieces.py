@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 from dataclasses import asdict, dataclass
@@ -17,8 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf.io.files import write_whole
-from radarsdf.io.npz import arrays_of
+from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import renumbered
@@ -153,9 +151,7 @@ def write_piece(city: TileBlend, name: str, settings: PieceSettings) -> Path:
     (tile,) = (planned.tile for planned in city.plan.tiles if planned.name == name)
     path = piece_path(city, tile, settings)
     if not path.is_file():
-        data = io.BytesIO()
-        np.savez(data, **vars(piece_of(city, tile, settings)))
-        write_whole(path, data.getvalue())
+        write_arrays(path, vars(piece_of(city, tile, settings)))
     return path
 
 
