@@ -19,7 +19,9 @@ ALL_ROWS = {"training": {"row_updates": False}}
 QUICK = FitConfig.quick(training={"intensity_iterations": 72}).to_dict()
 CASES = {
     "quick": QUICK,
+    "normals, 1 thread": NORMALS | {"num_threads": 1},
     "normals, 8 threads": NORMALS | {"num_threads": 8},
+    "all rows, 1 thread": ALL_ROWS | {"num_threads": 1},
     "all rows, 8 threads": ALL_ROWS | {"num_threads": 8},
     "all rows by autograd, 4 threads": {
         "training": {"row_updates": False, "gradients": "autograd"},
