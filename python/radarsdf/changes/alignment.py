@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.changes.placed import Floats, PlacedMap
@@ -16,7 +17,7 @@ from radarsdf.poses.expected import ExpectedStep
 from radarsdf.poses.rates import Rate
 from radarsdf.poses.rigid import moved, skew
 from radarsdf.poses.tracking import Tracker
-from radarsdf.poses.verdict import Verdict
+from radarsdf.poses.verdict import Verdict, means_of
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
@@ -56,45 +57,46 @@ def unaligned() -> Alignment:
     return Alignment(np.eye(4), np.zeros((6, 6)), np.zeros(3), False, "The maps were taken as they are.")
 
 
-def align(before: Map, after: Map) -> Alignment:
+def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     """Move the later map so that its surface lies on that of the earlier one, if that is an improvement.
 
     Half of its vertices say where, the others judge. It begins where the frames are, and where a search by planes finds most
     agreement within some metres.
     """
-    placed = PlacedMap(before, np.eye(4))
-    target, _ = placed.surface(None)
-    vertices, _ = PlacedMap(after, np.eye(4)).surface(None)
+    target, _ = before.surface(None)
+    vertices, _ = after.surface(None)
     if min(len(target), len(vertices)) < CELLS_OF_SURFACE:
         return unaligned()
     vertices = vertices[:: max(1, len(vertices) // _MOST_VERTICES)]
     judge = np.arange(len(vertices)) % 2 == 1
-    used, sigma_m = vertices[~judge], after.uncertainty(vertices[~judge])
+    used, sigma_m = vertices[~judge], after.radar_map.uncertainty(vertices[~judge])
     patches = np.unique(np.floor(vertices / _PATCH_M).astype(np.int64), axis=0, return_inverse=True)[1]
     centre = vertices.mean(axis=0)
     tree = cKDTree(target)
 
     def far_m(pose: Floats) -> Floats:
         """(N,) distances of the vertices that judge, m."""
-        there = PlacedMap(after, pose).to_common(vertices[judge])
+        there = after.at(pose).to_common(vertices[judge])
         nearest_m, _ = tree.query(there)
-        distance_m, _ = placed.distance(there)
+        distance_m, _ = before.distance(there)
         found: Floats = np.where(np.isfinite(distance_m), np.abs(distance_m), nearest_m)
         return np.maximum(found, _LEAST_M)
 
-    starts = [np.eye(4), *_searched(target, vertices, before)]
-    found = [_settled(placed, used, sigma_m, centre, start) for start in starts]
-    gains = [np.log(far_m(np.eye(4)) / far_m(pose)) for pose, _ in found]
+    starts = [np.eye(4), *_searched(target, vertices, before.radar_map)]
+    found = [_settled(before, used, sigma_m, centre, start) for start in starts]
+    as_given_m = far_m(np.eye(4))
+    gains = [np.log(as_given_m / far_m(pose)) for pose, _ in found]
     best = int(np.argmax([gain.mean() for gain in gains]))
     verdict = _verdict(gains[best], patches.reshape(-1)[judge])
     pose, covariance = found[best]
-    moved_m = float(np.sqrt((((PlacedMap(after, pose).to_common(vertices)) - vertices) ** 2).sum(1).mean()))
+    there = after.at(pose)
+    moved_m = float(np.sqrt(((there.to_common(vertices) - vertices) ** 2).sum(1).mean()))
     figures = f"{verdict.gain:+.1%} of their distance, by chance less than {verdict.needed:.1%}"
     if not verdict.improved:
         words = f"The frames were taken as they are: moved onto each other, the surfaces are not nearer ({figures})."
         return Alignment(np.eye(4), covariance, centre, False, words)
     words = f"The later map was moved by {moved_m:.3f} m, root mean square: its surface is nearer then ({figures})."
-    return Alignment(pose, covariance, PlacedMap(after, pose).to_common(centre[None])[0], True, words)
+    return Alignment(pose, covariance, there.to_common(centre[None])[0], True, words)
 
 
 def _searched(target: Floats, vertices: Floats, before: Map) -> list[Floats]:
@@ -152,9 +154,8 @@ def _jacobian(from_centre: Floats, normals: Floats) -> Floats:
     return np.concatenate([normals, turns], axis=1)
 
 
-def _verdict(gains: Floats, patches: Floats) -> Verdict:
-    counts = np.bincount(patches)
-    means = np.bincount(patches, gains)[counts > 0] / counts[counts > 0]
+def _verdict(gains: Floats, patches: NDArray[np.int64]) -> Verdict:
+    means = means_of(gains, patches)
     if len(means) < 2:
         return Verdict(0.0, np.inf, len(means))
     return Verdict(float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means))), len(means))

@@ -104,8 +104,9 @@ def compare(
             msg = f"{name} does not keep what rays passed: fit it with returns.passages, which FitConfig() has and quick() has not"
             raise ValueError(msg)
     corners = None if box is None else check_box(box)
-    alignment = align(before, after) if align_frames else unaligned()
-    earlier, later = PlacedMap(before, np.eye(4)), PlacedMap(after, alignment.T_before_after)
+    earlier, later = PlacedMap.of(before), PlacedMap.of(after)
+    alignment = align(earlier, later) if align_frames else unaligned()
+    later = later.at(alignment.T_before_after)
     of_before, of_after = (
         _Side.of(earlier, later, alignment, corners),
         _Side.of(later, earlier, alignment, corners),

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -45,6 +45,21 @@ class PlacedMap:
     radar_map: Map
     T_common_map: Floats
     """(4, 4) from the map's world to the common frame, m."""
+    vertices: Floats
+    """(V, 3) of the mesh that the map keeps by default, in leaf cells; world of the map, m."""
+    faces: NDArray[np.int32]
+    """(F, 3) rows of vertices."""
+
+    @classmethod
+    def of(cls, radar_map: Map) -> PlacedMap:
+        """A map whose world is the common frame."""
+        mesh = radar_map.mesh(radar_map.config.leaf_size_m, progress=False)
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+        return cls(radar_map, np.eye(4), vertices, faces)
+
+    def at(self, T_common_map: Floats) -> PlacedMap:
+        """The map in another place (4, 4)."""
+        return replace(self, T_common_map=T_common_map)
 
     @property
     def leaf_m(self) -> float:
@@ -60,13 +75,8 @@ class PlacedMap:
         return turned(x, self.T_common_map[:3, :3]) + self.T_common_map[:3, 3]
 
     def surface(self, box: ArrayLike | None) -> tuple[Floats, NDArray[np.int32]]:
-        """Vertices (V, 3), common frame, and faces (F, 3) of the mesh that the map keeps by default, in leaf cells.
-
-        `box` (2, 3): in the common frame.
-        """
-        mesh = self.radar_map.mesh(self.leaf_m, progress=False)
-        vertices = self.to_common(np.asarray(mesh.vertices, np.float64))
-        faces = np.asarray(mesh.faces, np.int32)
+        """Vertices (V, 3), common frame, and faces (F, 3) of the mesh. `box` (2, 3): in the common frame."""
+        vertices, faces = self.to_common(self.vertices), self.faces
         if box is None:
             return vertices, faces
         lower, upper = np.asarray(box, np.float64)

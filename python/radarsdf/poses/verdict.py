@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,12 +75,18 @@ class Verdict:
         edge_m = _PLACE * float(np.median(asked.ranges_m))
         cells = np.floor(asked.posed(before).points / edge_m)
         places = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
-        counts = np.bincount(asked.scans)
-        means = np.bincount(asked.scans, gains)[counts > 0] / counts[counts > 0]
+        means = means_of(gains, asked.scans)
         parts = min(len(means), int(places.max()) + 1)
         if parts < 2:
             return cls(0.0, np.inf, parts)
         return cls(float(means.mean()), max(_error_of_scans(means), _error_of_places(gains, places)), parts)
+
+
+def means_of(gains: Floats, groups: NDArray[np.integer[Any]]) -> Floats:
+    """(G,) mean of the gains (N,) of each group that has some. `groups` (N,): the number of the group of each."""
+    counts = np.bincount(groups)
+    found: Floats = np.bincount(groups, gains)[counts > 0] / counts[counts > 0]
+    return found
 
 
 def _error_of_scans(means: Floats) -> float:
