@@ -77,9 +77,9 @@ def test_a_mesh_that_grows_is_that_of_a_quick_fit():
         live.integrate(SCENE.points[i], SCENE.poses[i], SCENE.intensities[i])
         grown = live.mesh()
         assert mesh_bits(grown) == mesh_bits(map_of(range(i + 1)).mesh())
-    quick = FitConfig.quick(num_threads=1, returns=KNOWN)
+    quick = FitConfig.quick(num_threads=1, returns=KNOWN, encoding={"bridge_cells": 4})
     batch = radarsdf.fit(SCENE.points[:6], SCENE.poses[:6], config=quick, origin=ORIGIN, progress=False)
-    whole = batch.mesh(quick.leaf_size_m)
+    whole = batch.mesh(quick.leaf_size_m, min_component_triangles=8)
     assert len(whole.faces) == len(grown.faces) > 1000
 
     def triangles(mesh):
@@ -87,6 +87,19 @@ def test_a_mesh_that_grows_is_that_of_a_quick_fit():
         return np.unique(corners[mesh.faces].reshape(len(mesh.faces), -1), axis=0)
 
     assert triangles(whole).tobytes() == triangles(grown).tobytes()
+
+
+def test_a_change_reaches_the_bridges_that_it_opens_elsewhere():
+    live, poses = map_of([]), SCENE.poses
+    for points, at in zip(SCENE.points, poses, strict=True):
+        live.integrate(points[::4], at)
+    live.mesh()
+    world = np.concatenate([p @ at[:3, :3].T + at[:3, 3] for p, at in zip(SCENE.points, poses, strict=True)])
+    round_one = world[np.linalg.norm(world - world[3], axis=1) < 1.5]
+    live.integrate((round_one - poses[0][:3, 3]) @ poses[0][:3, :3], poses[0])
+    grown = mesh_bits(live.mesh())
+    live._state.forget_surface()
+    assert grown == mesh_bits(live.mesh())
 
 
 def test_map_and_finish_are_fits_of_all_scans():
@@ -98,7 +111,7 @@ def test_map_and_finish_are_fits_of_all_scans():
     points, poses, intensities = scans
     for found, settings in (
         (live.finish(progress=False), config),
-        (live.map(), FitConfig.quick(num_threads=1)),
+        (live.map(), FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4})),
     ):
         fitted = radarsdf.fit(
             points, np.stack(poses), intensities, config=settings, origin=ORIGIN, progress=False

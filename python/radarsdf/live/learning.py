@@ -26,13 +26,14 @@ _RETURNS_ASKED = 100_000  # for the noise: as many as those on flat surfels that
 
 
 def quick_of(config: FitConfig) -> FitConfig:
-    """The quick settings with the same cells, returns, seed and limits."""
+    """The quick settings with the same cells, returns, bridges, seed and limits."""
     return FitConfig.quick(
         leaf_size_m=config.leaf_size_m,
         seed=config.seed,
         num_threads=config.num_threads,
         max_memory_bytes=config.max_memory_bytes,
         returns=config.returns,
+        encoding={"bridge_cells": config.encoding.bridge_cells},
     )
 
 

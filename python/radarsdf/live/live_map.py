@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -27,7 +26,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.following import Follower
 from radarsdf.live.learning import finished, known_now
 from radarsdf.live.scan_log import ScanId, ScanLog
-from radarsdf.live.scans import checked_scan
+from radarsdf.live.scans import Integrated, checked_scan
 from radarsdf.live.state import GrowingState
 from radarsdf.live.storage import load_state, save_state
 from radarsdf.map import queries
@@ -42,20 +41,6 @@ if TYPE_CHECKING:
 Keys = NDArray[np.uint64]
 
 
-@dataclass(frozen=True)
-class Integrated:
-    """What became of a scan."""
-
-    scan_id: ScanId
-    """That it can be moved and taken out by."""
-    pose: NDArray[np.float64]
-    """(4, 4) T_world_sensor, m: where it was put."""
-    blocks: NDArray[np.uint64]
-    """(B,) keys of the blocks of 8 × 8 × 8 leaf cells whose returns changed, ascending."""
-    movers: int
-    """Number of its returns that were left out, because they move."""
-
-
 class LiveMap:
     """A map that grows scan by scan. Scans can be moved, and taken out again, without a trace.
 
@@ -66,8 +51,8 @@ class LiveMap:
     Parameters
     ----------
     config : FitConfig, optional
-        Settings. :meth:`mesh` and :meth:`map` are those of :meth:`FitConfig.quick` with the same cells and returns;
-        :meth:`finish` fits with all of them.
+        Settings. :meth:`mesh` and :meth:`map` are those of :meth:`FitConfig.quick` with the same cells, returns, and bridges
+        over gaps; :meth:`finish` fits with all of them.
     origin : (3,) array_like, optional
         Origin of the local frame, world, m. By default the first sensor position, moved to the next corner of a block of
         ``config.lattice``.
@@ -349,11 +334,12 @@ class LiveMap:
         min_confidence: float = 0.0,
         max_uncertainty: float | None = None,
         min_detection_rate: float = queries.MIN_DETECTION_RATE,
-        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
+        min_component_triangles: int | None = None,
     ) -> trimesh.Trimesh:
         """The surface as triangles, in voxels of the size of leaf cells. Only what changed is made anew.
 
-        The arguments and the result are those of :meth:`Map.mesh`. The mesh is empty if there is no surface.
+        The arguments and the result are those of :meth:`Map.mesh`; by default the smallest piece that is kept has the area that
+        it has in a mesh of the default voxels. The mesh is empty if there is no surface.
         """
         from radarsdf.map.meshing import check_limits  # noqa: PLC0415 - trimesh is slow to import
 
@@ -368,6 +354,8 @@ class LiveMap:
                 self._state.forget_surface()
                 raise
         limits = check_limits(found.scene, min_confidence, max_uncertainty, min_detection_rate)
+        if min_component_triangles is None:
+            min_component_triangles = queries.component_triangles(found.scene.config.leaf_size_m)
         whole_number(min_component_triangles, "min_component_triangles", 0)
         kept = found.surface.kept(*limits, min_component_triangles)
         return found.surface.mesh(found.scene.origin, kept, found.leaf_cells)

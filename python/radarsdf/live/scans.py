@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,24 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import check_values_of_scan, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.live.scan_log import LoggedScan, compact
+from radarsdf.live.scan_log import LoggedScan, ScanId, compact
 from radarsdf.returns.movers import Movers
 from radarsdf.returns.plausible import Plausible
 from radarsdf.returns.rays import Rays, check_scans, prepare
+
+
+@dataclass(frozen=True)
+class Integrated:
+    """What became of a scan."""
+
+    scan_id: ScanId
+    """That it can be moved and taken out by."""
+    pose: NDArray[np.float64]
+    """(4, 4) T_world_sensor, m: where it was put."""
+    blocks: NDArray[np.uint64]
+    """(B,) keys of the blocks of 8 × 8 × 8 leaf cells whose returns changed, ascending."""
+    movers: int
+    """Number of its returns that were left out, because they move."""
 
 
 def checked_scan(

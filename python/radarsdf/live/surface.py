@@ -20,7 +20,8 @@ from radarsdf.map.contents import Scene
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import Surface, local
 from radarsdf.returns.cells import lattice_of, merged_keys
-from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks, sums_round
+from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks, ReturnsOfCells, sums_round
+from radarsdf.returns.gaps import bridged
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
@@ -82,7 +83,9 @@ class GrowingSurface:
         self._planes = np.zeros((0, _PLANE))  # NaN without support
         self._ghosts = np.zeros(0, bool)
         self._normals = np.zeros((0, 3), np.float32)  # at the leaf cells with returns
-        # Of leaf cells near the surface.
+        # Of leaf cells that rays cross near their returns.
+        self._near = _NONE
+        # Of leaf cells near the surface: these, and those that bridge gaps between them.
         self._leaf_keys = _NONE
         self._values = np.zeros((0, 8), np.float32)  # signed distances at the corners, m
         self._crossed = np.zeros(0, bool)
@@ -208,12 +211,40 @@ class GrowingSurface:
         differs = (ghosts != self._ghosts)[cell_of_leaf] | (normals != self._normals).any(axis=1)
         self._ghosts, self._normals = ghosts, normals
         changed = np.union1d(changed, means.keys[differs])
-        redone = np.union1d(dirty, np.unique(shifted(changed, self._reach()) >> BLOCK_BITS))
-        round_them = np.unique(shifted(redone << BLOCK_BITS, ROUND << 3) >> BLOCK_BITS)
-        true = ~ghosts[cell_of_leaf] & within(means.keys, *leaves_of(round_them))
-        self._remake(redone, means.select(true), normals[true], num_threads)
+        near = np.union1d(dirty, np.unique(shifted(changed, self._reach()) >> BLOCK_BITS))
+        true = means.select(~ghosts[cell_of_leaf])
+        normals = normals[~ghosts[cell_of_leaf]]
+        self._find_near(near, true, num_threads)
+        told = told_by(true, self._noise, self._config.returns)
+        leaf_keys = self._bridged(told, num_threads)
+        # A cell that came or went tells which rays count at the corners of those round it.
+        opened = shifted(np.setxor1d(leaf_keys, self._leaf_keys, assume_unique=True), ROUND)
+        redone = np.union1d(near, np.unique(opened >> BLOCK_BITS))
+        round_them = leaves_of(_blocks_round(redone))
+        here = within(true.keys, *round_them)
+        self._remake(
+            redone,
+            leaf_keys[within(leaf_keys, *round_them)],
+            true.select(here),
+            normals[here],
+            told.select(here),
+            num_threads,
+        )
         self._triangles = None
         return redone
+
+    def _find_near(self, blocks: Keys, means: MeanRays, num_threads: int) -> None:
+        """The leaf cells of these blocks that rays cross near their returns."""
+        config = self._config
+        first, last = leaves_of(blocks)
+        here = means.select(within(means.keys, *leaves_of(_blocks_round(blocks))))
+        near = here.leaf_keys(config.leaf_size_m, config.near_band_m, num_threads)
+        self._near = Replacement.of(self._near, near[within(near, first, last)], first, last).keys
+
+    def _bridged(self, told: ReturnsOfCells, num_threads: int) -> Keys:
+        """All leaf cells near the surface."""
+        cells = self._config.encoding.bridge_cells
+        return bridged(self._near, told.keys, told.counts, cells, num_threads)
 
     def _reach(self) -> NDArray[np.int64]:
         """(S, 3) steps from a leaf cell to the corners of all that its returns have a part in."""
@@ -223,11 +254,17 @@ class GrowingSurface:
         inside = range(-cells, cells, 8)  # no more than a block apart
         return np.array(list(itertools.product([*inside, cells], repeat=3)), np.int64)
 
-    def _remake(self, blocks: Keys, means: MeanRays, normals: NDArray[np.float32], num_threads: int) -> None:
-        """The leaf cells of these blocks, by the rays in and round them."""
-        assert self._noise is not None
+    def _remake(
+        self,
+        blocks: Keys,
+        near: Keys,
+        means: MeanRays,
+        normals: NDArray[np.float32],
+        told: ReturnsOfCells,
+        num_threads: int,
+    ) -> None:
+        """The leaf cells of these blocks, by the leaf cells `near`, and the rays, in and round them."""
         config, size_m = self._config, self._config.leaf_size_m
-        near = means.leaf_keys(size_m, config.near_band_m, num_threads)
         first, last = leaves_of(blocks)
         own = within(near, first, last)
         leaf_keys = near[own]
@@ -238,9 +275,7 @@ class GrowingSurface:
         _, vertices = table.leaf_vertices()
         values = distances_m[vertices[own]]
         crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)
-        information, detections = sums_round(
-            told_by(means, self._noise, config.returns), leaf_keys, num_threads
-        )
+        information, detections = sums_round(told, leaf_keys, num_threads)
         rows = Replacement.of(self._leaf_keys, leaf_keys, first, last)
         self._leaf_keys = rows.keys
         self._values = rows.column(self._values, values)
@@ -263,3 +298,8 @@ class GrowingSurface:
         evidence = queries.interpolated(found, self._leaf_keys, size_m, local(scene, vertices + self._origin))
         surface = Surface.told_by(scene, vertices, faces, evidence, len(self._leaf_keys))
         return Triangles(scene, surface, len(self._leaf_keys))
+
+
+def _blocks_round(blocks: Keys) -> Keys:
+    """Keys of these blocks, and of those round them."""
+    return np.unique(shifted(blocks << BLOCK_BITS, ROUND << 3) >> BLOCK_BITS)

@@ -50,6 +50,11 @@ _CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in th
 _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
 
 
+def component_triangles(voxel_m: float) -> int:
+    """Triangles of the smallest piece that a mesh keeps in voxels of this edge, m: the area it has in voxels of the default."""
+    return round(MIN_COMPONENT_TRIANGLES * min(1.0, (VOXEL_M / voxel_m) ** 2))
+
+
 @torch.inference_mode(mode=False)  # gradients, of which normals are made, need ordinary tensors
 def to_local(contents: Scene, world: Tensor) -> Tensor:
     """World positions (N, 3), m, in the local frame, float32. The origin is subtracted in float64."""

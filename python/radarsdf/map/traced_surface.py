@@ -75,8 +75,7 @@ class TracedSurface:
         centres = corners.mean(axis=1)
         evidence = evidence_at(centres)
         rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
-        # A component is as large as one that a mesh of the default's finer voxels keeps.
-        components = round(queries.MIN_COMPONENT_TRIANGLES * min(1.0, (queries.VOXEL_M / voxel_m) ** 2))
+        components = queries.component_triangles(voxel_m)
         kept = surface.kept(0.0, max_uncertainty_m, queries.MIN_DETECTION_RATE, components)
         faces = np.ascontiguousarray(surface.faces[kept])
         return cls(
