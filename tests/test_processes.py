@@ -10,7 +10,6 @@ import multiprocessing
 import os
 import pickle
 import subprocess
-import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor
 
@@ -19,6 +18,8 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
+
+from .warm_python import warm_python
 
 QUICK = FitConfig(training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024})
 X = np.random.default_rng(0).uniform([8, -5, -1], [20, 5, 3], (30_000, 3))
@@ -58,7 +59,7 @@ assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
 
 
 def run(code):
-    subprocess.run([sys.executable, "-W", "ignore::DeprecationWarning", "-c", code], check=True, timeout=100)
+    subprocess.run([*warm_python(), "-c", code], check=True, timeout=100)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
@@ -93,9 +94,9 @@ def answers(radar_map, x):
 
 
 def test_a_map_goes_to_spawned_workers(radar_map):
-    pieces = np.array_split(X[:2000], 4)
-    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-        found = list(pool.map(answers, [radar_map] * 4, pieces))
+    pieces = np.array_split(X[:2000], 2)
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        found = list(pool.map(answers, [radar_map] * 2, pieces))
     for there, here in zip(zip(*found, strict=True), answers(radar_map, X[:2000]), strict=True):
         np.testing.assert_array_equal(np.concatenate(there), here)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from radarsdf import FitConfig
 from radarsdf.io.npz import Scans, write_scans
 
 from .cli.calls import call
+from .warm_python import warm_python
 
 SOURCES = str(Path(radarsdf.__file__).parents[1])  # the commands run in another folder
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX")
@@ -106,7 +108,9 @@ def all_commands(folder, redirections="", before_each=""):
     """Status, output and errors of all commands, run by one process in the folder."""
     (folder / "commands.json").write_text(json.dumps([COMMANDS, before_each]))
     (folder / "driver.py").write_text(DRIVER)
-    done = run(folder, f"{sys.executable} driver.py {redirections}")
+    # With streams that are closed from the start, a process of its own.
+    python = sys.executable if "&-" in redirections else shlex.join(warm_python())
+    done = run(folder, f"{python} driver.py {redirections}")
     assert done.returncode == 0, done.stderr
     return json.loads((folder / "statuses.json").read_text()), done.stdout, done.stderr
 
@@ -128,7 +132,7 @@ def usual(scene, tmp_path_factory):
 
 
 @POSIX
-@pytest.mark.parametrize("redirections", [">&-", "2>&-", ">&- 2>&-", "2>/dev/full"])
+@pytest.mark.parametrize("redirections", [">&- 2>&-", "2>/dev/full"])
 def test_every_command_without_streams(files, usual, redirections):
     folder, printed, said = usual
     statuses, output, errors = all_commands(files, redirections)

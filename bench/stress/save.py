@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +32,8 @@ while True:
 """
 
 
-def kill_savers(folder: Path, kills: int) -> tuple[list[int], int]:
-    """Kill processes that save two maps to one file in turn.
+def kill_savers(folder: Path, kills: int, python: Sequence[str] = (sys.executable,)) -> tuple[list[int], int]:
+    """Kill processes that save two maps to one file in turn; `python` are the first words of their command.
 
     Returns
     -------
@@ -59,12 +60,13 @@ def kill_savers(folder: Path, kills: int) -> tuple[list[int], int]:
     sources = [str(folder / f"version{i}.safetensors") for i in range(len(versions))]
     for _ in range(kills):
         saver = subprocess.Popen(
-            [sys.executable, "-c", _SAVER, *sources, str(target)], stdout=subprocess.PIPE, text=True
+            [*python, "-c", _SAVER, *sources, str(target)], stdout=subprocess.PIPE, text=True
         )
         assert saver.stdout is not None
         assert saver.stdout.readline() == "ready\n"
         time.sleep(rng.uniform(0, 0.05))
         saver.kill()
+        saver.stdout.read()  # until nobody has it open
         assert saver.wait() == -signal.SIGKILL
         saver.stdout.close()
         found[versions.index(_content(target))] += 1

@@ -10,10 +10,12 @@ import sys
 
 from radarsdf import _core
 
+from ..warm_python import warm_python
+
 
 def test_one_line_for_each_part():
     done = subprocess.run(
-        [sys.executable, "-m", "radarsdf", "info"], capture_output=True, text=True, timeout=60, check=True
+        [*warm_python(), "-m", "radarsdf", "info"], capture_output=True, text=True, timeout=60, check=True
     )
     names = ["radarsdf", "python", "torch", "compiler", "openmp", "instruction set"]
     for name, line in zip(names, done.stdout.splitlines(), strict=True):

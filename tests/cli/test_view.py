@@ -14,6 +14,7 @@ import urllib.request
 
 import pytest
 
+from ..warm_python import warm_python
 from .calls import refusal
 
 
@@ -51,7 +52,7 @@ def test_a_port_in_use(map_file, tmp_path, capsys):
 def test_it_serves_until_ctrl_c(map_file, scans_file):
     pytest.importorskip("viser", reason="the extra view is not installed")
     command = [
-        sys.executable,
+        *warm_python(),
         "-m",
         "radarsdf",
         "view",

@@ -11,12 +11,13 @@ import os
 import re
 import shlex
 import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from radarsdf.cli import main
+
+from ..warm_python import warm_python
 
 _FENCE = re.compile(r"^```(\S*)\s*$")
 _NOT_RUN = re.compile(r"^<!-- not run: (.+) -->$")
@@ -109,10 +110,11 @@ def _same(expected: list[str], printed: list[str]) -> bool:
 
 
 def shell_environment(folder: Path) -> dict[str, str]:
-    """Variables for the shell: `radarsdf` and `python` are those of this process."""
+    """Variables for the shell: `radarsdf` and `python` are those of this process, with all imported."""
     tools = folder / "tools"
     tools.mkdir()
-    for name, words in (("radarsdf", f'"{sys.executable}" -m radarsdf'), ("python", f'"{sys.executable}"')):
+    python = shlex.join(warm_python())
+    for name, words in (("radarsdf", f"{python} -m radarsdf"), ("python", python)):
         script = tools / name
         script.write_text(f'#!/bin/sh\nexec {words} "$@"\n', encoding="utf-8")
         script.chmod(0o755)

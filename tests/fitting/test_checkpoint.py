@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import signal
+import subprocess
 import sys
 
 import numpy as np
@@ -19,6 +20,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from ..settings import grouped
+from ..warm_python import warm_python
 
 # Batches of more rays than there are, so that the order is drawn anew, and two stages.
 QUICK = FitConfig(
@@ -117,8 +119,6 @@ def test_it_is_written_on_the_way_without_changing_the_result(scene, tmp_path, m
 def test_a_killed_fit_goes_on_from_what_was_written_last(scene, tmp_path):
     if sys.platform == "win32":
         pytest.skip("kills by signal")
-    import subprocess  # noqa: PLC0415
-
     path = tmp_path / "state"
     code = f"""
 import os, signal
@@ -137,7 +137,7 @@ def counted(self, state):
 radarsdf.fitting.checkpoint.Checkpoint.write = counted
 fitted(ground_and_wall(), {str(path)!r})
 """
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
+    assert subprocess.run([*warm_python(), "-c", code], check=False).returncode == -signal.SIGKILL
     with safe_open(path, "pt") as file:
         assert file.get_tensor("done").tolist() == [30, 37]
     assert_same_bits(fitted(scene), fitted(scene, path))

@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import io
 import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 from radarsdf import LiveMap
 
+from ..warm_python import warm_python
 from .test_live_map import SCENE, map_of, mesh_bits, state
 
 
@@ -64,7 +64,7 @@ for i in range(10**6):
 """
     file = tmp_path / "live.npz"
     with subprocess.Popen(
-        [sys.executable, "-c", code, str(file)], stdout=subprocess.PIPE, text=True
+        [*warm_python(), "-c", code, str(file)], stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         for _ in range(3):

@@ -17,11 +17,13 @@ import radarsdf
 from bench.stress import samples
 from bench.stress.save import kill_savers
 
+from ..warm_python import warm_python
+
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
 
 
 def test_a_killed_saver_leaves_one_of_the_versions(tmp_path):
-    found, _ = kill_savers(tmp_path, kills=3)
+    found, _ = kill_savers(tmp_path, kills=3, python=warm_python())
     assert sum(found) == 3
 
 

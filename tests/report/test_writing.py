@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import re
 import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ import radarsdf
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 from radarsdf.io import Scans
 
+from ..warm_python import warm_python
 from .conftest import HOSTILE
 from .reading import Page
 
@@ -258,4 +258,4 @@ for data in (
     assert data.startswith(b"\\x89PNG") and b"http" not in data
 assert settings() == before and "matplotlib.pyplot" not in sys.modules
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    subprocess.run([*warm_python(), "-c", code], check=True, timeout=120)
