@@ -59,13 +59,25 @@ def _rows(scene: Scene, options: Options, repetition: int) -> Iterable[Row]:
     rows = []
     for name in names:
         given = BREAKAGES[name](true, seed)
-        found = radarsdf.refine_poses(scene.points, given)
-        row = base | {"poses": name, "taken": float(found.improved), "seconds": found.report["seconds"]}
-        row |= _trajectory_errors(given, true, "given")
-        row |= _trajectory_errors(found.poses, true, "found", found.covariance)
+        row = base | _trajectory_errors(given, true, "given")
         row |= _map_errors(scene, aligned(given, true), "given", options)
-        rows.append(row | _map_errors(scene, aligned(found.poses, true), "found", options))
+        for source, measured in _measured(scene):
+            found = radarsdf.refine_poses(scene.points, given, **measured)
+            row |= {
+                "poses": name + source,
+                "taken": float(found.improved),
+                "seconds": found.report["seconds"],
+            }
+            row |= _trajectory_errors(found.poses, true, "found", found.covariance)
+            rows.append(row | _map_errors(scene, aligned(found.poses, true), "found", options))
     return rows + [base | row for row in _odometry_rows(scene, seed, options)]
+
+
+def _measured(scene: Scene) -> list[tuple[str, dict[str, Any]]]:
+    """What refinement is given besides returns, and how the rows are then named: nothing, and what was recorded."""
+    if scene.doppler_mps is None or scene.times_s is None:
+        return [("", {})]
+    return [("", {}), (", Doppler", {"doppler_mps": scene.doppler_mps, "times": scene.times_s})]
 
 
 def _odometry_rows(scene: Scene, seed: int, options: Options) -> Iterable[Row]:

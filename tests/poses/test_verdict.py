@@ -5,6 +5,7 @@
 import numpy as np
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.verdict import Verdict
+from radarsdf.returns.noise import SensorNoise
 
 
 def test_one_thing_that_moves_does_not_call_poses_improved():
@@ -28,4 +29,5 @@ def _verdict(things: int) -> Verdict:
         scans.append(np.concatenate([staying, rng.uniform(-40, 40, (1000, 3))]))
     returns = SensorReturns.of(scans, 0.1, None)
     held = rng.random(len(returns)) < 0.2
-    return Verdict.of(returns.select(held), returns.select(~held), before, after)
+    noise = SensorNoise(0.2, 0.001, 0.001)
+    return Verdict.of(returns.select(held), returns.select(~held), before, after, noise)

@@ -34,7 +34,7 @@ def check_drift(recording: Recording, config: FitConfig) -> list[Finding]:
         Finding(
             "poses_drift",
             "warning",
-            f"With refined poses, returns that took no part are {1 - np.exp(-report['gain']):.1%} nearer to those of other scans "
+            f"With refined poses, returns of other scans are {np.expm1(report['gain']):.1%} denser where returns that took no part lie "
             f"({report['gain'] / report['gain_error']:.0f} standard errors): a step is off by {report['sigma_m']:.3f} m and "
             f"{np.degrees(report['sigma_rad']):.2f} degrees, and {len(given)} scans end off by {drift_m:.2f} m and {drift_deg:.1f} "
             f"degrees{where}.",

@@ -41,9 +41,9 @@ class RefinedPoses:
     """(F, 6, 6) of the refined poses, relative to that of the scan in the middle: translation, m, and rotation vector about
     the sensor, rad, in world axes. Loops over more than 32 scans are left out, so it is rather too large there."""
     improved: bool
-    """Whether returns that took no part are nearer to those of other scans, by more than chance gives one of a thousand."""
+    """Whether returns that took no part agree better with those of other scans, by more than chance gives one of a thousand."""
     report: dict[str, Any]
-    """`verdict` in words; `gain`, by which the logarithm of that distance fell, and its `gain_error`; `sigma_m` and
+    """`verdict` in words; `gain`, by which the logarithm of the density of other scans' returns rose at them, and its `gain_error`; `sigma_m` and
     `sigma_rad` of a given step and its `bias`; `movers`, returns left out by their Doppler, and `notes` on what was not used; how far the poses moved, `moved_m` and `moved_rad`, root mean square; `noise`
     of the sensor; `scans`, `returns`, `rounds`, `seconds`."""
 
@@ -133,7 +133,7 @@ def refine_poses(
         held = held_out(len(returns), config.seed)
         used = returns.select(~held)
         found = PosesEstimate.of(used, given, motions, cell_m, limits, workers.num_threads)
-        verdict = Verdict.of(returns.select(held), used, given, found.poses)
+        verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
     steps_given = found.motions[0]
     report = {
         "verdict": verdict.words,

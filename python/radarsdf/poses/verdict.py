@@ -14,12 +14,11 @@ from scipy.stats import t as student
 
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.rigid import Floats
+from radarsdf.returns.noise import SensorNoise
 
-_NEIGHBOURS = 8  # of a return, among which the nearest one of another scan is looked for
-_MOST_RETURNS = 50_000  # that are asked
-_BY_CHANCE = (
-    1e-3  # probability that true poses seem improved. Of 48 simulated drives, seeds 101 to 112, none were
-)
+_NEIGHBOURS = 16  # of a return, of which those of other scans make the density there
+_MOST_RETURNS = 20_000  # that are asked
+_BY_CHANCE = 1e-3  # probability that true poses seem improved
 _HELD_OUT = 0.2  # of the returns
 _PLACE = 0.25  # edge of a place, in median ranges: what is seen as one thing from near and far is smaller
 
@@ -31,11 +30,11 @@ def held_out(count: int, seed: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How much nearer returns are to those of other scans."""
+    """How much better returns agree with those of other scans."""
 
     gain: float
-    """Mean over the scans of the mean logarithm of the distance to the nearest return of another scan, with the poses before,
-    less the same after."""
+    """Mean over the scans of the mean logarithm of the density of other scans' returns where returns lie, with the poses after,
+    less the same before."""
     error: float
     """Its standard error."""
     parts: int
@@ -54,24 +53,25 @@ class Verdict:
     @property
     def words(self) -> str:
         """One sentence."""
-        figures = f"{self.gain:+.2%} of their distance, by chance less than {self.needed:.2%} in {1 - _BY_CHANCE:.1%} of all cases"
+        figures = f"their density changes by {self.gain:+.2%}, by chance less than {self.needed:.2%} in {1 - _BY_CHANCE:.1%} of all cases"
         if self.improved:
-            return f"The refined poses make a sharper map: returns that took no part are nearer to those of other scans ({figures})."
-        return f"The given poses are kept: returns that took no part are not nearer to those of other scans ({figures})."
+            return f"The refined poses make a sharper map: returns that took no part agree better with those of other scans ({figures})."
+        return f"The given poses are kept: returns that took no part do not agree better with those of other scans ({figures})."
 
     @classmethod
-    def of(cls, held: SensorReturns, used: SensorReturns, before: Floats, after: Floats) -> Verdict:
-        """Of the returns `held` that took no part, beside those that were `used`.
+    def of(
+        cls, held: SensorReturns, used: SensorReturns, before: Floats, after: Floats, noise: SensorNoise
+    ) -> Verdict:
+        """Of the returns `held` that took no part, beside those that were `used`, by a sensor with this noise.
 
-        Returns do not judge one by one. Those of a scan have the errors of its pose in common, and so have neighbouring scans,
-        since errors of poses last. Those of a place may lie on one thing that moved, or that looks different from everywhere.
-        The standard error is the largest that one of these gives.
+        Returns do not judge one by one. Those of a scan have the errors of its pose in common. Those of a place may lie on one
+        thing that moved, or that looks different from everywhere. The standard error is the larger one of the two.
         """
         if len(held) == 0:
             return cls(0.0, np.inf, 0)
-        step = max(1, len(held) // _MOST_RETURNS)
+        step = -(-len(held) // _MOST_RETURNS)
         asked = held.select(np.arange(len(held)) % step == 0)
-        gains = np.log(_distances(asked, used, before) / _distances(asked, used, after))
+        gains = _gains(asked, used, before, after, noise)
         edge_m = _PLACE * float(np.median(asked.ranges_m))
         cells = np.floor(asked.posed(before).points / edge_m)
         places = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
@@ -79,7 +79,8 @@ class Verdict:
         parts = min(len(means), int(places.max()) + 1)
         if parts < 2:
             return cls(0.0, np.inf, parts)
-        return cls(float(means.mean()), max(_error_of_scans(means), _error_of_places(gains, places)), parts)
+        of_scans = float(means.std(ddof=1) / np.sqrt(len(means)))
+        return cls(float(means.mean()), max(of_scans, _error_of_places(gains, places)), parts)
 
 
 def means_of(gains: Floats, groups: NDArray[np.integer[Any]]) -> Floats:
@@ -89,27 +90,71 @@ def means_of(gains: Floats, groups: NDArray[np.integer[Any]]) -> Floats:
     return found
 
 
-def _error_of_scans(means: Floats) -> float:
-    """Standard error of the mean of those of scans (F,), in which neighbours are alike (Newey and West 1987, with their lags of
-    1994)."""
-    count, off = len(means), means - means.mean()
-    lags = min(int(4 * (count / 100) ** (2 / 9)), count - 1)
-    alone = (off**2).sum()
-    alike = [(1 - lag / (lags + 1)) * (off[lag:] * off[:-lag]).sum() for lag in range(1, lags + 1)]
-    together = alone + 2 * sum(alike)
-    return float(np.sqrt(max(alone, together) / (count * (count - 1))))
-
-
 def _error_of_places(gains: Floats, places: NDArray[np.int64]) -> float:
     """Standard error of the mean of gains (N,) of which those of a place (N,) may all be wrong together."""
     sums = np.bincount(places, gains - gains.mean())
     return float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1)) / len(gains))
 
 
-def _distances(asked: SensorReturns, used: SensorReturns, poses: Floats) -> NDArray[np.float64]:
-    tree = cKDTree(used.posed(poses).points)
-    distances, rows = tree.query(asked.posed(poses).points, _NEIGHBOURS)
-    others = used.scans[np.minimum(rows, len(used) - 1)] != asked.scans[:, None]
-    first = np.where(others.any(axis=1), others.argmax(axis=1), _NEIGHBOURS - 1)
-    found: NDArray[np.float64] = distances[np.arange(len(first)), first]
-    return np.maximum(found, 1e-3)
+def _gains(
+    asked: SensorReturns, used: SensorReturns, before: Floats, after: Floats, noise: SensorNoise
+) -> Floats:
+    """(N,) by how much the logarithm of the density at the asked returns rises.
+
+    Distances to a nearest return alone say mostly how returns happen to lie. A density over several ones says more. It is as wide
+    as the noise of both returns and as they lie apart. A return without any others nearby is clutter or the first look at
+    something: so the median of the densities is added to each, and such returns say little.
+    """
+    given = _Neighbours.of(asked, used, before)
+    least_m2 = float(np.median(given.nearest_m)) ** 2
+    density = given.density(asked, used, noise, least_m2)
+    floor = float(np.median(density))
+    if floor == 0:  # scans that have nothing in common where they are
+        return np.zeros(len(asked))
+    then = _Neighbours.of(asked, used, after).density(asked, used, noise, least_m2)
+    gains: Floats = np.log((then + floor) / (density + floor))
+    return gains
+
+
+@dataclass(frozen=True)
+class _Neighbours:
+    """The returns near those that are asked, with some poses."""
+
+    distances_m: Floats
+    """(N, K)."""
+    rows: NDArray[np.int64]
+    """(N, K) among the returns that were used."""
+    others: NDArray[np.bool_]
+    """(N, K) whether they belong to another scan."""
+
+    @classmethod
+    def of(cls, asked: SensorReturns, used: SensorReturns, poses: Floats) -> _Neighbours:
+        tree = cKDTree(used.posed(poses).points)
+        distances, rows = tree.query(asked.posed(poses).points, min(_NEIGHBOURS, len(used)))
+        distances, rows = distances.reshape(len(asked), -1), rows.reshape(len(asked), -1)
+        return cls(distances, rows, used.scans[rows] != asked.scans[:, None])
+
+    @property
+    def nearest_m(self) -> Floats:
+        """(N,) distance to the nearest return of another scan. Of those without any, to the last of the same scan."""
+        first = np.where(self.others.any(axis=1), self.others.argmax(axis=1), self.others.shape[1] - 1)
+        nearest: Floats = self.distances_m[np.arange(len(first)), first]
+        return nearest
+
+    def density(
+        self, asked: SensorReturns, used: SensorReturns, noise: SensorNoise, least_m2: float
+    ) -> Floats:
+        """(N,) of other scans' returns, up to a factor. `least_m2`: variance that is added to that of the noise."""
+        variances = [_variances_m2(returns, noise) for returns in (asked, used)]
+        variance = variances[0][:, None] + variances[1][self.rows] + least_m2
+        with np.errstate(under="ignore"):
+            parts = np.exp(-0.5 * self.distances_m**2 / variance) / variance**1.5
+        density: Floats = np.where(self.others, parts, 0.0).sum(axis=1)
+        return density
+
+
+def _variances_m2(returns: SensorReturns, noise: SensorNoise) -> Floats:
+    """(N,) of their noise, mean of the three axes."""
+    across = noise.azimuth_rad**2 + noise.elevation_rad**2
+    variances: Floats = (noise.range_m**2 + across * np.square(returns.ranges_m, dtype=np.float64)) / 3
+    return variances

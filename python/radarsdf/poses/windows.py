@@ -219,9 +219,9 @@ def _once(notes: Iterable[Iterable[str]]) -> list[str]:
 
 def _verdict(better: int, count: int) -> str:
     if better == 0:
-        return f"The given poses are kept: in none of {count} windows of scans are returns that took no part nearer to those of other scans."
+        return f"The given poses are kept: in none of {count} windows of scans do returns that took no part agree better with those of other scans."
     kept = "" if better == count else " In the others, the given steps are kept."
-    return f"The refined poses make a sharper map in {better} of {count} windows of scans: returns that took no part are nearer to those of other scans.{kept}"
+    return f"The refined poses make a sharper map in {better} of {count} windows of scans: returns that took no part agree better with those of other scans.{kept}"
 
 
 def _words(pieces: NDArray[np.int64], length_m: float, count: int) -> str:
