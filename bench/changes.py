@@ -3,13 +3,16 @@
 """``python -m bench.changes [KIND ...]``: what is found of cubes that come, go and move between two simulated drives.
 
 The second day has other noise and another way: half a metre beside, between the scans, and a little turned. Area within half
-a metre of a cube is no false one. Recall is the share of a cube's area on its map that is called gone, appeared or moved.
+a metre of a cube is no false one: precision is the share of the changed area that is near one. Recall is the share of a cube's area on
+its map that is called gone, appeared or moved.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,11 +22,15 @@ from radarsdf.changes.changes import UNSEEN, Changes
 from radarsdf.simulate import KINDS, Box, Scene, Simulation, drifted, materials, simulate
 from scipy.spatial.transform import Rotation
 
+from bench.paper.report import ROOT
+from bench.rows import kept
+
 Floats = NDArray[np.float64]
 
 _SIZES_M = (0.3, 0.6, 1.0, 2.0, 3.0)
 _CHANGES = ("put in", "taken out", "moved")
 _ON_M, _NEAR_M = 0.2, 0.5
+_FOUND = 0.2  # of a cube's area
 _TRIES = 20
 
 
@@ -38,7 +45,7 @@ class Change:
 
 
 def main() -> None:
-    """Print a row for each kind of scene, and recall by size and change."""
+    """Print and keep a row for each scene, and one for each size and change."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kinds", nargs="*", default=list(KINDS), metavar="KIND")
     parser.add_argument("--seed", type=int, default=31)
@@ -50,23 +57,47 @@ def main() -> None:
         metavar=("M", "DEG"),
         help="walk of a step's poses",
     )
+    parser.add_argument("--out", type=Path, default=ROOT / "bench_results", help="folder of the rows")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     found: dict[tuple[str, float], list[float]] = {}
+    kept(scenes(options, found), "bench.changes", options.out / "changes_scenes.json")
+    kept(sizes(found), "bench.changes", options.out / "changes_sizes.json")
+
+
+def scenes(
+    options: argparse.Namespace, found: dict[tuple[str, float], list[float]]
+) -> Iterator[dict[str, Any]]:
+    """A row for each kind of scene, without changes and with them. `found` gets the recalls."""
     for kind in options.kinds:
         first = KINDS[kind](seed=options.seed)
         rng = np.random.default_rng([options.seed, len(kind)])
         ways = first.poses, other_way(first.poses, rng)
         for changes in ([], cubes(first, rng)):
             compared = compare(first, ways, changes, options.drift, options.seed)
-            words = (
-                f"{kind:10} {len(changes):2d} cubes: false area {100 * false_share(compared, changes):.3f} %"
-            )
-            print(f"{words}; {compared.report['alignment'][:60]}", flush=True)
+            false_m2, seen_m2, true_m2 = areas(compared, changes)
+            yield {
+                "scene": kind,
+                "seed": options.seed,
+                "drift": " ".join(f"{step:g}" for step in options.drift),
+                "cubes": len(changes),
+                "false area, %": f"{100 * false_m2 / seen_m2:.3f}",
+                "precision": f"{true_m2 / (true_m2 + false_m2):.2f}" if true_m2 + false_m2 > 0 else "",
+            }
             for change in changes:
                 found.setdefault((change.kind, change.size_m), []).extend(recalls(compared, change))
+
+
+def sizes(found: dict[tuple[str, float], list[float]]) -> Iterator[dict[str, Any]]:
+    """A row for each change and size of a cube."""
     for (kind, size_m), shares in sorted(found.items()):
-        told = f"mean recall {np.mean(shares):.2f}, found {np.mean(np.array(shares) > 0.2):.2f}"
-        print(f"{kind:10} {size_m:3.1f} m: {told} of {len(shares)} surfaces")
+        yield {
+            "change": kind,
+            "edge, m": size_m,
+            "mean recall": f"{np.mean(shares):.2f}",
+            "a fifth found": f"{np.mean(np.array(shares) > _FOUND):.2f}",
+            "surfaces": len(shares),
+        }
 
 
 def other_way(poses: Floats, rng: np.random.Generator) -> Floats:
@@ -132,19 +163,20 @@ def compare(
     return radarsdf.compare(*maps)
 
 
-def false_share(found: Changes, changes: list[Change]) -> float:
-    """Area that is called changed, over that which both drives saw; away from the cubes."""
-    false = seen = 0.0
+def areas(found: Changes, changes: list[Change]) -> tuple[float, float, float]:
+    """Area away from the cubes that is called changed, all there that both drives saw, and what is called changed near them, m²."""
+    false = seen = true = 0.0
+    boxes = [box for change in changes for box in (change.before, change.after) if box is not None]
     for surface in (found.before, found.after):
-        kinds, areas = surface.of_faces()
+        kinds, face_m2 = surface.of_faces()
         middle = surface.vertices[surface.faces].mean(axis=1)
-        boxes = [box for change in changes for box in (change.before, change.after) if box is not None]
         away = np.ones(len(middle), bool)
         for box in boxes:
             away &= box.signed_distance(middle) > _NEAR_M
-        seen += float(areas[away & (kinds != UNSEEN)].sum())
-        false += float(areas[away & (kinds > 0)].sum())
-    return false / seen
+        seen += float(face_m2[away & (kinds != UNSEEN)].sum())
+        false += float(face_m2[away & (kinds > 0)].sum())
+        true += float(face_m2[~away & (kinds > 0)].sum())
+    return false, seen, true
 
 
 def recalls(found: Changes, change: Change) -> list[float]:

@@ -10,7 +10,7 @@ from radarsdf.changes.changes import GONE, SAME, ChangedSurface, Changes
 from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
-from bench.changes import Change, cubes, false_share, other_way, recalls
+from bench.changes import Change, areas, cubes, other_way, recalls, sizes
 
 
 def surface(places, kinds):
@@ -29,7 +29,9 @@ def test_recall_is_on_the_cube_and_false_area_away_from_it():
     after = surface([[9, 0, 0], [8, 0, 0], [7, 0, 0]], [2, SAME, SAME])
     found = Changes(before, after, np.eye(4), {})
     np.testing.assert_allclose(recalls(found, cube), [1 / 2], rtol=1e-5)
-    np.testing.assert_allclose(false_share(found, [cube]), 1 / 4, rtol=1e-5)
+    false, seen, near = (area / 0.005 for area in areas(found, [cube]))  # triangles
+    np.testing.assert_allclose([false, seen, near], [1, 4, 2], rtol=1e-5)
+    assert next(sizes({("moved", 1.0): [0.1, 0.5]}))["a fifth found"] == "0.50"
 
 
 def test_the_second_way_and_the_cubes_are_elsewhere():

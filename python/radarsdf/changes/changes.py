@@ -80,7 +80,8 @@ class Changes:
     """(4, 4) from the later map's world to that of the earlier one, m."""
     report: dict[str, Any]
     """`alignment` in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map tells of; `changed_share`, the
-    probable share of it that changed; `scale`, by which the maps are further apart than their uncertainty says;
+    probable share of it that changed; `scale` and `freedom`: over their standard errors, distances between the maps follow
+    Student's t with so many degrees of freedom, so much widened;
     `intensity_offset`, by which all intensities changed, sensor units."""
 
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:

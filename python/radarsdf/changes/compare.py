@@ -23,10 +23,12 @@ from radarsdf.changes.changes import (
     ChangedSurface,
     Changes,
 )
-from radarsdf.changes.placed import Floats, PlacedMap, Told
+from radarsdf.changes.placed import Floats, PlacedMap
 from radarsdf.changes.probability import (
     Absence,
-    absence,
+    Beside,
+    Errors,
+    errors_of,
     posterior,
     share_of_changes,
 )
@@ -111,11 +113,13 @@ def compare(
         _Side.of(earlier, later, alignment, corners),
         _Side.of(later, earlier, alignment, corners),
     )
-    absent = np.concatenate([of_before.absence.absent, of_after.absence.absent])
-    share = share_of_changes(absent)
+    sides = of_before, of_after
+    errors = errors_of([side.beside for side in sides])
+    found = [side.beside.absence(errors) for side in sides]
+    share = share_of_changes(np.concatenate([absence.absent for absence in found]))
     surfaces, offset = [], None
-    for side, kind in ((of_before, GONE), (of_after, APPEARED)):
-        kinds, probability, moved_m = side.kinds(share, kind)
+    for side, absence, kind in zip(sides, found, (GONE, APPEARED), strict=True):
+        kinds, probability, moved_m = side.kinds(absence, share, kind)
         change = np.full(len(kinds), np.nan)
         if kind == APPEARED and before.has_intensity and after.has_intensity:
             change, offset = side.reflectance(kinds)
@@ -125,8 +129,7 @@ def compare(
                 change.astype(np.float32),
             )
         )  # fmt: skip
-    scales = [of_before.absence.scale, of_after.absence.scale]
-    return _summed(surfaces[0], surfaces[1], alignment, share, max(scales), offset)
+    return _summed(surfaces[0], surfaces[1], alignment, share, errors, offset)
 
 
 def _quick(config: FitConfig) -> FitConfig:
@@ -152,39 +155,34 @@ class _Side:
     faces: NDArray[np.int32]
     own_map: PlacedMap
     other_map: PlacedMap
-    own: Told
-    other: Told
-    absence: Absence
+    beside: Beside
 
     @classmethod
     def of(cls, own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment, box: Floats | None) -> _Side:
         vertices, faces = own_map.surface(box)
-        own, other = own_map.told(vertices), other_map.told(vertices)
+        own = own_map.told(vertices)
+        other = other_map.told(vertices, own.normals)
         sigma_m = np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals))
-        found = absence(own, other, other_map.leaf_m, sigma_m)
-        return cls(vertices, faces, own_map, other_map, own, other, found)
+        return cls(vertices, faces, own_map, other_map, Beside.of(own, other, other_map.leaf_m, sigma_m))
 
-    def kinds(self, share: float, lost: int) -> tuple[NDArray[np.int8], Floats, Floats]:
+    def kinds(self, absence: Absence, share: float, lost: int) -> tuple[NDArray[np.int8], Floats, Floats]:
         """(V,) kinds, probabilities and movements. `lost`: what a surface is that the other map has not."""
-        exists = self.own.confidence
-        absent = exists * posterior(self.absence.absent, share)
-        parallel = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= _PARALLEL
-        shifted = np.where(
-            parallel, exists * self.other.confidence * posterior(self.absence.shifted, share), 0.0
-        )
-        seen = np.isfinite(self.other.distance_m)
-        behind = seen & (self.other.distance_m < 0)
+        own, other = self.beside.own, self.beside.other
+        absent = own.confidence * posterior(absence.absent, share)
+        elsewhere = own.confidence * posterior(absence.shifted, share)
+        parallel = np.einsum("ni,ni->n", own.normals, other.normals) >= _PARALLEL
+        shifted = np.where(parallel, other.confidence * elsewhere, 0.0)
+        seen = np.isfinite(other.distance_m)
+        behind = seen & (other.distance_m < 0)
         kinds = np.where(seen, SAME, UNSEEN).astype(np.int8)
-        kinds[behind & (shifted > _PROBABLE)] = MOVED
         # What lies deep behind the other surface is hidden by it.
-        deep = exists * posterior(self.absence.shifted, share) > _PROBABLE
-        kinds[behind & ~parallel & deep] = UNSEEN
-        gone = ~behind & (absent > _PROBABLE)
-        kinds[gone] = lost
-        kinds[gone & seen & (shifted > _PROBABLE)] = MOVED
+        kinds[behind & ~parallel & (elsewhere > _PROBABLE)] = UNSEEN
+        kinds[~behind & (absent > _PROBABLE)] = lost
+        # A surface that is elsewhere is more than one that is not here. Before the other one, rays must have passed, too.
+        kinds[(shifted > _PROBABLE) & (behind | (seen & (absent > _PROBABLE)))] = MOVED
         probability = np.where(kinds == MOVED, np.maximum(shifted, np.where(behind, 0, absent)), absent)
         # Along the normal: the earlier surface moved to where the later one is.
-        towards = -self.other.distance_m if lost == GONE else self.other.distance_m
+        towards = -other.distance_m if lost == GONE else other.distance_m
         return kinds, probability, np.where(kinds == MOVED, towards, np.nan)
 
     def reflectance(self, kinds: NDArray[np.int8]) -> tuple[Floats, float | None]:
@@ -222,7 +220,7 @@ def _smoothed(x: Floats, values: Floats) -> Floats:
 
 
 def _summed(
-    before: ChangedSurface, after: ChangedSurface, alignment: Alignment, share: float, scale: float, offset: float | None
+    before: ChangedSurface, after: ChangedSurface, alignment: Alignment, share: float, errors: Errors, offset: float | None
 ) -> Changes:  # fmt: skip
     areas = dict.fromkeys((NAMES[kind] for kind in CHANGED), 0.0)
     compared = 0.0
@@ -236,7 +234,8 @@ def _summed(
         "areas_m2": areas,
         "compared_m2": compared,
         "changed_share": share,
-        "scale": scale,
+        "scale": errors.scale,
+        "freedom": errors.freedom,
         "intensity_offset": offset,
     }
     return Changes(before, after, alignment.T_before_after, report)

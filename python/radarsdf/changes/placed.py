@@ -17,6 +17,8 @@ from radarsdf.products import turned
 Floats = NDArray[np.float64]
 
 _BLOCK_M = 32.0  # cells are looked up in blocks, so that few are in memory
+# Behind a surface: so far, the 27 cells hardly reach the side from which it is seen.
+_BEHIND_CELLS = 1.5
 _CELLS_ALONG_RAY = 3.0  # of the 27 round a place that one ray passes, on average about
 
 
@@ -35,7 +37,8 @@ class Told:
     hits: Floats
     """(N,) scans with returns in the 27 leaf cells round the place, added up over the cells."""
     passes: Floats
-    """(N,) scans with rays through these cells, likewise, a ray counted once."""
+    """(N,) scans with rays through the 27 cells round a place behind the surface, likewise, a ray counted once. Rays that graze a
+    surface pass before it, and do not tell that it is not there."""
 
 
 @dataclass(frozen=True)
@@ -95,16 +98,19 @@ class PlacedMap:
         with np.errstate(invalid="ignore", divide="ignore"):
             return distance_m, turned(gradient / length[:, None], self.T_common_map[:3, :3])
 
-    def told(self, x: Floats) -> Told:
-        """All that the map tells of places (N, 3)."""
+    def told(self, x: Floats, facing: Floats | None = None) -> Told:
+        """All that the map tells of places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
         own = self.to_own(x)
         evidence = self.radar_map.evidence_at(torch.from_numpy(np.ascontiguousarray(own)))
+        distance_m, normals = self.distance(x)
+        behind = x - _BEHIND_CELLS * self.leaf_m * np.nan_to_num(normals if facing is None else facing)
         return Told(
-            *self.distance(x),
+            distance_m,
+            normals,
             self.radar_map.uncertainty(own),
             self.radar_map.confidence(own),
             evidence.detections.numpy().astype(np.float64),
-            self._passes(own),
+            self._passes(self.to_own(behind)),
         )
 
     def _passes(self, own: Floats) -> Floats:
@@ -118,7 +124,7 @@ class PlacedMap:
                 continue
             x = own[rows]
             cells = self.radar_map.cells_round(x.min(axis=0) - 2 * leaf_m, x.max(axis=0) + 2 * leaf_m)
-            # The core counts up to seven scans for a cell.
+            # The core counts up to seven scans for a cell: counts up to 63 tell no more (bench/history/changes.md).
             round_cell = 27 * uniform_filter(cells.passed.astype(np.float32), 3, mode="constant")
             places = np.floor((x - cells.corner) / leaf_m).astype(np.int64)
             found[rows] = np.rint(round_cell[tuple(places.T)]) / _CELLS_ALONG_RAY
