@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Draws the figures of the pages: ``python docs/draw.py`` writes them to docs/figures.
 
-All are of one simulated drive and one fit of it. It takes half a minute and needs the extra `plot`.
+All but `changes.png` are of one simulated drive and one fit of it. It takes half a minute and needs the extra `plot`.
 """
 
 from __future__ import annotations
@@ -14,13 +14,18 @@ from typing import Any
 
 import numpy as np
 import radarsdf
+from radarsdf.changes.changes import APPEARED, COLORS, GONE, MOVED, NAMES, SAME, UNSEEN
 from radarsdf.render.figures import new_figure, png_of
-from radarsdf.render.picture import save_picture
+from radarsdf.render.picture import render, save_picture
 from radarsdf.render.view_picture import save_view_picture
+from radarsdf.simulate import Box, Scene, simulate
+from radarsdf.simulate.materials import CONCRETE
 
 HELD_OUT = 3  # the scan that is predicted
 BOX = (10.0, 45.0, -12.0, 12.0)  # part of the street that is drawn from above: x from, to, y from, to, m
 SIZE = {"width": 1200, "height": 560}
+TAKEN, PUT = (2.5, 2.5, 0.5), (2.5, -3.0, 0.5)  # centres of a box that goes and of one that comes, m
+ROUND_BOXES = [[-3.0, -6.0, -0.5], [12.0, 6.0, 3.0]]
 LIGHT, DARK, RED, BLUE = "#b9c2cc", "#2c3e50", "#c0392b", "#1f5a96"
 
 
@@ -95,6 +100,27 @@ def field(radar_map: radarsdf.RadarMap, height_m: float, path: Path) -> None:
     path.write_bytes(png_of(figure, dpi=100))
 
 
+def changes(frames: int, path: Path) -> None:
+    """What two drives past a wall tell of two boxes."""
+    first = radarsdf.simulate.wall(frames=frames)
+    beside = first.poses.copy()
+    beside[:, 1, 3] += 0.3
+    maps = []
+    for day, (poses, center) in enumerate(((first.poses, TAKEN), (beside, PUT))):
+        box = Box(np.array(center), np.full(3, 0.5), 0.3, CONCRETE)
+        scene = Scene([*first.scene.solids, box], first.scene.terrain)
+        drive = simulate(scene, first.sensor, poses, name="wall", seed=day, lidar_rays=1)
+        config = radarsdf.FitConfig.quick(returns={"passages": True})
+        maps.append(radarsdf.fit(drive.points, drive.poses, config=config))
+    mesh = radarsdf.compare(*maps, box=ROUND_BOXES).mesh()
+    figure = new_figure(figsize=(12, 5.6), facecolor="white")
+    figure.figimage(render(mesh, mesh.visual.vertex_colors, **SIZE), 0, 0)
+    for row, kind in enumerate((APPEARED, GONE, MOVED, SAME, UNSEEN)):
+        figure.text(0.02, 0.92 - 0.06 * row, "\u25a0", color=np.array(COLORS[kind]) / 255, size=15)
+        figure.text(0.04, 0.92 - 0.06 * row, NAMES[kind], size=15)
+    path.write_bytes(png_of(figure, dpi=100))
+
+
 def draw(folder: Path, frames: int) -> None:
     """Write all figures."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -117,6 +143,7 @@ def draw(folder: Path, frames: int) -> None:
     save_view_picture(folder / "view.png", [radar_map.render(drive.poses[HELD_OUT])], [measured])
     for path in folder.glob("*.png"):
         small(path)
+    changes(min(frames, 24), folder / "changes.png")  # fewer colours would tint its greys
 
 
 if __name__ == "__main__":
