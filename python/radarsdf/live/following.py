@@ -17,7 +17,7 @@ from radarsdf.poses.odometry import LEAST_TOLD
 from radarsdf.poses.rates import Rate
 from radarsdf.poses.rigid import Floats, rotation_vector
 from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begun
-from radarsdf.returns.doppler import SensorVelocity, sensor_velocity
+from radarsdf.returns.doppler import SensorVelocity, sensor_velocities
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 
 _STEPS = 100  # of the motion so far, that habits are learnt from
@@ -53,6 +53,7 @@ class Follower:
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
     _rates: deque[tuple[Rate | None, Rate | None]] = field(default_factory=lambda: deque(maxlen=_STEPS))
     _given: deque[tuple[LoggedScan, float]] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    _speeds: deque[Floats] = field(default_factory=lambda: deque(maxlen=WINDOW))  # of the last scans, m/s
     _sign: int = 0  # of the Doppler. 0: not known yet, so that it is not used
 
     def __post_init__(self) -> None:
@@ -64,7 +65,7 @@ class Follower:
         for before, at_s in self._given:
             self._place(before, at_s)
         self._given.clear()
-        scan, velocity = _standing(logged), _velocity(logged)
+        scan, velocity = _standing(logged), self._velocity(logged)
         if not self._steps:
             return Step(scan, time_s, velocity, begun(np.eye(4)))
         last = self._steps[-1]
@@ -86,11 +87,13 @@ class Follower:
     def keep(self, logged: LoggedScan, time_s: float | None, step: Step | None) -> None:
         """The scan was there: the next one is looked for from it. `step` None: its pose was given."""
         if step is not None:
-            self._take(step)
+            self._take(step, logged)
         elif time_s is not None:  # only looked at once a scan comes without its pose
             self._given.append((logged, time_s))
 
-    def _take(self, step: Step) -> None:
+    def _take(self, step: Step, logged: LoggedScan) -> None:
+        if logged.doppler_mps is not None:
+            self._speeds.append(logged.doppler_mps)
         if self._steps:
             before = self._steps[-1]
             duration_s = step.time_s - before.time_s
@@ -111,7 +114,13 @@ class Follower:
                 return
             piece, turn = last.found.piece, rotation_vector(last.found.pose[:3, :3].T @ pose[:3, :3])
         found = Tracked(pose, _GIVEN, 1.0, piece, turn)
-        self._take(Step(_standing(logged), time_s, _velocity(logged), found))
+        self._take(Step(_standing(logged), time_s, self._velocity(logged), found), logged)
+
+    def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
+        """By the Doppler of a scan. None: it has none."""
+        if logged.doppler_mps is None:
+            return None
+        return sensor_velocities([logged.points], [logged.doppler_mps], self._speeds)[0]
 
     def _drive(self, steps: list[Step]) -> Drive:
         """Of the last scans, with the habits so far."""
@@ -162,7 +171,3 @@ class Follower:
 def _standing(logged: LoggedScan) -> Floats:
     points = logged.points if logged.standing is None else logged.points[logged.standing]
     return np.ascontiguousarray(points, np.float64)
-
-
-def _velocity(logged: LoggedScan) -> SensorVelocity | None:
-    return None if logged.doppler_mps is None else sensor_velocity(logged.points, logged.doppler_mps)

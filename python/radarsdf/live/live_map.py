@@ -169,7 +169,7 @@ class LiveMap:
         intensities : (N,) array_like, optional
             Sensor units. All scans have them, or none has.
         doppler_mps : (N,) array_like, optional
-            Speed along the ray, m/s; NaN where it was not measured. Returns that move are left out.
+            Speed along the ray, m/s, folded or not; NaN where it was not measured. Returns that move are left out.
         time : float, optional
             When the scan was taken, s. Only scans without a pose need it.
         scan_id : hashable, optional

@@ -154,7 +154,9 @@ def folding_interval_mps(doppler_mps: Sequence[NDArray[Any]]) -> float | None:
 
 
 def sensor_velocities(
-    points: Sequence[NDArray[Any]], doppler_mps: Sequence[NDArray[Any]]
+    points: Sequence[NDArray[Any]],
+    doppler_mps: Sequence[NDArray[Any]],
+    others_mps: Sequence[NDArray[Any]] = (),
 ) -> list[SensorVelocity]:
     """The velocity in each of K scans of one sensor, which may fold speeds into an interval.
 
@@ -162,8 +164,10 @@ def sensor_velocities(
     ----------
     points, doppler_mps : sequences of K arrays
         (N_i, 3) and (N_i,) each, as for :func:`sensor_velocity`.
+    others_mps : sequence of arrays
+        Speeds of other scans, that help to find the interval.
     """
-    interval = folding_interval_mps(doppler_mps) if points else None
+    interval = folding_interval_mps([*others_mps, *doppler_mps]) if points else None
     choices = [
         [sensor_velocity(x, v, interval_mps=folded) for x, v in zip(points, doppler_mps, strict=True)]
         for folded in ((None, interval) if interval else (None,))
