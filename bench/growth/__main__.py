@@ -21,6 +21,8 @@ from bench.peers.interface import failure
 
 from . import fits, poses, surfels
 
+PYTHON = [sys.executable]
+"""First words of the command of a row."""
 TABLES = {"fits": fits, "poses": poses, "surfels": surfels}
 
 
@@ -74,7 +76,7 @@ def _in_a_process(table: str, case: dict[str, Any]) -> dict[str, Any]:
     # would be used again, and would hide a part of the peak.
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}
     done = subprocess.run(
-        [sys.executable, "-m", "bench.growth", table, "--row", json.dumps(case)],
+        [*PYTHON, "-m", "bench.growth", table, "--row", json.dumps(case)],
         cwd=ROOT,
         env=environment,
         capture_output=True,

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
-import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ CASES: list[tuple[int, bool, Changes]] = [
 ]
 """Returns, whether with intensities, settings."""
 WITHIN = 1.5
+_M_MMAP_THRESHOLD = -3  # of malloc.h
 MAX_GROWTH_MB = 8.0  # from a tenth of the fits to the last
 SHORT: Changes = {"training": {"sdf_iterations": 60, "intensity_iterations": 72, "batch_size": 16384}}
 """Enough iterations for the peak: pages of zeros take no memory until the training writes to them."""
@@ -44,19 +46,21 @@ def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
     return scans.points, scans.poses, scans.intensities if with_intensities else None
 
 
-def peak_of_a_fit(count: int, with_intensities: bool, changes: Changes) -> tuple[Estimate, float]:
-    """The estimate, and the measured growth of the peak memory, bytes, in a new process."""
+def peak_of_a_fit(
+    count: int, with_intensities: bool, changes: Changes, python: Sequence[str] = (sys.executable,)
+) -> tuple[Estimate, float]:
+    """The estimate, and the measured growth of the peak memory, bytes, in a new process, whose command begins with `python`."""
     case = json.dumps([count, with_intensities, merged(SHORT, changes)])
-    # With this threshold, the C library returns large freed blocks to the system. Otherwise freed memory would be used
-    # again, and would hide a part of the peak.
-    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}
-    command = [sys.executable, "-m", "bench.stress.memory", case]
-    done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    command = [*python, "-m", "bench.stress.memory", case]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     values, peak = json.loads(done.stdout)
     return Estimate(**values), peak
 
 
 def _measure(count: int, with_intensities: bool, changes: Changes) -> None:
+    # With this threshold, the C library returns large freed blocks to the system. Otherwise freed memory would be used
+    # again, and would hide a part of the peak.
+    ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1_000_000)
     scans, config = _street(count, with_intensities), FitConfig().override(**changes)
     estimate = radarsdf.estimate(*scans, config=config)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here

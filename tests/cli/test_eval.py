@@ -147,11 +147,21 @@ def test_points_are_no_mesh(scans_file, tmp_path, capsys):
     assert "the mesh has no surface" in refusal(capsys, tmp_path, "eval", path, scans_file)
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb", ".off"])
-def test_a_surface_is_ground_truth_everywhere_on_its_triangles(mesh_file, tmp_path, capsys, suffix):
-    plane = trimesh.Trimesh([[9, -4, 0], [18, -4, 0], [18, 4, 0], [9, 4, 0]], [[0, 1, 2], [0, 2, 3]])
-    path = tmp_path / f"plane{suffix}"
-    plane.export(path)
+PLANE = trimesh.Trimesh([[9, -4, 0], [18, -4, 0], [18, 4, 0], [9, 4, 0]], [[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".glb", ".off"])
+def test_surfaces_of_all_formats_are_the_same_ground_truth(tmp_path, suffix):
+    found = []
+    for path in (tmp_path / "plane.ply", tmp_path / f"plane{suffix}"):
+        PLANE.export(path)
+        found.append(read_ground_truth(path))
+    np.testing.assert_allclose(*found, atol=1e-5)
+
+
+def test_a_surface_is_ground_truth_everywhere_on_its_triangles(mesh_file, tmp_path, capsys):
+    path = tmp_path / "plane.ply"
+    PLANE.export(path)
     printed = values(capsys, "eval", mesh_file, path, *SAMPLES)["surface"]
     assert printed["num_ground_truth"] == 1_000_000
     assert printed["completion_ratio"] > 0.9  # of its four vertices, none is near a return
