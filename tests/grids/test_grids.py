@@ -33,6 +33,21 @@ def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
     assert grid.at([[np.nan, 0, 0], [1e9, 0, 0]]).tolist() == [-1, -1]
 
 
+def test_a_voxel_that_a_surface_grazes_is_not_free():
+    """No return is in it, for they were moved onto the surface, and rays pass it above the ground often enough."""
+    drive = radarsdf.simulate.KINDS["tunnel"](seed=5, frames=12)
+    config = radarsdf.FitConfig(num_threads=1)
+    radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
+    lower = np.floor(drive.poses[6, :3, 3] / 0.2) * 0.2 - [
+        12,
+        12,
+        2,
+    ]  # the ground is the border of two voxels
+    grid = radar_map.grid([lower, lower + [24, 24, 3]], 0.2)
+    assert (grid.at(drive.ground_truth) == 0).mean() < 0.0003
+    assert grid.free.sum() * 0.2**3 > 190
+
+
 def test_a_saved_map_has_the_same_grid(grid, sharp_map, tmp_path):
     sharp_map.save(tmp_path / "map.safetensors")
     again = radarsdf.load(tmp_path / "map.safetensors").grid(BOX, 0.2)

@@ -132,13 +132,19 @@ def _fine_grid(
     position_error_m = 0.0
     if len(rows[0]):
         x = np.stack([centres[axis][rows[axis]] for axis in range(3)], 1)
-        found_m, of_surface, before = _surface_in_voxels(radar_map, x, size)
-        distance_m[rows] = found_m
-        of_surface = np.where(_crossed(distance_m)[rows], of_surface, 0)
+        surface = _Planes.of(radar_map, x)
+        distance_m[rows] = surface.distance_m
+        # Where the map has it: how far it may be off is said by `position_error_m`, or rough surfaces would be nowhere.
+        of_surface = np.where(
+            _crossed(distance_m)[rows] & (np.abs(surface.distance_m) <= _HALF_WIDTH * size),
+            surface.confidence,
+            0,
+        )
         is_there = of_surface >= occupied_from
         occupied[rows] = is_there
         # Behind a surface, rays passed by mistake: nothing is free there.
-        free[rows] &= before <= free_to
+        free[rows] &= surface.before(_HALF_WIDTH * size) <= free_to
+        free &= surface.touch(np.stack(rows, 1), shape, size, max(1, round(leaf_m / size))) <= free_to
         of_rays = np.where(free[rows], probability[rows], 0)
         probability[rows] = 1 - (1 - of_surface) * (1 - of_rays)
         if is_there.any():
@@ -149,32 +155,65 @@ def _fine_grid(
     return Grid(np.array(lower), size, state, probability, distance_m, position_error_m)
 
 
-def _surface_in_voxels(
-    radar_map: Map, x: NDArray[np.float64], size: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Signed distances at centres (N, 3), m, and the probabilities of a surface in the voxel, where the map
-    has it, and in or before it, by its uncertainty."""
-    # Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
-    distance_m = radar_map.sdf(x) / np.maximum(np.linalg.norm(radar_map.gradient(x), axis=1), 1)
-    sigma_m = np.nan_to_num(radar_map.uncertainty(x), nan=size)
-    confidence = radar_map.confidence(x)
-    half_m = _HALF_WIDTH * size
+@dataclass(frozen=True)
+class _Planes:
+    """The surface as the map has it round N positions: a plane each, of which the distance is known with an error."""
 
-    def below(limit_m: float) -> NDArray[np.float64]:
-        """Probability that the true distance is below a limit."""
-        t = torch.from_numpy((limit_m - distance_m) / sigma_m)
-        share: NDArray[np.float64] = torch.special.ndtr(t).numpy()
-        return share
+    distance_m: NDArray[np.float32]
+    """(N,) signed distance of the position from the surface, m. NaN: unknown."""
+    normals: NDArray[np.float64]
+    """(N, 3) unit vectors to where distances grow."""
+    sigma_m: NDArray[np.float64]
+    """(N,) standard error of the distance, m."""
+    confidence: NDArray[np.float64]
+    """(N,) probability that there is a surface."""
 
-    before = confidence * below(half_m)
-    # Where the map has it: how far it may be off is said by `position_error_m`, or rough surfaces would be nowhere.
-    within = np.where(np.abs(distance_m) <= half_m, confidence, 0)
-    nothing = np.isnan(distance_m)
-    return (
-        distance_m.astype(np.float32),
-        np.where(nothing, 0, within).astype(np.float32),
-        np.where(nothing, 0, before).astype(np.float32),
-    )
+    @classmethod
+    def of(cls, radar_map: Map, x: NDArray[np.float64]) -> _Planes:
+        """The planes at positions (N, 3), world, m."""
+        gradient = np.asarray(radar_map.gradient(x), np.float64)
+        length = np.maximum(np.linalg.norm(gradient, axis=1), 1)
+        # Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
+        distance_m = (radar_map.sdf(x) / length).astype(np.float32)
+        unknown = np.isnan(distance_m)
+        sigma_m = np.nan_to_num(radar_map.uncertainty(x), nan=radar_map.config.leaf_size_m).astype(np.float64)
+        return cls(
+            distance_m,
+            gradient / np.linalg.norm(gradient, axis=1, keepdims=True).clip(1e-9),
+            sigma_m,
+            np.where(unknown, 0, radar_map.confidence(x)).astype(np.float64),
+        )
+
+    def before(self, limit_m: float) -> NDArray[np.float64]:
+        """(N,) probability that the surface is there, and nearer than a limit or that the position is behind it."""
+        return np.nan_to_num(self.confidence * _below((limit_m - self.distance_m) / self.sigma_m))
+
+    def touch(
+        self, voxels: NDArray[np.int64], shape: tuple[int, ...], size: float, step: int
+    ) -> NDArray[np.float32]:
+        """Largest probability, in each voxel of a grid, that one of these planes, from `step` voxels away, is in it.
+
+        A cell without a return may still be cut by the surface of its neighbour.
+        """
+        found = np.zeros(shape, np.float32)
+        rows = np.flatnonzero(self.confidence > 0)
+        for offset in np.ndindex(3, 3, 3):
+            moved = (np.array(offset) - 1) * step
+            targets = voxels[rows] + moved
+            inside = ((targets >= 0) & (targets < shape)).all(axis=1)
+            near, at = rows[inside], tuple(targets[inside].T)
+            distance_m = self.distance_m[near] + self.normals[near] @ (moved * size)
+            half_m = 0.5 * size * np.abs(self.normals[near]).sum(axis=1)
+            sigma_m = self.sigma_m[near]
+            share = _below((half_m - distance_m) / sigma_m) - _below((-half_m - distance_m) / sigma_m)
+            found[at] = np.maximum(found[at], (self.confidence[near] * share).astype(np.float32))
+        return found
+
+
+def _below(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of a standard normal distribution below t."""
+    share: NDArray[np.float64] = torch.special.ndtr(torch.from_numpy(np.asarray(t, np.float64))).numpy()
+    return share
 
 
 def _crossed(distance_m: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``python -m bench.grids [SCENE ...]``: what planners' grids call free though it is occupied, and their distances.
+
+A place is a point on a true surface that the radar could detect from one of its poses, in a box of 50 × 50 × 10 m round the
+middle of the way. Distances are those of free voxels, beside the true distance from their centres.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import radarsdf
+import torch
+from numpy.typing import NDArray
+from radarsdf.grids.grid import Grid
+from radarsdf.simulate import KINDS, SCENES, Simulation
+
+from bench.rows import kept
+
+Floats = NDArray[np.float64]
+
+VOXEL_M = 0.2
+_SIZE_M = np.array([50.0, 50.0, 10.0])
+_SENSOR_ABOVE_M = 3.5  # over the lower face of the box
+_PLACE_M = 0.05  # at most one place in each cube of this edge: places are even over the surface
+_RAYS = 10_000  # a round from a pose
+_DISTANCES = 20_000
+
+
+def box_of(drive: Simulation) -> Floats:
+    """Lower and upper corner (2, 3), world, m."""
+    middle = drive.poses[:, :3, 3].mean(axis=0)
+    lower = middle - [_SIZE_M[0] / 2, _SIZE_M[1] / 2, _SENSOR_ABOVE_M]
+    return np.stack([lower, lower + _SIZE_M])
+
+
+def seen_places(drive: Simulation, box: Floats, number: int, rng: np.random.Generator) -> Floats:
+    """At most so many places (N, 3), world, m: exact points of surfaces in view, in range and above the threshold."""
+    sensor = drive.sensor
+    found = np.zeros((0, 3))
+    poses = drive.poses[:: max(1, len(drive.poses) // 40)]
+    for _ in range(8):
+        rounds = [found]
+        for T_world_sensor in poses:
+            azimuth = rng.uniform(-1, 1, _RAYS) * sensor.azimuth_fov_rad / 2
+            up = rng.uniform(-1, 1, _RAYS) * np.sin(sensor.elevation_fov_rad / 2)
+            flat = np.sqrt(1 - up**2)
+            own = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up], 1)
+            rays, origin = own @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]
+            hits = drive.scene.raycast(origin, rays, sensor.max_range_m)
+            seen = sensor.echo_power_db(drive.scene, origin, rays, hits) >= sensor.threshold_db
+            seen &= hits.range_m >= sensor.min_range_m
+            x = origin + hits.range_m[seen, None] * rays[seen]
+            rounds.append(x[((x >= box[0]) & (x < box[1])).all(axis=1)])
+        found = np.concatenate(rounds)
+        _, first = np.unique(np.floor(found / _PLACE_M).astype(np.int64), axis=0, return_index=True)
+        found = found[first]
+        if len(found) >= number:
+            break
+    return rng.permutation(found)[:number]
+
+
+def judged(grid: Grid, places: Floats) -> dict[str, float]:
+    """Shares of places in free and occupied voxels, of all and of those that are not unknown, %; of voxels, m³."""
+    state = grid.at(places)
+    free, occupied = float((state == 0).mean()), float((state == 1).mean())
+    return {
+        "called free, %": round(100 * free, 3),
+        "of known, %": round(100 * free / max(free + occupied, 1e-12), 3),
+        "called occupied, %": round(100 * occupied, 1),
+        "free, m³": round(float(grid.free.sum()) * grid.voxel_size**3),
+    }
+
+
+def distances(grid: Grid, drive: Simulation, rng: np.random.Generator) -> dict[str, float]:
+    """Errors of the distances of free voxels, m, and how often they are beyond the stated error, %."""
+    field = grid.distances()
+    x = grid.centres(grid.free)
+    rows = rng.choice(len(x), min(_DISTANCES, len(x)), replace=False)
+    true = drive.scene.signed_distance(x[rows])
+    occupied, not_free = field.occupied_m[grid.free][rows], field.not_free_m[grid.free][rows]
+    return {
+        "median error, m": round(float(np.median(np.abs(occupied - true))), 3),
+        "stated, m": round(field.error_m, 3),
+        "beyond it, %": round(100 * float((np.abs(occupied - true) > field.error_m).mean()), 2),
+        "too far by it, %": round(100 * float((occupied - true > field.error_m).mean()), 2),
+        "not free too far, %": round(100 * float((not_free - true > field.error_m).mean()), 3),
+    }
+
+
+def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A row for each scene."""
+    torch.set_num_threads(options.threads)
+    kinds = dict(KINDS) | dict(SCENES)
+    for name in options.scenes or kinds:
+        drive = kinds[name](seed=options.seed, frames=8 if options.quick else None)
+        rng = np.random.default_rng(options.seed)
+        config = radarsdf.FitConfig(num_threads=options.threads)
+        if options.quick:
+            config = radarsdf.FitConfig.quick(num_threads=options.threads, returns={"passages": True})
+        begin = time.process_time()
+        radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
+        fitted = time.process_time()
+        box = box_of(drive)
+        grid = radar_map.grid(box, VOXEL_M)
+        made = time.process_time()
+        places = seen_places(drive, box, options.places, rng)
+        yield {
+            "scene": name,
+            "places": len(places),
+            **judged(grid, places),
+            **distances(grid, drive, rng),
+            "fit, s": round(fitted - begin, 1),
+            "grid, s": round(made - fitted, 1),
+        }
+
+
+def main() -> None:
+    """Print the table, and keep it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="*", metavar="SCENE")
+    parser.add_argument("--seed", type=int, default=161)
+    parser.add_argument("--places", type=int, default=100_000, help="of each scene, at most")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--quick", action="store_true", help="few scans and places: does it run?")
+    parser.add_argument("--out", type=Path, default=Path("bench_results/grids.json"))
+    options = parser.parse_args()
+    kept(rows(options), "bench.grids", options.out)
+
+
+if __name__ == "__main__":
+    main()
