@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,6 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path("radarsdf_demo"),
         help="the folder to write; default: radarsdf_demo",
     )
+    parser.add_argument(
+        "--view",
+        action=argparse.BooleanOptionalAction,
+        help="show the map in the browser at the end, until Ctrl-C; default: in a terminal of a machine with a screen",
+    )
     add_surface(parser)
     add_fit_options(parser)
     add_json(parser)
@@ -57,8 +63,13 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.npz import Scans, write_scans
     from radarsdf.render.picture import save_picture
 
+    shown = ends_with_viewer(options)
     options.out.mkdir(parents=True, exist_ok=True)
     check_outputs(options.out / name for name in ("scans.npz", "map.safetensors", "mesh.ply", "picture.png"))
+    results = Results(options)
+    results.add(
+        f"simulates the drive of a radar, makes a map of it, compares that with the truth, and writes all to {options.out}"
+    )
     simulation = radarsdf.simulate.SCENES[options.scene](frames=options.frames)
     scans = Scans(
         simulation.points,
@@ -68,11 +79,9 @@ def run(options: argparse.Namespace) -> None:
         truth_kind="simulated",
     )
     train, test = holdout(len(scans.points))
-    results = Results(options)
-    returns = sum(map(len, scans.points))
     results.add(
-        f"simulated a drive, {options.scene}: {returns} returns in {len(scans)} scans",
-        returns=returns,
+        f"simulated a drive, {options.scene}: {sum(map(len, scans.points))} returns in {len(scans)} scans",
+        returns=sum(map(len, scans.points)),
         scans=len(scans),
     )
 
@@ -111,6 +120,37 @@ def run(options: argparse.Namespace) -> None:
     looked_at = [str(options.out / name) for name in ("map.safetensors", "scans.npz")]
     results.add(f"next: {shlex.join(['radarsdf', 'view', *looked_at])}")
     results.end()
+    if shown:
+        _show(radar_map, scans, options)
+
+
+def _show(radar_map: RadarMap, scans: Scans, options: argparse.Namespace) -> None:
+    from radarsdf.cli.view import show
+
+    show(
+        radar_map,
+        scans,
+        open_page=True,
+        voxel_size=options.voxel,
+        progress=progress_of(options),
+        **limits_of(options),
+    )
+
+
+def ends_with_viewer(options: argparse.Namespace) -> bool:
+    """Whether the viewer ends the demo. It waits for who looks, so not unless somebody is there, or it was asked for."""
+    from radarsdf.view.serving import has_display, require_viser
+
+    asked, somebody = options.view, sys.stdout is not None and sys.stdout.isatty() and has_display()
+    if asked or (asked is None and somebody and not options.json):
+        try:
+            require_viser()
+        except ImportError:  # it is optional
+            if asked:
+                raise
+            return False
+        return True
+    return False
 
 
 def _say_errors(results: Results, radar_map: RadarMap, mesh: trimesh.Trimesh, scans: Scans) -> None:

@@ -5,11 +5,16 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING, Any
 
 from radarsdf.cli.map_in import add_map, load_map
 from radarsdf.cli.options import add_box, add_quiet, add_surface, box_of, limits_of, progress_of
 from radarsdf.cli.saying import say
 from radarsdf.cli.scans_in import add_scans, scans_of
+
+if TYPE_CHECKING:
+    from radarsdf.io.npz import Scans
+    from radarsdf.map.map import Map
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,19 +49,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
-    from radarsdf.view.serving import free_port, has_display, require_viser, ssh_line, url_of
+    from radarsdf.view.serving import free_port, has_display, require_viser
 
     # First: what would be said only after the map was read and meshed.
     require_viser()
     free_port(options.host, options.port or 0, exactly=True)
 
-    from radarsdf.view.viewer import Viewer
-
     radar_map = load_map(options.map)
     scans = None if options.scans is None else scans_of(options)
-    with Viewer(
+    show(
         radar_map,
         scans,
+        open_page=has_display() if options.open is None else options.open,
         voxel_size=options.voxel,
         box=box_of(options),
         max_vertices=options.max_vertices,
@@ -64,13 +68,21 @@ def run(options: argparse.Namespace) -> None:
         port=options.port,
         progress=progress_of(options),
         **limits_of(options),
-    ) as viewer:
+    )
+
+
+def show(radar_map: Map, scans: Scans | None, *, open_page: bool, **arguments: Any) -> None:
+    """Serve the page until Ctrl-C, and say where. `arguments`: those of :class:`radarsdf.view.viewer.Viewer`."""
+    from radarsdf.view.serving import ssh_line, url_of
+    from radarsdf.view.viewer import Viewer
+
+    with Viewer(radar_map, scans, **arguments) as viewer:
         url = url_of(viewer.host, viewer.port)
         for note in viewer.notes:
             say(note)
         say(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it")
         say(f"from elsewhere: {ssh_line(viewer.host, viewer.port)}, then {url_of('localhost', viewer.port)}")
-        if has_display() if options.open is None else options.open:
+        if open_page:
             import webbrowser
 
             webbrowser.open(url)
