@@ -16,7 +16,7 @@ RUN /opt/radarsdf/bin/pip install --no-cache-dir --no-compile --no-deps -c /sour
       --index-url https://download.pytorch.org/whl/cpu || true
 COPY . /source
 RUN /opt/radarsdf/bin/pip install --no-cache-dir --no-compile -c /source/constraints.txt "/source[plot,view]"
-# What only builds and tests of others need: a third of what is installed.
+# What only builds and tests of others need. torch/bin holds a program that `import torch` looks for.
 RUN cd /opt/radarsdf/lib/python3*/site-packages \
  && rm -r pip torch/include torch/share torch/test torch/lib/*test*.so torch/bin/*test* \
  && find . -type d \( -name tests -o -name __pycache__ \) -prune -exec rm -r {} +
