@@ -31,7 +31,7 @@ def test_a_drift_is_found_with_its_figures(drive):
     findings = radarsdf.check(drive.points, drifted(drive.poses, 0.05, 0.004, 1))
     (found,) = [finding for finding in findings if finding.name == "poses_drift"]
     assert found.severity == "warning"
-    assert "returns that took no part are" in found.evidence
+    assert "denser where returns that took no part lie" in found.evidence
     assert f"{SCANS} scans end off by" in found.evidence
     assert "radarsdf poses" in found.mend
 
