@@ -202,7 +202,7 @@ class _Planes:
             targets = voxels[rows] + moved
             inside = ((targets >= 0) & (targets < shape)).all(axis=1)
             near, at = rows[inside], tuple(targets[inside].T)
-            distance_m = self.distance_m[near] + self.normals[near] @ (moved * size)
+            distance_m = self.distance_m[near] + np.einsum("ni,i->n", self.normals[near], moved * size)
             half_m = 0.5 * size * np.abs(self.normals[near]).sum(axis=1)
             sigma_m = self.sigma_m[near]
             share = _below((half_m - distance_m) / sigma_m) - _below((-half_m - distance_m) / sigma_m)
