@@ -132,7 +132,7 @@ def usual(scene, tmp_path_factory):
 
 
 @POSIX
-@pytest.mark.parametrize("redirections", [">&- 2>&-", "2>/dev/full"])
+@pytest.mark.parametrize("redirections", [">&-", "2>&-", ">&- 2>&-", "2>/dev/full"])
 def test_every_command_without_streams(files, usual, redirections):
     folder, printed, said = usual
     statuses, output, errors = all_commands(files, redirections)

@@ -62,10 +62,6 @@ def good(request):
     return scans.points, scans.poses
 
 
-FEW = pytest.mark.parametrize("good", ["astyx"], indirect=True)
-"""Where one sensor tells as much as all: the whole check of more scans takes up to ten times as long."""
-
-
 def test_good_data_have_no_finding(good):
     assert worse_than_notes(radarsdf.check(*good)) == []
     assert worse_than_notes(check_cheaply(*good)) == []
@@ -79,7 +75,6 @@ def test_a_breakage_is_named(good, finding):
         assert (found[0].name, found[0].severity) == (finding, "error")
 
 
-@FEW
 @pytest.mark.parametrize(
     ("axis", "degrees", "words"), [("z", -45, "-45 degrees of yaw"), ("y", 15, "15 degrees of pitch")]
 )
@@ -135,7 +130,6 @@ def test_few_sparse_scans_have_no_finding(frames, seed):
     assert worse_than_notes(check_cheaply(scans.points, scans.poses)) == []
 
 
-@FEW
 def test_far_from_the_origin_nothing_changes(good):
     points, poses = good
     far = with_positions(poses, poses[:, :3, 3] + [4.5e5, 5.4e6, 100.0])
@@ -144,13 +138,11 @@ def test_far_from_the_origin_nothing_changes(good):
     assert radarsdf.check(*BREAKAGES["points_in_world_frame"](points, far))[0].name == "points_in_world_frame"
 
 
-@FEW
 def test_the_same_data_give_the_same_findings(good):
     broken = BREAKAGES["mirrored"](*good)
     assert radarsdf.check(*broken) == radarsdf.check(*broken)
 
 
-@FEW
 def test_millimetres_on_both_sides_are_found_by_the_ranges(good):
     points, poses = good
     found = radarsdf.check([1000 * p for p in points], with_positions(poses, 1000 * poses[:, :3, 3]))

@@ -93,7 +93,7 @@ def test_triangles_face_free_space(mesh):
     np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-6)
 
 
-@pytest.mark.parametrize("voxel_size", [0.1, 0.2])
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
 def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, voxel_size):
     mesh = sharp_map.mesh(voxel_size)
     assert len(mesh.faces) > 0
@@ -113,7 +113,7 @@ def test_small_voxels_have_their_centres_in_the_map(sharp_map, voxel_size):
     assert occupied.float().mean() > 0.9999
 
 
-@pytest.mark.parametrize("voxel_size", [0.07, 0.1, 0.15, 0.2, 0.3])
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.15, 0.2, 0.3])
 def test_any_voxel_size_gives_the_same_surface(sharp_map, voxel_size):
     mesh = sharp_map.mesh(voxel_size)
     centres = mesh.triangles_center[inside(mesh)]
@@ -132,7 +132,7 @@ def sharp_map_bounds(radar_map):
     return cells.min(axis=0) * LEAF_M + radar_map.origin, (cells.max(axis=0) + 1) * LEAF_M + radar_map.origin
 
 
-@pytest.mark.parametrize("voxel_size", [0.1, 0.15, 0.2, 0.3])
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.15, 0.2, 0.3])
 def test_meshes_are_manifold(sharp_map, voxel_size):
     mesh = sharp_map.mesh(voxel_size, min_component_triangles=0)
     border = single_edges(mesh.faces)  # fails where an edge has more than two triangles or two that disagree
@@ -302,7 +302,7 @@ def lattice(radar_map, voxel_size):
     return radarsdf.map.isosurface.sparse_lattice(voxels)
 
 
-@pytest.mark.parametrize("voxel_size", [0.1, 0.2])
+@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
 def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
     voxels, corners, voxel_corners = lattice(sharp_map, voxel_size)
     values = _corner_distances(sharp_map._contents, voxel_size, voxels, corners, voxel_corners, False)
@@ -318,16 +318,17 @@ def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
 
 
 # Voxels that do not divide the cells are moved otherwise at the border: there, a few vertices differ.
-@pytest.mark.parametrize("voxel_size", [0.1, 0.13])
+@pytest.mark.parametrize("voxel_size", [0.05, 0.07, 0.1, 0.13])
 def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, voxel_size, monkeypatch):
     cells = sharp_map.field.cells.table.leaf_cells()
     assert len(_crossed(sharp_map._contents, cells)) < 0.8 * len(cells)
     mesh = sharp_map.mesh(voxel_size)
     assert mesh.metadata["leaf_cells_searched"] < 0.8 * mesh.metadata["leaf_cells"] == 0.8 * len(cells)
     monkeypatch.setattr("radarsdf.map.voxels._crossed", lambda _, cells: cells)
-    whole, even = sharp_map.mesh(voxel_size), voxel_size == 0.1
-    assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4 if even else 1e-3)
+    whole = sharp_map.mesh(voxel_size)
+    assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4 if voxel_size in (0.05, 0.1) else 1e-3)
     distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)
+    even = voxel_size in (0.05, 0.1)
     assert np.quantile(distance_m, 0.9999 if even else 0.998) < 1e-4  # other batches, other rounding
 
 
@@ -351,7 +352,7 @@ def test_occupied_voxels_fill_the_cells(sharp_map):
         np.testing.assert_array_equal(np.unique(names(voxels // parts)), np.sort(cells))
 
 
-@pytest.mark.parametrize("voxel_size", [0.13, 0.3, 0.45])
+@pytest.mark.parametrize("voxel_size", [0.07, 0.15, 0.3, 0.45])
 def test_uneven_voxels_cover_the_cells_and_little_more(sharp_map, voxel_size):
     cells = sharp_map.field.cells.table.leaf_cells()
     voxels = occupied_voxels(sharp_map, voxel_size)
