@@ -4,7 +4,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 from pathlib import Path
+
+_M_MMAP_THRESHOLD = -3  # of malloc.h
 
 
 def memory_bytes(field: str) -> int:
@@ -17,3 +21,13 @@ def memory_bytes(field: str) -> int:
         return -1
     (line,) = (line for line in status.read_text().splitlines() if line.startswith(f"{field}:"))
     return 1024 * int(line.split()[1])
+
+
+def return_freed_memory() -> None:
+    """From now on, the C library returns large freed blocks to the system.
+
+    Otherwise freed memory would be used again, and would hide a part of the peak. A variable would come too late for a process
+    that is forked.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1_000_000)

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+from bench.memory import return_freed_memory
 from bench.paper.report import ROOT, provenance, write_json
 from bench.peers.interface import failure
 
@@ -29,6 +29,7 @@ TABLES = {"fits": fits, "poses": poses, "surfels": surfels}
 def main(arguments: list[str] | None = None) -> None:
     words = _parser().parse_args(arguments)
     if words.row:
+        return_freed_memory()
         print(json.dumps(TABLES[words.table].row(**json.loads(words.row)), default=float))
         return
     if words.table == "fits":
@@ -72,13 +73,9 @@ def _text(value: Any, form: str) -> str:
 
 
 def _in_a_process(table: str, case: dict[str, Any]) -> dict[str, Any]:
-    # With this threshold, the C library returns large freed blocks to the system. Otherwise freed memory of the scene
-    # would be used again, and would hide a part of the peak.
-    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "1000000"}
     done = subprocess.run(
         [*PYTHON, "-m", "bench.growth", table, "--row", json.dumps(case)],
         cwd=ROOT,
-        env=environment,
         capture_output=True,
         text=True,
         check=False,

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import subprocess
 import sys
@@ -18,7 +17,7 @@ import radarsdf.fitting.fit  # else the first fit would import it, in what is me
 from radarsdf import Estimate, FitConfig
 
 from bench.growth.street import street
-from bench.memory import memory_bytes
+from bench.memory import memory_bytes, return_freed_memory
 from bench.paper.report import markdown
 from bench.settings import Changes, flat, merged
 
@@ -35,7 +34,6 @@ CASES: list[tuple[int, bool, Changes]] = [
 ]
 """Returns, whether with intensities, settings."""
 WITHIN = 1.5
-_M_MMAP_THRESHOLD = -3  # of malloc.h
 MAX_GROWTH_MB = 8.0  # from a tenth of the fits to the last
 SHORT: Changes = {"training": {"sdf_iterations": 60, "intensity_iterations": 72, "batch_size": 16384}}
 """Enough iterations for the peak: pages of zeros take no memory until the training writes to them."""
@@ -58,9 +56,7 @@ def peak_of_a_fit(
 
 
 def _measure(count: int, with_intensities: bool, changes: Changes) -> None:
-    # With this threshold, the C library returns large freed blocks to the system. Otherwise freed memory would be used
-    # again, and would hide a part of the peak.
-    ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1_000_000)
+    return_freed_memory()
     scans, config = _street(count, with_intensities), FitConfig().override(**changes)
     estimate = radarsdf.estimate(*scans, config=config)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here

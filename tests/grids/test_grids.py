@@ -38,11 +38,8 @@ def test_a_voxel_that_a_surface_grazes_is_not_free():
     drive = radarsdf.simulate.KINDS["tunnel"](seed=5, frames=12)
     config = radarsdf.FitConfig(num_threads=1)
     radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
-    lower = np.floor(drive.poses[6, :3, 3] / 0.2) * 0.2 - [
-        12,
-        12,
-        2,
-    ]  # the ground is the border of two voxels
+    # The ground is the border of two voxels.
+    lower = np.floor(drive.poses[6, :3, 3] / 0.2) * 0.2 - [12, 12, 2]
     grid = radar_map.grid([lower, lower + [24, 24, 3]], 0.2)
     assert (grid.at(drive.ground_truth) == 0).mean() < 0.0003
     assert grid.free.sum() * 0.2**3 > 190

@@ -105,10 +105,14 @@ class Beside:
         """(N,) whether the distance is known."""
         return np.isfinite(self.other.distance_m) & np.isfinite(self.sigma_m)
 
+    def distances(self) -> tuple[Floats, Floats]:
+        """(K,) distances that are known, and their standard errors, m."""
+        return self.other.distance_m[self.observed], self.sigma_m[self.observed]
+
     def absence(self, errors: Errors) -> Absence:
         """Whether the surface is in the other map."""
         observed, reach_m = self.observed, self.reach_m
-        distance_m, sigma_m = self.other.distance_m[observed], self.sigma_m[observed]
+        distance_m, sigma_m = self.distances()
         same = errors.log_density(distance_m, sigma_m)
         absent = _passed(self.own, self.other)
         shifted = np.full(len(absent), -np.inf)
@@ -119,12 +123,10 @@ class Beside:
 
 def errors_of(sides: Sequence[Beside]) -> Errors:
     """The errors of the distances between two maps."""
-    known = [side.observed for side in sides]
-    return Errors.of(
-        np.concatenate([side.other.distance_m[rows] for side, rows in zip(sides, known, strict=True)]),
-        np.concatenate([side.sigma_m[rows] for side, rows in zip(sides, known, strict=True)]),
-        np.concatenate([np.full(rows.sum(), side.reach_m) for side, rows in zip(sides, known, strict=True)]),
-    )
+    known = [side.distances() for side in sides]
+    reaches_m = [np.full(len(found[0]), side.reach_m) for side, found in zip(sides, known, strict=True)]
+    distance_m, sigma_m = (np.concatenate(columns) for columns in zip(*known, strict=True))
+    return Errors.of(distance_m, sigma_m, np.concatenate(reaches_m))
 
 
 def _passed(own: Told, other: Told) -> Floats:

@@ -79,9 +79,10 @@ def run(options: argparse.Namespace) -> None:
         truth_kind="simulated",
     )
     train, test = holdout(len(scans.points))
+    returns = sum(map(len, scans.points))
     results.add(
-        f"simulated a drive, {options.scene}: {sum(map(len, scans.points))} returns in {len(scans)} scans",
-        returns=sum(map(len, scans.points)),
+        f"simulated a drive, {options.scene}: {returns} returns in {len(scans)} scans",
+        returns=returns,
         scans=len(scans),
     )
 

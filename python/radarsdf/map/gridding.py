@@ -172,14 +172,14 @@ class _Planes:
     def of(cls, radar_map: Map, x: NDArray[np.float64]) -> _Planes:
         """The planes at positions (N, 3), world, m."""
         gradient = np.asarray(radar_map.gradient(x), np.float64)
-        length = np.maximum(np.linalg.norm(gradient, axis=1), 1)
+        length = np.linalg.norm(gradient, axis=1)
         # Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
-        distance_m = (radar_map.sdf(x) / length).astype(np.float32)
+        distance_m = (radar_map.sdf(x) / np.maximum(length, 1)).astype(np.float32)
         unknown = np.isnan(distance_m)
         sigma_m = np.nan_to_num(radar_map.uncertainty(x), nan=radar_map.config.leaf_size_m).astype(np.float64)
         return cls(
             distance_m,
-            gradient / np.linalg.norm(gradient, axis=1, keepdims=True).clip(1e-9),
+            gradient / length[:, None].clip(1e-9),
             sigma_m,
             np.where(unknown, 0, radar_map.confidence(x)).astype(np.float64),
         )

@@ -106,12 +106,13 @@ def _gains(
     something: so the median of the densities is added to each, and such returns say little.
     """
     given = _Neighbours.of(asked, used, before)
-    least_m2 = float(np.median(given.nearest_m)) ** 2
-    density = given.density(asked, used, noise, least_m2)
+    of_asked, of_used = (_variances_m2(returns, noise) for returns in (asked, used))
+    of_asked += float(np.median(given.nearest_m)) ** 2
+    density = given.density(of_asked, of_used)
     floor = float(np.median(density))
     if floor == 0:  # scans that have nothing in common where they are
         return np.zeros(len(asked))
-    then = _Neighbours.of(asked, used, after).density(asked, used, noise, least_m2)
+    then = _Neighbours.of(asked, used, after).density(of_asked, of_used)
     gains: Floats = np.log((then + floor) / (density + floor))
     return gains
 
@@ -141,12 +142,9 @@ class _Neighbours:
         nearest: Floats = self.distances_m[np.arange(len(first)), first]
         return nearest
 
-    def density(
-        self, asked: SensorReturns, used: SensorReturns, noise: SensorNoise, least_m2: float
-    ) -> Floats:
-        """(N,) of other scans' returns, up to a factor. `least_m2`: variance that is added to that of the noise."""
-        variances = [_variances_m2(returns, noise) for returns in (asked, used)]
-        variance = variances[0][:, None] + variances[1][self.rows] + least_m2
+    def density(self, of_asked: Floats, of_used: Floats) -> Floats:
+        """(N,) of other scans' returns, up to a factor, by the variances of those asked (N,) and of all that were used, m²."""
+        variance = of_asked[:, None] + of_used[self.rows]
         with np.errstate(under="ignore"):
             parts = np.exp(-0.5 * self.distances_m**2 / variance) / variance**1.5
         density: Floats = np.where(self.others, parts, 0.0).sum(axis=1)
