@@ -1,8 +1,11 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
+#include <algorithm>
+
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "returns/ray_average.hpp"
+#include "returns/smooth_distances.hpp"
 
 namespace radarsdf {
 
@@ -33,6 +36,36 @@ void bind_ray_average(VertexTableClass& table) {
       "the "
       "`points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of "
       "its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame.");
+  table.attr("SMOOTHING_REACH") = kSmoothingReach;
+  table.def(
+      "smoothed",
+      [](const VertexTable& t, const Array<float>& distances_m, const Array<float>& points, const Array<float>& normals,
+         const Array<float>& information, int iterations, int num_threads) {
+        const std::int64_t count = check_points(points);
+        check_shape(normals, count, 3, "normals");
+        if (check_column(information, "information") != count) {
+          throw std::invalid_argument("information must have shape (N,)");
+        }
+        if (check_column(distances_m, "distances_m") != t.num_rows()) {
+          throw std::invalid_argument("distances_m must have shape (num_rows,)");
+        }
+        Array<float> result(distances_m.size());
+        std::copy_n(distances_m.data(), distances_m.size(), result.mutable_data());
+        float* moved = result.mutable_data();
+        const KnownPlanes planes{points.data(), normals.data(), information.data(), count};
+        {
+          const py::gil_scoped_release release;
+          smooth_distances(t, planes, iterations, moved, num_threads);
+        }
+        return result;
+      },
+      "distances_m"_a.noconvert(), "points"_a.noconvert(), "normals"_a.noconvert(), "information"_a.noconvert(),
+      "iterations"_a, "num_threads"_a = 0,
+      "Of an octree: `distances_m` (num_rows,) float32 after so many steps towards distances that agree with the "
+      "planes "
+      "through `points` (N, 3) with these `normals` (N, 3) and this `information` (N,), m^-2, all float32, local "
+      "frame, "
+      "and bend as little as they can. An iteration carries what is known SMOOTHING_REACH vertices far.");
 }
 
 }  // namespace radarsdf

@@ -180,6 +180,8 @@ class VertexTable:
     """
     From points to rows of the feature matrix (num_rows, 8).
     """
+
+    SMOOTHING_REACH: typing.ClassVar[int] = 2
     def __init__(
         self,
         leaf_keys: numpy.typing.NDArray[numpy.uint64],
@@ -403,6 +405,18 @@ class VertexTable:
     ) -> None:
         """
         The same by the threads of a crew, without directions.
+        """
+    def smoothed(
+        self,
+        distances_m: numpy.typing.NDArray[numpy.float32],
+        points: numpy.typing.NDArray[numpy.float32],
+        normals: numpy.typing.NDArray[numpy.float32],
+        information: numpy.typing.NDArray[numpy.float32],
+        iterations: typing.SupportsInt | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.float32]:
+        """
+        Of an octree: `distances_m` (num_rows,) float32 after so many steps towards distances that agree with the planes through `points` (N, 3) with these `normals` (N, 3) and this `information` (N,), m^-2, all float32, local frame, and bend as little as they can. An iteration carries what is known SMOOTHING_REACH vertices far.
         """
     @property
     def encoding(self) -> Encoding: ...

@@ -28,6 +28,7 @@
 #include "returns/looks.hpp"
 #include "returns/onto_planes.hpp"
 #include "returns/ray_average.hpp"
+#include "returns/smooth_distances.hpp"
 #include "returns/surface_crossings.hpp"
 #include "surface/marching_cubes.hpp"
 #include "surface/ray_tracing.hpp"
@@ -225,6 +226,8 @@ void sums_and_rays(int threads, Results& results) {
   std::vector<float> weights(kPoints, 1.0F), distances(static_cast<std::size_t>(table.num_rows()));
   radarsdf::average_rays(table, {points.data(), directions.data(), directions.data(), weights.data(), kPoints}, 0.6,
                          distances.data(), threads);
+  radarsdf::smooth_distances(table, {points.data(), directions.data(), weights.data(), kPoints}, 3, distances.data(),
+                             threads);
   results.add(distances.data(), table.num_rows());
 }
 

@@ -21,6 +21,7 @@
 #include "returns/looks.hpp"
 #include "returns/principal_axes.hpp"
 #include "returns/ray_average.hpp"
+#include "returns/smooth_distances.hpp"
 #include "returns/surface_crossings.hpp"
 
 namespace {
@@ -323,8 +324,22 @@ TEST_CASE("rays that meet a plane straight average to its distance, cut at the t
               doctest::Approx(std::clamp(z, -kTruncation, kTruncation)).epsilon(1e-4));
     }
   }
+  // What agrees with the planes already stays, but for rounding, where the truncation bends nothing.
+  for (const int threads : test::kThreads) {
+    std::vector<float> distances(static_cast<std::size_t>(table.num_rows()));
+    for (std::size_t row = 0; row < distances.size(); ++row)
+      distances[row] = static_cast<float>(vertices.coordinates[3 * row + 2] * kSize) - kHeight;
+    radarsdf::smooth_distances(table, {points.data(), normals.data(), weights.data(), kRays}, 5, distances.data(),
+                               threads);
+    for (std::size_t row = 0; row < distances.size(); ++row) {
+      const double z = vertices.coordinates[3 * row + 2] * kSize - static_cast<double>(kHeight);
+      REQUIRE(static_cast<double>(distances[row]) == doctest::Approx(z).epsilon(1e-4));
+    }
+  }
   const radarsdf::VertexTable planes(cells.sorted_keys(1), kSize, 1, radarsdf::Encoding::kTriQuadtree, 1);
   float none = 0;
+  CHECK_THROWS_AS(radarsdf::smooth_distances(planes, {nullptr, nullptr, nullptr, 0}, 1, &none, 1),
+                  std::invalid_argument);
   CHECK_THROWS_AS(radarsdf::average_rays(planes, {nullptr, nullptr, nullptr, nullptr, 0}, kTruncation, &none, 1),
                   std::invalid_argument);
 }

@@ -147,9 +147,22 @@ def test_the_network_starts_as_one_input(hidden):
     assert network.layers[-1].weight.grad.any()
 
 
-def test_only_an_octree_holds_an_average():
-    with pytest.raises(ValueError, match="octree"):
-        FitConfig(training={"start": "average"})
+def test_a_smoothed_average_is_nearer_to_a_surface_that_bends_little():
+    rng = np.random.default_rng(2)
+    points, poses = rays_down([0.0], spacing_m=0.15)
+    points = [points[0] + [0, 0, 1] * rng.normal(0, 0.08, (len(points[0]), 1))]
+    x = inner_points()
+    errors = [
+        np.square(fit(points, poses, start=start).sdf(x) - x[:, 2]).mean()
+        for start in ("average", "smoothed")
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("start", ["average", "smoothed"])
+def test_only_an_octree_holds_an_average(start):
+    with pytest.raises(ValueError, match=f"'{start}' needs encoding.kind 'octree'"):
+        FitConfig(training={"start": start})
     with pytest.raises(ValueError, match="start"):
         FitConfig(training={"start": "zero"})
     with pytest.raises(ValueError, match="at least 2"):

@@ -77,7 +77,9 @@ def test_a_mesh_that_grows_is_that_of_a_quick_fit():
         live.integrate(SCENE.points[i], SCENE.poses[i], SCENE.intensities[i])
         grown = live.mesh()
         assert mesh_bits(grown) == mesh_bits(map_of(range(i + 1)).mesh())
-    quick = FitConfig.quick(num_threads=1, returns=KNOWN, encoding={"bridge_cells": 4})
+    quick = FitConfig.quick(
+        num_threads=1, returns=KNOWN, encoding={"bridge_cells": 4}, training={"start": "smoothed"}
+    )
     batch = radarsdf.fit(SCENE.points[:6], SCENE.poses[:6], config=quick, origin=ORIGIN, progress=False)
     whole = batch.mesh(quick.leaf_size_m, min_component_triangles=8)
     assert len(whole.faces) == len(grown.faces) > 1000
@@ -102,6 +104,21 @@ def test_a_change_reaches_the_bridges_that_it_opens_elsewhere():
     assert grown == mesh_bits(live.mesh())
 
 
+def test_a_change_far_along_a_drive_is_all_that_is_made_anew():
+    """Farther apart than smoothing carries anything, so that most of the map is none of the change's business."""
+    poses = SCENE.poses.copy()
+    poses[:, :3, 3] += 40.0 * np.arange(len(poses))[:, None] * [1, 0, 0]
+    live = map_of(range(7), poses=poses)
+    live.mesh()
+    live.integrate(SCENE.points[7], poses[6], SCENE.intensities[7])
+    surface, changes, noise = live._state.changes()
+    redone = surface.update(changes, noise, 1)
+    assert 0 < len(redone) < 0.4 * len(np.unique(surface._leaf_keys >> np.uint64(9)))
+    grown = mesh_bits(live.mesh())
+    live._state.forget_surface()
+    assert grown == mesh_bits(live.mesh())
+
+
 def test_map_and_finish_are_fits_of_all_scans():
     config = FitConfig(num_threads=1, training={"sdf_iterations": 3, "intensity_iterations": 3})
     live = map_of([3, 0, 2, 1, 4], config)
@@ -111,7 +128,10 @@ def test_map_and_finish_are_fits_of_all_scans():
     points, poses, intensities = scans
     for found, settings in (
         (live.finish(progress=False), config),
-        (live.map(), FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4})),
+        (
+            live.map(),
+            FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4}, training={"start": "smoothed"}),
+        ),
     ):
         fitted = radarsdf.fit(
             points, np.stack(poses), intensities, config=settings, origin=ORIGIN, progress=False

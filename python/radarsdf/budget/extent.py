@@ -14,7 +14,9 @@ from radarsdf.returns.rays import Rays
 def check_extent(rays: Rays, config: FitConfig) -> None:
     """A single outlier must not be met in the middle of the work, nor by an error that does not say what it is."""
     limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m
-    reach_m = max(config.near_band_m, config.truncation_m if config.training.start == "average" else 0.0)
+    reach_m = max(config.near_band_m, config.leaf_size_m)  # smoothing asks a leaf cell away from a return
+    if config.training.start != "noise":
+        reach_m = max(reach_m, config.truncation_m)
     if np.abs(rays.points).max() + reach_m > limit_m:
         distance_m = np.abs(rays.points).max(axis=1) + reach_m
         outside = int((distance_m > limit_m).sum())

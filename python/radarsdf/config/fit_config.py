@@ -92,9 +92,9 @@ class FitConfig:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        if self.training.start == "average":
+        if self.training.start != "noise":
             if self.encoding.kind != "octree" or min(self.networks.sdf_hidden) < 2:
-                msg = "training.start 'average' needs encoding.kind 'octree' and networks.sdf_hidden of at least 2"
+                msg = f"training.start {self.training.start!r} needs encoding.kind 'octree' and networks.sdf_hidden of at least 2"
                 raise ValueError(msg)
             # A vertex of the map that no ray counts at would keep the distance 0, that of the surface.
             if self.training.truncation_cells < self.sampling.near_band_cells:

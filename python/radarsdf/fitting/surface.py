@@ -45,7 +45,7 @@ class SurfaceReturns:
         given: ScanSums | None = None,
     ) -> SurfaceReturns:
         """Cleans `rays` as ``config.returns`` says, and keeps those that are `inside`, (N,). None: all."""
-        averages = config.training.start == "average"
+        averages = config.training.start != "noise"
         # Without an sdf stage, only the average uses the surface, and it takes distances to surfels anyway.
         onto_planes = config.returns.onto_planes and config.training.sdf_iterations != 0
         sums = ScanSums.of(rays, config.leaf_size_m, num_threads) if given is None else given

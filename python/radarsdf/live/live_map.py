@@ -52,7 +52,7 @@ class LiveMap:
     ----------
     config : FitConfig, optional
         Settings. :meth:`mesh` and :meth:`map` are those of :meth:`FitConfig.quick` with the same cells, returns, and bridges
-        over gaps; :meth:`finish` fits with all of them.
+        over gaps, and with ``training.start`` "smoothed"; :meth:`finish` fits with all of them.
     origin : (3,) array_like, optional
         Origin of the local frame, world, m. By default the first sensor position, moved to the next corner of a block of
         ``config.lattice``.
@@ -361,7 +361,7 @@ class LiveMap:
         return found.surface.mesh(found.scene.origin, kept, found.leaf_cells)
 
     def map(self) -> RadarMap:
-        """What is known now, as a map that does not grow: the quick fit of all scans. Intensities are in closed form.
+        """What is known now, as a map that does not grow: the quick fit of all scans, smoothed. Intensities are in closed form.
 
         Raises
         ------

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, Encoding, VertexTable
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.start import average_at_vertices, normals_at, told_by
+from radarsdf.fitting.start import average_at_vertices, cells_smoothed, normals_at, told_by
 from radarsdf.live.rows import ROUND, Keys, Replacement, changed_rows, leaves_of, shifted, within
 from radarsdf.map import queries
 from radarsdf.map.contents import Scene
@@ -29,6 +29,8 @@ from radarsdf.returns.scan_sums import ScanSums
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels, planes_round, support_round
 
 _NONE = np.zeros(0, np.uint64)
+_LARGE_BITS = np.uint64(3)  # by which the key of a block is longer than that of a large one
+_LARGE_CELLS = 16  # along its edge
 _PLANE = 9  # numbers of a surfel: centre, normal, variances
 
 
@@ -220,7 +222,9 @@ class GrowingSurface:
         # A cell that came or went tells which rays count at the corners of those round it.
         opened = shifted(np.setxor1d(leaf_keys, self._leaf_keys, assume_unique=True), ROUND)
         redone = np.union1d(near, np.unique(opened >> BLOCK_BITS))
-        round_them = leaves_of(_blocks_round(redone))
+        there = np.union1d(leaf_keys >> BLOCK_BITS, self._leaf_keys >> BLOCK_BITS)
+        redone = np.intersect1d(self._smoothed_with(redone), there, assume_unique=True)
+        round_them = leaves_of(self._smoothed_with(_blocks_round(redone)))
         here = within(true.keys, *round_them)
         self._remake(
             redone,
@@ -254,6 +258,18 @@ class GrowingSurface:
         inside = range(-cells, cells, 8)  # no more than a block apart
         return np.array(list(itertools.product([*inside, cells], repeat=3)), np.int64)
 
+    def _smoothed_with(self, blocks: Keys) -> Keys:
+        """Keys of these blocks, and of those that smoothing may reach from them, or them from."""
+        reach = cells_smoothed(self._config)
+        if reach == 0:
+            return blocks
+        # By larger blocks, of 16³ leaf cells: to step from all to all takes longer than what is smoothed too far away.
+        steps = _steps(math.ceil(reach / _LARGE_CELLS))
+        large = shifted(np.unique(blocks >> _LARGE_BITS) << (BLOCK_BITS + _LARGE_BITS), steps * _LARGE_CELLS)
+        large = np.unique(large >> (BLOCK_BITS + _LARGE_BITS))
+        found: Keys = ((large << _LARGE_BITS)[:, None] | np.arange(8, dtype=np.uint64)).reshape(-1)
+        return found
+
     def _remake(
         self,
         blocks: Keys,
@@ -269,7 +285,7 @@ class GrowingSurface:
         own = within(near, first, last)
         leaf_keys = near[own]
         table = VertexTable(near, size_m, 1, Encoding.OCTREE, num_threads)
-        distances_m = average_at_vertices(table, means, normals, config, num_threads)
+        distances_m = average_at_vertices(table, means, told, normals, config, num_threads)
         # As the field's features hold it.
         distances_m = distances_m / np.float32(config.sigma_m) * np.float32(config.sigma_m)
         _, vertices = table.leaf_vertices()
@@ -298,6 +314,11 @@ class GrowingSurface:
         evidence = queries.interpolated(found, self._leaf_keys, size_m, local(scene, vertices + self._origin))
         surface = Surface.told_by(scene, vertices, faces, evidence, len(self._leaf_keys))
         return Triangles(scene, surface, len(self._leaf_keys))
+
+
+def _steps(reach: int) -> NDArray[np.int64]:
+    """((2 reach + 1)³, 3) steps of at most so many along each axis."""
+    return np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)), np.int64)
 
 
 def _blocks_round(blocks: Keys) -> Keys:
