@@ -42,7 +42,18 @@ def test_the_second_way_and_the_cubes_are_elsewhere():
     assert off_m.min() > 0.01
     np.testing.assert_allclose(np.linalg.det(way[:, :3, :3]), 1)
     changes = cubes(drive, rng)
-    assert {change.kind for change in changes} <= {"put in", "taken out", "moved"}
+    assert {change.kind for change in changes} <= {
+        "put in",
+        "taken out",
+        "moved",
+        "repainted",
+        "patch repainted",
+    }
+    painted = [change for change in changes if "repainted" in change.kind]
+    assert painted
+    for change in painted:
+        np.testing.assert_array_equal(change.before.center, change.after.center)
+        assert abs(change.before.material.reflectivity_db - change.after.material.reflectivity_db) == 6
     assert len(changes) > 3
     for change in changes:
         box = change.before or change.after

@@ -112,7 +112,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "9"
+    assert metadata["format_version"] == "10"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -157,7 +157,7 @@ def test_files_of_other_programs(tmp_path):
             radarsdf.load(tmp_path / "other.safetensors")
 
 
-@pytest.mark.parametrize("version", ["4", "5", "10", "", "1.5", "-1", "one"])
+@pytest.mark.parametrize("version", ["4", "5", "9", "11", "", "1.5", "-1", "one"])
 def test_other_versions(saved, tmp_path, version):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "new.safetensors", tensors, metadata | {"format_version": version})
@@ -421,3 +421,21 @@ def test_columns_of_features_that_are_zero_are_not_in_the_file(saved, tmp_path):
     assert again.field.cells.features.equal(quick.field.cells.features)
     assert saved[2]["field.cells.features"].shape[1] == 8
     assert again.nbytes == quick.nbytes > 3 * (tmp_path / "quick.safetensors").stat().st_size / 2
+
+
+def test_echoes_are_kept_bit_for_bit(scene, tmp_path):
+    radar_map, path, tensors, metadata = saved_parts(fitted(scene, returns={"passages": True}), tmp_path)
+    loaded, expected = radarsdf.load(path).echoes(), radar_map.echoes()
+    assert len(expected.counts) > 100
+    for name in ("points", "directions", "ranges_m", "intensities", "counts"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(expected, name))
+    assert loaded.sigma == expected.sigma > 0
+    for name, wrong in (
+        ("counts", torch.zeros_like(tensors["echoes.counts"])),
+        ("points", tensors["echoes.points"][:-1]),
+        ("intensities", tensors["echoes.intensities"] * math.nan),
+        ("directions", tensors["echoes.directions"].to(torch.int16)),
+    ):
+        write(path, tensors | {f"echoes.{name}": wrong}, metadata)
+        with pytest.raises(ValueError, match="is not a whole radarsdf map: the echoes"):
+            radarsdf.load(path)

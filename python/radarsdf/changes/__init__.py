@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Two maps of one place: what appeared, what is gone, what moved its surface."""
+"""Two maps of one place: what appeared, what is gone, what moved its surface, what was repainted."""

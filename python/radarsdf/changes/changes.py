@@ -19,13 +19,15 @@ from radarsdf.map.isosurface import mesh_components
 if TYPE_CHECKING:
     import trimesh
 
-UNSEEN, SAME, GONE, APPEARED, MOVED = -1, 0, 1, 2, 3
-NAMES = {UNSEEN: "unseen", SAME: "same", GONE: "gone", APPEARED: "appeared", MOVED: "moved"}
-CHANGED = (APPEARED, GONE, MOVED)
+UNSEEN, SAME, GONE, APPEARED, MOVED, REPAINTED = -1, 0, 1, 2, 3, 4
+NAMES = {
+    UNSEEN: "unseen", SAME: "same", GONE: "gone", APPEARED: "appeared", MOVED: "moved", REPAINTED: "repainted",
+}  # fmt: skip
+CHANGED = (APPEARED, GONE, MOVED, REPAINTED)
 # Told from each other by colour-blind people, too (Okabe and Ito 2008).
 COLORS = {
     UNSEEN: (225, 225, 225), SAME: (165, 165, 165), GONE: (213, 94, 0), APPEARED: (0, 158, 115),
-    MOVED: (230, 159, 0),
+    MOVED: (230, 159, 0), REPAINTED: (204, 121, 167),
 }  # fmt: skip
 
 
@@ -38,13 +40,15 @@ class ChangedSurface:
     faces: NDArray[np.int32]
     """(F, 3) rows of vertices. They face free space."""
     kind: NDArray[np.int8]
-    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved. Unseen: the other map does not tell."""
+    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved, 4 repainted. Unseen: the other map does not tell. Repainted, on the
+    later surface: as it was, but for its reflectance."""
     probability: NDArray[np.float32]
     """(V,) of that change; of the likeliest one where it is the same or unseen."""
     moved_m: NDArray[np.float32]
     """(V,) how far the surface moved along its normal towards free space, m. NaN where it did not."""
     intensity_change: NDArray[np.float32]
-    """(V,) later less earlier reflectance, sensor units, without what all places have in common. NaN where it is unknown."""
+    """(V,) later less earlier intensity from views that both drives had, sensor units, without what all places have in
+    common. NaN where there were none."""
 
     def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
         """(F,) kind of each face, that of most of its vertices, or the first; and areas, m²."""
@@ -59,7 +63,7 @@ class Region:
     """Faces of one change that hang together."""
 
     kind: str
-    """``appeared``, ``gone`` or ``moved``."""
+    """``appeared``, ``gone``, ``moved`` or ``repainted``."""
     box: Floats
     """(2, 3) lower and upper corner, world of the earlier map, m."""
     area_m2: float
@@ -75,7 +79,7 @@ class Changes:
     before: ChangedSurface
     """The earlier surface: what is gone, and what moved."""
     after: ChangedSurface
-    """The later surface: what appeared, and what moved."""
+    """The later surface: what appeared, what moved, and what was repainted."""
     T_before_after: Floats
     """(4, 4) from the later map's world to that of the earlier one, m."""
     report: dict[str, Any]
@@ -87,7 +91,7 @@ class Changes:
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:
         """Changes that hang together, the largest first; without those of a smaller area, m²."""
         found = []
-        for surface, kinds in ((self.before, (GONE, MOVED)), (self.after, (APPEARED, MOVED))):
+        for surface, kinds in ((self.before, (GONE, MOVED)), (self.after, (APPEARED, MOVED, REPAINTED))):
             of_faces, areas = surface.of_faces()
             for kind in kinds:
                 rows = np.flatnonzero(of_faces == kind)
@@ -108,8 +112,8 @@ class Changes:
     def mesh(self) -> trimesh.Trimesh:
         """The later surface, and of the earlier one what is gone or moved, in colours.
 
-        Green appeared, vermilion is gone, orange moved, grey is the same, and light grey was
-        not seen before. `kind`, `probability`, `moved_m` and `intensity_change` are attributes of the vertices.
+        Green appeared, vermilion is gone, orange moved, purple was repainted, grey is the same, and light
+        grey was not seen before. `kind`, `probability`, `moved_m` and `intensity_change` are attributes of the vertices.
         """
         import trimesh  # noqa: PLC0415 - slow to import
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from radarsdf.changes.alignment import Alignment, align, unaligned
 from radarsdf.changes.changes import (
@@ -18,6 +17,7 @@ from radarsdf.changes.changes import (
     GONE,
     MOVED,
     NAMES,
+    REPAINTED,
     SAME,
     UNSEEN,
     ChangedSurface,
@@ -32,12 +32,12 @@ from radarsdf.changes.probability import (
     posterior,
     share_of_changes,
 )
+from radarsdf.changes.reflectance import Differences
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
 from radarsdf.map.meshing import check_box
-from radarsdf.returns.evidence import CELLS_OF_SURFACE
 
 _PROBABLE = 0.5  # more likely than not
 _PARALLEL = np.cos(np.pi / 4)  # a surface that moved is still about parallel
@@ -52,12 +52,13 @@ def compare(
     align_frames: bool = True,
     box: ArrayLike | None = None,
 ) -> Changes:
-    """What appeared, what is gone and what moved its surface between two maps, and how their reflectance differs.
+    """What appeared, what is gone, what moved its surface and what was repainted between two maps.
 
     "Not seen" is not "gone". A surface is gone only where rays of the later drive passed the place, and it appeared only where
     those of the earlier drive did. A place that the other drive did not see through is unseen. How likely a change is follows
     from both maps: from their distance beside their uncertainty, from how many scans hit the place and passed it on both
-    days, and from the confidence of the surface that changed. How much changes at all is found from all places together.
+    days, from the confidence of the surface that changed, and from how strong returns were that were seen alike. How much changes at
+    all is found from all places together.
 
     Parameters
     ----------
@@ -89,9 +90,8 @@ def compare(
     Notes
     -----
     A thing that stood on the ground is "moved" where its top was about parallel to the ground and within two leaf cells of it.
-    Reflectance is compared as from the middle of the earlier drive, and only where the surface is the same. A box of 2 m
-    repainted by 10 dB shows 7 to 10 dB. But where nothing changed, 5 % of the places differ by 2 to 10 dB, too, so that
-    `intensity_change` is no change of its own, and has no probability.
+    Repainted is what both maps have, but what answers more strongly or weakly on the later day, from views that both drives had.
+    Echoes near what appeared, went or moved are left out.
     """
     if not isinstance(before, Map):
         msg = f"before must be a map, not {type(before).__name__}"
@@ -117,19 +117,32 @@ def compare(
     errors = errors_of([side.beside for side in sides])
     found = [side.beside.absence(errors) for side in sides]
     share = share_of_changes(np.concatenate([absence.absent for absence in found]))
-    surfaces, offset = [], None
-    for side, absence, kind in zip(sides, found, (GONE, APPEARED), strict=True):
-        kinds, probability, moved_m = side.kinds(absence, share, kind)
-        change = np.full(len(kinds), np.nan)
-        if kind == APPEARED and before.has_intensity and after.has_intensity:
-            change, offset = side.reflectance(kinds)
-        surfaces.append(
-            ChangedSurface(
-                side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m.astype(np.float32),
-                change.astype(np.float32),
-            )
-        )  # fmt: skip
-    return _summed(surfaces[0], surfaces[1], alignment, share, errors, offset)
+    told = [
+        side.kinds(absence, share, kind)
+        for side, absence, kind in zip(sides, found, (GONE, APPEARED), strict=True)
+    ]
+    differences = Differences.of(earlier, later)
+    changes = [np.full(len(side.vertices), np.nan) for side in sides]
+    if differences is not None:
+        changed = np.concatenate(
+            [side.vertices[kinds > SAME] for side, (kinds, _, _) in zip(sides, told, strict=True)]
+        )
+        kinds, probability, moved_m = told[1]
+        same = kinds == SAME
+        changes[1], repainted = differences.apart_from(changed).probability(of_after.vertices, same)
+        told[1] = (
+            np.where(repainted > _PROBABLE, REPAINTED, kinds).astype(np.int8),
+            np.where(same, np.maximum(probability, repainted), probability),
+            moved_m,
+        )
+    before_surface, after_surface = (
+        ChangedSurface(
+            side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m.astype(np.float32),
+            change.astype(np.float32),
+        )
+        for side, (kinds, probability, moved_m), change in zip(sides, told, changes, strict=True)
+    )  # fmt: skip
+    return _summed(before_surface, after_surface, alignment, share, errors, differences)
 
 
 def _quick(config: FitConfig) -> FitConfig:
@@ -185,42 +198,10 @@ class _Side:
         towards = -other.distance_m if lost == GONE else other.distance_m
         return kinds, probability, np.where(kinds == MOVED, towards, np.nan)
 
-    def reflectance(self, kinds: NDArray[np.int8]) -> tuple[Floats, float | None]:
-        """Differences of intensities (V,), later less earlier, without their median, and this."""
-        x, maps = self.vertices, (self.other_map, self.own_map)
-        earlier = maps[0]
-        # As from the middle of the earlier drive, at a range that both sensors measured.
-        towards = earlier.to_common(earlier.radar_map.origin[None]) - x
-        away_m = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-6)
-        sensors = x + towards / away_m * np.sqrt(np.prod(earlier.radar_map.sensor.range_m))
-        first, second = (
-            placed.radar_map.intensity(placed.to_own(x), placed.to_own(sensors)) for placed in maps
-        )
-        scales = [scale for placed in maps if (scale := placed.radar_map.intensity_scale) is not None]
-        low, high = max(scale.low for scale in scales), min(scale.high for scale in scales)
-        margin = 1e-4 * (high - low)
-        # At the ends of a scale it may be anything beyond.
-        with np.errstate(invalid="ignore"):
-            known = (np.minimum(first, second) > low + margin) & (np.maximum(first, second) < high - margin)
-        change = _smoothed(x, np.where(known & (kinds == SAME), second - first, np.nan))
-        if np.isnan(change).all():
-            return change, None
-        offset = float(np.nanmedian(change))
-        return change - offset, offset
-
-
-def _smoothed(x: Floats, values: Floats) -> Floats:
-    """(N,) medians over as many places as a surface has cells round each: single ones are off by 10 dB at edges."""
-    found = np.full(len(x), np.nan)
-    rows = np.flatnonzero(np.isfinite(values))
-    if len(rows) >= CELLS_OF_SURFACE:
-        _, near = cKDTree(x[rows]).query(x[rows], CELLS_OF_SURFACE)
-        found[rows] = np.median(values[rows][near], axis=1)
-    return found
-
 
 def _summed(
-    before: ChangedSurface, after: ChangedSurface, alignment: Alignment, share: float, errors: Errors, offset: float | None
+    before: ChangedSurface, after: ChangedSurface, alignment: Alignment, share: float, errors: Errors,
+    differences: Differences | None,
 ) -> Changes:  # fmt: skip
     areas = dict.fromkeys((NAMES[kind] for kind in CHANGED), 0.0)
     compared = 0.0
@@ -236,6 +217,6 @@ def _summed(
         "changed_share": share,
         "scale": errors.scale,
         "freedom": errors.freedom,
-        "intensity_offset": offset,
+        "intensity_offset": None if differences is None else differences.offset,
     }
     return Changes(before, after, alignment.T_before_after, report)

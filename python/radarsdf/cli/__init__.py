@@ -28,7 +28,7 @@ COMMANDS = {
     "tiles": "fit a map that does not fit into memory, in tiles, here or on a cluster",
     "mesh": "extract the surface of a map as a triangle mesh",
     "grid": "write what is occupied, free and unknown, for planners: OctoMap, ROS's map_server, costs for wheels",
-    "compare": "say what appeared, is gone or moved between two maps, or a map and new scans",
+    "compare": "say what appeared, is gone, moved or was repainted between two maps, or a map and new scans",
     "view": "show a map in the browser, with a sensor that can be dragged",
     "render": "predict the scan that the radar would get from other poses",
     "report": "write a page about a map: pictures, errors, plots, settings",

@@ -30,6 +30,7 @@ from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
+from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence, Looks, ReturnsOfCells
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.passages import Passages
@@ -200,6 +201,7 @@ def _learn_directly(
     _initialise(field, start, config)
     evidence = Evidence.of(returns, rays, leaf_keys, config.leaf_size_m, num_threads, given.looks)
     passages = _passages(given, surface, config, num_threads)
+    echoes = _echoes(learnt, scale, config)
     clock.lap("start_s")
     schedule = Schedule.of(
         config,
@@ -222,6 +224,7 @@ def _learn_directly(
         config=config,
         evidence=evidence,
         passages=passages,
+        echoes=echoes,
         rough_share=rough_share,
         sensor=sensor,
         report=_report(given, learnt, surface, field, schedule, config, num_threads),
@@ -245,6 +248,16 @@ def _passages(given: FitInput, surface: SurfaceReturns, config: FitConfig, num_t
         return Passages.none()
     rays = given.rays if surface.true is None else given.rays.select(surface.true)
     return Passages.of(rays, surface.noise, config.leaf_size_m, given.box_cells, num_threads)
+
+
+def _echoes(rays: Rays, scale: IntensityScale | None, config: FitConfig) -> Echoes:
+    """How strong the returns were, for comparisons, which need passages, too."""
+    known = rays.with_intensity
+    if not config.returns.passages or scale is None or not known.any():
+        return Echoes.none()
+    chosen = rays if known.all() else rays.select(known)
+    assert chosen.intensities is not None
+    return Echoes.of(chosen, scale.to_unit(chosen.intensities), config.leaf_size_m)
 
 
 def _initialise(field: Field, start: Start, config: FitConfig) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
+from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.passages import Passages
 from radarsdf.returns.reflectance import Reflectance
@@ -51,3 +52,5 @@ class MapContents(Scene):
     """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
     passages: Passages = dataclasses.field(default_factory=Passages.none)
     """What rays passed. Empty if the map keeps none."""
+    echoes: Echoes = dataclasses.field(default_factory=Echoes.none)
+    """How strong the returns were. Empty if the map keeps no passages, or was fitted without intensities."""

@@ -16,6 +16,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries
 from radarsdf.map.positions import as_positions
+from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -391,6 +392,10 @@ class Map(ABC):
     def has_intensity(self) -> bool:
         """Whether intensities were given to the fit."""
         return self.intensity_scale is not None
+
+    @abstractmethod
+    def echoes(self) -> EchoesAt:
+        """How strong the returns of the fit were. Empty without intensities, or without ``returns.passages``."""
 
     @property
     @abstractmethod

@@ -20,6 +20,7 @@ from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
 from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.sensor import Sensor
 
@@ -155,6 +156,12 @@ class RadarMap(Map):
     @property
     def intensity_scale(self) -> IntensityScale | None:
         return self._contents.intensity_scale
+
+    def echoes(self) -> EchoesAt:
+        scale = self.intensity_scale
+        return self._contents.echoes.in_world(
+            self.origin, *((0, 1) if scale is None else (scale.low, scale.high))
+        )
 
     @property
     def rough_share(self) -> float:

@@ -24,18 +24,23 @@ from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors
 from radarsdf.map.contents import MapContents
 from radarsdf.map.fit_report import checked_report
+from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.passages import Passages
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 9
+FORMAT_VERSION = 10
 _FEATURES = "field.cells.features"
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
 _PASSAGES = ("keys", "planes")  # bits, stored as int64, which all readers of safetensors have
+_ECHOES = {
+    "points": torch.float32, "directions": torch.int8, "ranges_m": torch.float16, "intensities": torch.float32,
+    "counts": torch.int16,
+}  # fmt: skip
 # Types and numbers of dimensions of the arrays of `Reflectance`. Keys have at most 63 bits, as those of leaf cells.
 _REFLECTANCE = {
     "coefficients": (torch.float64, 2),
@@ -105,6 +110,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         f"passages.{name}": torch.from_numpy(getattr(contents.passages, name).view(np.int64))
         for name in _PASSAGES
     }
+    tensors |= {f"echoes.{name}": torch.from_numpy(getattr(contents.echoes, name)) for name in _ECHOES}
     if contents.reflectance is not None:
         tensors |= _tensors_of(contents.reflectance)
     scale = contents.intensity_scale
@@ -112,6 +118,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
         "network_share": None if contents.reflectance is None else contents.reflectance.network_share,
+        "echo_sigma": contents.echoes.sigma,
         "rough_share": contents.rough_share,
         "sensor": contents.sensor.to_dict(),
         "report": contents.report,
@@ -170,6 +177,17 @@ def _passages_of(tensors: dict[str, Tensor]) -> Passages:
     passages = Passages(*(array.numpy().copy().view(np.uint64) for array in arrays))
     passages.check()
     return passages
+
+
+def _echoes_of(tensors: dict[str, Tensor], sigma: float, leaf_size_m: float) -> Echoes:
+    """Takes its part of the tensors."""
+    arrays = {name: tensors.pop(f"echoes.{name}") for name in _ECHOES}
+    if any(array.dtype != _ECHOES[name] or not array.isfinite().all() for name, array in arrays.items()):
+        msg = "the echoes are not finite, or of other types"
+        raise ValueError(msg)
+    echoes = Echoes(**{name: array.numpy().copy() for name, array in arrays.items()}, sigma=sigma)
+    echoes.check(leaf_size_m)
+    return echoes
 
 
 @torch.inference_mode(mode=False)  # or the map could not give gradients
@@ -259,6 +277,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         msg = "information holds something other than finite numbers of at least 0"
         raise ValueError(msg)
     passages = _passages_of(tensors)
+    echoes = _echoes_of(tensors, float(description["echo_sigma"]), config.leaf_size_m)
     scale = None
     if description["intensity_scale"] is not None:
         scale = IntensityScale.between(description["intensity_scale"])
@@ -301,6 +320,7 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         report=checked_report(description["report"]),
         evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
         passages=passages,
+        echoes=echoes,
         rough_share=rough_share,
         sensor=Sensor.from_dict(description["sensor"]),
     )

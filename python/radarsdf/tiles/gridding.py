@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What is known of leaf cells in a box that reaches over several tiles."""
+"""What tiles know place by place, each of its own places: leaf cells in a box, and echoes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.map.gridding import CellsInBox, cells_of
+from radarsdf.returns.echoes import EchoesAt
 from radarsdf.tiles.blend import TileBlend
 
 
@@ -34,3 +35,16 @@ def cells_of_tiles(tiles: TileBlend, lower: NDArray[np.float64], upper: NDArray[
         )
         passed[place], returns[place], observed[place] = found
     return CellsInBox(lattice.position(first), passed, returns, observed)
+
+
+def echoes_of_tiles(tiles: TileBlend) -> EchoesAt:
+    """See :meth:`Map.echoes`. Each is that of the tile that it lies in."""
+    scale = tiles.intensity_scale
+    ends = (0.0, 1.0) if scale is None else (scale.low, scale.high)
+    found = []
+    for planned in tiles.tiles:
+        contents = tiles.contents_of(planned.tile)
+        echoes = contents.echoes.in_world(contents.origin, *ends)
+        cells = np.floor(tiles.config.lattice.cells(echoes.points)[:, :2])
+        found.append(echoes.select((cells // tiles.plan.tile_cells == planned.tile).all(axis=1)))
+    return EchoesAt.together(found)

@@ -19,6 +19,7 @@ from torch import Tensor
 from radarsdf.checks import check_poses, instance, path_of, real_array
 from radarsdf.map import queries, storage
 from radarsdf.map.map import Map
+from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.blend import Share, TileBlend, averages, distance
 from radarsdf.tiles.drive_poses import DrivePoses
@@ -152,6 +153,11 @@ class TiledMap(TileBlend, Map):
         from radarsdf.tiles.gridding import cells_of_tiles  # noqa: PLC0415 - it imports trimesh, which is slow
 
         return cells_of_tiles(self, lower, upper)
+
+    def echoes(self) -> EchoesAt:
+        from radarsdf.tiles.gridding import echoes_of_tiles  # noqa: PLC0415 - as above
+
+        return echoes_of_tiles(self)
 
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
         return self.evidence(_contiguous(world))

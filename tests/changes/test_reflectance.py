@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Two drives through one place, between which boxes are repainted."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf.changes.changes import REPAINTED, UNSEEN
+from radarsdf.poses.rigid import transform
+from radarsdf.simulate import Box, Scene, simulate
+from radarsdf.simulate.materials import CONCRETE
+
+STRONGER, WEAKER, KEPT = (np.array([2.5, y, 0.5]) for y in (2.8, -0.2, -3.2))
+QUICK = radarsdf.FitConfig.quick(returns={"passages": True})
+STRONGER_DB, GAIN_DB = 8.0, 5.0
+
+
+def box(center, more_db=0.0):
+    material = dataclasses.replace(CONCRETE, reflectivity_db=CONCRETE.reflectivity_db + more_db)
+    return Box(center, np.full(3, 0.5), 0.3, material)
+
+
+@pytest.fixture(scope="module")
+def drives():
+    """A drive past a wall with three boxes, one without changes, and one after two were repainted."""
+    drive = radarsdf.simulate.wall(frames=24)
+    other = drive.poses.copy()
+    other[:, 1, 3] += 0.3
+    before, after = (
+        Scene([*drive.scene.solids, box(STRONGER, more), box(WEAKER, -more), box(KEPT)], drive.scene.terrain)
+        for more in (0.0, STRONGER_DB)
+    )
+    return [
+        simulate(scene, drive.sensor, poses, name="wall", seed=seed, lidar_rays=1)
+        for scene, poses, seed in ((before, drive.poses, 1), (before, other, 2), (after, other, 3))
+    ]
+
+
+@pytest.fixture(scope="module")
+def maps(drives):
+    return [radarsdf.fit(drive.points, drive.poses, drive.intensities, config=QUICK) for drive in drives]
+
+
+@pytest.fixture(scope="module")
+def changes(maps):
+    return radarsdf.compare(maps[0], maps[2])
+
+
+def on_box(surface, center):
+    """Share of a box's area that is repainted, and the median change of intensity there."""
+    kinds, areas = surface.of_faces()
+    middle = surface.vertices[surface.faces].mean(axis=1)
+    on = (np.abs(box(center).signed_distance(middle)) < 0.15) & (middle[:, 2] > 0.3)
+    change = np.nanmedian(surface.intensity_change[np.unique(surface.faces[on])])
+    return areas[on & (kinds == REPAINTED)].sum() / areas[on].sum(), change
+
+
+def test_what_was_repainted_is_found_and_nothing_else(changes):
+    for center, more in ((STRONGER, STRONGER_DB), (WEAKER, -STRONGER_DB)):
+        share, change = on_box(changes.after, center)
+        assert share > 0.7
+        assert abs(change - more) < 2.0
+    assert on_box(changes.after, KEPT)[0] == 0
+    kinds, areas = changes.after.of_faces()
+    middle = changes.after.vertices[changes.after.faces].mean(axis=1)
+    away = np.min([box(center).signed_distance(middle) for center in (STRONGER, WEAKER)], axis=0) > 0.6
+    assert areas[away & (kinds == REPAINTED)].sum() < 0.005 * areas[away & (kinds != UNSEEN)].sum()
+    found = [region for region in changes.regions(0.5) if region.kind == "repainted"]
+    assert len(found) == 2
+    assert min(region.probability for region in found) > 0.8
+    assert changes.report["areas_m2"]["repainted"] >= sum(region.area_m2 for region in found) > 2
+
+
+def test_nothing_was_repainted_between_two_drives_through_one_scene(maps):
+    same = radarsdf.compare(maps[0], maps[1])
+    assert same.report["areas_m2"]["repainted"] < 0.0025 * same.report["compared_m2"]
+    assert abs(same.report["intensity_offset"]) < 0.2
+
+
+def test_another_gain_and_another_frame_are_no_change(drives, maps):
+    apart = transform(np.array([0.0, 0.0, 0.03]), np.array([0.4, -0.3, 0.1]))
+    drive = drives[1]
+    louder = [intensities + GAIN_DB for intensities in drive.intensities]
+    other = radarsdf.fit(drive.points, apart @ drive.poses, louder, config=QUICK)
+    found = radarsdf.compare(maps[0], other)
+    assert "moved" in found.report["alignment"]
+    assert abs(found.report["intensity_offset"] - GAIN_DB) < 0.3
+    assert found.report["areas_m2"]["repainted"] < 0.0025 * found.report["compared_m2"]
+
+
+def test_without_intensities_nothing_is_said_of_them(drives, maps):
+    blind = radarsdf.fit(drives[2].points, drives[2].poses, config=QUICK)
+    found = radarsdf.compare(maps[0], blind)
+    assert len(blind.echoes().counts) == 0
+    assert found.report["intensity_offset"] is None
+    assert np.isnan(found.after.intensity_change).all()
+    assert found.report["areas_m2"]["repainted"] == 0
