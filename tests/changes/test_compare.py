@@ -121,6 +121,35 @@ def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
         np.testing.assert_array_equal(arrays["before_kind"], changes.before.kind)
 
 
+def test_the_command_writes_a_page_and_shows_what_changed(maps, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
+    from radarsdf.view import changed  # noqa: PLC0415
+
+    def stop(view):
+        assert view.port > 0
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(changed.ChangesView, "wait", stop)
+    for number, name in ((0, "a"), (2, "b")):
+        maps[number].save(tmp_path / f"{name}.safetensors")
+    page = tmp_path / "changes.html"
+    arguments = [
+        "compare",
+        *(str(tmp_path / f"{n}.safetensors") for n in "ab"),
+        "--report",
+        str(page),
+        "--view",
+    ]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "what changed is on http://" in said
+    assert f"{page} written" in said
+    text = page.read_text("utf-8")
+    assert "a.safetensors and b.safetensors: what changed" in text
+    assert text.count("data:image/jpeg") >= 5
+
+
 def test_maps_without_passages_and_poses_of_maps_are_refused(maps, drives):
     drive = drives[0]
     blind = radarsdf.fit(drive.points[:4], drive.poses[:4], config=radarsdf.FitConfig.quick())

@@ -70,6 +70,20 @@ class Region:
     """Area, m²."""
     probability: float
     """Mean over its vertices."""
+    moved_m: float | None
+    """How far it moved along its normal, mean, m. None of other changes."""
+    intensity_change: float | None
+    """Later less earlier intensity, mean, sensor units. None of other changes."""
+
+    @property
+    def words(self) -> str:
+        """What happened, such as "moved by 0.21 m"."""
+        if self.moved_m is not None:
+            return f"{self.kind} by {abs(self.moved_m):.2f} m"
+        if self.intensity_change is not None:
+            stronger = "stronger" if self.intensity_change > 0 else "weaker"
+            return f"{self.kind}, {abs(self.intensity_change):.1f} {stronger}"
+        return self.kind
 
 
 @dataclass(frozen=True)
@@ -104,6 +118,8 @@ class Changes:
                         Region(
                             NAMES[kind], np.stack([x.min(axis=0), x.max(axis=0)]), float(areas[faces].sum()),
                             float(surface.probability[vertices].mean()),
+                            _mean(surface.moved_m[vertices]) if kind == MOVED else None,
+                            _mean(surface.intensity_change[vertices]) if kind == REPAINTED else None,
                         )
                     )  # fmt: skip
         found.sort(key=lambda region: -region.area_m2)
@@ -127,8 +143,7 @@ class Changes:
             mesh.vertex_attributes[name] = np.concatenate(
                 [getattr(self.after, name), getattr(self.before, name)[used]]
             )
-        table = np.array([COLORS[kind] for kind in sorted(COLORS)], np.uint8)
-        colors = table[np.asarray(mesh.vertex_attributes["kind"], np.int64) + 1]
+        colors = colors_of(np.asarray(mesh.vertex_attributes["kind"], np.int8))
         mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
         return mesh
 
@@ -156,3 +171,14 @@ class Changes:
             return
         arrays = {f"{side}_{name}": value for side in ("before", "after") for name, value in vars(getattr(self, side)).items()}  # fmt: skip
         write_arrays(target, {"T_before_after": self.T_before_after} | arrays, compressed=True)
+
+
+def colors_of(kinds: NDArray[np.int8]) -> NDArray[np.uint8]:
+    """(V, 3) sRGB of kinds (V,)."""
+    table = np.array([COLORS[kind] for kind in sorted(COLORS)], np.uint8)
+    return table[np.asarray(kinds, np.int64) - min(COLORS)]
+
+
+def _mean(values: NDArray[np.float32]) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else None

@@ -5,12 +5,18 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from radarsdf.cli.map_in import add_map, is_map, load_map
-from radarsdf.cli.options import add_box, add_json, box_of
+from radarsdf.cli.options import add_address, add_box, add_json, box_of
 from radarsdf.cli.results import Results
+from radarsdf.cli.saying import say
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
+
+if TYPE_CHECKING:
+    from radarsdf.changes.changes import Changes, Region
 
 _SAID = 10  # regions, the largest first
 
@@ -25,6 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="the file to write: a mesh in colours, such as changes.ply, or .npz with all arrays",
     )
+    parser.add_argument(
+        "--report", type=Path, metavar="PAGE", help="write a page about what changed, such as changes.html"
+    )
+    parser.add_argument(
+        "--view", action="store_true", help="show what changed in the browser at the end, until Ctrl-C"
+    )
+    add_address(parser)
     parser.add_argument(
         "--align",
         action=argparse.BooleanOptionalAction,
@@ -44,12 +57,21 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.files import check_outputs
     from radarsdf.io.meshes import check_mesh_path
 
-    if options.out is not None:
-        if options.out.suffix != ".npz":
-            check_mesh_path(options.out)
-        check_outputs([options.out], [options.map, *inputs_of(options)])
+    if options.out is not None and options.out.suffix != ".npz":
+        check_mesh_path(options.out)
+    check_outputs([options.out, options.report], [options.map, *inputs_of(options)])
+    if options.report is not None:
+        from radarsdf.report.extras import require_extras
+
+        require_extras()
+    if options.view:
+        from radarsdf.view.serving import free_port, require_viser
+
+        require_viser()
+        free_port(options.host, options.port or 0, exactly=True)
     after = load_map(options.scans) if is_map(options.scans) else scans_of(options)
-    changes = compare(load_map(options.map), after, align_frames=options.align, box=box_of(options))
+    before = load_map(options.map)
+    changes = compare(before, after, align_frames=options.align, box=box_of(options))
     results = Results(options)
     report = changes.report
     results.add(report["alignment"], alignment=report["alignment"], T_before_after=changes.T_before_after)
@@ -63,7 +85,7 @@ def run(options: argparse.Namespace) -> None:
     for region in regions[:_SAID]:
         x, y, z = region.box.mean(axis=0)
         results.add(
-            f"{region.kind}: {region.area_m2:.2f} m2 round {x:.1f} {y:.1f} {z:.1f}, probability {region.probability:.2f}"
+            f"{region.words}: {region.area_m2:.2f} m2 round {x:.1f} {y:.1f} {z:.1f}, probability {region.probability:.2f}"
         )
     results.add(
         regions=[
@@ -72,6 +94,8 @@ def run(options: argparse.Namespace) -> None:
                 "box": region.box,
                 "area_m2": region.area_m2,
                 "probability": region.probability,
+                "moved_m": region.moved_m,
+                "intensity_change": region.intensity_change,
             }
             for region in regions
         ]
@@ -79,4 +103,26 @@ def run(options: argparse.Namespace) -> None:
     if options.out is not None:
         changes.save(options.out)
         results.add(f"{options.out} written", out=options.out)
+    edge_m = before.config.leaf_size_m
+    if options.report is not None:
+        from radarsdf.report.changes import write_changes_report
+
+        names = options.map.absolute().name, options.scans.absolute().name
+        write_changes_report(options.report, changes, names, edge_m, regions)
+        results.add(f"{options.report} written", report=options.report)
     results.end()
+    if options.view:
+        _show(changes, regions, edge_m, options)
+
+
+def _show(changes: Changes, regions: Sequence[Region], edge_m: float, options: argparse.Namespace) -> None:
+    """Serve a page until Ctrl-C, and say where."""
+    from radarsdf.view.changed import ChangesView
+    from radarsdf.view.serving import url_of
+
+    with ChangesView(changes, regions, edge_m, host=options.host, port=options.port) as view:
+        say(f"what changed is on {url_of(view.host, view.port)}; Ctrl-C ends it")
+        try:
+            view.wait()
+        except KeyboardInterrupt:  # the way to end it, and no failure
+            say("stopped")

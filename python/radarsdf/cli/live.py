@@ -10,7 +10,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from radarsdf.cli.options import add_fit_options, add_json, config_of, progress_of
+from radarsdf.cli.options import add_address, add_fit_options, add_json, config_of, progress_of
 from radarsdf.cli.results import Results, counted
 from radarsdf.cli.saving import save_map
 from radarsdf.cli.saying import say
@@ -46,10 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--find", action="store_true", help="do not use the poses of the scans: track them on the last ones"
     )
     parser.add_argument("--view", action="store_true", help="show the map in the browser while it grows")
-    parser.add_argument("--host", default="127.0.0.1", help="address of that page; default: 127.0.0.1")
-    parser.add_argument(
-        "--port", type=int, metavar="N", help="its port; default: 8080, or the next that is free"
-    )
+    add_address(parser)
     add_fit_options(parser)
     add_json(parser)
 

@@ -161,3 +161,16 @@ def add_box(parser: argparse.ArgumentParser) -> None:
 def box_of(options: argparse.Namespace) -> list[list[float]] | None:
     """The lower and the upper corner, world frame, m. None: no box."""
     return None if options.box is None else [options.box[:3], options.box[3:]]
+
+
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Declare where a page is served: ``options.host`` and ``options.port``."""
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to listen on; default: 127.0.0.1, which only this machine reaches; with 0.0.0.0 everyone who can reach "
+        "the machine sees the map, by its address or its name",
+    )
+    parser.add_argument(
+        "--port", type=int, metavar="N", help="port to listen on; default: 8080, or the next that is free"
+    )

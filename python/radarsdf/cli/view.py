@@ -8,7 +8,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from radarsdf.cli.map_in import add_map, load_map
-from radarsdf.cli.options import add_box, add_quiet, add_surface, box_of, limits_of, progress_of
+from radarsdf.cli.options import add_address, add_box, add_quiet, add_surface, box_of, limits_of, progress_of
 from radarsdf.cli.saying import say
 from radarsdf.cli.scans_in import add_scans, scans_of
 
@@ -30,15 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="thin the mesh if it has more than N vertices; default: 500000",
     )
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen on; default: 127.0.0.1, which only this machine reaches; with 0.0.0.0 everyone who can reach "
-        "the machine sees the map, by its address or its name",
-    )
-    parser.add_argument(
-        "--port", type=int, metavar="N", help="port to listen on; default: 8080, or the next that is free"
-    )
+    add_address(parser)
     parser.add_argument(
         "--open",
         action=argparse.BooleanOptionalAction,

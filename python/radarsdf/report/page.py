@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Literal, NamedTuple
@@ -118,6 +118,15 @@ def color_bar(colors: Sequence[tuple[int, int, int]], low: str, high: str, label
         f'<div class="bar"><span>{escape(low)}</span><i style="background:linear-gradient(to right, {stops})"></i>'
         f"<span>{escape(high)}</span><span>{escape(label)}</span></div>"
     )
+
+
+def color_key(colors: Mapping[str, tuple[int, int, int]]) -> str:
+    """What fixed colours mean."""
+    marks = (
+        f'<span><i style="background:rgb({r} {g} {b})"></i> {escape(name)}</span>'
+        for name, (r, g, b) in colors.items()
+    )
+    return f'<div class="bar key">{"".join(marks)}</div>'
 
 
 def frame(document: str, title: str) -> str:

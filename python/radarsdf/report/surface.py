@@ -18,9 +18,9 @@ from radarsdf.report.subject import Subject
 from radarsdf.view.framing import look_at_all
 
 _WIDTH, _HEIGHT = 1040, 650  # pixels
-_FRAME_ASPECT = 8 / 5  # of the frame of the 3D scene on any screen, as in the page's style
+FRAME_ASPECT = 8 / 5  # of the frame of the 3D scene on any screen, as in the page's style
 _JPEG_QUALITY = 82
-_SIDES = {
+SIDES = {
     "One long side": (25.0, 36.0),
     "The other long side": (205.0, 36.0),
     "Steeply from above": (0.0, 70.0),  # not straight: walls would be lines
@@ -54,7 +54,7 @@ def surface_section(subject: Subject) -> Section:
                     f"The surface, {painted}. View: {name.lower()}.",
                     f"{name}.",
                 )
-                for name in _SIDES
+                for name in SIDES
             )
         ),
         paragraph(f"The surface is {painted}. Frame: world, with z up."),
@@ -85,18 +85,22 @@ def colored(
     return intensity_colors(values, float(low), float(high))[:, :3], bar
 
 
-def picture(mesh: Any, colors: NDArray[np.uint8], side: str = "One long side") -> bytes:
-    """A picture of a mesh as a JPEG file. Colours (V, 3) of its vertices; none, (0, 3): grey."""
+def picture(
+    mesh: Any,
+    colors: NDArray[np.uint8],
+    side: str = "One long side",
+    to_eye: NDArray[np.float64] | None = None,
+) -> bytes:
+    """A picture of a mesh as a JPEG file. Colours (V, 3) of its vertices; none, (0, 3): grey. `to_eye` (3,): from where, not a side."""
     from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
 
     vertices = np.asarray(mesh.vertices, np.float64)
-    pixels = render(
-        mesh,
-        colors if len(colors) else None,
-        width=_WIDTH,
-        height=_HEIGHT,
-        viewpoint=eye_around(vertices, *_SIDES[side]),
-    )
+    if to_eye is None:
+        viewpoint = eye_around(vertices, *SIDES[side])
+    else:
+        middle, size_m = middle_of(vertices)
+        viewpoint = middle + 2 * size_m * to_eye / np.linalg.norm(to_eye)
+    pixels = render(mesh, colors if len(colors) else None, width=_WIDTH, height=_HEIGHT, viewpoint=viewpoint)
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format="jpeg", quality=_JPEG_QUALITY, optimize=True)
     return file.getvalue()
@@ -109,7 +113,7 @@ def _scene(subject: Subject, colors: NDArray[np.uint8]) -> str:
     sensors = None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin
     center, _ = middle_of(vertices)
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
-    look = look_at_all(everything, eye_around(vertices, *_SIDES["One long side"]) - center, _FRAME_ASPECT)
+    look = look_at_all(everything, eye_around(vertices, *SIDES["One long side"]) - center, FRAME_ASPECT)
     return scene_page(
         vertices,
         np.asarray(mesh.faces, np.int32),

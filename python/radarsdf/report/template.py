@@ -44,6 +44,7 @@ iframe { display: block; width: 100%; aspect-ratio: 8 / 5; background: #fff; bor
 .bar { display: flex; flex-wrap: wrap; align-items: center; gap: 2px 8px; font-size: .8125rem; color: var(--soft);
   margin: 6px 0; font-variant-numeric: tabular-nums; }
 .bar i { flex: 0 1 180px; min-width: 80px; height: 10px; border-radius: 5px; }
+.key { gap: 4px 16px; } .key i { display: inline-block; min-width: 12px; width: 12px; height: 12px; border-radius: 3px; }
 .wide { overflow-x: auto; margin: 0 0 14px; }
 table { border-collapse: collapse; font-size: .9375rem; }
 caption { text-align: left; padding-bottom: 4px; }

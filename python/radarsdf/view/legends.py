@@ -50,6 +50,11 @@ def marks(
     )
 
 
+def key(colors: Mapping[str, tuple[int, int, int]]) -> str:
+    """What fixed colours mean."""
+    return _BLOCK.format("".join(_patch(name, color) for name, color in colors.items()))
+
+
 def paragraph(text: str) -> str:
     """A text."""
     return _BLOCK.format(escape(text))
@@ -63,9 +68,15 @@ def table(rows: Mapping[str, str]) -> str:
 
 def _patches(classes: Classes) -> list[str]:
     return [
-        _MARK.format(width="0.8em", height="0.8em", color=_rgb(color), shape="border-radius:0.2em", text=name)
+        _patch(name, color)
         for name, color in zip(reversed(classes.names), reversed(classes.colors), strict=True)
     ]
+
+
+def _patch(name: str, color: tuple[int, int, int]) -> str:
+    return _MARK.format(
+        width="0.8em", height="0.8em", color=_rgb(color), shape="border-radius:0.2em", text=escape(name)
+    )
 
 
 def _bar(scale: Colors) -> str:

@@ -72,7 +72,7 @@ class ShownSurface:
             np.asarray(mesh.faces, np.int32),
             np.asarray(attributes["uncertainty_m"], np.float32),
             np.asarray(attributes["confidence"], np.float32),
-            _lightness(np.asarray(mesh.vertex_normals, np.float64)),
+            lightness_of(np.asarray(mesh.vertex_normals, np.float64)),
             edge_m,
         )
 
@@ -86,6 +86,7 @@ class ShownSurface:
         return np.flatnonzero(used), faces
 
 
-def _lightness(normals: _Floats) -> NDArray[np.float32]:
+def lightness_of(normals: _Floats) -> NDArray[np.float32]:
+    """(V,) factor of the lightness of colours for normals (V, 3), so that the shape is seen."""
     light: NDArray[np.float64] = np.clip(normals @ np.array(_TO_LIGHT), 0.0, 1.0)
     return (_SHADE + (1 - _SHADE) * light).astype(np.float32)
