@@ -7,12 +7,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.live import accuracy, circles, kills, loops, rates, removal, tracking
+from bench.live import accuracy, circles, growth, kills, loops, rates, removal, tracking
 from bench.rows import kept
 
 _COMMANDS = {
     "rates": rates,
     "accuracy": accuracy,
+    "growth": growth,
     "removal": removal,
     "circles": circles,
     "kills": kills,

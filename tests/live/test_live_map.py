@@ -113,7 +113,11 @@ def test_a_change_far_along_a_drive_is_all_that_is_made_anew():
     live.integrate(SCENE.points[7], poses[6], SCENE.intensities[7])
     surface, changes, noise = live._state.changes()
     redone = surface.update(changes, noise, 1)
-    assert 0 < len(redone) < 0.4 * len(np.unique(surface._leaf_keys >> np.uint64(9)))
+    assert (
+        0
+        < len(redone)
+        < 0.4 * len(np.unique(surface._surface.gather(surface._surface.regions)["keys"] >> np.uint64(9)))
+    )
     grown = mesh_bits(live.mesh())
     live._state.forget_surface()
     assert grown == mesh_bits(live.mesh())

@@ -50,6 +50,12 @@ class Replacement:
         after[self._is_new], after[~self._is_new] = new, before[self._stays]
         return after  # type: ignore[return-value]
 
+    def rows(self, before: dict[str, NDArray[Any]], new: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """All columns, by their names, with :attr:`keys`."""
+        return {
+            name: self.keys if name == "keys" else self.column(before[name], new[name]) for name in before
+        }
+
 
 def within(keys: Keys, first: Keys, last: Keys) -> NDArray[np.bool_]:
     """(N,) which of the ascending `keys` (N,) lie between one of `first` (B,) and the same of `last` (B,), ends included."""

@@ -14,19 +14,17 @@ from numpy.typing import NDArray
 from radarsdf._core import CellBlocks, Encoding, VertexTable
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.start import average_at_vertices, cells_smoothed, normals_at, told_by
+from radarsdf.live.ghosts import NOWHERE, GrowingGhosts, means_of, surfels_of
+from radarsdf.live.regions import REGION_BITS, RegionTable, Rows, regions_of, regions_round
 from radarsdf.live.rows import ROUND, Keys, Replacement, changed_rows, leaves_of, shifted, within
-from radarsdf.map import queries
-from radarsdf.map.contents import Scene
-from radarsdf.map.isosurface import extract_cells, sparse_lattice
-from radarsdf.map.meshing import Surface, local
-from radarsdf.returns.cells import lattice_of, merged_keys
-from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks, ReturnsOfCells, sums_round
+from radarsdf.live.triangles import GrowingTriangles, Triangles
+from radarsdf.returns.cells import merged_keys
+from radarsdf.returns.evidence import BLOCK_BITS, Looks, ReturnsOfCells, sums_round
 from radarsdf.returns.gaps import bridged
-from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.scan_sums import ScanSums
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels, planes_round, support_round
+from radarsdf.returns.surfels import LEAVES_PER_SURFEL, MIN_SUPPORT, planes_round, support_round
 
 _NONE = np.zeros(0, np.uint64)
 _LARGE_BITS = np.uint64(3)  # by which the key of a block is longer than that of a large one
@@ -48,18 +46,8 @@ class Changes:
     """Of those of them that anything looked at."""
 
 
-@dataclass(frozen=True)
-class Triangles:
-    """All triangles of the surface with what decides which of them are kept."""
-
-    scene: Scene
-    surface: Surface
-    leaf_cells: int
-    """Number of leaf cells near the surface."""
-
-
 class GrowingSurface:
-    """What follows from sums over scans. :meth:`update` makes anew what depends on changes, and nothing else.
+    """What follows from sums over scans. :meth:`update` makes anew what depends on changes, and asks for nothing far from them.
 
     All is a function of the sums, the looks and the noise: however they came about, it has the same bits. One thread at a
     time.
@@ -74,181 +62,230 @@ class GrowingSurface:
 
     def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
         self._config = config
-        self._origin = origin
-        self._sums = ScanSums(config.leaf_size_m, _NONE, np.zeros((0, 14), np.int64), np.zeros(0, np.uint32))
-        self._means = MeanRays.of_sums(self._sums)
         self._noise: SensorNoise | None = None
-        # Of cells of surfels.
-        self._keys = _NONE
-        self._moments = np.zeros((0, 13))
-        self._support = np.zeros(0)
-        self._planes = np.zeros((0, _PLANE))  # NaN without support
-        self._ghosts = np.zeros(0, bool)
-        self._normals = np.zeros((0, 3), np.float32)  # at the leaf cells with returns
+        vectors, numbers = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+        # Of leaf cells with returns: sums, mean rays, normals, and the key of the first plane that the ray crosses.
+        self._leaves = RegionTable(
+            sums=np.zeros((0, 14), np.int64),
+            scans=np.zeros(0, np.uint32),
+            points=vectors,
+            directions=vectors,
+            counts=numbers,
+            ranges_m=numbers,
+            normals=vectors,
+            first=_NONE,
+        )
+        # Of cells of surfels. Planes are NaN without support.
+        self._cells = RegionTable(
+            LEAVES_PER_SURFEL,
+            moments=np.zeros((0, 13)),
+            support=np.zeros(0),
+            planes=np.zeros((0, _PLANE)),
+            passed=np.zeros(0),
+            opaque=np.zeros(0, bool),
+            behind=np.zeros(0),
+            ghosts=np.zeros(0, bool),
+        )
+        self._ghosts = GrowingGhosts(self._leaves, self._cells, config.leaf_size_m)
+        self._on_planes: dict[
+            int, tuple[float, float]
+        ] = {}  # returns in cells with planes, and with flat ones
         # Of leaf cells that rays cross near their returns.
-        self._near = _NONE
-        # Of leaf cells near the surface: these, and those that bridge gaps between them.
-        self._leaf_keys = _NONE
-        self._values = np.zeros((0, 8), np.float32)  # signed distances at the corners, m
-        self._crossed = np.zeros(0, bool)
-        self._information = np.zeros(0, np.float32)
-        self._detections = np.zeros(0, np.uint32)
-        self._looks = Looks(_NONE, np.zeros(0, np.uint32))
-        self._rough_share = 0.0
-        self._triangles: Triangles | None = None
+        self._near = RegionTable()
+        # Of leaf cells near the surface: these, and those that bridge gaps between them. Signed distances at the corners, m.
+        self._surface = RegionTable(
+            values=np.zeros((0, 8), np.float32),
+            crossed=np.zeros(0, bool),
+            information=numbers,
+            detections=np.zeros(0, np.uint32),
+        )
+        # Of blocks, by the keys of their first leaf cells.
+        self._looks = RegionTable(scans=np.zeros(0, np.uint32))
+        self._triangles = GrowingTriangles(config, origin)
 
     @property
     def num_bytes(self) -> int:
         """Memory of what is kept, bytes."""
-        held = [*vars(self).values(), *vars(self._sums).values(), *vars(self._means).values()]
-        return sum(array.nbytes for array in held if isinstance(array, np.ndarray))
+        tables = (self._leaves, self._cells, self._near, self._surface, self._looks, self._triangles)
+        return sum(table.num_bytes for table in tables)
+
+    @property
+    def num_leaves(self) -> int:
+        """Number of leaf cells near the surface."""
+        return self._surface.num_rows
 
     def update(self, changes: Changes, noise: SensorNoise, num_threads: int) -> Keys:
         """Takes changes in. Gives the keys (D,) of the blocks of the surface that were made anew, ascending."""
+        looked = self._take_looks(changes)
         changed = self._take_sums(changes)
-        self._take_looks(changes)
+        of_rays, dirty = regions_of(changed), _NONE
         if noise != self._noise:  # ghosts and evidence depend on it everywhere
-            self._noise, dirty = noise, np.unique(self._sums.keys >> BLOCK_BITS)
-        else:
-            dirty = _NONE
-        if len(changed) == 0 and len(dirty) == 0:
-            return _NONE
-        self._fit_planes(changed, num_threads)
-        surfels = self._surfels()
-        self._rough_share = surfels.rough_share()
-        return self._derive(surfels, changed, dirty, num_threads)
+            self._noise, of_rays = noise, np.union1d(of_rays, self._leaves.regions)
+            dirty = np.unique(self._leaves.gather(of_rays)["keys"] >> BLOCK_BITS)
+        redone = _NONE
+        if len(of_rays):
+            of_planes = np.union1d(of_rays, self._fit_planes(changed, num_threads))
+            redone = self._derive(of_rays, of_planes, changed, dirty, num_threads)
+        stale = np.union1d(looked, regions_of(redone << BLOCK_BITS))
+        self._triangles.cut(regions_round(stale, 1), self._surface, self._looks, num_threads)
+        return redone
 
     def triangles(self, num_threads: int) -> Triangles:
         """All triangles, and what the returns tell of their vertices."""
-        if self._triangles is None:
-            self._triangles = self._extracted(num_threads)
-        return self._triangles
+        del num_threads
+        returns = sum(in_all for in_all, _ in self._on_planes.values())
+        flat = sum(on_flat for _, on_flat in self._on_planes.values())
+        return self._triangles.joined(1 - flat / returns if returns else 0.0, self.num_leaves)
 
     def _take_sums(self, changes: Changes) -> Keys:
-        """The keys of the leaf cells whose sums changed."""
+        """The keys of the leaf cells whose sums changed, and of the others in their blocks."""
+        regions = regions_of(changes.returns << BLOCK_BITS)
         first, last = leaves_of(changes.returns)
-        before, after = self._sums, changes.sums
-        there = within(before.keys, first, last)
+        before, after = self._leaves.gather(regions), changes.sums
+        there = within(before["keys"], first, last)
         changed = changed_rows(
-            before.keys[there],
-            (before.sums[there], before.scans[there]),
+            before["keys"][there],
+            (before["sums"][there], before["scans"][there]),
             after.keys,
             (after.sums, after.scans),
         )
         if len(changed) == 0:
             return changed
-        rows = Replacement.of(before.keys, after.keys, first, last)
-        self._sums = ScanSums(
-            before.leaf_size_m,
-            rows.keys,
-            rows.column(before.sums, after.sums),
-            rows.column(before.scans, after.scans),
-        )
-        old, new = self._means, MeanRays.of_sums(after)
-        self._means = MeanRays(
-            rows.keys,
-            rows.column(old.points, new.points),
-            rows.column(old.directions, new.directions),
-            rows.column(old.counts, new.counts),
-            rows.column(old.scans, new.scans),
-            rows.column(old.ranges_m, new.ranges_m),
-        )
-        self._normals = rows.column(self._normals, np.full((len(after.keys), 3), np.nan, np.float32))
+        means = MeanRays.of_sums(after)
+        new: Rows = vars(means) | {
+            "sums": after.sums,
+            "normals": np.full((len(after.keys), 3), np.nan, np.float32),
+            "first": np.full(len(after.keys), NOWHERE),
+        }
+        self._leaves.put(regions, Replacement.of(before["keys"], after.keys, first, last).rows(before, new))
         keys, moments = after.merged_moments()
-        rows = Replacement.of(self._keys, keys, merged_keys(first), merged_keys(last))
-        self._keys = rows.keys
-        self._moments = rows.column(self._moments, moments)
-        self._support = rows.column(self._support, np.zeros(len(keys)))
-        self._planes = rows.column(self._planes, np.full((len(keys), _PLANE), np.nan))
-        self._ghosts = rows.column(self._ghosts, np.zeros(len(keys), bool))
+        before = self._cells.gather(regions)
+        passed = np.zeros(len(keys))
+        _, kept, old = np.intersect1d(keys, before["keys"], assume_unique=True, return_indices=True)
+        passed[kept] = before["passed"][old]
+        new = {
+            "keys": keys,
+            "moments": moments,
+            "support": np.zeros(len(keys)),
+            "planes": np.full((len(keys), _PLANE), np.nan),
+            "passed": passed,
+            "opaque": np.zeros(len(keys), bool),
+            "behind": np.zeros(len(keys)),
+            "ghosts": np.zeros(len(keys), bool),
+        }
+        rows = Replacement.of(before["keys"], keys, merged_keys(first), merged_keys(last))
+        self._cells.put(regions, rows.rows(before, new))
         # All of a block is new in these columns, so all of it is to be made.
         return np.union1d(changed, after.keys)
 
-    def _take_looks(self, changes: Changes) -> None:
-        if len(changes.look_blocks) == 0:
-            return
+    def _take_looks(self, changes: Changes) -> Keys:
+        """The regions whose looks changed."""
         blocks, new = changes.look_blocks, changes.looks
-        rows = Replacement.of(self._looks.keys, new.keys, blocks, blocks)
-        self._looks = Looks(rows.keys, rows.column(self._looks.scans, new.scans))
-        self._triangles = None
+        regions = regions_of(blocks << BLOCK_BITS)
+        before = self._looks.gather(regions)
+        rows = Replacement.of(
+            before["keys"], new.keys << BLOCK_BITS, blocks << BLOCK_BITS, blocks << BLOCK_BITS
+        )
+        self._looks.put(regions, rows.rows(before, {"keys": new.keys << BLOCK_BITS, "scans": new.scans}))
+        return regions
 
-    def _fit_planes(self, changed: Keys, num_threads: int) -> None:
-        """Surfels of the cells round changed ones."""
-        blocks = CellBlocks(self._keys)
+    def _fit_planes(self, changed: Keys, num_threads: int) -> Keys:
+        """Surfels of the cells round changed ones. Gives the regions of these, ascending."""
         near = shifted(np.unique(merged_keys(changed)), ROUND)
+        regions = np.unique(self._cells.regions_of(near))
+        cells = self._cells.gather(regions_round(regions, 1))
+        keys, moments, blocks = cells["keys"], cells["moments"], CellBlocks(cells["keys"])
         rows = blocks.rows(near, num_threads)
         rows = rows[rows >= 0]
-        self._support[rows] = support_round(blocks, self._keys[rows], self._moments, num_threads)
-        self._planes[rows] = np.nan
-        rows = rows[self._support[rows] >= MIN_SUPPORT]
+        cells["support"][rows] = support_round(blocks, keys[rows], moments, num_threads)
+        cells["planes"][rows] = np.nan
+        rows = rows[cells["support"][rows] >= MIN_SUPPORT]
         centres, normals, _, variances = planes_round(
-            blocks, self._keys[rows], self._moments, LEAVES_PER_SURFEL * self._config.leaf_size_m, num_threads
+            blocks, keys[rows], moments, LEAVES_PER_SURFEL * self._config.leaf_size_m, num_threads
         )
-        self._planes[rows] = np.concatenate([centres, normals, variances], axis=1)
+        cells["planes"][rows] = np.concatenate([centres, normals, variances], axis=1)
+        own = np.isin(self._cells.regions_of(keys), regions)
+        self._cells.put(regions, {name: column[own] for name, column in cells.items()})
+        for region in regions:
+            surfels = surfels_of(self._cells.gather(region[None]), self._config.leaf_size_m)
+            returns = surfels.counts[surfels.cell_of_plane]
+            self._on_planes[int(region)] = float(returns.sum()), float(returns[surfels.is_flat()].sum())
+        return regions
 
-    def _surfels(self) -> Surfels:
-        cell_of_plane = np.flatnonzero(self._support >= MIN_SUPPORT)
-        planes = self._planes[cell_of_plane]
-        return Surfels(
-            cell_size_m=LEAVES_PER_SURFEL * self._config.leaf_size_m,
-            keys=self._keys,
-            blocks=CellBlocks(self._keys),
-            counts=self._moments[:, 0].copy(),
-            support=self._support,
-            cell_of_plane=cell_of_plane,
-            centres=planes[:, :3].copy(),
-            normals=planes[:, 3:6].copy(),
-            variances=planes[:, 6:].copy(),
-        )
+    def _derive(self, of_rays: Keys, of_planes: Keys, changed: Keys, dirty: Keys, num_threads: int) -> Keys:
+        """Distances and evidence in the blocks round changed leaf cells, and in the `dirty` blocks.
 
-    def _derive(self, surfels: Surfels, changed: Keys, dirty: Keys, num_threads: int) -> Keys:
-        """Distances and evidence in the blocks round changed leaf cells, and in the `dirty` blocks."""
+        `of_rays`, `of_planes`: regions in which mean rays and planes changed.
+        """
         assert self._noise is not None
-        means = self._means
-        cell_of_leaf = surfels.cells_of_leaves(means.keys, num_threads)
-        ghosts = np.zeros(len(self._keys), bool)
         if self._config.returns.drop_ghosts:
-            ghosts = find_ghosts(surfels, means, self._noise, num_threads)
-        normals = normals_at(means, surfels, num_threads)
-        differs = (ghosts != self._ghosts)[cell_of_leaf] | (normals != self._normals).any(axis=1)
-        self._ghosts, self._normals = ghosts, normals
-        changed = np.union1d(changed, means.keys[differs])
+            ghosts = self._ghosts.update(of_rays, of_planes, self._noise, num_threads)
+            near_ghosts = self._leaves.gather(np.unique(self._cells.regions_of(ghosts)))["keys"]
+            changed = np.union1d(changed, near_ghosts[np.isin(merged_keys(near_ghosts), ghosts)])
+        changed = np.union1d(changed, self._turn(of_planes, num_threads))
         near = np.union1d(dirty, np.unique(shifted(changed, self._reach()) >> BLOCK_BITS))
-        true = means.select(~ghosts[cell_of_leaf])
-        normals = normals[~ghosts[cell_of_leaf]]
-        self._find_near(near, true, num_threads)
+        # Bridges that open or close tell of cells at most a block of medians away, and smoothing carries what they do.
+        middle = regions_of(near << BLOCK_BITS)
+        inner, around = regions_round(middle, 2), regions_round(middle, 3)
+        leaves, cell_rows = self._leaves.gather(around), self._cells.gather(around)
+        cell_of_leaf = CellBlocks(cell_rows["keys"]).rows(merged_keys(leaves["keys"]), num_threads)
+        is_true = ~cell_rows["ghosts"][cell_of_leaf]
+        true, normals = means_of(leaves).select(is_true), leaves["normals"][is_true]
+        near_keys = self._find_near(near, true, around, num_threads)
         told = told_by(true, self._noise, self._config.returns)
-        leaf_keys = self._bridged(told, num_threads)
+        surface = self._surface.gather(around)
+        leaf_keys = bridged(
+            near_keys, told.keys, told.counts, self._config.encoding.bridge_cells, num_threads
+        )
+        leaf_keys = np.concatenate(
+            [
+                leaf_keys[np.isin(leaf_keys >> REGION_BITS, inner)],
+                surface["keys"][~np.isin(surface["keys"] >> REGION_BITS, inner)],
+            ]
+        )
+        leaf_keys.sort()
         # A cell that came or went tells which rays count at the corners of those round it.
-        opened = shifted(np.setxor1d(leaf_keys, self._leaf_keys, assume_unique=True), ROUND)
+        opened = shifted(np.setxor1d(leaf_keys, surface["keys"], assume_unique=True), ROUND)
         redone = np.union1d(near, np.unique(opened >> BLOCK_BITS))
-        there = np.union1d(leaf_keys >> BLOCK_BITS, self._leaf_keys >> BLOCK_BITS)
+        there = np.union1d(leaf_keys >> BLOCK_BITS, surface["keys"] >> BLOCK_BITS)
         redone = np.intersect1d(self._smoothed_with(redone), there, assume_unique=True)
         round_them = leaves_of(self._smoothed_with(_blocks_round(redone)))
         here = within(true.keys, *round_them)
-        self._remake(
-            redone,
-            leaf_keys[within(leaf_keys, *round_them)],
-            true.select(here),
-            normals[here],
-            told.select(here),
-            num_threads,
+        self._surface.put(
+            around,
+            self._remade(
+                surface,
+                redone,
+                leaf_keys[within(leaf_keys, *round_them)],
+                true.select(here),
+                normals[here],
+                told.select(here),
+                num_threads,
+            ),
         )
-        self._triangles = None
         return redone
 
-    def _find_near(self, blocks: Keys, means: MeanRays, num_threads: int) -> None:
-        """The leaf cells of these blocks that rays cross near their returns."""
+    def _turn(self, regions: Keys, num_threads: int) -> Keys:
+        """The keys of the leaf cells in these regions whose normals differ from before."""
+        leaves = self._leaves.gather(regions)
+        surfels = surfels_of(self._cells.gather(regions), self._config.leaf_size_m)
+        normals = normals_at(means_of(leaves), surfels, num_threads)
+        differs = (normals != leaves["normals"]).any(axis=1)
+        leaves["normals"] = normals
+        self._leaves.put(regions, leaves)
+        found: Keys = leaves["keys"][differs]
+        return found
+
+    def _find_near(self, blocks: Keys, means: MeanRays, regions: Keys, num_threads: int) -> Keys:
+        """The leaf cells of these `regions` that rays cross near their returns: in these `blocks` found anew."""
         config = self._config
         first, last = leaves_of(blocks)
         here = means.select(within(means.keys, *leaves_of(_blocks_round(blocks))))
         near = here.leaf_keys(config.leaf_size_m, config.near_band_m, num_threads)
-        self._near = Replacement.of(self._near, near[within(near, first, last)], first, last).keys
-
-    def _bridged(self, told: ReturnsOfCells, num_threads: int) -> Keys:
-        """All leaf cells near the surface."""
-        cells = self._config.encoding.bridge_cells
-        return bridged(self._near, told.keys, told.counts, cells, num_threads)
+        before = self._near.gather(regions)["keys"]
+        found = Replacement.of(before, near[within(near, first, last)], first, last).keys
+        self._near.put(regions, {"keys": found})
+        return found
 
     def _reach(self) -> NDArray[np.int64]:
         """(S, 3) steps from a leaf cell to the corners of all that its returns have a part in."""
@@ -270,16 +307,17 @@ class GrowingSurface:
         found: Keys = ((large << _LARGE_BITS)[:, None] | np.arange(8, dtype=np.uint64)).reshape(-1)
         return found
 
-    def _remake(
+    def _remade(
         self,
+        before: Rows,
         blocks: Keys,
         near: Keys,
         means: MeanRays,
         normals: NDArray[np.float32],
         told: ReturnsOfCells,
         num_threads: int,
-    ) -> None:
-        """The leaf cells of these blocks, by the leaf cells `near`, and the rays, in and round them."""
+    ) -> Rows:
+        """The rows `before` with the leaf cells of these blocks anew, by the leaf cells `near`, and the rays, in and round them."""
         config, size_m = self._config, self._config.leaf_size_m
         first, last = leaves_of(blocks)
         own = within(near, first, last)
@@ -292,28 +330,9 @@ class GrowingSurface:
         values = distances_m[vertices[own]]
         crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)
         information, detections = sums_round(told, leaf_keys, num_threads)
-        rows = Replacement.of(self._leaf_keys, leaf_keys, first, last)
-        self._leaf_keys = rows.keys
-        self._values = rows.column(self._values, values)
-        self._crossed = rows.column(self._crossed, crossed)
-        self._information = rows.column(self._information, information)
-        self._detections = rows.column(self._detections, detections)
-
-    def _extracted(self, num_threads: int) -> Triangles:
-        crossed, size_m = self._crossed, self._config.leaf_size_m
-        cells = lattice_of(self._leaf_keys[crossed]).astype(np.int32)
-        order = np.lexsort(cells.T[::-1])  # as of a sparse lattice
-        _, corners, of_cells = sparse_lattice(cells, num_threads=num_threads)
-        values = np.zeros(len(corners), np.float32)
-        values[of_cells] = self._values[crossed][order]
-        vertices, faces = extract_cells(
-            corners, values, of_cells, spacing=[size_m] * 3, num_threads=num_threads
-        )
-        scene = Scene(self._origin, self._config, self._rough_share)
-        found = Evidence(self._information, self._detections, self._looks.at(self._leaf_keys))
-        evidence = queries.interpolated(found, self._leaf_keys, size_m, local(scene, vertices + self._origin))
-        surface = Surface.told_by(scene, vertices, faces, evidence, len(self._leaf_keys))
-        return Triangles(scene, surface, len(self._leaf_keys))
+        rows = Replacement.of(before["keys"], leaf_keys, first, last)
+        new = {"values": values, "crossed": crossed, "information": information, "detections": detections}
+        return rows.rows(before, new)
 
 
 def _steps(reach: int) -> NDArray[np.int64]:

@@ -54,44 +54,79 @@ def find_ghosts(
         if isinstance(rays, MeanRays)
         else (surfels.cells_at(rays.points, num_threads), None)
     )
-    table = np.concatenate([surfels.centres, surfels.normals, np.sqrt(surfels.variances[:, :1])], 1)
-    table = table.astype(np.float32)
-
-    def crossed(planes: NDArray[np.int64], rays: Rays | MeanRays) -> NDArray[np.int32]:
-        """(N,) row in `planes` of the first plane that each ray crosses from its front, or -1."""
-        surfel_map = SurfelMap(
-            surfels.keys[surfels.cell_of_plane[planes]], table[planes], surfels.cell_size_m
-        )
-        return surfel_map.first_crossings(
-            np.ascontiguousarray(rays.points),
-            np.ascontiguousarray(rays.directions),
-            np.ascontiguousarray(rays.ranges_m),
-            noise.range_m,
-            noise.angle_rad,
-            _MARGIN * surfels.cell_size_m,
-            _SIGMAS,
-            num_threads,
-        )
 
     def count(rows: NDArray[np.int32], of: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
         counted = np.bincount(rows[of], None if weights is None else weights[of], size)
         return counted.astype(np.float64)
 
     flat = np.flatnonzero(surfels.is_flat())
-    first = crossed(flat, rays)
-    passed = np.zeros((len(surfels.keys), 1))
-    flat_cells = surfels.cell_of_plane[flat]
-    passed[flat_cells, 0] = count(first, first >= 0, len(flat))
-    support = surfels.support[flat_cells]
-    flat_keys = surfels.keys[flat_cells]
-    passed_round = surfels.blocks.sum_round(flat_keys, passed, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
-    opaque = support / (support + passed_round) > _MIN_OPACITY
-    # A ray through a surface that is not opaque may cross an opaque one behind it. There are few such rays.
+    first = first_crossed(surfels, flat, rays, noise, num_threads)
+    passed = np.zeros(len(surfels.keys))
+    passed[surfels.cell_of_plane[flat]] = count(first, first >= 0, len(flat))
+    opaque = are_opaque(surfels, flat, passed, num_threads)
+    behind = are_behind(surfels, flat, opaque, first, rays, noise, num_threads)
+    return mostly_behind(surfels, count(cell_of_ray, behind, len(surfels.keys)), num_threads)
+
+
+def first_crossed(
+    surfels: Surfels,
+    planes: NDArray[np.int64],
+    rays: Rays | MeanRays,
+    noise: SensorNoise,
+    num_threads: int = 0,
+) -> NDArray[np.int32]:
+    """(N,) row in `planes`, rows of surfels, of the first that each ray crosses from its front, or -1."""
+    chosen = (surfels.centres[planes], surfels.normals[planes], np.sqrt(surfels.variances[planes, :1]))
+    surfel_map = SurfelMap(
+        surfels.keys[surfels.cell_of_plane[planes]],
+        np.concatenate(chosen, 1).astype(np.float32),
+        surfels.cell_size_m,
+    )
+    return surfel_map.first_crossings(
+        np.ascontiguousarray(rays.points),
+        np.ascontiguousarray(rays.directions),
+        np.ascontiguousarray(rays.ranges_m),
+        noise.range_m,
+        noise.angle_rad,
+        _MARGIN * surfels.cell_size_m,
+        _SIGMAS,
+        num_threads,
+    )
+
+
+def are_opaque(
+    surfels: Surfels, planes: NDArray[np.int64], passed: NDArray[np.float64], num_threads: int = 0
+) -> NDArray[np.bool_]:
+    """(P,) which of `planes`, rows of flat surfels, most rays end at. `passed` (C,): rays whose first one is that of each cell."""
+    cells = surfels.cell_of_plane[planes]
+    support = surfels.support[cells]
+    passed_round = surfels.blocks.sum_round(
+        surfels.keys[cells], np.ascontiguousarray(passed[:, None]), NEIGHBOUR_WEIGHT, num_threads
+    )[:, 0]
+    opaque: NDArray[np.bool_] = support / (support + passed_round) > _MIN_OPACITY
+    return opaque
+
+
+def are_behind(
+    surfels: Surfels,
+    planes: NDArray[np.int64],
+    opaque: NDArray[np.bool_],
+    first: NDArray[np.int32],
+    rays: Rays | MeanRays,
+    noise: SensorNoise,
+    num_threads: int = 0,
+) -> NDArray[np.bool_]:
+    """(N,) which rays end behind an opaque one of `planes`; `first` (N,) as of :func:`first_crossed`."""
     behind = first >= 0
+    # A ray through a surface that is not opaque may cross an opaque one behind it. There are few such rays.
     through = np.flatnonzero(behind)[~opaque[first[behind]]]
-    behind[through] = crossed(flat[opaque], rays.select(through)) >= 0
-    behind_in_cell = count(cell_of_ray, behind, len(surfels.keys))
-    columns = np.stack([behind_in_cell, surfels.counts], 1)
+    behind[through] = first_crossed(surfels, planes[opaque], rays.select(through), noise, num_threads) >= 0
+    return behind
+
+
+def mostly_behind(surfels: Surfels, behind: NDArray[np.float64], num_threads: int = 0) -> NDArray[np.bool_]:
+    """(C,) the cells round which most returns are `behind` (C,) a surface, in number."""
+    columns = np.stack([behind, surfels.counts], 1)
     sums = surfels.blocks.sum_round(surfels.keys, columns, 1.0, num_threads)
     ghosts: NDArray[np.bool_] = sums[:, 0] > _MIN_SHARE * sums[:, 1]
     return ghosts
