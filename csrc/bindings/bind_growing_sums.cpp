@@ -38,7 +38,10 @@ void bind_growing_sums(py::module_& m) {
             change.collect(rays, sign);
           },
           "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "sign"_a,
-          "One scan comes (1) or goes (-1): `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.");
+          "One scan comes (1) or goes (-1): `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.")
+      .def(
+          "block_keys", [](const SumsChange& change) { return to_array(change.block_keys()); },
+          "Keys of the blocks that it may change, uint64, ascending.");
   py::class_<GrowingSums>(m, "GrowingSums",
                           "Sums over scans in cells, and looks at blocks of 8 x 8 x 8 cells, in a table that grows.")
       .def(py::init<>())

@@ -77,6 +77,16 @@ void SumsChange::collect(const RaysOfScan& rays, std::int64_t sign) {
   }
 }
 
+std::vector<std::uint64_t> SumsChange::block_keys() const {
+  std::vector<std::uint64_t> keys;
+  keys.reserve(looks_.size() + cells_.size());
+  for (const Look& look : looks_) keys.push_back(look.key);
+  for (const Cell& cell : cells_) keys.push_back(block_of(cell.key));
+  std::sort(keys.begin(), keys.end());
+  keys.erase(std::unique(keys.begin(), keys.end()), keys.end());
+  return keys;
+}
+
 ChangedBlocks GrowingSums::apply(const SumsChange& change) {
   std::int64_t new_cells = 0, new_blocks = 0;
   for (const SumsChange::Cell& cell : change.cells_) {

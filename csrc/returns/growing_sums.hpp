@@ -45,6 +45,8 @@ class SumsChange {
   // sign: 1 adds the scan, -1 takes it out. Throws std::invalid_argument for rays without keys.
   void collect(const RaysOfScan& rays, std::int64_t sign);
 
+  std::vector<std::uint64_t> block_keys() const;  // that it may change, ascending
+
  private:
   friend class GrowingSums;
   struct Cell {

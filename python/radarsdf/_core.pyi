@@ -676,6 +676,10 @@ class SumsChange:
         leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
         quantum_m: typing.SupportsFloat | typing.SupportsIndex,
     ) -> None: ...
+    def block_keys(self) -> numpy.typing.NDArray[numpy.uint64]:
+        """
+        Keys of the blocks that it may change, uint64, ascending.
+        """
     def collect(
         self,
         points: numpy.typing.NDArray[numpy.float32],

@@ -16,7 +16,6 @@ from radarsdf.checks import (
     check_poses,
     instance,
     not_negative,
-    number,
     path_of,
     positions,
     real_array,
@@ -26,7 +25,8 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.following import Follower
 from radarsdf.live.learning import finished, known_now
 from radarsdf.live.scan_log import ScanId, ScanLog
-from radarsdf.live.scans import Integrated, checked_scan
+from radarsdf.live.scans import Integrated, checked_scan, finite_time
+from radarsdf.live.shelf import Shelf
 from radarsdf.live.state import GrowingState
 from radarsdf.live.storage import load_state, save_state
 from radarsdf.map import queries
@@ -60,7 +60,8 @@ class LiveMap:
         Memory that the map may take, bytes. Beyond it, the oldest scans are let go: they stay in the map, but can no
         longer be moved or taken out. None: all are kept.
     folder : path-like, optional
-        An empty or new folder, to which scans are written instead of being let go.
+        An empty or new folder, to which scans are written instead of being let go, and the map by :meth:`clear_outside`
+        instead of being forgotten.
 
     Raises
     ------
@@ -100,6 +101,7 @@ class LiveMap:
             None if origin is None else positions([np.asarray(origin)], "origin")[0],
             None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1),
             ScanLog(place),
+            None if place is None else Shelf(place),
         )
         self._follower = Follower(config, config.num_threads)
         self._lock = threading.RLock()  # of the state
@@ -185,7 +187,7 @@ class LiveMap:
         """
         scan = checked_scan(points, intensities, doppler_mps, self._state.config.returns)
         given = None if pose is None else check_poses([real_array(pose, "pose")], 1)[0].copy()
-        time_s = None if time is None else _finite(time)
+        time_s = None if time is None else finite_time(time)
         if given is None and time_s is None:
             msg = "a scan needs a pose, or a time"
             raise ValueError(msg)
@@ -275,12 +277,15 @@ class LiveMap:
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
         """Forgets the map beyond a ball. Scans that reach beyond it can then be neither moved nor taken out.
 
+        With a folder, nothing is forgotten: regions of 64³ leaf cells that lie beyond the ball go there, and come back, with
+        the same bits, when a scan that reaches them is added, moved or taken out. Until then :meth:`mesh` is without them.
+
         Parameters
         ----------
         centre : (3,) array_like
             World, m.
         radius_m : float
-            Blocks with their middle farther away are forgotten.
+            Blocks with their middle farther away are forgotten, or regions are put away of which all is farther away.
 
         Returns
         -------
@@ -301,7 +306,7 @@ class LiveMap:
         OSError
             If the file cannot be written.
         """
-        with self._lock:
+        with self._lock, self._state.whole():
             state = self._state.stored()
         save_state(state, path)
 
@@ -368,7 +373,7 @@ class LiveMap:
         ValueError
             If there is no scan that could be taken out.
         """
-        with self._lock:
+        with self._lock, self._state.whole():
             scans, sums = list(self._state.log.scans()), self._state.all_sums()
             looks = Looks(*self._state.sums.looks_of(self._state.sums.block_keys()))
         return known_now(scans, sums, looks, self._state.quick, self._state.origin)
@@ -387,11 +392,3 @@ class LiveMap:
                 raise ValueError(msg)
             scans = list(self._state.log.scans())
         return finished(scans, self._state.config, self._state.origin, progress)
-
-
-def _finite(time: float) -> float:
-    time_s = number(time, "time")
-    if not np.isfinite(time_s):
-        msg = f"time must be finite, not {time_s}"
-        raise ValueError(msg)
-    return time_s

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import check_values_of_scan, real_array
+from radarsdf.checks import check_values_of_scan, number, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.live.scan_log import LoggedScan, ScanId, compact
@@ -58,6 +58,15 @@ def checked_scan(
         speeds,
         standing,
     )
+
+
+def finite_time(time: float) -> float:
+    """When a scan was taken, s. Raises a ValueError if it is no time."""
+    time_s = number(time, "time")
+    if not np.isfinite(time_s):
+        msg = f"time must be finite, not {time_s}"
+        raise ValueError(msg)
+    return time_s
 
 
 def rays_of(scan: LoggedScan, config: FitConfig, origin: NDArray[np.float64] | None) -> Rays:

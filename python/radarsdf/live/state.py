@@ -4,14 +4,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import GrowingSums, SumsChange
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.learning import noise_of, quick_of
+from radarsdf.live.regions import REGION_CELLS, cubes_of, regions_of
 from radarsdf.live.scan_log import LoggedScan, ScanLog
 from radarsdf.live.scans import rays_of
+from radarsdf.live.shelf import Shelf
 from radarsdf.live.storage import Stored
 from radarsdf.live.surface import Changes, GrowingSurface
 from radarsdf.returns.cells import lattice_of
@@ -39,15 +44,23 @@ class GrowingState:
         Memory beyond which scans are let go, bytes.
     log : ScanLog
         An empty one.
+    shelf : Shelf or None
+        Where sums are put that are far away. None: they are forgotten.
     """
 
     def __init__(
-        self, config: FitConfig, origin: NDArray[np.float64] | None, max_bytes: int | None, log: ScanLog
+        self,
+        config: FitConfig,
+        origin: NDArray[np.float64] | None,
+        max_bytes: int | None,
+        log: ScanLog,
+        shelf: Shelf | None = None,
     ) -> None:
         self.config, self.quick = config, quick_of(config)
         self.origin = origin
         self.max_bytes = max_bytes
         self.log = log
+        self._shelf = shelf
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
@@ -76,6 +89,8 @@ class GrowingState:
 
     def apply(self, change: SumsChange) -> Keys:
         """Makes a change. Gives the keys of the blocks whose returns changed. An error leaves all as it was."""
+        if self._shelf:
+            self._bring_back(self._shelf.touched(change.block_keys()))
         returns, looks = self.sums.apply(change)
         self._mark(returns, looks)
         return returns
@@ -88,16 +103,41 @@ class GrowingState:
             self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 
     def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
-        """Forgets blocks beyond a ball. Gives their keys."""
+        """Forgets blocks beyond a ball, or puts the regions away that lie beyond it. Gives the keys of the blocks."""
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
+        if self._shelf is not None:
+            regions = regions_of(keys << BLOCK_BITS)
+            lower = cubes_of(regions) * (REGION_CELLS * self.config.leaf_size_m) + self.origin
+            nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
+            return self._put_away(regions[np.square(nearest - centre).sum(axis=1) > radius_m**2])
         middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
         gone: Keys = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
         self.sums.erase(gone)
         self.log.seal_beyond(centre, radius_m)
         self._mark(gone, gone)
         return gone
+
+    @contextmanager
+    def whole(self) -> Iterator[None]:
+        """Within, nothing is put away. Afterwards, the same regions are again."""
+        away = _NONE if self._shelf is None else self._shelf.regions
+        self._bring_back(away)
+        try:
+            yield
+        finally:
+            self._put_away(away)
+
+    def _bring_back(self, regions: Keys) -> None:
+        if self._shelf is not None:
+            blocks = self._shelf.bring_back(self.sums, regions)
+            self._mark(blocks, blocks)
+
+    def _put_away(self, regions: Keys) -> Keys:
+        blocks = _NONE if self._shelf is None else self._shelf.put_away(self.sums, regions)
+        self._mark(blocks, blocks)
+        return blocks
 
     def all_sums(self) -> ScanSums:
         """Of all cells."""

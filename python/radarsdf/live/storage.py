@@ -44,13 +44,14 @@ class Stored:
     looks: NDArray[np.uint32]
 
 
-_SUMS: dict[str, tuple[Any, tuple[int | None, ...]]] = {
+SUMS: dict[str, tuple[Any, tuple[int | None, ...]]] = {
     "keys": (np.uint64, (None,)),
     "sums": (np.int64, (None, 14)),
     "scans_of_cells": (np.uint32, (None,)),
     "look_keys": (np.uint64, (None,)),
     "looks": (np.uint32, (None,)),
 }
+"""Types and shapes of what is kept of cells and blocks, in the order in which the core takes it. None: any length."""
 
 
 def save_state(stored: Stored, path: str | PathLike[str]) -> None:
@@ -75,7 +76,7 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
         ],
     }
     scans = list(stored.scans.values())
-    arrays: dict[str, NDArray[Any]] = {name: getattr(stored, name) for name in _SUMS}
+    arrays: dict[str, NDArray[Any]] = {name: getattr(stored, name) for name in SUMS}
     arrays["poses"] = np.stack([scan.pose for scan in scans]) if scans else np.zeros((0, 4, 4))
     arrays["counts"] = np.array([len(scan.points) for scan in scans], np.int64)
     for name in _COLUMNS:
@@ -90,7 +91,7 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
 
 def load_state(path: str | PathLike[str]) -> Stored:
     """The state that :func:`save_state` wrote. Raises a ValueError if the file is none, or damaged."""
-    names = ("described", "poses", "counts", *_SUMS, *_COLUMNS, *(f"{name}_single" for name in _COLUMNS))
+    names = ("described", "poses", "counts", *SUMS, *_COLUMNS, *(f"{name}_single" for name in _COLUMNS))
     arrays = arrays_of(Path(path), names)
     try:
         return _state_of(arrays)
@@ -99,13 +100,10 @@ def load_state(path: str | PathLike[str]) -> Stored:
         raise ValueError(msg) from error
 
 
-def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
-    described = json.loads(arrays["described"].tobytes())
-    if described["format"] != _FORMAT:
-        msg = f"format {described['format']!r:.20}"
-        raise ValueError(msg)
+def checked_sums(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The arrays of :data:`SUMS`. Raises a KeyError or a ValueError if they are none."""
     sums = {}
-    for name, (dtype, shape) in _SUMS.items():
+    for name, (dtype, shape) in SUMS.items():
         array = sums[name] = np.ascontiguousarray(arrays[name])
         fits = array.ndim == len(shape) and all(
             n in (None, m) for m, n in zip(array.shape, shape, strict=True)
@@ -116,6 +114,15 @@ def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
     if (np.diff(sums["keys"].astype(np.float64)) < 0).any() or (sums["sums"][:, 0] < 1).any():
         msg = "its sums are none"
         raise ValueError(msg)
+    return sums
+
+
+def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
+    described = json.loads(arrays["described"].tobytes())
+    if described["format"] != _FORMAT:
+        msg = f"format {described['format']!r:.20}"
+        raise ValueError(msg)
+    sums = checked_sums(arrays)
     ids, held, counts = described["ids"], described["held"], arrays["counts"].tolist()
     poses = check_poses(arrays["poses"], len(ids)) if ids else np.zeros((0, 4, 4))
     columns = {name: _parts(arrays, name, held, counts) for name in _COLUMNS}

@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Sums of a map that grows which are put away to a folder, region by region, and come back with the same bits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from radarsdf._core import GrowingSums
+from radarsdf.io.npz import arrays_of, write_arrays
+from radarsdf.live.regions import REGION_BITS, Keys, regions_of
+from radarsdf.live.storage import SUMS, checked_sums
+from radarsdf.returns.evidence import BLOCK_BITS
+
+
+class Shelf:
+    """A file for each region that was put away. `folder`: where to; none is made before there is something to write."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._paths: dict[int, Path] = {}
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @property
+    def regions(self) -> Keys:
+        """(R,) keys of the regions that are put away, ascending."""
+        return np.array(sorted(self._paths), np.uint64)
+
+    def put_away(self, sums: GrowingSums, regions: Keys) -> Keys:
+        """Moves all blocks of `regions` out of `sums`, once all are written. Gives the keys of the blocks, ascending."""
+        blocks = sums.block_keys()
+        of_blocks = blocks << BLOCK_BITS
+        gone, written = [], {}
+        for region in regions.tolist():
+            own = blocks[of_blocks >> REGION_BITS == region]
+            if len(own) == 0:
+                continue
+            written[region] = self._folder / f"region-{region:016x}.npz"
+            columns = (*sums.sums_of(own), *sums.looks_of(own))
+            write_arrays(written[region], dict(zip(SUMS, columns, strict=True)))
+            gone.append(own)
+        self._paths |= written
+        keys = np.concatenate([blocks[:0], *gone])
+        sums.erase(keys)
+        return keys
+
+    def bring_back(self, sums: GrowingSums, regions: Keys) -> Keys:
+        """Moves those of `regions` that are put away into `sums`, all or none. Gives the keys of their blocks, ascending."""
+        found = [region for region in regions.tolist() if region in self._paths]
+        if not found:
+            return np.zeros(0, np.uint64)
+        read = []
+        for region in found:
+            path = self._paths[region]
+            try:
+                read.append(checked_sums(arrays_of(path, tuple(SUMS))))
+            except (KeyError, ValueError) as error:
+                msg = f"{path} is no region of this map, or it is damaged: {error}"
+                raise ValueError(msg) from error
+        joined = {name: np.concatenate([arrays[name] for arrays in read]) for name in SUMS}
+        sums.insert(*joined.values())
+        for region in found:
+            self._paths.pop(region).unlink(missing_ok=True)
+        return np.union1d(joined["look_keys"], joined["keys"] >> BLOCK_BITS)
+
+    def touched(self, blocks: Keys) -> Keys:
+        """Those of the regions of `blocks` (B,) that are put away."""
+        return np.intersect1d(regions_of(blocks << BLOCK_BITS), self.regions, assume_unique=True)
