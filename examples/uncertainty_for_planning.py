@@ -29,7 +29,7 @@ def main() -> None:
     drive = radarsdf.simulate.hugin(frames=20)
     radar_map = radarsdf.fit(drive.points, drive.poses)
 
-    every = radar_map.mesh(0.2, max_uncertainty=np.inf, min_detection_rate=0, min_component_triangles=0)
+    every = radar_map.mesh(0.2, max_uncertainty=np.inf, min_confidence=0, min_component_triangles=0)
     certain = radar_map.mesh(0.2, max_uncertainty=CERTAIN_M, min_confidence=PROBABLE)
     print(
         f"{every.area:.0f} m² of surface, {certain.area:.0f} m² within {CERTAIN_M} m and with {PROBABLE:.0%}"

@@ -72,7 +72,7 @@ def test_fits(wall, tmp_path):
 def test_maps(a_map):
     refused("path", radarsdf.load, NO_PATH)
     refused("path", a_map.save, NO_PATH)
-    for name in ("min_confidence", "max_uncertainty", "min_detection_rate", "voxel_size"):
+    for name in ("min_confidence", "max_uncertainty", "voxel_size"):
         refused(name, a_map.mesh, NO_NUMBER)
     refused("box", a_map.mesh, NO_ARRAY)
     refused("viewpoint", a_map.mesh, NO_ARRAY)

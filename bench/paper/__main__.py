@@ -171,7 +171,7 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         metavar="NAME=VALUE",
         help="curve, calibration: one more fit, with these settings of FitConfig, such as training.joint=False, or of the mesh, such as "
-        "mesh.min_detection_rate=0; may be repeated",
+        "mesh.min_confidence=0; may be repeated",
     )
     return parser
 

@@ -29,7 +29,7 @@ _OURS = ("radarsdf", "radarsdf, intensities")
 # Settings that differ from the default, measured one by one, with intensities.
 _LEVERS: tuple[Changes, ...] = (
     {"returns": {"drop_ghosts": False}},
-    {"mesh": {"min_detection_rate": 0.0}},
+    {"mesh": {"min_confidence": 0.0}},
     {"encoding": {"bridge_cells": 0}},
     {"training": {"row_updates": False}},
     {"training": {"optimiser": "adam", "intensity_learning_rate": 6e-3}},

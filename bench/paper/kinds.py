@@ -65,7 +65,7 @@ def _judged(scene: Scene, options: Options, name: str, repetition: int) -> list[
 
 
 WHOLE: dict[str, Any] = {
-    "min_detection_rate": 0.0,
+    "min_confidence": 0.0,
     "max_uncertainty": np.inf,
     "min_component_triangles": 0,
 }

@@ -60,7 +60,7 @@ class Peer:
 
 # What the published mesh leaves out.
 _MESHES: dict[str, dict[str, Any]] = {
-    "paper": {"min_detection_rate": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 300}
+    "paper": {"min_confidence": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 300}
 }
 
 

@@ -1,19 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The rule that `python -m bench.paper.one_probability` tries beside that of a mesh."""
+"""What `python -m bench.paper.one_probability` learns."""
 
 from __future__ import annotations
-
-import dataclasses
 
 import numpy as np
 import pytest
 import radarsdf
-import torch
 from radarsdf import FitConfig
-from radarsdf.map import queries
 
-from bench.paper.one_probability import Example, columns_of, threshold
+from bench.paper.one_probability import Example, logistic_regression
 
 
 @pytest.fixture(scope="module")
@@ -30,26 +26,11 @@ def contents():
     )._contents
 
 
-def test_the_threshold_is_that_of_the_highest_expected_f_score():
-    rng = np.random.default_rng(1)
-    p, added, areas = rng.uniform(size=(3, 200))
-    found = threshold(p, added, areas)
-
-    def expected(limit):
-        kept = p >= limit
-        precision = (p * areas)[kept].sum() / areas[kept].sum()
-        completion = (added * areas)[kept].sum() / (added * areas).sum()
-        return 2 * precision * completion / (precision + completion)
-
-    assert expected(found) == pytest.approx(max(expected(limit) for limit in p))
-    assert expected(found) > expected(0) + 0.01
-
-
 def test_what_a_second_layer_adds_is_nothing(contents):
     """Two vertices lie near two points of the truth: the more probable one covers it."""
     near, points = np.array([0, 1, 0, 1, 2]), np.array([0, 0, 1, 1, 2])
     areas = np.ones(3)
-    example = Example("", "", np.zeros((3, 3)), contents, None, None, None, areas, None, near, points)
+    example = Example("", "", np.zeros((3, 3)), contents, 0.2, None, None, None, areas, None, near, points)
     added = example.added(np.array([0.9, 0.5, 0.7]))
     assert added[1] == 0
     assert added[0] == pytest.approx(2 * added[2])
@@ -57,14 +38,11 @@ def test_what_a_second_layer_adds_is_nothing(contents):
     assert both[0] == both[1] == pytest.approx(both[2])
 
 
-def test_what_is_missing_counts_in_deviations_of_chance(contents):
-    """A surface that answers as often as it should misses nothing, however many scans looked."""
-    evidence = queries.evidence(contents, torch.tensor([[5.0, 0, 0]]))
-    assert columns_of(contents, evidence)[0, 2] == 0
-    missing = [
-        columns_of(contents, evidence._replace(detections=evidence.detections * 0, looks=evidence.looks * n))
-        for n in (1, 100)
-    ]
-    assert 0 < missing[0][0, 2] < missing[1][0, 2] / 5
-    rough = dataclasses.replace(contents, rough_share=0.3)
-    assert columns_of(rough, evidence)[0, 3] == pytest.approx(np.log(0.3))
+def test_a_regression_finds_the_numbers_again():
+    rng = np.random.default_rng(0)
+    columns = np.column_stack([np.ones(5000), rng.normal(size=(5000, 2))])
+    numbers = np.array([-0.5, 1.0, -2.0])
+    shares = 1 / (1 + np.exp(-(columns @ numbers)))
+    np.testing.assert_allclose(
+        logistic_regression(columns, shares, rng.uniform(size=5000)), numbers, atol=1e-6
+    )

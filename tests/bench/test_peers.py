@@ -45,7 +45,7 @@ def test_changes_of_a_group_leave_its_other_settings():
         "training": {"learning_rate": 1e-2},
         "seed": 1,
     }
-    published = {"min_detection_rate": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 300}
+    published = {"min_confidence": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 300}
     assert peer.options["mesh"] == {"voxel_size": 0.3, **published}
     assert "num_levels" not in PEERS["SHINE (octree)"].options["changes"]["encoding"]
 

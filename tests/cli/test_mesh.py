@@ -4,8 +4,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+import radarsdf
 import trimesh
+from radarsdf.map.threshold import Threshold
 
 from .calls import call, refusal
 
@@ -13,6 +16,7 @@ BOX = ["--box", 9, -4, -1, 18, 4, 1]
 
 
 def test_a_part_in_colour_with_a_picture(map_file, tmp_path, capsys):
+    fitted = radarsdf.load(map_file).mesh(0.2, box=np.reshape(BOX[1:], (2, 3)), progress=False)
     ply, png = tmp_path / "mesh.ply", tmp_path / "mesh.png"
     view = ["--viewpoint", 2, 0, 1.5, "--picture", png]
     assert call("mesh", map_file, "-o", ply, "--voxel", 0.2, *BOX, *view, "--quiet") == 0
@@ -20,6 +24,7 @@ def test_a_part_in_colour_with_a_picture(map_file, tmp_path, capsys):
     printed = capsys.readouterr()
     assert printed.out.splitlines() == [
         f"{len(mesh.vertices)} vertices and {len(mesh.faces)} triangles written to {ply}",
+        f"{Threshold.of_mesh(fitted.metadata)}",
         f"picture written to {png}",
     ]
     assert printed.err == ""
@@ -35,11 +40,10 @@ def test_less_is_left_where_more_is_asked(map_file, tmp_path):
         assert call("mesh", map_file, "-o", path, "--voxel", 0.2, *BOX, "--quiet", *words) == 0
         return len(trimesh.load_mesh(path, process=False).faces)
 
-    everything = triangles()
-    assert 0 < triangles("--min-confidence", 0.995) < everything
-    assert 0 < triangles("--min-detection-rate", 0.3) < everything
-    assert 0 < triangles("--max-uncertainty", 0.015) < everything
-    assert triangles("--min-detection-rate", 0.028) == everything  # the default
+    default = triangles()
+    assert 0 < triangles("--min-confidence", 0.995) < default
+    assert triangles("--min-confidence", 0) >= default
+    assert 0 < triangles("--max-uncertainty", 0.015) < default
 
 
 @pytest.mark.parametrize("viewpoint", [[], ["--viewpoint", 0, 0, 1]])
@@ -62,8 +66,8 @@ def test_a_viewpoint_for_a_map_without_intensities(scans_file, tmp_path, capsys)
         (["--voxel", 0], "voxel"),
         (["--box", 1, 1, 1, 0, 0, 0], "box must be a lower and an upper corner"),
         (["--min-confidence", 2], "min_confidence"),
-        (["--min-detection-rate", -0.1], "min_detection_rate"),
-        (["--min-detection-rate", "nan"], "min_detection_rate"),
+        (["--min-confidence", -0.1], "min_confidence"),
+        (["--min-confidence", "nan"], "min_confidence"),
     ],
 )
 def test_values_that_make_no_sense(map_file, tmp_path, capsys, words, said):

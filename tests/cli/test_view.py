@@ -68,8 +68,9 @@ def test_it_serves_until_ctrl_c(map_file, scans_file):
         [*command, "--quiet"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=hidden
     )
     try:
-        first, second = process.stdout.readline(), process.stdout.readline()
+        first, second, third = (process.stdout.readline() for _ in range(3))
         port = int(re.fullmatch(r"\d+ vertices on http://localhost:(\d+); Ctrl-C ends it\n", first)[1])
+        assert third.startswith("the surface is kept from a confidence of 0.")
         assert second == (
             f"from elsewhere: ssh -L {port}:localhost:{port} {socket.gethostname()}, then http://localhost:{port}\n"
         )

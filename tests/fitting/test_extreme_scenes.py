@@ -51,7 +51,7 @@ def finite(radar_map, sensor):
     if radar_map.has_intensity:
         assert np.isfinite(radar_map.intensity(x, sensor)).all()
     voxel_size = radar_map.config.leaf_size_m / 2
-    mesh = radar_map.mesh(voxel_size, min_detection_rate=0, min_component_triangles=0, progress=False)
+    mesh = radar_map.mesh(voxel_size, min_confidence=0, min_component_triangles=0, progress=False)
     assert np.isfinite(mesh.vertices).all()
     return x, mesh
 

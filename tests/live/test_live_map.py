@@ -81,7 +81,7 @@ def test_a_mesh_that_grows_is_that_of_a_quick_fit():
         num_threads=1, returns=KNOWN, encoding={"bridge_cells": 4}, training={"start": "smoothed"}
     )
     batch = radarsdf.fit(SCENE.points[:6], SCENE.poses[:6], config=quick, origin=ORIGIN, progress=False)
-    whole = batch.mesh(quick.leaf_size_m, min_component_triangles=8)
+    whole = batch.mesh(quick.leaf_size_m)
     assert len(whole.faces) == len(grown.faces) > 1000
 
     def triangles(mesh):

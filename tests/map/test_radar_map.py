@@ -299,7 +299,12 @@ def test_confidence_is_that_of_the_returns_round_a_point(sharp_map, scene):
     assert (confidence > 0).all()
     assert (confidence < 1).all()
     near = np.abs(returns[:, None] - returns[None, :300]).max(axis=2) < 0.3  # 27 cells of 0.2 m, centred
-    assert np.corrcoef(near.sum(axis=0), confidence[:300] / (1 - confidence[:300]))[0, 1] > 0.8
+    # The odds grow with what these tell together. Their number alone counts only where they are too few for a surface.
+    ranges_m = np.linalg.norm(np.concatenate(scene.points), axis=1)
+    range_m, azimuth_rad, elevation_rad = sharp_map.report["noise"].values()
+    information = 1 / (range_m**2 + ranges_m**2 * (azimuth_rad**2 + elevation_rad**2))
+    odds = confidence[:300] / (1 - confidence[:300])
+    assert np.corrcoef(information @ near, odds)[0, 1] > 0.8
     assert (sharp_map.confidence(returns + [0, 0, 50.0]) == 0).all()
     # Continuous: no step from one cell to the next. It falls steeply only where the information ends.
     line = np.linspace(returns[0] - 0.5, returns[0] + 0.5, 2001)

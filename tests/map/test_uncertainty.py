@@ -96,7 +96,7 @@ def test_nothing_is_known_where_nothing_was_observed(walls):
 
 def test_the_mesh_leaves_out_what_is_uncertain(walls):
     _, radar_map = walls
-    kept = {"min_detection_rate": 0, "min_component_triangles": 0}
+    kept = {"min_confidence": 0, "min_component_triangles": 0}
     everything = radar_map.mesh(max_uncertainty=math.inf, **kept)
     certain = radar_map.mesh(max_uncertainty=0.035, **kept)
     assert everything.vertices[:, 0].max() > 39

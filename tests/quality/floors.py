@@ -252,7 +252,7 @@ def jittered(kind: str, scene: Scene, sigma_m: float) -> Quality:
 def with_ghosts(kind: str, scene: Scene) -> Quality:
     """With all that mirrors and clutter bring, and every piece of surface."""
     config = config_of(kind, scene).override(returns={"drop_ghosts": False})
-    everything = {"min_detection_rate": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 0}
+    everything = {"min_confidence": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 0}
     return measure(scene, config, VOXEL_M[kind], intensities=False, **everything)
 
 

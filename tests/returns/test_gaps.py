@@ -104,7 +104,7 @@ def test_a_sparse_surface_has_fewer_holes():
     for cells in (0, 2):
         config = FitConfig(num_threads=1, encoding={"bridge_cells": cells})
         radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
-        mesh = radar_map.mesh(min_detection_rate=0)
+        mesh = radar_map.mesh(min_confidence=0)
         area[cells] = mesh.area
         off_m = np.minimum(np.abs(mesh.vertices[:, 2]), np.abs(mesh.vertices[:, 0] - 20))
         assert np.percentile(off_m, 95) < 0.2

@@ -10,6 +10,7 @@ import radarsdf
 import trimesh
 from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, mesh_components, sparse_lattice
+from radarsdf.map.meshing import Surface
 
 from .conftest import TILE_M
 
@@ -34,9 +35,9 @@ def in_one_go(city, steps, min_triangles):
     )
     evidence = city.evidence(vertices)
     contents = city.any_contents
-    good = queries.answers(evidence, queries.MIN_DETECTION_RATE).numpy()
-    uncertainty_m = queries.uncertainty(contents, evidence).numpy()
-    good &= np.nan_to_num(uncertainty_m, nan=np.inf) <= queries.max_uncertainty_m(contents)
+    surface = Surface.told_by(contents, vertices, faces, evidence, 0)
+    good = surface.confidence >= surface.tally.threshold().min_confidence
+    good &= np.nan_to_num(surface.uncertainty_m, nan=np.inf) <= queries.max_uncertainty_m(contents)
     faces = faces[good[faces].all(axis=1)]
     labels, sizes = mesh_components(faces, len(vertices))
     return vertices, faces[sizes[labels] >= min_triangles]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf.map.colors import intensity_colors
+from radarsdf.map.threshold import Threshold
 from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import glb
 from radarsdf.view.light import shaded
@@ -56,7 +57,7 @@ def test_a_map_without_a_surface_here(sharp_map):
 def test_limits_leave_out_vertices_and_their_triangles():
     surface = ShownSurface(
         SQUARE, TWO, np.array([0.1, 0.1, 0.1, 0.4], np.float32), np.array([0.5, 1, 1, 1], np.float32),
-        np.ones(4, np.float32), 1.0,
+        np.ones(4, np.float32), Threshold(0.5, 0.9, 0.9, 0.9, 0.9), 1.0,
     )  # fmt: skip
 
     def part(*limits):

@@ -155,9 +155,10 @@ def ends_with_viewer(options: argparse.Namespace) -> bool:
 
 
 def _say_errors(results: Results, radar_map: RadarMap, mesh: trimesh.Trimesh, scans: Scans) -> None:
-    """Say how far the mesh is from the truth, if that is known, and what the lines on intensities are."""
+    """Say how far the mesh is from the truth, expected and measured if that is known, and what the lines on intensities are."""
     from radarsdf.evaluation import format_metrics, surface_metrics
 
+    results.add_threshold(mesh.metadata)
     if scans.ground_truth is not None:
         metrics = surface_metrics(mesh, scans.ground_truth, samples=1_000_000)
         results.add(

@@ -60,6 +60,7 @@ def run(options: argparse.Namespace) -> None:
     origin = write_mesh(options.out, mesh)
     results = Results(options)
     say_mesh(results, mesh, options.out, origin)
+    results.add_threshold(mesh.metadata)
     if options.picture:
         save_picture(options.picture, mesh, scalar=mesh.vertex_attributes.get("intensity"))
         results.add(f"picture written to {options.picture}", picture=options.picture)

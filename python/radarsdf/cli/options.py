@@ -111,9 +111,8 @@ def add_surface(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--min-confidence",
         type=float,
-        default=0.0,
         metavar="C",
-        help="leave out the surface whose confidence is below C, 0 to 1; default: 0",
+        help="leave out the surface whose confidence is below C, 0 to 1; default: that of the highest expected F-score",
     )
     parser.add_argument(
         "--max-uncertainty",
@@ -122,18 +121,10 @@ def add_surface(parser: argparse.ArgumentParser) -> None:
         help="leave out the surface whose standard error is above M, m; default: it follows from the returns",
     )
     parser.add_argument(
-        "--min-detection-rate",
-        type=float,
-        default=0.028,
-        metavar="RATE",
-        help="leave out the surface with returns in a smaller share of the scans that looked there; default: 0.028",
-    )
-    parser.add_argument(
         "--min-component",
         type=int,
-        default=30,
         metavar="N",
-        help="leave out connected pieces of fewer triangles; default: 30",
+        help="leave out connected pieces of fewer triangles; default: 30, and fewer in voxels above 0.1 m",
     )
 
 
@@ -142,7 +133,6 @@ def limits_of(options: argparse.Namespace) -> dict[str, Any]:
     return {
         "min_confidence": options.min_confidence,
         "max_uncertainty": options.max_uncertainty,
-        "min_detection_rate": options.min_detection_rate,
         "min_component_triangles": options.min_component,
     }
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,13 @@ class Results:
         if line is not None and not self._json:
             say(line)
         self._values |= values
+
+    def add_threshold(self, metadata: Mapping[str, Any]) -> None:
+        """Say from which confidence on a mesh with this ``metadata`` was kept, and what that costs."""
+        from radarsdf.map.threshold import Threshold
+
+        threshold = Threshold.of_mesh(metadata)
+        self.add(str(threshold), **threshold.metadata)
 
     def end(self) -> None:
         """Print the object, if it is for programs. A number that is not finite is null."""

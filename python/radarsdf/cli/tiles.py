@@ -219,6 +219,7 @@ def _mesh(options: argparse.Namespace, results: Results, folder: Path, out: Path
         triangles=triangles,
         out=out,
     )
+    results.add_threshold(city.threshold(options.voxel, **limits_of(options)).metadata)
 
 
 def _clean(results: Results, folder: Path) -> None:

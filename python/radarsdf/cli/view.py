@@ -74,6 +74,7 @@ def show(radar_map: Map, scans: Scans | None, *, open_page: bool, **arguments: A
             say(note)
         say(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it")
         say(f"from elsewhere: {ssh_line(viewer.host, viewer.port)}, then {url_of('localhost', viewer.port)}")
+        say(f"the surface is {viewer.surface.threshold}")
         if open_page:
             import webbrowser
 

@@ -184,7 +184,7 @@ class FitConfig:
     def paper(cls, **changes: Any) -> FitConfig:
         """The settings of 3QFPI as published. `changes`: as for :meth:`override`.
 
-        For a mesh as published, call ``mesh(min_detection_rate=0, max_uncertainty=math.inf, min_component_triangles=300)``.
+        For a mesh as published, call ``mesh(min_confidence=0, max_uncertainty=math.inf, min_component_triangles=300)``.
         """
         return cls(
             returns=ReturnsConfig(

@@ -29,7 +29,6 @@ from radarsdf.live.scans import Integrated, checked_scan, finite_time
 from radarsdf.live.shelf import Shelf
 from radarsdf.live.state import GrowingState
 from radarsdf.live.storage import load_state, save_state
-from radarsdf.map import queries
 from radarsdf.returns.evidence import Looks
 from radarsdf.threads import resolve_num_threads
 
@@ -336,17 +335,15 @@ class LiveMap:
     def mesh(
         self,
         *,
-        min_confidence: float = 0.0,
+        min_confidence: float | None = None,
         max_uncertainty: float | None = None,
-        min_detection_rate: float = queries.MIN_DETECTION_RATE,
         min_component_triangles: int | None = None,
     ) -> trimesh.Trimesh:
         """The surface as triangles, in voxels of the size of leaf cells. Only what changed is made anew.
 
-        The arguments and the result are those of :meth:`Map.mesh`; by default the smallest piece that is kept has the area that
-        it has in a mesh of the default voxels. The mesh is empty if there is no surface.
+        The arguments and the result are those of :meth:`Map.mesh`. The mesh is empty if there is no surface.
         """
-        from radarsdf.map.meshing import check_limits  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.map.meshing import Limits  # noqa: PLC0415 - trimesh is slow to import
 
         with self._reading:
             num_threads = resolve_num_threads(self._state.config.num_threads)
@@ -358,12 +355,9 @@ class LiveMap:
             except BaseException:  # Ctrl-C, say: half of it would be wrong from now on
                 self._state.forget_surface()
                 raise
-        limits = check_limits(found.scene, min_confidence, max_uncertainty, min_detection_rate)
-        if min_component_triangles is None:
-            min_component_triangles = queries.component_triangles(found.scene.config.leaf_size_m)
-        whole_number(min_component_triangles, "min_component_triangles", 0)
-        kept = found.surface.kept(*limits, min_component_triangles)
-        return found.surface.mesh(found.scene.origin, kept, found.leaf_cells)
+        voxel_m = found.scene.config.leaf_size_m
+        limits = Limits.of(found.scene, voxel_m, min_confidence, max_uncertainty, min_component_triangles)
+        return found.surface.mesh(found.scene.origin, limits, found.leaf_cells)
 
     def map(self) -> RadarMap:
         """What is known now, as a map that does not grow: the quick fit of all scans, smoothed. Intensities are in closed form.

@@ -5,22 +5,60 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import MAX_POSITION_M, not_negative, number, positive, real_array, whole_number
+from radarsdf.checks import MAX_POSITION_M, number, positive, real_array, whole_number
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents, Scene
 from radarsdf.map.isosurface import extract_cells, mesh_components
+from radarsdf.map.threshold import Tally, Threshold, areas_round
 from radarsdf.map.voxels import sample_lattice
 
 with whole_import():
     import trimesh
+
+
+class Limits(NamedTuple):
+    """What a mesh leaves out; see :meth:`Map.mesh`."""
+
+    min_confidence: float | None
+    """None: that of the highest expected F-score."""
+    max_uncertainty: float
+    """m"""
+    min_component_triangles: int
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        voxel_m: float,
+        min_confidence: float | None = None,
+        max_uncertainty: float | None = None,
+        min_component_triangles: int | None = None,
+    ) -> Limits:
+        """The arguments of :meth:`Map.mesh` as numbers. Raises a ValueError if they are out of range."""
+        if min_confidence is not None:
+            min_confidence = number(min_confidence, "min_confidence")
+            if not 0 <= min_confidence <= 1:
+                msg = f"min_confidence must be in [0, 1], not {min_confidence}"
+                raise ValueError(msg)
+        if max_uncertainty is None:
+            max_uncertainty = queries.max_uncertainty_m(scene)
+        max_uncertainty = number(max_uncertainty, "max_uncertainty")
+        if max_uncertainty < 0:
+            msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
+            raise ValueError(msg)
+        if min_component_triangles is None:
+            min_component_triangles = queries.piece_triangles(voxel_m)
+        whole_number(min_component_triangles, "min_component_triangles", 0)
+        return cls(min_confidence, max_uncertainty, min_component_triangles)
 
 
 @dataclass(frozen=True)
@@ -37,6 +75,8 @@ class Surface:
     """(V,) see :meth:`Map.confidence`."""
     uncertainty_m: NDArray[np.float32]
     """(V,) see :meth:`Map.uncertainty`."""
+    tally: Tally
+    """All of it by its confidence."""
     cells_searched: int
     """Number of leaf cells in which the surface can be."""
 
@@ -71,39 +111,49 @@ class Surface:
         cells_searched: int,
     ) -> Surface:
         """Triangles with the evidence of their vertices; all as of the fields."""
+        confidence = queries.confidence(scene, evidence)
         return cls(
             vertices,
             faces,
             evidence,
-            queries.confidence(scene, evidence).numpy(),
+            confidence.numpy(),
             queries.uncertainty(scene, evidence).numpy(),
+            Tally.of(
+                areas_round(vertices, faces),
+                confidence.double().numpy(),
+                queries.covering(scene, evidence).numpy(),
+                queries.reach(scene, evidence).numpy(),
+                evidence.detections.double().numpy(),
+            ),
             cells_searched,
         )
 
-    def kept(
-        self,
-        min_confidence: float,
-        max_uncertainty: float,
-        min_detection_rate: float,
-        min_component_triangles: int,
-    ) -> NDArray[np.bool_]:
-        """Which of the faces a mesh keeps, (F,). The arguments are those of :meth:`Map.mesh`."""
-        good = (self.confidence >= min_confidence) & queries.answers(
-            self.evidence, min_detection_rate
-        ).numpy()
-        good &= np.nan_to_num(self.uncertainty_m, nan=np.inf) <= max_uncertainty
-        kept: NDArray[np.bool_] = good[self.faces].all(axis=1)
+    def kept(self, limits: Limits) -> NDArray[np.bool_]:
+        """Which of the faces a mesh keeps, (F,)."""
+        good = np.nan_to_num(self.uncertainty_m, nan=np.inf) <= limits.max_uncertainty
+        good &= self.confidence >= self.threshold(limits).min_confidence
+        kept = np.asarray(good[self.faces].all(axis=1), bool)
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
-            kept[rows] = sizes[labels] >= min_component_triangles
+            kept[rows] = sizes[labels] >= limits.min_component_triangles
         return kept
 
-    def mesh(self, origin: NDArray[np.float64], kept: NDArray[np.bool_], leaf_cells: int) -> trimesh.Trimesh:
-        """The faces that are `kept` (F,), in the world; `leaf_cells` of the whole map."""
+    def threshold(self, limits: Limits) -> Threshold:
+        """From which confidence on a mesh keeps it."""
+        return self.tally.threshold(limits.min_confidence)
+
+    def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
+        """What the limits leave, in the world; `leaf_cells` of the whole map."""
+        mesh = self.part(origin, self.kept(limits))
+        mesh.metadata |= {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
+        mesh.metadata |= self.threshold(limits).metadata
+        return mesh
+
+    def part(self, origin: NDArray[np.float64], kept: NDArray[np.bool_]) -> trimesh.Trimesh:
+        """The faces that are `kept` (F,), in the world."""
         used, faces = renumbered(len(self.vertices), self.faces[kept])
         mesh = trimesh.Trimesh(self.vertices[used] + origin, faces, process=False)
-        mesh.metadata |= {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         mesh.vertex_attributes["confidence"] = self.confidence[used]
         mesh.vertex_attributes["uncertainty_m"] = self.uncertainty_m[used]
         return mesh
@@ -115,47 +165,27 @@ def extract_mesh(
     *,
     box: ArrayLike | None,
     viewpoint: ArrayLike | None,
-    min_confidence: float,
+    min_confidence: float | None,
     max_uncertainty: float | None,
-    min_detection_rate: float,
-    min_component_triangles: int,
+    min_component_triangles: int | None,
     progress: bool | None,
 ) -> trimesh.Trimesh:
     """See :meth:`Map.mesh`."""
-    limits = check_limits(contents, min_confidence, max_uncertainty, min_detection_rate)
-    whole_number(min_component_triangles, "min_component_triangles", 0)
     voxel_size = positive(voxel_size, "voxel_size")
     if voxel_size > MAX_POSITION_M:
         msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
         raise ValueError(msg)
+    limits = Limits.of(contents, voxel_size, min_confidence, max_uncertainty, min_component_triangles)
     sensor_position = None if viewpoint is None else check_viewpoint(contents.intensity_scale, viewpoint)
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)
-    kept = surface.kept(*limits, min_component_triangles)
-    mesh = surface.mesh(contents.origin, kept, len(contents.evidence.looks))
+    mesh = surface.mesh(contents.origin, limits, len(contents.evidence.looks))
     if sensor_position is not None:
         points, _ = queries.into_cells(contents, local(contents, np.array(mesh.vertices, np.float64)))
         sensors = local(contents, np.array(sensor_position[None])).expand(len(points), 3)
         assert contents.intensity_scale is not None
         add_intensity(mesh, queries.intensity(contents, points, sensors).numpy(), contents.intensity_scale)
     return mesh
-
-
-def check_limits(
-    contents: Scene, min_confidence: float, max_uncertainty: float | None, min_detection_rate: float
-) -> tuple[float, float, float]:
-    """These arguments of :meth:`Map.mesh` as numbers. Raises a ValueError if they are out of range."""
-    min_confidence = number(min_confidence, "min_confidence")
-    if not 0 <= min_confidence <= 1:
-        msg = f"min_confidence must be in [0, 1], not {min_confidence}"
-        raise ValueError(msg)
-    if max_uncertainty is None:
-        max_uncertainty = queries.max_uncertainty_m(contents)
-    max_uncertainty = number(max_uncertainty, "max_uncertainty")
-    if max_uncertainty < 0:
-        msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
-        raise ValueError(msg)
-    return min_confidence, max_uncertainty, not_negative(min_detection_rate, "min_detection_rate")
 
 
 def local(contents: Scene, world: NDArray[np.float64]) -> torch.Tensor:

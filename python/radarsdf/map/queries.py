@@ -34,25 +34,26 @@ _ROUGH_FLOOR_CELLS = 1.1
 # Up to this error, apart from that part, a surface is meshed, leaf cells: in smooth scenes, and over the rough share.
 _MAX_ERROR_CELLS = 2.0
 _ROUGH_MAX_ERROR_CELLS = 0.27
-# Of the confidence, found by `python -m bench.paper.confidence_model`: logit = the first number, and the others times
-# the logarithms of the error in leaf cells, of the detection rate, and of the rough share.
-_LOGIT = (-2.34, -0.99, 0.40, -1.16)
+# Found by `python -m bench.paper.one_probability`: the logit of the confidence, and that of `covering`, are the first number, and
+# the others times the columns of `terms`.
+_CONFIDENCE = (-2.09, -1.01, -1.37, -1.01)
+_COVERING = (-3.58, -0.75, -1.73, -0.51)
+_LEAST_LOGIT = -80.0  # what was seen is not impossible: float32 has this probability
 _MIN_ROUGH_SHARE = 0.01
-# A place counts as answering too rarely if its detections are so many standard deviations of a chance count (Poisson)
-# below what is expected: ten scans cannot tell as much as a thousand.
-_RATE_DEVIATIONS = 0.5
+# At least so many of the scans that looked at a surface have a return in one of its cells.
+_DETECTION_RATE = 1 / 36
+_SMOOTH = 0.5  # deviations of chance: a few more detections than needed are a little more evidence
 # Defaults of a mesh.
 VOXEL_M = 0.1
-MIN_DETECTION_RATE = 0.028
-MIN_COMPONENT_TRIANGLES = 30
+_PIECE_TRIANGLES = 30  # of the smallest piece that is kept, in voxels of that edge
 INWARD = 1e-3  # how far points on the border of a map are moved into it, edges of a cell
 _CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
 _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
 
 
-def component_triangles(voxel_m: float) -> int:
-    """Triangles of the smallest piece that a mesh keeps in voxels of this edge, m: the area it has in voxels of the default."""
-    return round(MIN_COMPONENT_TRIANGLES * min(1.0, (VOXEL_M / voxel_m) ** 2))
+def piece_triangles(voxel_m: float) -> int:
+    """Triangles of the smallest piece that a mesh keeps in voxels of this edge, m: in larger voxels fewer, of more area."""
+    return round(_PIECE_TRIANGLES * min(1.0, VOXEL_M / voxel_m))
 
 
 @torch.inference_mode(mode=False)  # gradients, of which normals are made, need ordinary tensors
@@ -204,30 +205,39 @@ def _floor_m(contents: Scene) -> float:
 def confidence(contents: Scene, evidence: EvidenceAt) -> Tensor:
     """(N,) probability that a surface is within a leaf cell's edge. 0 where there are no returns."""
     start_vector_library()
-    terms = confidence_terms(contents, evidence)
-    probability = (terms * torch.tensor(_LOGIT, dtype=torch.float64, device="cpu")).sum(1).sigmoid()
-    # A surface is no nearer than its position is known: the share of a normal distribution within a cell's edge.
-    error_cells = terms[:, 1].exp()
-    return probability.minimum(torch.erf(math.sqrt(0.5) / error_cells)).float()
+    # A surface is no nearer than its position is known.
+    return _logistic(_CONFIDENCE, contents, evidence).minimum(reach(contents, evidence)).float()
 
 
-def confidence_terms(contents: Scene, evidence: EvidenceAt) -> Tensor:
-    """(N, 4) float64: 1, and the logarithms of what the confidence depends on. Infinite without returns."""
-    error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
-    rate = (evidence.detections + 0.5) / (evidence.looks + 2)  # finite and positive, whatever the counts
-    rough_share = torch.full_like(error_cells, max(contents.rough_share, _MIN_ROUGH_SHARE))
-    return torch.stack(
-        [torch.ones_like(error_cells), error_cells.log(), rate.double().log(), rough_share.log()], 1
-    )
+def covering(contents: Scene, evidence: EvidenceAt) -> Tensor:
+    """(N,) float64: truth that a surface covers and none of more confidence does, for its area. In proportion to each other."""
+    return _logistic(_COVERING, contents, evidence)
 
 
-def answers(evidence: EvidenceAt, rate: float) -> Tensor:
-    """(N,) bool, whether scans that looked there had returns often enough for a surface.
+def reach(contents: Scene, evidence: EvidenceAt) -> Tensor:
+    """(N,) float64: share of a normal distribution of the position's error within a leaf cell's edge. 0 without returns."""
+    return torch.erf(math.sqrt(0.5) / _error_cells(contents, evidence))
 
-    `rate`: share of them with a return in a cell of the surface.
+
+def terms(contents: Scene, evidence: EvidenceAt) -> Tensor:
+    """(N, 4) float64, of which logits are made: 1, the logarithm of the error in leaf cells, how many returns of a surface are
+    missing there, in deviations of chance, and the logarithm of the rough share. Infinite without returns.
     """
-    expected = CELLS_OF_SURFACE * rate * evidence.looks
-    return evidence.detections >= expected - _RATE_DEVIATIONS * expected.sqrt()
+    error_cells = _error_cells(contents, evidence)
+    expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.looks.double()
+    deviations = (expected - evidence.detections.double()) / (expected + 1).sqrt()
+    missing = (deviations + deviations.square().add(_SMOOTH**2).sqrt()) / 2  # a smooth max(0, deviations)
+    rough_share = torch.full_like(error_cells, max(contents.rough_share, _MIN_ROUGH_SHARE))
+    return torch.stack([torch.ones_like(error_cells), error_cells.log(), missing, rough_share.log()], 1)
+
+
+def _logistic(logit: tuple[float, ...], contents: Scene, evidence: EvidenceAt) -> Tensor:
+    weights = torch.tensor(logit, dtype=torch.float64, device="cpu")
+    return (terms(contents, evidence) * weights).sum(1).clamp(min=_LEAST_LOGIT).sigmoid()
+
+
+def _error_cells(contents: Scene, evidence: EvidenceAt) -> Tensor:
+    return evidence.information.double().rsqrt() / contents.config.leaf_size_m
 
 
 @torch.inference_mode(mode=False)

@@ -73,10 +73,9 @@ class RadarMap(Map):
         *,
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
-        min_confidence: float = 0.0,
+        min_confidence: float | None = None,
         max_uncertainty: float | None = None,
-        min_detection_rate: float = queries.MIN_DETECTION_RATE,
-        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
+        min_component_triangles: int | None = None,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
         from radarsdf.map.meshing import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
@@ -88,7 +87,6 @@ class RadarMap(Map):
             viewpoint=viewpoint,
             min_confidence=min_confidence,
             max_uncertainty=max_uncertainty,
-            min_detection_rate=min_detection_rate,
             min_component_triangles=min_component_triangles,
             progress=progress,
         )

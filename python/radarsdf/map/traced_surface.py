@@ -16,7 +16,7 @@ from radarsdf._core import SurfaceTracer
 from radarsdf.budget.estimate import check_views
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
-from radarsdf.map.meshing import Surface
+from radarsdf.map.meshing import Limits, Surface
 from radarsdf.threads import resolve_num_threads
 
 # Scans that looked at a place where none had a return count for so many: with few looks, a rate is uncertain.
@@ -55,8 +55,7 @@ class TracedSurface:
         check_views(contents.config.max_memory_bytes, cells=len(contents.evidence.looks))
         return cls.of_surface(
             Surface.of(contents, voxel_m),
-            voxel_m,
-            queries.max_uncertainty_m(contents),
+            Limits.of(contents, voxel_m),
             lambda points: queries.evidence(contents, torch.from_numpy(points.astype(np.float32))),
         )
 
@@ -64,20 +63,17 @@ class TracedSurface:
     def of_surface(
         cls,
         surface: Surface,
-        voxel_m: float,
-        max_uncertainty_m: float,
+        limits: Limits,
         evidence_at: Callable[[NDArray[np.float64]], queries.EvidenceAt],
     ) -> TracedSurface:
-        """All triangles of a surface in voxels of this edge, m. `evidence_at`: of points (N, 3), local frame, m."""
+        """All triangles of a surface, of which rays meet those that `limits` leave. `evidence_at`: of points (N, 3), local frame, m."""
         corners = surface.vertices[surface.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         twice_m2 = np.sqrt(np.einsum("ni,ni->n", across, across))
         centres = corners.mean(axis=1)
         evidence = evidence_at(centres)
         rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
-        components = queries.component_triangles(voxel_m)
-        kept = surface.kept(0.0, max_uncertainty_m, queries.MIN_DETECTION_RATE, components)
-        faces = np.ascontiguousarray(surface.faces[kept])
+        faces = np.ascontiguousarray(surface.faces[surface.kept(limits)])
         return cls(
             SurfaceTracer(surface.vertices, faces, resolve_num_threads(0)),
             centres,

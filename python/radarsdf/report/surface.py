@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.map.colors import NEUTRAL, intensity_colors
+from radarsdf.map.threshold import Threshold
 from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.report.page import Section, color_bar, frame, grid, image, note, paragraph
 from radarsdf.report.scene import scene_page
@@ -58,6 +59,7 @@ def surface_section(subject: Subject) -> Section:
             )
         ),
         paragraph(f"The surface is {painted}. Frame: world, with z up."),
+        paragraph(f"It is {Threshold.of_mesh(subject.mesh.metadata)}."),
     ]
     if spacing_m != subject.voxel_size_m:
         body.append(

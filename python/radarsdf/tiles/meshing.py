@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.budget.estimate import check_triangles
-from radarsdf.checks import path_of, positive, whole_number
+from radarsdf.checks import path_of, positive
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import whole_file
 from radarsdf.io.records import ply_header, records
-from radarsdf.map import queries
-from radarsdf.map.meshing import check_box, check_limits
+from radarsdf.map.meshing import Limits, check_box
+from radarsdf.map.threshold import Threshold
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.pieces import PieceSettings, divides, mesh_tile, piece_path, write_piece
 from radarsdf.tiles.running import Task, run_tasks
 from radarsdf.tiles.tileset import content_folder, write_tileset
-from radarsdf.tiles.welding import WeldedMesh
+from radarsdf.tiles.welding import WeldedMesh, tally_of
 
 with whole_import():
     import trimesh
@@ -32,13 +32,12 @@ with whole_import():
 def mesh_of(
     city: TileBlend,
     voxel_size: float,
-    min_component_triangles: int,
     executor: Executor | None,
     progress: bool | None,
     **limits: Any,
 ) -> trimesh.Trimesh:
     """See :meth:`TiledMap.mesh`."""
-    welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
+    welded = _welded(city, voxel_size, executor, progress, **limits)
     check_triangles(welded.num_faces, city.config.max_memory_bytes)
     parts = list(welded.parts())
     mesh = trimesh.Trimesh(
@@ -47,6 +46,7 @@ def mesh_of(
         process=False,
     )
     mesh.metadata |= {"leaf_cells": int(welded.cells[0]), "leaf_cells_searched": int(welded.cells[1])}
+    mesh.metadata |= welded.threshold.metadata
     mesh.vertex_attributes["confidence"] = np.concatenate([part.confidence for part in parts])
     mesh.vertex_attributes["uncertainty_m"] = np.concatenate([part.uncertainty_m for part in parts])
     return mesh
@@ -56,7 +56,6 @@ def export_mesh(
     city: TileBlend,
     path: str | PathLike[str],
     voxel_size: float,
-    min_component_triangles: int,
     executor: Executor | None,
     progress: bool | None,
     **limits: Any,
@@ -68,10 +67,10 @@ def export_mesh(
         raise ValueError(msg)
     if suffix == ".json":
         content_folder(Path(path))  # first: it says at once if it cannot be written
-        welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
+        welded = _welded(city, voxel_size, executor, progress, **limits)
         return write_tileset(city, Path(path), welded)
     with whole_file(path) as file:  # first: it says at once if it cannot be written
-        welded = _welded(city, voxel_size, min_component_triangles, executor, progress, **limits)
+        welded = _welded(city, voxel_size, executor, progress, **limits)
         columns = ("x", "y", "z", "confidence", "uncertainty_m")
         types = ["<f8"] * 3 + ["<f4"] * 2
         header = ply_header(np.dtype(list(zip(columns, types, strict=True))), welded.num_vertices)
@@ -87,24 +86,42 @@ def export_mesh(
     return welded.num_vertices, welded.num_faces
 
 
+def threshold_of(
+    city: TileBlend, voxel_size: float, executor: Executor | None, progress: bool | None, **limits: Any
+) -> Threshold:
+    """See :meth:`TiledMap.threshold`."""
+    paths, found = _pieces(city, voxel_size, executor, progress, **limits)
+    return tally_of(paths).threshold(found.min_confidence)
+
+
 def _welded(
+    city: TileBlend, voxel_size: float, executor: Executor | None, progress: bool | None, **limits: Any
+) -> WeldedMesh:
+    """Meshes all tiles, and welds them."""
+    paths, found = _pieces(city, voxel_size, executor, progress, **limits)
+    return WeldedMesh(paths, found.min_confidence, found.min_component_triangles)
+
+
+def _pieces(
     city: TileBlend,
     voxel_size: float,
-    min_component_triangles: int,
     executor: Executor | None,
     progress: bool | None,
     *,
     box: ArrayLike | None = None,
-    min_confidence: float = 0.0,
+    min_confidence: float | None = None,
     max_uncertainty: float | None = None,
-    min_detection_rate: float = queries.MIN_DETECTION_RATE,
-) -> WeldedMesh:
-    """Meshes all tiles, and welds them."""
-    whole_number(min_component_triangles, "min_component_triangles", 0)
+    min_component_triangles: int | None = None,
+) -> tuple[list[Path], Limits]:
+    """Meshes all tiles: the files of the pieces, and what a mesh of them leaves out."""
+    voxel_size = positive(voxel_size, "voxel_size")
+    limits = Limits.of(
+        city.any_contents, voxel_size, min_confidence, max_uncertainty, min_component_triangles
+    )
     settings = PieceSettings(
-        divides(positive(voxel_size, "voxel_size"), city.config.leaf_size_m),
+        divides(voxel_size, city.config.leaf_size_m),
         None if box is None else tuple(tuple(corner) for corner in check_box(box).tolist()),
-        *check_limits(city.any_contents, min_confidence, max_uncertainty, min_detection_rate),
+        limits.max_uncertainty,
     )
     tiles = [tile for tile in city.tiles if not piece_path(city, tile.tile, settings).is_file()]
     if executor is None:  # what this map holds in memory serves all tiles
@@ -118,4 +135,4 @@ def _welded(
         names = ", ".join(f"{tiles[i].name}: {reason}" for i, reason in failed.items())
         msg = f"{len(failed)} of {len(city.tiles)} tiles could not be meshed: {names!s:.400}"
         raise ValueError(msg)
-    return WeldedMesh([piece_path(city, tile.tile, settings) for tile in city.tiles], min_component_triangles)
+    return [piece_path(city, tile.tile, settings) for tile in city.tiles], limits

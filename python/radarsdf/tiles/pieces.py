@@ -17,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.io.npz import arrays_of, write_arrays
-from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
-from radarsdf.map.meshing import renumbered
+from radarsdf.map.meshing import Surface, renumbered
+from radarsdf.map.threshold import SUMS
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
@@ -39,12 +39,8 @@ class PieceSettings:
     """Along the edge of a leaf cell."""
     box: tuple[tuple[float, ...], ...] | None
     """Lower and upper corner, world, m."""
-    min_confidence: float
-    """As of :meth:`Map.mesh`."""
     max_uncertainty: float
-    """Likewise, m."""
-    min_detection_rate: float
-    """Likewise."""
+    """As of :meth:`Map.mesh`, m."""
 
     def to_json(self) -> str:
         """For arguments of tasks. :meth:`from_json` is its inverse."""
@@ -77,6 +73,8 @@ class Piece:
     axis."""
     cells: NDArray[np.int64]
     """(2,) leaf cells, and those in which the surface can be."""
+    tally: NDArray[np.float64]
+    """:meth:`Tally.sums` of all surface of the tile."""
 
     @classmethod
     def load(cls, path: Path) -> Piece:
@@ -108,6 +106,7 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
     "border_rows": (np.int64, None),
     "border_edges": (np.int64, None, 4),
     "cells": (np.int64, 2),
+    "tally": (np.float64, SUMS),
 }
 """Type and shape of each array of a `Piece`. None: any length."""
 
@@ -156,7 +155,7 @@ def write_piece(city: TileBlend, name: str, settings: PieceSettings) -> Path:
 
 
 def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
-    """The triangles of the blended field in the leaf cells of a tile that are to be kept, before small pieces go."""
+    """The triangles of the blended field in the leaf cells of a tile that are certain enough, whatever their confidence."""
     config, steps = city.config, settings.voxels_per_cell
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
     cells = _cells_in(city, tile)
@@ -181,18 +180,20 @@ def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
         spacing=[voxel_m] * 3,
         num_threads=threads,
     )
-    evidence = city.evidence(vertices)
-    confidence = queries.confidence(city.any_contents, evidence).numpy()
-    uncertainty_m = queries.uncertainty(city.any_contents, evidence).numpy()
-    good = (confidence >= settings.min_confidence) & queries.answers(
-        evidence, settings.min_detection_rate
-    ).numpy()
-    good &= np.nan_to_num(uncertainty_m, nan=np.inf) <= settings.max_uncertainty
+    surface = Surface.told_by(city.any_contents, vertices, faces, city.evidence(vertices), len(cells))
+    good = np.nan_to_num(surface.uncertainty_m, nan=np.inf) <= settings.max_uncertainty
     kept, faces = renumbered(len(vertices), faces[good[faces].all(axis=1)])
     vertices = vertices[kept]
     rows, edges = _border(config.lattice.cells(vertices) * steps, city.plan.tile_cells * steps)
     return Piece(
-        vertices, faces, confidence[kept], uncertainty_m[kept], rows, edges, np.array([found, len(cells)])
+        vertices,
+        faces,
+        surface.confidence[kept],
+        surface.uncertainty_m[kept],
+        rows,
+        edges,
+        np.array([found, len(cells)]),
+        surface.tally.sums(),
     )
 
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from radarsdf.map.gridding import CellsInBox
+    from radarsdf.map.threshold import Threshold
     from radarsdf.map.views import View, ViewedMap
     from radarsdf.tiles.grid import Tile
 
@@ -121,10 +122,9 @@ class TiledMap(TileBlend, Map):
         *,
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
-        min_confidence: float = 0.0,
+        min_confidence: float | None = None,
         max_uncertainty: float | None = None,
-        min_detection_rate: float = queries.MIN_DETECTION_RATE,
-        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
+        min_component_triangles: int | None = None,
         executor: Executor | None = None,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
@@ -138,11 +138,11 @@ class TiledMap(TileBlend, Map):
 
         sensor_position = None if viewpoint is None else check_viewpoint(self.intensity_scale, viewpoint)
         mesh = mesh_of(
-            self, voxel_size, min_component_triangles, executor, progress,
+            self, voxel_size, executor, progress,
             box=box,
             min_confidence=min_confidence,
             max_uncertainty=max_uncertainty,
-            min_detection_rate=min_detection_rate,
+            min_component_triangles=min_component_triangles,
         )  # fmt: skip
         if sensor_position is not None and self.intensity_scale is not None:
             values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position, extrapolate=True)
@@ -208,7 +208,6 @@ class TiledMap(TileBlend, Map):
         path: str | PathLike[str],
         voxel_size: float = queries.VOXEL_M,
         *,
-        min_component_triangles: int = queries.MIN_COMPONENT_TRIANGLES,
         executor: Executor | None = None,
         progress: bool | None = None,
         **limits: Any,
@@ -228,7 +227,15 @@ class TiledMap(TileBlend, Map):
         """
         from radarsdf.tiles.meshing import export_mesh  # noqa: PLC0415 - as above
 
-        return export_mesh(self, path, voxel_size, min_component_triangles, executor, progress, **limits)
+        return export_mesh(self, path, voxel_size, executor, progress, **limits)
+
+    def threshold(
+        self, voxel_size: float = queries.VOXEL_M, *, progress: bool | None = None, **limits: Any
+    ) -> Threshold:
+        """What is expected of a mesh; arguments are those of :meth:`mesh`. After it or :meth:`export`, it takes no time."""
+        from radarsdf.tiles.meshing import threshold_of  # noqa: PLC0415 - as above
+
+        return threshold_of(self, voxel_size, None, progress, **limits)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Copies the plan and the maps of the tiles that are done to a new folder. The rays of the tiles stay behind.

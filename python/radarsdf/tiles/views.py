@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from radarsdf.budget.estimate import check_views
 from radarsdf.map import queries
-from radarsdf.map.meshing import Surface
+from radarsdf.map.meshing import Limits, Surface
 from radarsdf.map.traced_surface import TracedSurface
 from radarsdf.map.views import ViewedMap
 from radarsdf.tiles.blend import TileBlend
@@ -45,26 +45,23 @@ def viewed_tiles(
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(config.max_memory_bytes, cells=cells)
     origin = config.lattice.position(city.plan.origin_cells(tiles[0]))
-    everything = PieceSettings(1, None, 0.0, math.inf, 0.0)
+    everything = PieceSettings(1, None, math.inf)
     pieces = [piece_of(city, tile, everything) for tile in tiles]
     before = np.cumsum([0, *[len(piece.vertices) for piece in pieces]])
     together = np.concatenate([piece.vertices for piece in pieces])
     # Pieces share the vertices on their borders, to the bit.
     vertices, rows = np.unique(together, axis=0, return_inverse=True)
     faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, before, strict=False)])
-    evidence = city.evidence(vertices)
-    surface = Surface(
+    surface = Surface.told_by(
+        city.any_contents,
         vertices - origin,
         rows.ravel()[faces].astype(np.int32),
-        evidence,
-        queries.confidence(city.any_contents, evidence).numpy(),
-        queries.uncertainty(city.any_contents, evidence).numpy(),
+        city.evidence(vertices),
         cells,
     )
     traced = TracedSurface.of_surface(
         surface,
-        config.leaf_size_m,
-        queries.max_uncertainty_m(city.any_contents),
+        Limits.of(city.any_contents, config.leaf_size_m),
         lambda points: city.evidence(points + origin),
     )
 

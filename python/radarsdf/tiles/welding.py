@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from radarsdf.map.isosurface import mesh_components
 from radarsdf.map.meshing import renumbered
+from radarsdf.map.threshold import SUMS, Tally
 from radarsdf.tiles.pieces import Piece
 
 
@@ -31,6 +32,11 @@ class WeldedPart(NamedTuple):
     """(F, 3) rows of the vertices of all parts."""
 
 
+def tally_of(paths: Sequence[Path]) -> Tally:
+    """Of all surface of pieces in these files."""
+    return Tally.of_sums(sum((Piece.load(path).tally for path in paths), np.zeros(SUMS)))
+
+
 class WeldedMesh:
     """The mesh of pieces in files. Only what touches borders is held in memory.
 
@@ -38,12 +44,17 @@ class WeldedMesh:
     ----------
     paths : sequence of Path
         The pieces, in the order of their tiles.
+    min_confidence : float or None
+        Triangles with a vertex of less confidence are left out. None: that of the highest expected F-score of all pieces.
     min_component_triangles : int
-        Components of fewer triangles are left out, counted over all pieces.
+        Components of fewer triangles are then left out, counted over all pieces.
     """
 
-    def __init__(self, paths: Sequence[Path], min_component_triangles: int) -> None:
+    def __init__(
+        self, paths: Sequence[Path], min_confidence: float | None, min_component_triangles: int
+    ) -> None:
         self._paths = paths
+        self.threshold = tally_of(paths).threshold(min_confidence)
         self._kept = self._large(min_component_triangles)
         self.num_vertices = self.num_faces = 0
         self.cells = np.zeros(2, np.int64)
@@ -91,22 +102,28 @@ class WeldedMesh:
 
     def _used(self, i: int) -> tuple[Piece, NDArray[np.bool_], NDArray[np.int32]]:
         """A piece, which of its vertices are used, and the faces as rows of these."""
+        piece, faces, labels, _ = self._components(i)
+        return piece, *renumbered(len(piece.vertices), faces[self._kept[i][labels]])
+
+    def _components(self, i: int) -> tuple[Piece, NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+        """A piece, its triangles that are probable enough, to which component each belongs, and the sizes of those."""
         piece = Piece.load(self._paths[i])
-        labels, _ = mesh_components(piece.faces, len(piece.vertices))
-        return piece, *renumbered(len(piece.vertices), piece.faces[self._kept[i][labels]])
+        good = piece.confidence >= self.threshold.min_confidence
+        faces = piece.faces[good[piece.faces].all(axis=1)]
+        return piece, faces, *mesh_components(faces, len(piece.vertices))
 
     def _large(self, min_triangles: int) -> list[NDArray[np.bool_]]:
         """Which of the components of each piece are kept. Those that meet at a border are one."""
         sizes, edges, of_vertex = [], [], []
         before = 0
-        for path in self._paths:
-            piece = Piece.load(path)
-            labels, counts = mesh_components(piece.faces, len(piece.vertices))
-            label = np.zeros(len(piece.vertices), np.int64)
-            label[piece.faces] = labels[:, None]
+        for i in range(len(self._paths)):
+            piece, faces, labels, counts = self._components(i)
+            label = np.full(len(piece.vertices), -1, np.int64)
+            label[faces] = labels[:, None]
+            used = label[piece.border_rows] >= 0
             sizes.append(counts)
-            edges.append(piece.border_edges)
-            of_vertex.append(label[piece.border_rows] + before)
+            edges.append(piece.border_edges[used])
+            of_vertex.append(label[piece.border_rows[used]] + before)
             before += len(counts)
         if before == 0:
             return [np.zeros(0, bool) for _ in sizes]

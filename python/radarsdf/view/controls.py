@@ -69,7 +69,12 @@ class Controls:
             "uncertainty ≤ m", 0.0, largest_m, step_m, largest_m, hint="hides what is more uncertain"
         )
         self._confidence = gui.add_slider(
-            "confidence ≥", 0.0, 1.0, 1 / _STEPS, 0.0, hint="hides what is less probable"
+            "confidence ≥",
+            0.0,
+            1.0,
+            1 / _STEPS,
+            0.0,
+            hint=f"hides what is less probable; the mesh is {surface.threshold}",
         )
 
     def _fill_scans(self, gui: Any, measured: Colors | None, scans: int) -> None:

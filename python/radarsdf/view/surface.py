@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import whole_number
 from radarsdf.map.meshing import renumbered
+from radarsdf.map.threshold import Threshold
 from radarsdf.view.thinning import thinned
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ class ShownSurface:
     """(V,) see `Map.confidence`."""
     lightness: NDArray[np.float32]
     """(V,) factor of the lightness of colours, at most 1, so that the shape is seen."""
+    threshold: Threshold
+    """From which confidence on the mesh was kept."""
     spacing_m: float
     """How far apart vertices are: the edge of the voxels, or more if the mesh was thinned."""
 
@@ -62,6 +65,7 @@ class ShownSurface:
         """
         whole_number(max_vertices, "max_vertices", _FEWEST)
         mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress, **limits)
+        threshold = Threshold.of_mesh(mesh.metadata)
         mesh, edge_m = thinned(mesh, max_vertices, voxel_size)
         if len(mesh.vertices) == 0:
             msg = "the map has no surface here"
@@ -73,6 +77,7 @@ class ShownSurface:
             np.asarray(attributes["uncertainty_m"], np.float32),
             np.asarray(attributes["confidence"], np.float32),
             lightness_of(np.asarray(mesh.vertex_normals, np.float64)),
+            threshold,
             edge_m,
         )
 

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""From which confidence on a mesh keeps a surface: where the F-score that is expected is highest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, astuple, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_PARTS = 1000  # of the confidences from 0 to 1
+_SCALARS = 3
+SUMS = 3 * _PARTS + _SCALARS
+"""Numbers of a :class:`Tally`."""
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """The least confidence of a mesh, and what is expected of it. The names are those in the ``metadata`` of a mesh."""
+
+    min_confidence: float
+    """In [0, 1]. Surface of less is left out."""
+    expected_precision: float
+    """Share of the area kept that is expected to be true; 0 if nothing is kept."""
+    expected_completion: float
+    """Share of the true surface that it is expected to cover; 0 if none is expected."""
+    whole_precision: float
+    """The same if all surface were kept, whatever its confidence."""
+    whole_completion: float
+    """Likewise."""
+
+    @classmethod
+    def of_mesh(cls, metadata: Mapping[str, Any]) -> Threshold:
+        """That of a mesh with this ``metadata``."""
+        return cls(**{name: metadata[name] for name in cls.__dataclass_fields__})
+
+    @property
+    def metadata(self) -> dict[str, float]:
+        """What a mesh says of it."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return (
+            f"kept from a confidence of {self.min_confidence:.2f} on: {self.expected_precision:.0%} of it is expected to be "
+            f"true, and to cover {self.expected_completion:.0%} of what is there; of all surface that was found, "
+            f"{self.whole_precision:.0%} and {self.whole_completion:.0%}"
+        )
+
+
+@dataclass(frozen=True)
+class Tally:
+    """The surface of a map, added up by its confidence. Sums of parts of a map, such as tiles, are those of the whole."""
+
+    area_m2: Floats
+    """(B,) of the surface in each of B equal parts of the confidences from 0 to 1."""
+    true_m2: Floats
+    """(B,) how much of it is expected to be true."""
+    covering: Floats
+    """(B,) how much of the truth it is expected to cover that no surface of more confidence does; in proportion to each other."""
+    existing_m2: float
+    """True surface that was seen, whether or not it is known well enough where it is."""
+    once_m2: float
+    """How much of the surface that is expected to be true has a return of one scan in one cell."""
+    twice_m2: float
+    """… of two."""
+
+    @classmethod
+    def of(
+        cls, area_m2: Floats, confidence: Floats, covering: Floats, reach: Floats, detections: Floats
+    ) -> Tally:
+        """Of a surface by its vertices.
+
+        Parameters
+        ----------
+        area_m2 : (V,) float64
+            By :func:`areas_round`, m².
+        confidence, covering, reach : (V,) float64
+            By the functions of :mod:`radarsdf.map.queries` of these names.
+        detections : (V,) float64
+            Scans with returns round each vertex.
+        """
+        true_m2 = confidence * area_m2
+        parts = np.minimum((confidence * _PARTS).astype(np.int64), _PARTS - 1)
+        existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
+        scans = np.round(detections)
+
+        def by_confidence(values: Floats) -> Floats:
+            return np.bincount(parts, values, _PARTS).astype(np.float64)
+
+        return cls(
+            by_confidence(area_m2),
+            by_confidence(true_m2),
+            by_confidence(covering * area_m2),
+            float(np.minimum(existing_m2, area_m2).sum()),
+            float(true_m2[scans == 1].sum()),
+            float(true_m2[scans == 2].sum()),
+        )
+
+    def sums(self) -> Floats:
+        """(SUMS,) all numbers, which may be added to those of other parts of a map. :meth:`of_sums` is the inverse."""
+        return np.concatenate([np.atleast_1d(values) for values in astuple(self)])
+
+    @classmethod
+    def of_sums(cls, sums: Floats) -> Tally:
+        """The tally with these numbers (SUMS,)."""
+        area_m2, true_m2, covering = sums[:-_SCALARS].reshape(-1, _PARTS)
+        existing_m2, once_m2, twice_m2 = sums[-_SCALARS:].tolist()
+        return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)
+
+    def threshold(self, min_confidence: float | None = None) -> Threshold:
+        """That of the highest expected F-score, or what is expected of a given one."""
+        kept_m2, true_m2, covering = (
+            np.cumsum(values[::-1])[::-1] for values in (self.area_m2, self.true_m2, self.covering)
+        )
+        precision = np.divide(true_m2, kept_m2, out=np.zeros_like(true_m2), where=kept_m2 > 0)
+        completion = covering / covering[0] if covering[0] > 0 else covering
+        if min_confidence is None:
+            total = precision + self.reachable * completion
+            # Over twice the reachable share, which is the same for all: if nothing can be reached, all is kept.
+            f_score = np.divide(precision * completion, total, out=np.zeros_like(total), where=total > 0)
+            part = int(np.flatnonzero(f_score == f_score.max())[-1]) if f_score.any() else 0
+            min_confidence = part / _PARTS
+        else:
+            part = min(round(min_confidence * _PARTS), _PARTS - 1)
+        completion = self.reachable * completion
+        expected = (precision[part], completion[part], precision[0], completion[0])
+        return Threshold(min_confidence, *map(float, expected))
+
+    @property
+    def reachable(self) -> float:
+        """Share of the true surface that can be covered: that scans saw, and that lies near enough to where it was found.
+
+        At least once² / (2 · twice) was seen by no scan: the estimate of Chao for species that no sample has.
+        """
+        true_m2 = float(self.true_m2.sum())
+        if true_m2 == 0 or (self.once_m2 > 0 and self.twice_m2 == 0):
+            return 0.0
+        unseen_m2 = self.once_m2**2 / (2 * self.twice_m2) if self.once_m2 > 0 else 0.0
+        return true_m2 / (true_m2 + unseen_m2) * true_m2 / self.existing_m2
+
+
+def areas_round(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
+    """(V,) a third of the area of the triangles (F, 3) round each vertex (V, 3), m, in m²."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    thirds = np.repeat(np.sqrt(np.einsum("ni,ni->n", across, across)) / 6, 3)
+    return np.bincount(faces.ravel(), thirds, len(vertices)).astype(np.float64)

@@ -1,0 +1,191 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The mesh keeps what is probable enough for the highest expected F-score, and says what that costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.map.meshing import Surface
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.threshold import Tally, Threshold
+
+WALL_X_M = 10.1
+PATCH_X_M = 6.1
+MESH = {"min_component_triangles": 0, "progress": False}
+
+
+def plane(rng, x_m, half_m, count):
+    """Returns (N, 3) of a square that faces the sensor."""
+    return np.column_stack([rng.normal(x_m, 0.03, count), rng.uniform(-half_m, half_m, (count, 2))])
+
+
+def fit(points):
+    """Seen from the origin."""
+    config = FitConfig.quick(num_threads=2)
+    poses = np.tile(np.eye(4), (len(points), 1, 1))
+    # Wall and patch are in the middle of cells.
+    return radarsdf.fit(points, poses, config=config, origin=(0, 0, 0), progress=False)
+
+
+def wall_and_patch(scans):
+    """All scans see a wall, one of them a dense patch before it: the others look through there."""
+    rng = np.random.default_rng(0)
+    points = [plane(rng, WALL_X_M, 2.0, 60) for _ in range(scans)]
+    points[scans // 2] = np.concatenate([points[scans // 2], plane(rng, PATCH_X_M, 0.6, 400)])
+    return fit(points)
+
+
+def triangles_near(mesh, x_m):
+    return int((np.abs(mesh.triangles_center[:, 0] - x_m) < 0.5).sum()) if len(mesh.faces) else 0
+
+
+@pytest.fixture(scope="module")
+def of_many():
+    return wall_and_patch(100)
+
+
+@pytest.fixture(scope="module")
+def of_few():
+    return wall_and_patch(4)
+
+
+def test_a_patch_that_one_scan_of_many_saw_is_left_out(of_many):
+    everything = of_many.mesh(min_confidence=0, **MESH)
+    assert triangles_near(everything, PATCH_X_M) > 200
+    default = of_many.mesh(**MESH)
+    assert triangles_near(default, PATCH_X_M) == 0
+    assert triangles_near(default, WALL_X_M) == triangles_near(everything, WALL_X_M) > 2000
+
+
+def test_a_patch_that_one_scan_of_few_saw_is_kept(of_few):
+    everything, default = of_few.mesh(min_confidence=0, **MESH), of_few.mesh(**MESH)
+    assert triangles_near(default, PATCH_X_M) == triangles_near(everything, PATCH_X_M) > 200
+
+
+def test_a_patch_is_kept_where_few_of_many_scans_looked(of_many):
+    """As the first test, but for the looks: only every tenth scan looked there."""
+    contents = of_many._contents
+    few = dataclasses.replace(of_many.evidence, looks=of_many.evidence.looks // 10)
+    mesh = RadarMap(dataclasses.replace(contents, evidence=few)).mesh(**MESH)
+    everything = of_many.mesh(min_confidence=0, **MESH)
+    assert triangles_near(mesh, PATCH_X_M) == triangles_near(everything, PATCH_X_M) > 200
+
+
+@pytest.mark.parametrize("name", ["of_many", "of_few"])
+def test_a_higher_confidence_never_keeps_more(name, request):
+    radar_map = request.getfixturevalue(name)
+    kept = []
+    for least in (0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1):
+        mesh = radar_map.mesh(min_confidence=least, **MESH)
+        assert mesh.metadata["min_confidence"] == least
+        kept.append({tuple(corners) for corners in mesh.triangles.reshape(-1, 9).tolist()})
+    assert all(more >= less for more, less in itertools.pairwise(kept))
+    assert len({len(triangles) for triangles in kept}) > 2
+    assert len(kept[-1]) == 0
+
+
+def test_the_mesh_says_what_it_was_kept_from_and_what_that_costs(of_many):
+    default = of_many.mesh(**MESH)
+    threshold = Threshold.of_mesh(default.metadata)
+    given = of_many.mesh(min_confidence=threshold.min_confidence, **MESH)
+    np.testing.assert_array_equal(default.triangles, given.triangles)
+    assert Threshold.of_mesh(given.metadata) == threshold
+    everything = of_many.mesh(min_confidence=0, **MESH)
+    area = everything.area_faces / 3
+    p = everything.vertex_attributes["confidence"][everything.faces].sum(axis=1)
+    # All that is uncertain beyond the limit is left out of this mesh, and counts there.
+    assert threshold.whole_precision == pytest.approx((p * area).sum() / everything.area, abs=0.02)
+    assert threshold.expected_precision > threshold.whole_precision
+    assert threshold.expected_completion < threshold.whole_completion
+    assert f"kept from a confidence of {threshold.min_confidence:.2f} on" in str(threshold)
+
+
+def tally(area_m2, confidence, covering, existing=1.0, once=0.0, twice=0.0):
+    """Of surface with these confidences (N,); `existing` as a multiple of the true surface that can be found."""
+    area, p = np.array(area_m2, float), np.array(confidence)
+    rows = np.round(p * 1000).astype(int)
+    sums = (np.bincount(rows, values, 1000).astype(float) for values in (area, area * p, covering))
+    return Tally(*sums, existing * float((area * p).sum()), once, twice)
+
+
+def test_the_threshold_is_that_of_the_highest_expected_f_score():
+    # Precisions from the highest on are 0.9, 0.85, 0.7 and completions 0.5, 0.8, 1: F-scores 0.643, 0.824, 0.824 and less.
+    found = tally([1, 1, 1, 10], [0.9, 0.8, 0.4, 0.1], [5, 3, 2, 0]).threshold()
+    assert found.min_confidence == 0.8
+    assert found.expected_precision == pytest.approx(0.85)
+    assert found.expected_completion == pytest.approx(0.8)
+    assert found.whole_precision == pytest.approx(3.1 / 13)
+    assert found.whole_completion == 1
+
+
+def test_the_less_can_be_reached_the_more_is_kept():
+    surface = [1, 1, 1, 10], [0.9, 0.8, 0.4, 0.1], [5, 3, 1, 1]
+    half_seen = tally(*surface, once=3.1, twice=1.55)  # as much again was seen by no scan
+    assert half_seen.reachable == pytest.approx(0.5)
+    assert tally(*surface, existing=2).reachable == pytest.approx(0.5)
+    assert tally(*surface).reachable == 1
+    seen, unseen = (tally(*surface, existing=existing).threshold() for existing in (1, 3))
+    assert unseen.min_confidence == 0.4 < seen.min_confidence
+    assert unseen.expected_completion == pytest.approx(0.9 / 3)
+
+
+def test_where_nothing_can_be_reached_all_that_adds_something_is_kept():
+    """One scan saw everything, and nothing was seen twice: how much there is nobody knows."""
+    found = tally([1, 1, 1], [0.9, 0.5, 0.2], [5, 3, 1], once=1.6)
+    assert found.reachable == 0
+    assert found.threshold().min_confidence == 0.2
+    assert found.threshold().expected_completion == 0
+
+
+def test_nothing_has_a_threshold_too():
+    found = tally([], np.zeros(0), [], existing=0).threshold()
+    assert found == Threshold(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_the_sums_of_parts_are_those_of_the_whole(of_many):
+    surface = Surface.of(of_many._contents, 0.2)
+    middle = surface.vertices[surface.faces].mean(axis=1)[:, 1] > 0
+
+    def of(faces):
+        scene = of_many._contents
+        return Surface.told_by(scene, surface.vertices, faces, surface.evidence, 0).tally
+
+    parts = [of(surface.faces[middle]), of(surface.faces[~middle])]
+    assert min(part.existing_m2 for part in parts) > 3
+    together = Tally.of_sums(parts[0].sums() + parts[1].sums())
+    np.testing.assert_allclose(together.sums(), surface.tally.sums(), rtol=1e-9, atol=1e-9)
+    assert together.area_m2.sum() == pytest.approx(surface.part(np.zeros(3), middle | ~middle).area)
+    assert together.threshold().min_confidence == surface.tally.threshold().min_confidence
+
+
+def wall_and_clutter(scans):
+    """A wall, and before it 30 places where a scan in 25 has four returns."""
+    places = np.random.default_rng(5).uniform([4, -1.5, -1.5], [8, 1.5, 1.5], (30, 3))
+    places[:, 1:] *= places[:, :1] / WALL_X_M  # all scans look through them at the wall
+    rng = np.random.default_rng(0)
+    points = []
+    for _ in range(scans):
+        here = places[rng.random(len(places)) < 0.04]
+        clutter = here[:, None] + rng.uniform(-0.2, 0.2, (len(here), 4, 3))
+        points.append(np.concatenate([plane(rng, WALL_X_M, 2.0, 50), clutter.reshape(-1, 3)]))
+    return fit(points)
+
+
+def test_ten_times_the_scans_bring_no_more_false_surface():
+    false_m2, all_of_it_m2 = [], []
+    for scans in (15, 150):
+        radar_map = wall_and_clutter(scans)
+        for found, arguments in ((false_m2, {}), (all_of_it_m2, {"min_confidence": 0})):
+            mesh = radar_map.mesh(progress=False, **arguments)
+            is_false = mesh.triangles_center[:, 0] < WALL_X_M - 0.6
+            found.append(mesh.area_faces[is_false].sum())
+            assert mesh.area_faces[~is_false].sum() > 13  # of 16 m² of wall
+    assert 0 < false_m2[1] < false_m2[0]
+    assert all_of_it_m2[1] > 3 * all_of_it_m2[0] > 0  # repeated often enough to be meshed
+    assert false_m2[1] / all_of_it_m2[1] < 0.2 * false_m2[0] / all_of_it_m2[0]
