@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import FEATURE_DIM, CellSet, sample_cells, sample_rays
+from radarsdf.budget.blocks import count_blocks, most_blocks
 from radarsdf.budget.durations import SECONDS, shared, work_of
 from radarsdf.budget.extent import check_extent
 from radarsdf.budget.schedule import Schedule, seen_jointly
@@ -34,6 +35,7 @@ _PER_RETURN_CHECKED = (
     200.0  # rays with and without ghosts, and the training's copy, for which the others make room
 )
 _PER_CELL = 215.0
+_PER_BLOCK = 300.0  # of 8 × 8 × 8 leaf cells that rays passed
 _PER_OCTREE_ROW = 30.0  # freed when the rows are numbered
 _COPIES = 4  # of each parameter that learns: value, two moments of Adam, last finite value
 _PER_ROW = 8.0  # if only the touched rows move: marks of Adam
@@ -132,7 +134,9 @@ def estimate_rays(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | Non
         with_intensity=_trains_intensity(rays, config),
     )
     return Estimate(
-        peak_memory_bytes=_fit_bytes(learnt, len(rays), cells, rows, config),
+        peak_memory_bytes=_fit_bytes(
+            learnt, len(rays), cells, rows, count_blocks(rays, learnt, config), config
+        ),
         seconds=sum(SECONDS[kind] * amount for kind, amount in shared(work, threads).items()),
         returns=len(learnt),
         leaf_cells=cells,
@@ -152,11 +156,14 @@ def _trains_intensity(rays: Rays, config: FitConfig) -> bool:
     return rays.intensities is not None and config.trains_intensity
 
 
-def _fit_bytes(rays: Rays, num_checked: int, cells: int, rows: int, config: FitConfig) -> int:
-    """Of a map that is learnt from `rays`, the only ones of `num_checked` whose returns are inside."""
+def _fit_bytes(rays: Rays, num_checked: int, cells: int, rows: int, blocks: int, config: FitConfig) -> int:
+    """Of a map that is learnt from `rays`, the only ones of `num_checked` whose returns are inside.
+
+    `blocks`: that rays passed.
+    """
     count, with_intensity = len(rays), _trains_intensity(rays, config)
     schedule, moves_rows = _schedule(rays, rows, config), config.moves_rows(with_intensity)
-    memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL
+    memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL + blocks * _PER_BLOCK
     memory += 4 * rows * FEATURE_DIM * _copies(config, schedule, with_intensity=with_intensity)
     networks = parameters_of(sdf_widths(config))
     if with_intensity:
@@ -206,7 +213,14 @@ def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = 
     corners = 12 if config.encoding.kind == "tri-quadtree" else 8
     if (
         available is None
-        or _fit_bytes(rays, len(rays), cells, cells * corners * config.encoding.num_levels, config)
+        or _fit_bytes(
+            rays,
+            len(rays),
+            cells,
+            cells * corners * config.encoding.num_levels,
+            most_blocks(rays, config),
+            config,
+        )
         <= available
     ):
         return
