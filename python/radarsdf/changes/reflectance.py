@@ -136,15 +136,17 @@ class Differences:
     def probability(self, x: Floats, counting: NDArray[np.bool_]) -> tuple[Floats, Floats]:
         """(V,) difference round places (V, 3), and how probable it is that the reflectance there changed.
 
-        Only the places that are `counting` (V,) may have changed. Where views of one place differ on one day by more than
-        their numbers of returns explain, errors are as much larger (Birge's ratio): at edges, near mirrors, in thickets.
+        Only the places that are `counting` (V,) may have changed. Where views of one place differ by more than their numbers of
+        returns explain, on one day or in how far they changed, errors are as much larger (Birge's ratio): at edges, near
+        mirrors, in thickets. What is repainted changes alike from all views.
         """
         between = self.between.round(x, self.reach_m)
         days = [means.round(x, self.reach_m) for means in self.within]
         chi2, freedom = (np.sum([getattr(day, name) for day in days], axis=0) for name in ("chi2", "freedom"))
         known = counting & np.isfinite(between.mean)
         changed = np.zeros(len(x))
-        ratio = np.sqrt(np.maximum(chi2 / np.maximum(freedom, 1), 1))
+        of_day, of_change = chi2 / np.maximum(freedom, 1), between.chi2 / np.maximum(between.freedom, 1)
+        ratio = np.sqrt(np.maximum(np.maximum(of_day, of_change), 1))
         sigma = (between.sigma * ratio)[known]
         # A change is as likely by any difference that the range of intensities has room for.
         odds = 0.5 * (between.mean[known] / sigma) ** 2 + np.log(
