@@ -85,7 +85,7 @@ class Example:
             _VOXEL_M[preset],
             surface,
             queries.terms(contents, surface.evidence).numpy(),
-            queries.reach(contents, surface.evidence).numpy(),
+            queries.probabilities(contents, surface.evidence).reach.numpy(),
             areas_round(surface.vertices, surface.faces),
             distance_m <= leaf_m,
             np.concatenate([np.array(rows, np.int64) for rows in found]),
@@ -139,7 +139,7 @@ def models(examples: list[Example]) -> tuple[FloatArray, FloatArray]:
 
 
 def confidence(example: Example, numbers: FloatArray) -> FloatArray:
-    """(V,) as :func:`queries.confidence`, by these numbers."""
+    """(V,) as :func:`queries.probabilities`, by these numbers."""
     return np.minimum(example.predicted(numbers), example.reach)
 
 

@@ -111,7 +111,8 @@ class Surface:
         cells_searched: int,
     ) -> Surface:
         """Triangles with the evidence of their vertices; all as of the fields."""
-        confidence = queries.confidence(scene, evidence)
+        found = queries.probabilities(scene, evidence)
+        confidence = found.confidence.float()
         return cls(
             vertices,
             faces,
@@ -121,8 +122,8 @@ class Surface:
             Tally.of(
                 areas_round(vertices, faces),
                 confidence.double().numpy(),
-                queries.covering(scene, evidence).numpy(),
-                queries.reach(scene, evidence).numpy(),
+                found.covering.numpy(),
+                found.reach.numpy(),
                 evidence.detections.double().numpy(),
             ),
             cells_searched,

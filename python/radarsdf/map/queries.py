@@ -34,7 +34,7 @@ _ROUGH_FLOOR_CELLS = 1.1
 # Up to this error, apart from that part, a surface is meshed, leaf cells: in smooth scenes, and over the rough share.
 _MAX_ERROR_CELLS = 2.0
 _ROUGH_MAX_ERROR_CELLS = 0.27
-# Found by `python -m bench.paper.one_probability`: the logit of the confidence, and that of `covering`, are the first number, and
+# Found by `python -m bench.paper.one_probability`: the logit of the confidence, and that of the covering, are the first number, and
 # the others times the columns of `terms`.
 _CONFIDENCE = (-2.09, -1.01, -1.37, -1.01)
 _COVERING = (-3.58, -0.75, -1.73, -0.51)
@@ -204,40 +204,46 @@ def _floor_m(contents: Scene) -> float:
 
 def confidence(contents: Scene, evidence: EvidenceAt) -> Tensor:
     """(N,) probability that a surface is within a leaf cell's edge. 0 where there are no returns."""
+    return probabilities(contents, evidence).confidence.float()
+
+
+class Probabilities(NamedTuple):
+    """What the evidence at N points says of a surface there, float64. 0 where there are no returns, or next to that."""
+
+    confidence: Tensor
+    """(N,) see :func:`confidence`."""
+    covering: Tensor
+    """(N,) truth that the surface covers and none of more confidence does, for its area; in proportion to each other."""
+    reach: Tensor
+    """(N,) share of a normal distribution of the position's error within a leaf cell's edge."""
+
+
+def probabilities(contents: Scene, evidence: EvidenceAt) -> Probabilities:
+    """All three of each point."""
     start_vector_library()
+    columns = terms(contents, evidence)
+    true, covering = (
+        (columns * torch.tensor(logit, dtype=torch.float64, device="cpu"))
+        .sum(1)
+        .clamp(min=_LEAST_LOGIT)
+        .sigmoid()
+        for logit in (_CONFIDENCE, _COVERING)
+    )
+    reach = torch.erf(math.sqrt(0.5) / columns[:, 1].exp())
     # A surface is no nearer than its position is known.
-    return _logistic(_CONFIDENCE, contents, evidence).minimum(reach(contents, evidence)).float()
-
-
-def covering(contents: Scene, evidence: EvidenceAt) -> Tensor:
-    """(N,) float64: truth that a surface covers and none of more confidence does, for its area. In proportion to each other."""
-    return _logistic(_COVERING, contents, evidence)
-
-
-def reach(contents: Scene, evidence: EvidenceAt) -> Tensor:
-    """(N,) float64: share of a normal distribution of the position's error within a leaf cell's edge. 0 without returns."""
-    return torch.erf(math.sqrt(0.5) / _error_cells(contents, evidence))
+    return Probabilities(true.minimum(reach), covering, reach)
 
 
 def terms(contents: Scene, evidence: EvidenceAt) -> Tensor:
     """(N, 4) float64, of which logits are made: 1, the logarithm of the error in leaf cells, how many returns of a surface are
     missing there, in deviations of chance, and the logarithm of the rough share. Infinite without returns.
     """
-    error_cells = _error_cells(contents, evidence)
+    error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
     expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.looks.double()
     deviations = (expected - evidence.detections.double()) / (expected + 1).sqrt()
     missing = (deviations + deviations.square().add(_SMOOTH**2).sqrt()) / 2  # a smooth max(0, deviations)
     rough_share = torch.full_like(error_cells, max(contents.rough_share, _MIN_ROUGH_SHARE))
     return torch.stack([torch.ones_like(error_cells), error_cells.log(), missing, rough_share.log()], 1)
-
-
-def _logistic(logit: tuple[float, ...], contents: Scene, evidence: EvidenceAt) -> Tensor:
-    weights = torch.tensor(logit, dtype=torch.float64, device="cpu")
-    return (terms(contents, evidence) * weights).sum(1).clamp(min=_LEAST_LOGIT).sigmoid()
-
-
-def _error_cells(contents: Scene, evidence: EvidenceAt) -> Tensor:
-    return evidence.information.double().rsqrt() / contents.config.leaf_size_m
 
 
 @torch.inference_mode(mode=False)

@@ -80,7 +80,7 @@ class Tally:
         area_m2 : (V,) float64
             By :func:`areas_round`, m².
         confidence, covering, reach : (V,) float64
-            By the functions of :mod:`radarsdf.map.queries` of these names.
+            By :func:`queries.probabilities`.
         detections : (V,) float64
             Scans with returns round each vertex.
         """
