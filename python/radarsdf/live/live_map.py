@@ -59,8 +59,8 @@ class LiveMap:
         Memory that the map may take, bytes. Beyond it, the oldest scans are let go: they stay in the map, but can no
         longer be moved or taken out. None: all are kept.
     folder : path-like, optional
-        An empty or new folder, to which scans are written instead of being let go, and the map by :meth:`clear_outside`
-        instead of being forgotten.
+        An empty or new folder, to which scans are written instead of being let go, and regions of the map far away by
+        :meth:`clear_outside`, or beyond `max_bytes`, instead of being forgotten.
 
     Raises
     ------

@@ -28,6 +28,8 @@ from radarsdf.threads import resolve_num_threads
 Keys = NDArray[np.uint64]
 _NONE = np.zeros(0, np.uint64)
 _MARKS = 64  # lists of changed blocks, before they are joined
+_BYTES_OF_SUMS = 350  # of a cell with returns, in a table with room for twice as many
+_LEFT = 0.75  # of the cells that there may be, so that regions are not put away for each scan
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
 
 
@@ -61,6 +63,7 @@ class GrowingState:
         self.max_bytes = max_bytes
         self.log = log
         self._shelf = shelf
+        self._in_use = _NONE  # regions that the last change reached
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
@@ -89,18 +92,38 @@ class GrowingState:
 
     def apply(self, change: SumsChange) -> Keys:
         """Makes a change. Gives the keys of the blocks whose returns changed. An error leaves all as it was."""
-        if self._shelf:
-            self._bring_back(self._shelf.touched(change.block_keys()))
+        if self._shelf is not None:
+            blocks = change.block_keys()
+            self._bring_back(self._shelf.touched(blocks))
+            self._in_use = regions_of(blocks << BLOCK_BITS)
         returns, looks = self.sums.apply(change)
         self._mark(returns, looks)
         return returns
 
     def bound(self) -> None:
-        """Lets scans go where memory is short."""
-        if self.max_bytes is not None and self.num_bytes > self.max_bytes:
+        """Lets scans go where memory is short, and puts regions away if there is a folder."""
+        if self.max_bytes is None:
+            return
+        if self._shelf is not None and len(self._in_use):
+            # The surface grows and shrinks with the next mesh.
+            surface = 0.0 if self._surface is None else self._surface.num_bytes_of_cell
+            if self.sums.num_bytes + surface * self.sums.num_cells > self.max_bytes:
+                self._bound_cells(int(self.max_bytes / (_BYTES_OF_SUMS + surface)))
+        if self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans that tell it may go
                 self._settle_noise()
             self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
+
+    def _bound_cells(self, most: int) -> None:
+        """Puts the farthest regions away, if there are more than `most` cells. Those that the last change reached stay."""
+        if self.sums.num_cells <= most:
+            return
+        regions = np.setdiff1d(regions_of(self.sums.block_keys() << BLOCK_BITS), self._in_use)
+        away = cubes_of(regions) - cubes_of(self._in_use).mean(axis=0)
+        for region in regions[np.argsort(-np.square(away).sum(axis=1), kind="stable")]:
+            self._put_away(region[None])
+            if self.sums.num_cells <= _LEFT * most:
+                break
 
     def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
         """Forgets blocks beyond a ball, or puts the regions away that lie beyond it. Gives the keys of the blocks."""

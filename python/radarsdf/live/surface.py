@@ -110,6 +110,11 @@ class GrowingSurface:
         return sum(table.num_bytes for table in tables)
 
     @property
+    def num_bytes_of_cell(self) -> float:
+        """Likewise, for each leaf cell with returns."""
+        return self.num_bytes / max(self._leaves.num_rows, 1)
+
+    @property
     def num_leaves(self) -> int:
         """Number of leaf cells near the surface."""
         return self._surface.num_rows
