@@ -11,6 +11,7 @@ import trimesh
 from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.meshing import Surface
+from radarsdf.map.threshold import Threshold
 
 from .conftest import TILE_M
 
@@ -88,6 +89,21 @@ def test_export_writes_the_same_mesh(city, tmp_path):
     np.testing.assert_array_equal(raw["uncertainty_m"].ravel(), mesh.vertex_attributes["uncertainty_m"])
     with pytest.raises(ValueError, match=r"written as \.ply"):
         city.export(tmp_path / "city.obj", 0.2)
+
+
+def test_the_threshold_is_that_of_the_whole_map(city):
+    """No tile has one of its own: their sums give it, whatever is kept afterwards."""
+    for given in (None, 0.3):
+        mesh = city.mesh(0.2, min_confidence=given, progress=False)
+        threshold = city.threshold(0.2, min_confidence=given, progress=False)
+        assert threshold == Threshold.of_mesh(mesh.metadata)
+        assert mesh.vertex_attributes["confidence"].min() >= threshold.min_confidence
+    whole = city.mesh(
+        0.2, min_confidence=0, max_uncertainty=np.inf, min_component_triangles=0, progress=False
+    )
+    thirds = np.repeat(whole.area_faces / 3, 3)
+    confidence = whole.vertex_attributes["confidence"][whole.faces].ravel()
+    assert threshold.whole_precision == pytest.approx(np.average(confidence, weights=thirds), abs=1e-4)
 
 
 def test_a_box_and_a_viewpoint(city):
