@@ -8,6 +8,7 @@ function(radarsdf_link_for_older_glibc target)
     endif()
     target_sources(${target} PRIVATE ${PROJECT_SOURCE_DIR}/cmake/glibc_2_28.cpp)
     target_link_options(${target} PRIVATE -static-libstdc++ -Wl,--exclude-libs,ALL,--gc-sections
-                                          -Wl,--wrap=pow,--wrap=exp,--wrap=pthread_once,--wrap=__pthread_key_create)
+                                          -Wl,--wrap=pow,--wrap=exp,--wrap=pthread_once,--wrap=__pthread_key_create
+                                          -Wl,--wrap=pthread_create,--wrap=pthread_join)
   endif()
 endfunction()
