@@ -429,10 +429,10 @@ def test_paper_is_the_published_configuration():
     assert lengths == (0.3, 0.8, 0.0275, 409.6)
 
 
-def test_quick_averages_and_trains_no_surface():
+def test_quick_smooths_averages_and_trains_no_surface():
     quick = FitConfig.quick(seed=4)
     assert (quick.training.start, quick.training.sdf_iterations, quick.encoding.kind) == (
-        "average",
+        "smoothed",
         0,
         "octree",
     )

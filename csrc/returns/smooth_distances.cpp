@@ -19,6 +19,7 @@ namespace {
 
 constexpr std::int64_t kBlock = 1 << 13;  // vertices or cells of a thread, at least
 constexpr int kPlaces = 3;                // of a plane where its distance is known
+constexpr double kBend = 2;               // leaf cells: second difference of a distance whose slope turns from -1 to 1
 
 // A place where the distance is known, and the corners of the cell that it is in.
 struct Place {
@@ -94,7 +95,7 @@ class Plates {
     const CellBlocks leaves(table_->leaf_keys().data(), static_cast<std::int64_t>(table_->leaf_keys().size()));
     std::vector<std::int32_t> cells(static_cast<std::size_t>(count));
     leaves.rows(keys.data(), count, cells.data(), num_threads_);
-    const auto scale = static_cast<float>(size_m * size_m / kPlaces);
+    const auto scale = static_cast<float>(kBend * kBend * size_m * size_m / kPlaces);
     for (const std::int32_t at : stable_order(keys.data(), count)) {
       const auto i = static_cast<std::size_t>(at);
       if (cells[i] < 0) continue;

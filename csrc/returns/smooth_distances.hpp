@@ -25,7 +25,7 @@ constexpr int kSmoothingReach = 2;
 // Moves distances_m, (table.num_rows()), towards the least sum of
 //   information * (d - t)^2 / 3, over the three places of each plane a leaf cell behind, on and before it, where the
 //   distance is t = -leaf, 0, leaf, and d is interpolated between the vertices of the cell that the place is in, and
-//   (second difference / leaf)^2, over all vertices and axes with a neighbour on both sides,
+//   (second difference / (2 leaf))^2, over all vertices and axes with a neighbour on both sides,
 // by so many steps of Chebyshev's iteration, from what is there. Rows of coarser levels stay. What a vertex gets
 // depends, to the bit, on what is within kSmoothingReach * iterations vertices alone, and not on the number of threads.
 // Throws std::invalid_argument for a table that is no octree's, or places without keys.

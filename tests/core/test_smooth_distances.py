@@ -42,7 +42,7 @@ def system(table, points, normals, information):
         for place, cell, told in zip(places, cells, information, strict=True):
             if cell < 0:
                 continue
-            row, weight = np.zeros(len(corners)), LEAF_M * np.sqrt(told / 3)
+            row, weight = np.zeros(len(corners)), 2 * LEAF_M * np.sqrt(told / 3)
             for corner in of_cells[cell]:
                 row[corner] = weight * np.prod(1 - np.abs(place / LEAF_M - corners[corner]))
             rows.append(row)

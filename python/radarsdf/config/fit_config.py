@@ -165,19 +165,19 @@ class FitConfig:
 
     @classmethod
     def quick(cls, **changes: Any) -> FitConfig:
-        """Settings for a surface that is averaged over the rays instead of trained.
+        """Settings for a surface that is averaged over the rays and smoothed, instead of trained.
 
-        The fit takes a fraction of the time; the surface is rougher and the map larger. Mesh it with voxels of the
-        size of its leaf cells, since smaller ones show no more detail. Intensities are in closed form, and take a
+        The fit takes a fraction of the time; the map is larger. Mesh it with voxels of the size of its leaf cells, since
+        smaller ones show no more detail. Intensities are in closed form, and take a
         quarter to a half of the time without them. Free space is not kept: for that, change ``returns.passages``.
         `changes`: as for :meth:`override`.
         """
         return cls(
             returns=ReturnsConfig(passages=False),
-            encoding=EncodingConfig(kind="octree", num_levels=1, fourier_count=0, bridge_cells=0),
+            encoding=EncodingConfig(kind="octree", num_levels=1, fourier_count=0),
             networks=NetworksConfig(sdf_hidden=(2,), reflectance="closed-form"),
             sampling=SamplingConfig(near_band_cells=2.0),
-            training=TrainingConfig(start="average", sdf_iterations=0, joint=False),
+            training=TrainingConfig(start="smoothed", sdf_iterations=0, joint=False),
         ).override(**changes)
 
     @classmethod

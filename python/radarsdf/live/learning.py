@@ -26,7 +26,7 @@ _RETURNS_ASKED = 100_000  # for the noise: as many as those on flat surfels that
 
 
 def quick_of(config: FitConfig) -> FitConfig:
-    """The quick settings with the same cells, returns, bridges, seed and limits, and a smoothed average."""
+    """The quick settings with the same cells, returns, bridges, seed and limits."""
     return FitConfig.quick(
         leaf_size_m=config.leaf_size_m,
         seed=config.seed,
@@ -34,7 +34,6 @@ def quick_of(config: FitConfig) -> FitConfig:
         max_memory_bytes=config.max_memory_bytes,
         returns=config.returns,
         encoding={"bridge_cells": config.encoding.bridge_cells},
-        training={"start": "smoothed"},
     )
 
 
