@@ -168,8 +168,8 @@ class FitConfig:
         """Settings for a surface that is averaged over the rays and smoothed, instead of trained.
 
         The fit takes a fraction of the time; the map is larger. Mesh it with voxels of the size of its leaf cells, since
-        smaller ones show no more detail. Intensities are in closed form, and take a
-        quarter to a half of the time without them. Free space is not kept: for that, change ``returns.passages``.
+        smaller ones show no more detail. Intensities are in closed form, and take a quarter to a half of the time
+        without them. Free space is not kept: for that, change ``returns.passages``.
         `changes`: as for :meth:`override`.
         """
         return cls(
