@@ -51,7 +51,7 @@ class LiveMap:
     ----------
     config : FitConfig, optional
         Settings. :meth:`mesh` and :meth:`map` are those of :meth:`FitConfig.quick` with the same cells, returns, and bridges
-        over gaps, and with ``training.start`` "smoothed"; :meth:`finish` fits with all of them.
+        over gaps; :meth:`finish` fits with all of them.
     origin : (3,) array_like, optional
         Origin of the local frame, world, m. By default the first sensor position, moved to the next corner of a block of
         ``config.lattice``.
@@ -351,7 +351,7 @@ class LiveMap:
                 surface, changes, noise = self._state.changes()
             try:
                 surface.update(changes, noise, num_threads)
-                found = surface.triangles(num_threads)
+                found = surface.triangles()
             except BaseException:  # Ctrl-C, say: half of it would be wrong from now on
                 self._state.forget_surface()
                 raise

@@ -4,13 +4,13 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
+from radarsdf.live.rows import steps_round
 from radarsdf.returns.cells import lattice_of
 
 Keys = NDArray[np.uint64]
@@ -32,8 +32,8 @@ def regions_of(leaf_keys: Keys) -> Keys:
 
 def regions_round(regions: Keys, reach: int) -> Keys:
     """Keys of these regions, and of those at most so many away along each axis."""
-    steps = np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)), np.int64)
-    return _regions_at((cubes_of(regions)[:, None] + steps).reshape(-1, 3))
+    cubes = (cubes_of(regions)[:, None] + steps_round(reach)).reshape(-1, 3)
+    return np.unique(_regions_at(np.unique(np.clip(cubes, -_FARTHEST, _FARTHEST - 1), axis=0)))
 
 
 def cubes_of(regions: Keys) -> NDArray[np.int64]:
@@ -42,8 +42,9 @@ def cubes_of(regions: Keys) -> NDArray[np.int64]:
 
 
 def _regions_at(cubes: NDArray[np.int64]) -> Keys:
-    places = REGION_CELLS * np.unique(np.clip(cubes, -_FARTHEST, _FARTHEST - 1), axis=0).astype(np.float64)
-    return np.unique(cell_keys(np.ascontiguousarray(places + 0.5), 1.0, 1) >> REGION_BITS)
+    """(R,) keys of the regions at these positions (R, 3)."""
+    places = (REGION_CELLS * cubes).astype(np.float64) + 0.5
+    return cell_keys(np.ascontiguousarray(places), 1.0, 1) >> REGION_BITS
 
 
 class RegionTable:
@@ -100,6 +101,4 @@ class RegionTable:
             return keys >> REGION_BITS
         bits = REGION_BITS - np.uint64(3 * self._merged)
         regions, rows = np.unique(keys >> bits, return_inverse=True)
-        cubes = lattice_of(regions << bits) // (REGION_CELLS >> self._merged)
-        places = (REGION_CELLS * cubes).astype(np.float64) + 0.5
-        return (cell_keys(np.ascontiguousarray(places), 1.0, 1) >> REGION_BITS)[rows]
+        return _regions_at(lattice_of(regions << bits) // (REGION_CELLS >> self._merged))[rows]

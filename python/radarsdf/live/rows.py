@@ -18,7 +18,13 @@ from radarsdf.returns.evidence import BLOCK_BITS
 Keys = NDArray[np.uint64]
 _Column = TypeVar("_Column", bound=NDArray[Any])
 
-ROUND: NDArray[np.int64] = np.array(list(itertools.product((-1, 0, 1), repeat=3)), np.int64)
+
+def steps_round(reach: int) -> NDArray[np.int64]:
+    """((2 reach + 1)³, 3) steps of at most so many along each axis."""
+    return np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)), np.int64)
+
+
+ROUND = steps_round(1)
 """(27, 3) steps from a cell to itself and to those round it."""
 
 

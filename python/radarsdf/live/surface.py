@@ -16,7 +16,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.start import average_at_vertices, cells_smoothed, normals_at, told_by
 from radarsdf.live.ghosts import NOWHERE, GrowingGhosts, means_of, surfels_of
 from radarsdf.live.regions import REGION_BITS, RegionTable, Rows, regions_of, regions_round
-from radarsdf.live.rows import ROUND, Keys, Replacement, changed_rows, leaves_of, shifted, within
+from radarsdf.live.rows import ROUND, Keys, Replacement, changed_rows, leaves_of, shifted, steps_round, within
 from radarsdf.live.triangles import GrowingTriangles, Triangles
 from radarsdf.returns.cells import merged_keys
 from radarsdf.returns.evidence import BLOCK_BITS, Looks, ReturnsOfCells, sums_round
@@ -135,9 +135,8 @@ class GrowingSurface:
         self._triangles.cut(regions_round(stale, 1), self._surface, self._looks, num_threads)
         return redone
 
-    def triangles(self, num_threads: int) -> Triangles:
+    def triangles(self) -> Triangles:
         """All triangles, and what the returns tell of their vertices."""
-        del num_threads
         returns = sum(in_all for in_all, _ in self._on_planes.values())
         flat = sum(on_flat for _, on_flat in self._on_planes.values())
         return self._triangles.joined(1 - flat / returns if returns else 0.0, self.num_leaves)
@@ -306,7 +305,7 @@ class GrowingSurface:
         if reach == 0:
             return blocks
         # By larger blocks, of 16³ leaf cells: to step from all to all takes longer than what is smoothed too far away.
-        steps = _steps(math.ceil(reach / _LARGE_CELLS))
+        steps = steps_round(math.ceil(reach / _LARGE_CELLS))
         large = shifted(np.unique(blocks >> _LARGE_BITS) << (BLOCK_BITS + _LARGE_BITS), steps * _LARGE_CELLS)
         large = np.unique(large >> (BLOCK_BITS + _LARGE_BITS))
         found: Keys = ((large << _LARGE_BITS)[:, None] | np.arange(8, dtype=np.uint64)).reshape(-1)
@@ -338,11 +337,6 @@ class GrowingSurface:
         rows = Replacement.of(before["keys"], leaf_keys, first, last)
         new = {"values": values, "crossed": crossed, "information": information, "detections": detections}
         return rows.rows(before, new)
-
-
-def _steps(reach: int) -> NDArray[np.int64]:
-    """((2 reach + 1)³, 3) steps of at most so many along each axis."""
-    return np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)), np.int64)
 
 
 def _blocks_round(blocks: Keys) -> Keys:
