@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -79,13 +80,7 @@ class Piece:
     @classmethod
     def load(cls, path: Path) -> Piece:
         """Reads what :func:`mesh_tile` wrote. Raises a ValueError if the file is damaged."""
-        arrays = arrays_of(path, _ARRAYS)
-        for name, (dtype, *shape) in _ARRAYS.items():
-            array = arrays.get(name)
-            if array is None or array.dtype != dtype or not _has_shape(array, shape):
-                msg = f"{path} is not a whole piece of a mesh: {name} is missing, or of another type or shape"
-                raise ValueError(msg)
-        piece = cls(**arrays)
+        piece = cls(**_checked(path, _ARRAYS))
         count, borders = len(piece.vertices), len(piece.border_rows)
         if (
             {count} != {len(piece.confidence), len(piece.uncertainty_m)}
@@ -96,6 +91,21 @@ class Piece:
             msg = f"{path} is not a whole piece of a mesh: its arrays do not fit together"
             raise ValueError(msg)
         return piece
+
+
+def tally_sums(path: Path) -> NDArray[np.float64]:
+    """The `tally` of the piece in a file, of which nothing else is read. Raises as :meth:`Piece.load`."""
+    return _checked(path, ["tally"])["tally"]
+
+
+def _checked(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    arrays = arrays_of(path, names)
+    for name in names:
+        array, (dtype, *shape) = arrays.get(name), _ARRAYS[name]
+        if array is None or array.dtype != dtype or not _has_shape(array, shape):
+            msg = f"{path} is not a whole piece of a mesh: {name} is missing, or of another type or shape"
+            raise ValueError(msg)
+    return arrays
 
 
 _ARRAYS: dict[str, tuple[Any, ...]] = {

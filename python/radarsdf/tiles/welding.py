@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from radarsdf.map.isosurface import mesh_components
 from radarsdf.map.meshing import renumbered
 from radarsdf.map.threshold import SUMS, Tally
-from radarsdf.tiles.pieces import Piece
+from radarsdf.tiles.pieces import Piece, tally_sums
 
 
 class WeldedPart(NamedTuple):
@@ -34,7 +34,7 @@ class WeldedPart(NamedTuple):
 
 def tally_of(paths: Sequence[Path]) -> Tally:
     """Of all surface of pieces in these files."""
-    return Tally.of_sums(sum((Piece.load(path).tally for path in paths), np.zeros(SUMS)))
+    return Tally.of_sums(sum((tally_sums(path) for path in paths), np.zeros(SUMS)))
 
 
 class WeldedMesh:
