@@ -144,9 +144,14 @@ class Tally:
         return true_m2 / (true_m2 + unseen_m2) * true_m2 / self.existing_m2
 
 
-def areas_round(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
-    """(V,) a third of the area of the triangles (F, 3) round each vertex (V, 3), m, in m²."""
+def across_triangles(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, Floats]:
+    """(F, 3) vectors across triangles (F, 3), twice as long as their areas, and (F,) these lengths, m²."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    thirds = np.repeat(np.sqrt(np.einsum("ni,ni->n", across, across)) / 6, 3)
+    return across, np.sqrt(np.einsum("ni,ni->n", across, across))
+
+
+def areas_round(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
+    """(V,) a third of the area of the triangles (F, 3) round each vertex (V, 3), m, in m²."""
+    thirds = np.repeat(across_triangles(vertices, faces)[1] / 6, 3)
     return np.bincount(faces.ravel(), thirds, len(vertices)).astype(np.float64)

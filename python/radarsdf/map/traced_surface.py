@@ -17,6 +17,7 @@ from radarsdf.budget.estimate import check_views
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.meshing import Limits, Surface
+from radarsdf.map.threshold import across_triangles
 from radarsdf.threads import resolve_num_threads
 
 # Scans that looked at a place where none had a return count for so many: with few looks, a rate is uncertain.
@@ -67,10 +68,8 @@ class TracedSurface:
         evidence_at: Callable[[NDArray[np.float64]], queries.EvidenceAt],
     ) -> TracedSurface:
         """All triangles of a surface, of which rays meet those that `limits` leave. `evidence_at`: of points (N, 3), local frame, m."""
-        corners = surface.vertices[surface.faces]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        twice_m2 = np.sqrt(np.einsum("ni,ni->n", across, across))
-        centres = corners.mean(axis=1)
+        across, twice_m2 = across_triangles(surface.vertices, surface.faces)
+        centres = surface.vertices[surface.faces].mean(axis=1)
         evidence = evidence_at(centres)
         rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
         faces = np.ascontiguousarray(surface.faces[surface.kept(limits)])
