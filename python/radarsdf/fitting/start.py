@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -88,13 +89,17 @@ class FromAverage(Start):
         average_rays(
             field,
             self._means,
-            self.returns_of_cells(),
+            self._told,
             self._surface.surfels,
             self._config,
             self._num_threads,
         )
 
     def returns_of_cells(self) -> ReturnsOfCells:
+        return self._told
+
+    @cached_property
+    def _told(self) -> ReturnsOfCells:
         return told_by(self._means, self._surface.noise, self._config.returns)
 
     @property
