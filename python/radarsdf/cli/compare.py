@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from radarsdf.cli.map_in import add_map, is_map, load_map
-from radarsdf.cli.options import add_address, add_box, add_json, box_of
+from radarsdf.cli.options import add_address, add_box, add_json, box_of, check_address
 from radarsdf.cli.results import Results
 from radarsdf.cli.saying import say
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
@@ -65,10 +65,7 @@ def run(options: argparse.Namespace) -> None:
 
         require_extras()
     if options.view:
-        from radarsdf.view.serving import free_port, require_viser
-
-        require_viser()
-        free_port(options.host, options.port or 0, exactly=True)
+        check_address(options)
     after = load_map(options.scans) if is_map(options.scans) else scans_of(options)
     before = load_map(options.map)
     changes = compare(before, after, align_frames=options.align, box=box_of(options))

@@ -10,7 +10,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from radarsdf.cli.options import add_address, add_fit_options, add_json, config_of, progress_of
+from radarsdf.cli.options import add_address, add_fit_options, add_json, check_address, config_of, progress_of
 from radarsdf.cli.results import Results, counted
 from radarsdf.cli.saving import save_map
 from radarsdf.cli.saying import say
@@ -63,10 +63,7 @@ def run(options: argparse.Namespace) -> None:
         check_pose_suffix(options.trajectory)
     check_outputs([options.out, options.trajectory], inputs_of(options))
     if options.view:
-        from radarsdf.view.serving import free_port, require_viser
-
-        require_viser()
-        free_port(options.host, options.port or 0, exactly=True)
+        check_address(options)
     scans, with_poses = _read(options)
     results = Results(options)
 
@@ -156,8 +153,7 @@ class _Shown:
     def wait(self) -> None:
         """Until Ctrl-C."""
         with contextlib.suppress(KeyboardInterrupt):
-            while True:
-                self._ended.wait(1.0)
+            self._view.wait()
 
     def stop(self) -> None:
         self._ended.set()

@@ -164,3 +164,11 @@ def add_address(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--port", type=int, metavar="N", help="port to listen on; default: 8080, or the next that is free"
     )
+
+
+def check_address(options: argparse.Namespace) -> None:
+    """Before any work: raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
+    from radarsdf.view.serving import free_port, require_viser
+
+    require_viser()
+    free_port(options.host, options.port or 0, exactly=True)

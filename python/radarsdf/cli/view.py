@@ -8,7 +8,16 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from radarsdf.cli.map_in import add_map, load_map
-from radarsdf.cli.options import add_address, add_box, add_quiet, add_surface, box_of, limits_of, progress_of
+from radarsdf.cli.options import (
+    add_address,
+    add_box,
+    add_quiet,
+    add_surface,
+    box_of,
+    check_address,
+    limits_of,
+    progress_of,
+)
 from radarsdf.cli.saying import say
 from radarsdf.cli.scans_in import add_scans, scans_of
 
@@ -41,12 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
-    from radarsdf.view.serving import free_port, has_display, require_viser
+    from radarsdf.view.serving import has_display
 
-    # First: what would be said only after the map was read and meshed.
-    require_viser()
-    free_port(options.host, options.port or 0, exactly=True)
-
+    check_address(options)
     radar_map = load_map(options.map)
     scans = None if options.scans is None else scans_of(options)
     show(

@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
-from radarsdf.view.framing import FOV_RAD, look_at_all
+from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import glb
 from radarsdf.view.legends import key, paragraph, table
 from radarsdf.view.light import shaded
@@ -83,17 +82,12 @@ class ChangesView(Page):
         look = look_at_all(local, _TO_EYE, _ASPECT)
         self._start()
         server = self._server
-        server.initial_camera.fov = FOV_RAD
-        server.initial_camera.position, server.initial_camera.look_at = map(tuple, look)
+        self._begin_at(look)
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
         server.gui.add_html(key(MEANING))
         server.gui.add_html(paragraph(changes.report["alignment"]))
         rows = {place_of(region): f"{region.words}, {region.area_m2:.1f} m²" for region in regions[:_LISTED]}
         server.gui.add_html(table(rows) if rows else paragraph("Nothing changed."))
-
-    def wait(self) -> None:
-        """Wait until Ctrl-C."""
-        threading.Event().wait()
 
 
 def place_of(region: Region) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.view.framing import FOV_RAD, look_at_all
+from radarsdf.view.framing import look_at_all
 from radarsdf.view.page import Page
 
 if TYPE_CHECKING:
@@ -52,8 +52,7 @@ class GrowingView(Page):
         if self._origin is None:  # of the page, which is in float32
             self._origin = path[0].copy()
             look = look_at_all(vertices - self._origin, _TO_EYE, _ASPECT)
-            server.initial_camera.fov = FOV_RAD
-            server.initial_camera.position, server.initial_camera.look_at = map(tuple, look)
+            self._begin_at(look)
         with server.atomic():
             server.scene.add_mesh_simple(
                 "/surface",

@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from radarsdf.view.serving import free_port, require_viser, start_server, stop_server
+from radarsdf.view.framing import FOV_RAD, Look
+from radarsdf.view.serving import WAIT_STEP_S, free_port, require_viser, start_server, stop_server
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -31,6 +33,17 @@ class Page:
 
     def _start(self) -> None:
         self._server: Any = start_server(self.host, self.port)
+
+    def _begin_at(self, look: Look) -> None:
+        """From where, and at what, pages look when they are opened."""
+        camera = self._server.initial_camera
+        camera.fov = FOV_RAD
+        camera.position, camera.look_at = map(tuple, look)
+
+    def wait(self) -> None:
+        """Wait until Ctrl-C."""
+        while True:
+            time.sleep(WAIT_STEP_S)
 
     def stop(self) -> None:
         """Close the page and end all threads."""

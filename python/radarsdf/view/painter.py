@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from radarsdf.view.latest import Latest
+from radarsdf.view.serving import WAIT_STEP_S
 
 HELD_S = 2.0
 """After so long without a new position the mesh is shown, though the sensor is still held."""
-_STEP_S = 0.2
 SLID_S = 0.25
 """A slider has no end of a drag: this is the pause that is taken for one."""
 
@@ -81,8 +81,7 @@ class Painter:
 
     def wait(self) -> None:
         """Wait for the end of the thread. An error that ended it is raised here."""
-        # In steps: where the system hands Ctrl-C to another thread, an endless wait of the main thread does not see it.
-        while not self._ended.wait(_STEP_S):
+        while not self._ended.wait(WAIT_STEP_S):
             pass
         if self._error is not None:
             raise self._error

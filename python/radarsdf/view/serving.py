@@ -26,6 +26,8 @@ _WINDOW_S = 0.05  # viser collects messages for a sixtieth of a second
 _ROUND_TRIPS = 3
 _PATIENCE_S = 20.0
 _STARTING = threading.Lock()
+WAIT_STEP_S = 0.2
+"""The main thread waits in such steps: where the system hands Ctrl-C to another thread, an endless wait does not see it."""
 
 
 def require_viser() -> None:

@@ -113,9 +113,7 @@ class Viewer(Page):
         self._extent = np.concatenate([vertices - origin, path])
         size_m = float(np.linalg.norm(np.ptp(self._extent, axis=0)))
         server = self._server
-        look = self._look(_ASPECT)
-        server.initial_camera.fov = FOV_RAD
-        server.initial_camera.position, server.initial_camera.look_at = map(tuple, look)
+        self._begin_at(self._look(_ASPECT))
         start = origin if scans is None else scans.poses[0, :3, 3]
         first = (float(start[0]), float(start[1]), float(start[2]))
         self.quantities = quantities_of(self._map, self.surface, scans, first)
