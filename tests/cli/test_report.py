@@ -84,7 +84,7 @@ def test_the_map_is_kept_if_the_report_fails(scans_file, tmp_path, capsys, monke
     def fail(*_):
         raise OSError(28, "No space left on device", str(page))
 
-    monkeypatch.setattr("radarsdf.report.writing.write_whole", fail)
+    monkeypatch.setattr("radarsdf.report.page.write_whole", fail)
     assert call("fit", scans_file, "-o", out, "--report", page, *FAST) == 1
     assert "No space left on device" in capsys.readouterr().err
     assert files(tmp_path) == ["map.safetensors"]

@@ -211,7 +211,7 @@ def test_an_old_file_stays_if_the_new_one_cannot_be_made(subject, tmp_path, monk
     path = tmp_path / "report.html"
     path.write_text("old")
     with monkeypatch.context() as patch:
-        patch.setattr("radarsdf.report.writing.page", lambda *_: 1 / 0)
+        patch.setattr("radarsdf.report.page.page", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             other(subject, path, scans=None, held_out=None)
     monkeypatch.setattr("radarsdf.io.files.os.fsync", lambda _: (_ for _ in ()).throw(OSError(28, "full")))

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from os import PathLike
 from typing import Any
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
-from radarsdf.io.files import write_whole
 from radarsdf.render.picture import eye_around, middle_of
 from radarsdf.report.extras import require_extras
 from radarsdf.report.page import (
@@ -24,9 +22,9 @@ from radarsdf.report.page import (
     image,
     items,
     note,
-    page,
     paragraph,
     table,
+    write_page,
 )
 from radarsdf.report.scene import scene_page
 from radarsdf.report.subject import MOST_VERTICES
@@ -89,10 +87,7 @@ def write_changes_report(
     sections = [_conclusion(changes, regions), _surface(mesh), _list(regions)]
     if regions and len(mesh.faces):
         sections.insert(2, _pictures(mesh, regions))
-    made = f"radarsdf compare, {time.strftime('%Y-%m-%d %H:%M')}"
-    data = page(f"{names[0]} and {names[1]}: what changed", made, facts, sections).encode()
-    write_whole(path, data)
-    return len(data)
+    return write_page(path, f"{names[0]} and {names[1]}: what changed", "compare", facts, sections)
 
 
 def _conclusion(changes: Changes, regions: Sequence[Region]) -> Section:

@@ -5,11 +5,14 @@
 from __future__ import annotations
 
 import base64
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from os import PathLike
 from typing import Literal, NamedTuple
 
+from radarsdf.io.files import write_whole
 from radarsdf.report.template import TEMPLATE
 
 
@@ -31,6 +34,20 @@ class Verdict(NamedTuple):
     name: str
     """What it is about."""
     text: str
+
+
+def write_page(
+    path: str | PathLike[str],
+    title: str,
+    command: str,
+    facts: Sequence[tuple[str, str]],
+    sections: Iterable[Section],
+) -> int:
+    """Write :func:`page`, whole or not at all, with the `command` that made it and when. Returns its size, bytes."""
+    made = f"radarsdf {command}, {time.strftime('%Y-%m-%d %H:%M')}"
+    data = page(title, made, facts, sections).encode()
+    write_whole(path, data)
+    return len(data)
 
 
 def page(title: str, subtitle: str, facts: Sequence[tuple[str, str]], sections: Iterable[Section]) -> str:

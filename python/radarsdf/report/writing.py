@@ -4,14 +4,12 @@
 
 from __future__ import annotations
 
-import time
 from os import PathLike
 
-from radarsdf.io.files import write_whole
 from radarsdf.report.conclusion import conclusion_section
 from radarsdf.report.extras import require_extras
 from radarsdf.report.intensity import intensity_section
-from radarsdf.report.page import page
+from radarsdf.report.page import write_page
 from radarsdf.report.subject import Subject
 from radarsdf.report.surface import surface_section
 from radarsdf.report.training import (
@@ -70,10 +68,7 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
         versions_section(),
     ]
     facts = [*_facts(subject), *error_facts, *intensity_facts]
-    made = f"radarsdf report, {time.strftime('%Y-%m-%d %H:%M')}"
-    data = page(subject.name, made, facts, sections).encode()
-    write_whole(path, data)
-    return len(data)
+    return write_page(path, subject.name, "report", facts, sections)
 
 
 def _facts(subject: Subject) -> list[tuple[str, str]]:
