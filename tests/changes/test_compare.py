@@ -12,11 +12,12 @@ from radarsdf.changes.changes import APPEARED, GONE, UNSEEN
 from radarsdf.changes.probability import share_of_changes
 from radarsdf.cli import main
 from radarsdf.poses.rigid import transform
-from radarsdf.simulate import Box, Scene, simulate
+from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
+from .conftest import drives_past
+
 TAKEN, PUT = np.array([2.5, 2.5, 0.5]), np.array([2.5, -3.0, 0.5])
-QUICK = radarsdf.FitConfig.quick(returns={"passages": True})
 
 
 def box(center):
@@ -26,26 +27,7 @@ def box(center):
 @pytest.fixture(scope="module")
 def drives():
     """A drive past a wall, one without changes, and one after them."""
-    drive = radarsdf.simulate.wall(frames=24)
-    other = drive.poses.copy()
-    other[:, 1, 3] += 0.3
-    before, after = (
-        Scene([*drive.scene.solids, *extra], drive.scene.terrain) for extra in ([box(TAKEN)], [box(PUT)])
-    )
-    return [
-        simulate(scene, drive.sensor, poses, name="wall", seed=seed, lidar_rays=1)
-        for scene, poses, seed in ((before, drive.poses, 1), (before, other, 2), (after, other, 3))
-    ]
-
-
-@pytest.fixture(scope="module")
-def maps(drives):
-    return [radarsdf.fit(drive.points, drive.poses, drive.intensities, config=QUICK) for drive in drives]
-
-
-@pytest.fixture(scope="module")
-def changes(maps):
-    return radarsdf.compare(maps[0], maps[2])
+    return drives_past([box(TAKEN)], [box(PUT)])
 
 
 def shares(surface, kind, center):

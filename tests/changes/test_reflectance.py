@@ -11,11 +11,12 @@ import pytest
 import radarsdf
 from radarsdf.changes.changes import REPAINTED, UNSEEN
 from radarsdf.poses.rigid import transform
-from radarsdf.simulate import Box, Scene, simulate
+from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
+from .conftest import QUICK, drives_past
+
 STRONGER, WEAKER, KEPT = (np.array([2.5, y, 0.5]) for y in (2.8, -0.2, -3.2))
-QUICK = radarsdf.FitConfig.quick(returns={"passages": True})
 STRONGER_DB, GAIN_DB = 8.0, 5.0
 
 
@@ -27,27 +28,9 @@ def box(center, more_db=0.0):
 @pytest.fixture(scope="module")
 def drives():
     """A drive past a wall with three boxes, one without changes, and one after two were repainted."""
-    drive = radarsdf.simulate.wall(frames=24)
-    other = drive.poses.copy()
-    other[:, 1, 3] += 0.3
-    before, after = (
-        Scene([*drive.scene.solids, box(STRONGER, more), box(WEAKER, -more), box(KEPT)], drive.scene.terrain)
-        for more in (0.0, STRONGER_DB)
+    return drives_past(
+        *([box(STRONGER, more), box(WEAKER, -more), box(KEPT)] for more in (0.0, STRONGER_DB)),
     )
-    return [
-        simulate(scene, drive.sensor, poses, name="wall", seed=seed, lidar_rays=1)
-        for scene, poses, seed in ((before, drive.poses, 1), (before, other, 2), (after, other, 3))
-    ]
-
-
-@pytest.fixture(scope="module")
-def maps(drives):
-    return [radarsdf.fit(drive.points, drive.poses, drive.intensities, config=QUICK) for drive in drives]
-
-
-@pytest.fixture(scope="module")
-def changes(maps):
-    return radarsdf.compare(maps[0], maps[2])
 
 
 def on_box(surface, center):
