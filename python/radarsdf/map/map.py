@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from os import PathLike
 from typing import TYPE_CHECKING, Any, overload
 
@@ -15,15 +15,14 @@ from torch import Tensor
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries
+from radarsdf.map.parts import MapParts
 from radarsdf.map.positions import as_positions
-from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.sensor import Sensor
 
 if TYPE_CHECKING:
     import trimesh
 
     from radarsdf.grids.grid import Grid
-    from radarsdf.map.gridding import CellsInBox
     from radarsdf.map.views import View
 
 
@@ -32,7 +31,7 @@ GRID_VOXEL_M = 0.2
 OCCUPIED_FROM, FREE_TO = 0.5, 0.125
 
 
-class Map(ABC):
+class Map(MapParts):
     """A surface and its reflectance: what :class:`RadarMap` and :class:`TiledMap` have in common.
 
     Queries take world coordinates, m, as NumPy arrays or CPU tensors. Results are of the same kind: float64
@@ -306,19 +305,6 @@ class Map(ABC):
         return make_grid(self, box, voxel_size, occupied_from, free_to)
 
     @abstractmethod
-    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellsInBox:
-        """What is known of the leaf cells that lie between two corners (3,), world, m, wholly or in part."""
-
-    @abstractmethod
-    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
-        """What the returns round positions (N, 3), world, m, tell of a surface there."""
-
-    @property
-    @abstractmethod
-    def passage_odds(self) -> NDArray[np.float64]:
-        """(8,) how much more often 0 to 7 or more scans pass a leaf cell behind a surface than one before it."""
-
-    @abstractmethod
     def render(
         self,
         T_world_sensor: ArrayLike,
@@ -393,10 +379,6 @@ class Map(ABC):
         """Whether intensities were given to the fit."""
         return self.intensity_scale is not None
 
-    @abstractmethod
-    def echoes(self) -> EchoesAt:
-        """How strong the returns of the fit were. Empty without intensities, or without ``returns.passages``."""
-
     @property
     @abstractmethod
     def rough_share(self) -> float:
@@ -421,27 +403,3 @@ class Map(ABC):
     @abstractmethod
     def file_bytes(self) -> int:
         """Size of the file that :meth:`save` writes, without the names of its arrays: less than 4 kB; bytes."""
-
-    @abstractmethod
-    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`sdf` at positions (N, 3) in the world, m: (N,)."""
-
-    @abstractmethod
-    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`gradient` there, (N, 3)."""
-
-    @abstractmethod
-    def _observed(self, world: Tensor) -> Tensor:
-        """:meth:`observed` there, (N,) bool."""
-
-    @abstractmethod
-    def _uncertainty(self, world: Tensor) -> Tensor:
-        """:meth:`uncertainty` there, (N,)."""
-
-    @abstractmethod
-    def _confidence(self, world: Tensor) -> Tensor:
-        """:meth:`confidence` there, (N,)."""
-
-    @abstractmethod
-    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`intensity` there, (N,), for sensors at (N, 3)."""

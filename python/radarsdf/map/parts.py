@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What each kind of map answers in its own way, for the questions of ``Map``."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from radarsdf.map import queries
+from radarsdf.returns.echoes import EchoesAt
+
+if TYPE_CHECKING:
+    from radarsdf.map.gridding import CellsInBox
+
+
+class MapParts(ABC):
+    """Answers at positions that were checked, and what grids and comparisons of maps read."""
+
+    @abstractmethod
+    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellsInBox:
+        """What is known of the leaf cells that lie between two corners (3,), world, m, wholly or in part."""
+
+    @abstractmethod
+    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+        """What the returns round positions (N, 3), world, m, tell of a surface there."""
+
+    @property
+    @abstractmethod
+    def passage_odds(self) -> NDArray[np.float64]:
+        """(8,) how much more often 0 to 7 or more scans pass a leaf cell behind a surface than one before it."""
+
+    @abstractmethod
+    def echoes(self) -> EchoesAt:
+        """How strong the returns of the fit were. Empty without intensities, or without ``returns.passages``."""
+
+    @abstractmethod
+    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
+        """:meth:`Map.sdf` at positions (N, 3) in the world, m: (N,)."""
+
+    @abstractmethod
+    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
+        """:meth:`Map.gradient` there, (N, 3)."""
+
+    @abstractmethod
+    def _observed(self, world: Tensor) -> Tensor:
+        """:meth:`Map.observed` there, (N,) bool."""
+
+    @abstractmethod
+    def _uncertainty(self, world: Tensor) -> Tensor:
+        """:meth:`Map.uncertainty` there, (N,)."""
+
+    @abstractmethod
+    def _confidence(self, world: Tensor) -> Tensor:
+        """:meth:`Map.confidence` there, (N,)."""
+
+    @abstractmethod
+    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
+        """:meth:`Map.intensity` there, (N,), for sensors at (N, 3)."""
