@@ -11,6 +11,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
 from radarsdf.live.scan_log import SealedScan
+from radarsdf.returns.evidence import BLOCK_BITS
 
 from ..conftest import ground_and_wall, pose
 
@@ -113,11 +114,9 @@ def test_a_change_far_along_a_drive_is_all_that_is_made_anew():
     live.integrate(SCENE.points[7], poses[6], SCENE.intensities[7])
     surface, changes, noise = live._state.changes()
     redone = surface.update(changes, noise, 1)
-    assert (
-        0
-        < len(redone)
-        < 0.4 * len(np.unique(surface._surface.gather(surface._surface.regions)["keys"] >> np.uint64(9)))
-    )
+    table = surface._distances.table
+    blocks = np.unique(table.gather(table.regions)["keys"] >> BLOCK_BITS)
+    assert 0 < len(redone) < 0.4 * len(blocks)
     grown = mesh_bits(live.mesh())
     live._state.forget_surface()
     assert grown == mesh_bits(live.mesh())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The ghosts of a map that grows: what :func:`radarsdf.returns.ghosts.find_ghosts` finds, asked again only where rays pass changes."""
+"""The ghosts of a map that grows: what `find_ghosts` of `returns/ghosts.py` finds, asked again only where rays pass changes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from radarsdf.returns.surfels import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels
 NOWHERE = np.uint64(2**64 - 1)
 """In the place of the key of a cell: a ray crosses no plane."""
 
-_Boxes = NDArray[np.float64]  # (R, 2, 3) lower and upper corners, local, m
+_Boxes = NDArray[np.float64]  # (R, 2, 3) lower and upper corners, local frame, m
 
 
 def surfels_of(rows: Rows, leaf_size_m: float) -> Surfels:
@@ -47,41 +47,52 @@ def means_of(rows: Rows) -> MeanRays:
 
 
 class GrowingGhosts:
-    """Keeps the columns `passed`, `opaque`, `behind` and `ghosts` of cells of surfels, and `first` of leaf cells.
+    """Answers the four questions of :func:`find_ghosts`, each again only where its answer may differ.
+
+    1. Which flat plane does each ray cross first? Columns `first` of leaf cells: the key of the plane's cell, or
+       :data:`NOWHERE`; `passed` of cells of surfels: how many rays cross its plane first.
+    2. Which planes do most rays end at? `opaque` of cells of surfels.
+    3. How many rays of each cell end behind an opaque plane? `behind` of cells of surfels.
+    4. Round which cells are most returns behind one? `ghosts` of cells of surfels.
+
+    What a ray answers depends on the planes along it, which may be in other regions than its end. So of each region, a box
+    is kept that holds all rays that end in it: a plane matters to them only if the region of the plane meets the box.
 
     Parameters
     ----------
     leaves, cells : RegionTable
-        Of leaf cells with returns, and of cells of surfels. Theirs are the other columns.
+        Of leaf cells with returns, and of cells of surfels. The other columns are theirs.
     leaf_size_m : float
         Edge of a leaf cell, m.
     """
 
     def __init__(self, leaves: RegionTable, cells: RegionTable, leaf_size_m: float) -> None:
         self._leaves, self._cells, self._leaf_size_m = leaves, cells, leaf_size_m
-        # Of the rays that end in each region: the box they are in, and how many cross which plane first.
         self._boxes: dict[int, _Boxes] = {}
+        # Of the rays that end in each region: keys of the planes that some cross first, and how many do.
         self._crossings: dict[int, tuple[Keys, NDArray[np.float64]]] = {}
 
     def update(self, of_rays: Keys, of_planes: Keys, noise: SensorNoise, num_threads: int) -> Keys:
-        """Takes in that mean rays changed in the regions `of_rays`, and planes in `of_planes`; both ascending.
+        """Takes in that mean rays changed that end in the regions `of_rays`, and planes in `of_planes`; both ascending.
 
         Returns
         -------
         (G,) ndarray
             Keys of the cells of surfels that became ghosts or are none any more, ascending.
         """
-        before = self._boxes_of(of_rays)
+        boxes_before = self._boxes_of(of_rays)
         self._find_boxes(of_rays)
-        asked = np.union1d(of_rays, self._passing(of_planes))
-        crossed = self._touched(np.concatenate([self._boxes_of(asked), before]))
-        self._count_passed(asked, crossed, noise, num_threads)
-        of_opaque = np.union1d(of_planes, self._find_opaque(crossed, num_threads))
-        asked = np.union1d(asked, self._passing(of_opaque))
-        self._count_behind(asked, noise, num_threads)
-        return self._find_ghosts(asked, num_threads)
+        rays = np.union1d(of_rays, self._ends_of_rays_through(of_planes))
+        # Rays that are gone passed planes, too.
+        planes = self._planes_in(np.concatenate([self._boxes_of(rays), boxes_before]))
+        self._ask_first(rays, planes, noise, num_threads)
+        of_opaque = np.union1d(of_planes, self._ask_opaque(planes, num_threads))
+        rays = np.union1d(rays, self._ends_of_rays_through(of_opaque))
+        self._ask_behind(rays, noise, num_threads)
+        return self._ask_ghosts(rays, num_threads)
 
     def _boxes_of(self, regions: Keys) -> _Boxes:
+        """Those that hold the rays that end in these regions; of regions without rays none."""
         found = [self._boxes[region] for region in regions.tolist() if region in self._boxes]
         return np.array(found).reshape(-1, 2, 3)
 
@@ -98,61 +109,70 @@ class GrowingGhosts:
             self._boxes[int(region)] = np.stack([both.min(axis=0) - margin_m, both.max(axis=0) + margin_m])
 
     def _cubes(self, regions: Keys) -> _Boxes:
+        """What the regions themselves span."""
         lower = cubes_of(regions)
         return np.stack([lower, lower + 1], 1) * (REGION_CELLS * self._leaf_size_m)
 
-    def _passing(self, regions: Keys) -> Keys:
-        """The regions in which rays end that may pass one of these."""
+    def _ends_of_rays_through(self, regions: Keys) -> Keys:
+        """The regions in which rays end that may pass one of these, ascending."""
         where = np.array(sorted(self._boxes), np.uint64)
         return where[_meet(self._boxes_of(where), self._cubes(regions))]
 
-    def _touched(self, boxes: _Boxes) -> Keys:
-        """The regions with planes that rays in these boxes may pass."""
+    def _planes_in(self, boxes: _Boxes) -> Keys:
+        """The regions with planes that rays in these boxes may pass, ascending."""
         regions = self._cells.regions
         return regions[_meet(self._cubes(regions), boxes)]
 
-    def _count_passed(self, asked: Keys, crossed: Keys, noise: SensorNoise, num_threads: int) -> None:
-        rows, cells = self._leaves.gather(asked), self._cells.gather(crossed)
+    def _surfels(self, cells: Rows) -> tuple[Surfels, NDArray[np.int64]]:
+        """Surfels of cells, and which of them are flat."""
         surfels = surfels_of(cells, self._leaf_size_m)
-        flat = np.flatnonzero(surfels.is_flat())
+        return surfels, np.flatnonzero(surfels.is_flat())
+
+    def _put_own(self, regions: Keys, column: str, found: NDArray[Any], cells: Rows) -> NDArray[np.bool_]:
+        """Keeps what was found of `cells`, those in `regions` and round them. Gives which of those in them differ from before."""
+        own = np.isin(self._cells.regions_of(cells["keys"]), regions)
+        differs: NDArray[np.bool_] = own & (found != cells[column])
+        cells[column] = found
+        self._cells.put(regions, {name: values[own] for name, values in cells.items()})
+        return differs
+
+    def _ask_first(self, rays: Keys, planes: Keys, noise: SensorNoise, num_threads: int) -> None:
+        """Question 1, of the rays that end in the regions `rays`. `planes`: all regions that they pass, or passed before."""
+        rows, cells = self._leaves.gather(rays), self._cells.gather(planes)
+        surfels, flat = self._surfels(cells)
         found = first_crossed(surfels, flat, means_of(rows), noise, num_threads)
-        keys = np.append(surfels.keys[surfels.cell_of_plane[flat]], NOWHERE)
+        keys = np.append(surfels.keys[surfels.cell_of_plane[flat]], NOWHERE)  # the last is that of -1
         first = rows["first"] = keys[found]
         passed = np.append(cells["passed"], 0.0)  # the last is that of cells that are there no more
-        ends = np.searchsorted(self._leaves.regions_of(rows["keys"]), asked, side="right").tolist()
+        ends = np.searchsorted(self._leaves.regions_of(rows["keys"]), rays, side="right").tolist()
         starts = [0, *ends[:-1]]
-        for region, start, end in zip(asked.tolist(), starts, ends, strict=True):
+        for region, start, end in zip(rays.tolist(), starts, ends, strict=True):
             old = self._crossings.pop(region, None)
             if old is not None:
                 passed[surfels.blocks.rows(old[0], 1)] -= old[1]
             if start == end:
                 continue
-            planes, which = np.unique(first[start:end], return_inverse=True)
-            counted = np.bincount(which, rows["counts"][start:end], len(planes))
-            new = self._crossings[region] = planes[planes != NOWHERE], counted[planes != NOWHERE]
+            crossed, which = np.unique(first[start:end], return_inverse=True)
+            counted = np.bincount(which, rows["counts"][start:end], len(crossed))
+            new = self._crossings[region] = crossed[crossed != NOWHERE], counted[crossed != NOWHERE]
             passed[surfels.blocks.rows(new[0], 1)] += new[1]
         cells["passed"] = passed[:-1]
-        self._leaves.put(asked, rows)
-        self._cells.put(crossed, cells)
+        self._leaves.put(rays, rows)
+        self._cells.put(planes, cells)
 
-    def _find_opaque(self, regions: Keys, num_threads: int) -> Keys:
-        """The regions in which it changed which planes are opaque."""
-        cells = self._cells.gather(regions_round(regions, 1))
-        surfels = surfels_of(cells, self._leaf_size_m)
-        flat = np.flatnonzero(surfels.is_flat())
+    def _ask_opaque(self, planes: Keys, num_threads: int) -> Keys:
+        """Question 2, of the planes in these regions. Gives the regions in which an answer differs, ascending."""
+        cells = self._cells.gather(regions_round(planes, 1))  # rays past the cells round a plane count, too
+        surfels, flat = self._surfels(cells)
         opaque = np.zeros(len(surfels.keys), bool)
         opaque[surfels.cell_of_plane[flat]] = are_opaque(surfels, flat, cells["passed"], num_threads)
-        of_cells = self._cells.regions_of(cells["keys"])
-        own = np.isin(of_cells, regions)
-        differs = own & (opaque != cells["opaque"])
-        cells["opaque"] = opaque
-        self._cells.put(regions, {name: column[own] for name, column in cells.items()})
-        return np.unique(of_cells[differs])
+        differs = self._put_own(planes, "opaque", opaque, cells)
+        return np.unique(self._cells.regions_of(cells["keys"])[differs])
 
-    def _count_behind(self, asked: Keys, noise: SensorNoise, num_threads: int) -> None:
-        rows, cells = self._leaves.gather(asked), self._cells.gather(self._touched(self._boxes_of(asked)))
-        surfels = surfels_of(cells, self._leaf_size_m)
-        flat = np.flatnonzero(surfels.is_flat())
+    def _ask_behind(self, rays: Keys, noise: SensorNoise, num_threads: int) -> None:
+        """Question 3, of the rays that end in these regions."""
+        rows, cells = self._leaves.gather(rays), self._cells.gather(self._planes_in(self._boxes_of(rays)))
+        surfels, flat = self._surfels(cells)
         number = np.full(len(surfels.keys) + 1, -1, np.int32)  # of the flat plane of each cell
         number[surfels.cell_of_plane[flat]] = np.arange(len(flat), dtype=np.int32)
         first = np.full(len(rows["keys"]), -1, np.int32)
@@ -160,19 +180,16 @@ class GrowingGhosts:
         first[crosses] = number[surfels.blocks.rows(rows["first"][crosses], num_threads)]
         opaque = cells["opaque"][surfels.cell_of_plane[flat]]
         behind = are_behind(surfels, flat, opaque, first, means_of(rows), noise, num_threads)
-        own = self._cells.gather(asked)
+        own = self._cells.gather(rays)
         cell_of_ray = CellBlocks(own["keys"]).rows(merged_keys(rows["keys"]), num_threads)
         own["behind"] = np.bincount(cell_of_ray[behind], rows["counts"][behind], len(own["keys"]))
-        self._cells.put(asked, own)
+        self._cells.put(rays, own)
 
-    def _find_ghosts(self, asked: Keys, num_threads: int) -> Keys:
-        regions = regions_round(asked, 1)
-        cells = self._cells.gather(regions_round(asked, 2))
+    def _ask_ghosts(self, rays: Keys, num_threads: int) -> Keys:
+        """Question 4, of the cells in the regions in which these rays end, and round them. Gives the keys of those that differ."""
+        cells = self._cells.gather(regions_round(rays, 2))
         ghosts = mostly_behind(surfels_of(cells, self._leaf_size_m), cells["behind"], num_threads)
-        own = np.isin(self._cells.regions_of(cells["keys"]), regions)
-        differs = own & (ghosts != cells["ghosts"])
-        cells["ghosts"] = ghosts
-        self._cells.put(regions, {name: column[own] for name, column in cells.items()})
+        differs = self._put_own(regions_round(rays, 1), "ghosts", ghosts, cells)
         found: Keys = cells["keys"][differs]
         return found
 

@@ -4,31 +4,27 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, Encoding, VertexTable
+from radarsdf._core import CellBlocks
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.start import average_at_vertices, cells_smoothed, normals_at, told_by
+from radarsdf.fitting.start import normals_at
+from radarsdf.live.distances import GrowingDistances
 from radarsdf.live.ghosts import NOWHERE, GrowingGhosts, means_of, surfels_of
-from radarsdf.live.regions import REGION_BITS, RegionTable, Rows, regions_of, regions_round
-from radarsdf.live.rows import ROUND, Keys, Replacement, changed_rows, leaves_of, shifted, steps_round, within
+from radarsdf.live.regions import RegionTable, Rows, regions_of, regions_round
+from radarsdf.live.rows import ROUND, Keys, Replacement, changed_rows, leaves_of, shifted, within
 from radarsdf.live.triangles import GrowingTriangles, Triangles
 from radarsdf.returns.cells import merged_keys
-from radarsdf.returns.evidence import BLOCK_BITS, Looks, ReturnsOfCells, sums_round
-from radarsdf.returns.gaps import bridged
+from radarsdf.returns.evidence import BLOCK_BITS, Looks
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.scan_sums import ScanSums
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL, MIN_SUPPORT, planes_round, support_round
 
 _NONE = np.zeros(0, np.uint64)
-_LARGE_BITS = np.uint64(3)  # by which the key of a block is longer than that of a large one
-_LARGE_CELLS = 16  # along its edge
 _PLANE = 9  # numbers of a surfel: centre, normal, variances
 
 
@@ -87,18 +83,9 @@ class GrowingSurface:
             ghosts=np.zeros(0, bool),
         )
         self._ghosts = GrowingGhosts(self._leaves, self._cells, config.leaf_size_m)
-        self._on_planes: dict[
-            int, tuple[float, float]
-        ] = {}  # returns in cells with planes, and with flat ones
-        # Of leaf cells that rays cross near their returns.
-        self._near = RegionTable()
-        # Of leaf cells near the surface: these, and those that bridge gaps between them. Signed distances at the corners, m.
-        self._surface = RegionTable(
-            values=np.zeros((0, 8), np.float32),
-            crossed=np.zeros(0, bool),
-            information=numbers,
-            detections=np.zeros(0, np.uint32),
-        )
+        # Of each region: returns in cells with planes, and in those with flat ones.
+        self._on_planes: dict[int, tuple[float, float]] = {}
+        self._distances = GrowingDistances(config)
         # Of blocks, by the keys of their first leaf cells.
         self._looks = RegionTable(scans=np.zeros(0, np.uint32))
         self._triangles = GrowingTriangles(config, origin)
@@ -106,7 +93,7 @@ class GrowingSurface:
     @property
     def num_bytes(self) -> int:
         """Memory of what is kept, bytes."""
-        tables = (self._leaves, self._cells, self._near, self._surface, self._looks, self._triangles)
+        tables = (self._leaves, self._cells, self._distances, self._looks, self._triangles)
         return sum(table.num_bytes for table in tables)
 
     @property
@@ -117,7 +104,7 @@ class GrowingSurface:
     @property
     def num_leaves(self) -> int:
         """Number of leaf cells near the surface."""
-        return self._surface.num_rows
+        return self._distances.table.num_rows
 
     def update(self, changes: Changes, noise: SensorNoise, num_threads: int) -> Keys:
         """Takes changes in. Gives the keys (D,) of the blocks of the surface that were made anew, ascending."""
@@ -130,9 +117,11 @@ class GrowingSurface:
         redone = _NONE
         if len(of_rays):
             of_planes = np.union1d(of_rays, self._fit_planes(changed, num_threads))
-            redone = self._derive(of_rays, of_planes, changed, dirty, num_threads)
+            changed = self._count_otherwise(of_rays, of_planes, changed, num_threads)
+            reached = np.union1d(dirty, self._distances.blocks_reached(changed))
+            redone = self._distances.update(reached, self._leaves, self._cells, noise, num_threads)
         stale = np.union1d(looked, regions_of(redone << BLOCK_BITS))
-        self._triangles.cut(regions_round(stale, 1), self._surface, self._looks, num_threads)
+        self._triangles.cut(regions_round(stale, 1), self._distances.table, self._looks, num_threads)
         return redone
 
     def triangles(self) -> Triangles:
@@ -216,58 +205,18 @@ class GrowingSurface:
             self._on_planes[int(region)] = float(returns.sum()), float(returns[surfels.is_flat()].sum())
         return regions
 
-    def _derive(self, of_rays: Keys, of_planes: Keys, changed: Keys, dirty: Keys, num_threads: int) -> Keys:
-        """Distances and evidence in the blocks round changed leaf cells, and in the `dirty` blocks.
+    def _count_otherwise(self, of_rays: Keys, of_planes: Keys, changed: Keys, num_threads: int) -> Keys:
+        """Keys of the leaf cells whose returns count otherwise than before.
 
-        `of_rays`, `of_planes`: regions in which mean rays and planes changed.
+        These are the `changed` ones; those that became ghosts, or are none any more; and those whose planes turned.
+        `of_rays`, `of_planes`: regions in which mean rays and planes changed, ascending.
         """
         assert self._noise is not None
         if self._config.returns.drop_ghosts:
             ghosts = self._ghosts.update(of_rays, of_planes, self._noise, num_threads)
             near_ghosts = self._leaves.gather(np.unique(self._cells.regions_of(ghosts)))["keys"]
             changed = np.union1d(changed, near_ghosts[np.isin(merged_keys(near_ghosts), ghosts)])
-        changed = np.union1d(changed, self._turn(of_planes, num_threads))
-        near = np.union1d(dirty, np.unique(shifted(changed, self._reach()) >> BLOCK_BITS))
-        # Bridges that open or close tell of cells at most a block of medians away, and smoothing carries what they do.
-        middle = regions_of(near << BLOCK_BITS)
-        inner, around = regions_round(middle, 2), regions_round(middle, 3)
-        leaves, cell_rows = self._leaves.gather(around), self._cells.gather(around)
-        cell_of_leaf = CellBlocks(cell_rows["keys"]).rows(merged_keys(leaves["keys"]), num_threads)
-        is_true = ~cell_rows["ghosts"][cell_of_leaf]
-        true, normals = means_of(leaves).select(is_true), leaves["normals"][is_true]
-        near_keys = self._find_near(near, true, around, num_threads)
-        told = told_by(true, self._noise, self._config.returns)
-        surface = self._surface.gather(around)
-        leaf_keys = bridged(
-            near_keys, told.keys, told.counts, self._config.encoding.bridge_cells, num_threads
-        )
-        leaf_keys = np.concatenate(
-            [
-                leaf_keys[np.isin(leaf_keys >> REGION_BITS, inner)],
-                surface["keys"][~np.isin(surface["keys"] >> REGION_BITS, inner)],
-            ]
-        )
-        leaf_keys.sort()
-        # A cell that came or went tells which rays count at the corners of those round it.
-        opened = shifted(np.setxor1d(leaf_keys, surface["keys"], assume_unique=True), ROUND)
-        redone = np.union1d(near, np.unique(opened >> BLOCK_BITS))
-        there = np.union1d(leaf_keys >> BLOCK_BITS, surface["keys"] >> BLOCK_BITS)
-        redone = np.intersect1d(self._smoothed_with(redone), there, assume_unique=True)
-        round_them = leaves_of(self._smoothed_with(_blocks_round(redone)))
-        here = within(true.keys, *round_them)
-        self._surface.put(
-            around,
-            self._remade(
-                surface,
-                redone,
-                leaf_keys[within(leaf_keys, *round_them)],
-                true.select(here),
-                normals[here],
-                told.select(here),
-                num_threads,
-            ),
-        )
-        return redone
+        return np.union1d(changed, self._turn(of_planes, num_threads))
 
     def _turn(self, regions: Keys, num_threads: int) -> Keys:
         """The keys of the leaf cells in these regions whose normals differ from before."""
@@ -279,66 +228,3 @@ class GrowingSurface:
         self._leaves.put(regions, leaves)
         found: Keys = leaves["keys"][differs]
         return found
-
-    def _find_near(self, blocks: Keys, means: MeanRays, regions: Keys, num_threads: int) -> Keys:
-        """The leaf cells of these `regions` that rays cross near their returns: in these `blocks` found anew."""
-        config = self._config
-        first, last = leaves_of(blocks)
-        here = means.select(within(means.keys, *leaves_of(_blocks_round(blocks))))
-        near = here.leaf_keys(config.leaf_size_m, config.near_band_m, num_threads)
-        before = self._near.gather(regions)["keys"]
-        found = Replacement.of(before, near[within(near, first, last)], first, last).keys
-        self._near.put(regions, {"keys": found})
-        return found
-
-    def _reach(self) -> NDArray[np.int64]:
-        """(S, 3) steps from a leaf cell to the corners of all that its returns have a part in."""
-        config = self._config
-        # A ray ends in a cell of its band. The corners of that cell have others round them.
-        cells = math.ceil(max(config.truncation_m, config.near_band_m) / config.leaf_size_m - 1e-9) + 1
-        inside = range(-cells, cells, 8)  # no more than a block apart
-        return np.array(list(itertools.product([*inside, cells], repeat=3)), np.int64)
-
-    def _smoothed_with(self, blocks: Keys) -> Keys:
-        """Keys of these blocks, and of those that smoothing may reach from them, or them from."""
-        reach = cells_smoothed(self._config)
-        if reach == 0:
-            return blocks
-        # By larger blocks, of 16³ leaf cells: to step from all to all takes longer than what is smoothed too far away.
-        steps = steps_round(math.ceil(reach / _LARGE_CELLS))
-        large = shifted(np.unique(blocks >> _LARGE_BITS) << (BLOCK_BITS + _LARGE_BITS), steps * _LARGE_CELLS)
-        large = np.unique(large >> (BLOCK_BITS + _LARGE_BITS))
-        found: Keys = ((large << _LARGE_BITS)[:, None] | np.arange(8, dtype=np.uint64)).reshape(-1)
-        return found
-
-    def _remade(
-        self,
-        before: Rows,
-        blocks: Keys,
-        near: Keys,
-        means: MeanRays,
-        normals: NDArray[np.float32],
-        told: ReturnsOfCells,
-        num_threads: int,
-    ) -> Rows:
-        """The rows `before` with the leaf cells of these blocks anew, by the leaf cells `near`, and the rays, in and round them."""
-        config, size_m = self._config, self._config.leaf_size_m
-        first, last = leaves_of(blocks)
-        own = within(near, first, last)
-        leaf_keys = near[own]
-        table = VertexTable(near, size_m, 1, Encoding.OCTREE, num_threads)
-        distances_m = average_at_vertices(table, means, told, normals, config, num_threads)
-        # As the field's features hold it.
-        distances_m = distances_m / np.float32(config.sigma_m) * np.float32(config.sigma_m)
-        _, vertices = table.leaf_vertices()
-        values = distances_m[vertices[own]]
-        crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)
-        information, detections = sums_round(told, leaf_keys, num_threads)
-        rows = Replacement.of(before["keys"], leaf_keys, first, last)
-        new = {"values": values, "crossed": crossed, "information": information, "detections": detections}
-        return rows.rows(before, new)
-
-
-def _blocks_round(blocks: Keys) -> Keys:
-    """Keys of these blocks, and of those round them."""
-    return np.unique(shifted(blocks << BLOCK_BITS, ROUND << 3) >> BLOCK_BITS)
