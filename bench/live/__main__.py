@@ -25,9 +25,14 @@ _COMMANDS = {
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.live", description=__doc__)
     parser.add_argument("what", choices=_COMMANDS)
-    parser.add_argument("cases", nargs="*", help="scenes, of circles a number of scans; default: all")
+    parser.add_argument(
+        "cases",
+        nargs="*",
+        help="scenes, of `accuracy` also files, of `circles` a number of scans; default: all",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the scenes")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--tenths", type=int, nargs="+", default=range(1, 11), help="of `accuracy`")
     parser.add_argument("--quick", action="store_true", help="only show that it runs")
     parser.add_argument("--out", type=Path, default=Path("bench_results"))
     options = parser.parse_intermixed_args()
