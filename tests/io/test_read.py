@@ -186,7 +186,7 @@ def test_an_npz_of_ours_loses_what_is_not_finite(tmp_path):
 
 
 def test_extrinsic(tmp_path):
-    clouds(tmp_path, 2)
+    clouds(tmp_path / "radar", 2)  # so that base_T_radar.txt is the only text in the folder, and no scan
     mounting = pose([0.5, 0, 1], np.pi / 2)
     assert_allclose(read(tmp_path, POSES[:2], extrinsic=mounting).poses, POSES[:2] @ mounting)
     (tmp_path / "base_T_radar.txt").write_text(

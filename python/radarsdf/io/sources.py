@@ -38,7 +38,7 @@ _NOT_SCANS = {
     *TIME_FILES,
     "calib.txt",
     "calibration.txt",
-    "base_T_radar.txt",
+    "base_t_radar.txt",
     "readme.txt",
     "license.txt",
 }
