@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from radarsdf.evaluation import holdout
-from radarsdf.io.datasets.folders import is_posed_folder, read_posed_folder
-from radarsdf.io.datasets.snail_radar import is_snail_radar, read_snail_radar
+from radarsdf.io import read
+from radarsdf.io.datasets.snail_radar import is_snail_radar
 from radarsdf.io.npz import Scans, read_scans
 from radarsdf.returns.rays import prepare
 from radarsdf.simulate import KINDS, SCENES, Simulation
@@ -126,8 +126,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
         - the name of a simulated scene in `radarsdf.simulate.SCENES`, or of a kind in `radarsdf.simulate.KINDS`;
         - an ``.npz`` file for :func:`radarsdf.io.npz.read_scans`. Only lidar points within 1 m of a return that is
           2.5 to 60 m from its sensor are ground truth;
-        - a folder for :func:`radarsdf.io.datasets.folders.read_posed_folder`, such as a recording of Viking Hill;
-        - a sequence of SNAIL-Radar for :func:`radarsdf.io.datasets.snail_radar.read_snail_radar`.
+        - a folder of scans with poses for :func:`radarsdf.io.read`, such as a recording of Viking Hill.
 
         All lidar points of a folder are ground truth. Use `box` to select a part.
     frames : int, optional
@@ -153,16 +152,12 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
         scene = _simulated(simulations[spec](seed=seed, frames=frames))
     elif Path(spec).is_file() and Path(spec).suffix == ".npz":
         scene = _file(Path(spec), frames)
-    elif is_snail_radar(Path(spec)):
-        scene = _recorded(Path(spec).resolve().name, read_snail_radar(Path(spec), frames), frames)
-        scene = dataclasses.replace(scene, min_range_m=_MIN_RANGE_OCULII_M)
-    elif is_posed_folder(Path(spec)):
-        scene = _recorded(Path(spec).resolve().name, read_posed_folder(Path(spec), frames), frames)
+    elif Path(spec).is_dir():
+        scene = _folder(Path(spec), frames)
     else:
         msg = (
             f"no scene {spec!r}: expected a simulated scene ({', '.join([*sorted(SCENES), *sorted(KINDS)])}), an .npz file of scans, "
-            "a folder with radar/*.pcd and poses.txt (export ROS bags, such as those of Viking Hill, to one) or "
-            "a sequence of SNAIL-Radar with eagleg7/enhanced/*.pcd and utm50r_T_xt32.txt"
+            "or a folder of scans with poses"
         )
         raise ValueError(msg)
     return scene if box is None else dataclasses.replace(scene, box=_corners(box))
@@ -189,6 +184,11 @@ def _file(path: Path, frames: int | None) -> Scene:
         max_range_m=_MAX_RANGE_FILE_M,
     )
     return dataclasses.replace(scene, ground_truth=_seen_by_both(scene))
+
+
+def _folder(path: Path, frames: int | None) -> Scene:
+    scene = _recorded(path.resolve().name, read(path), frames)
+    return dataclasses.replace(scene, min_range_m=_MIN_RANGE_OCULII_M) if is_snail_radar(path) else scene
 
 
 def _recorded(name: str, scans: Scans, frames: int | None) -> Scene:

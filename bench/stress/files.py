@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import radarsdf
 from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.io import read
 from radarsdf.io.clouds.pcd import read_pcd
-from radarsdf.io.datasets.folders import read_posed_folder
 from radarsdf.io.ground_truth import read_ground_truth
 from radarsdf.io.meshes import read_mesh
 from radarsdf.io.npz import read_scans
@@ -89,13 +89,14 @@ def _folder(path: Path) -> None:
     """Reads a folder with the damaged file among valid ones. A ValueError may name any file of the folder."""
     folder = path.parent if path.parent.name != "radar" else path.parent.parent
     try:
-        scans = read_posed_folder(folder)
+        scans = read(folder)
+        points, _ = scans.points, scans.ground_truth  # which read the files
     except ValueError as error:
         if str(folder) in str(error):  # a valid file is named if it does not fit to the damaged one
             msg = f"{path}: {error}"
             raise ValueError(msg) from error
         raise
-    assert 1 <= len(scans.points) == len(scans.poses) <= 2  # one of the two scans may have no pose
+    assert 1 <= len(points) == len(scans.poses) <= 2  # one of the two scans may have no pose
 
 
 READERS = {
@@ -178,7 +179,7 @@ def try_file(reader: Reader, path: Path, data: bytes, outcomes: Outcomes) -> Non
 
 
 def place(reader: Reader, folder: Path) -> Path:
-    """Path of the file of a reader in `folder`. For `read_posed_folder`, the other files are written."""
+    """Path of the file of a reader in `folder`. For `radarsdf.io.read`, the other files are written."""
     if reader.read is _folder:
         samples.write_folder(folder)
     return folder / reader.name

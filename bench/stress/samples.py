@@ -316,7 +316,7 @@ def meshes() -> list[bytes]:
 
 
 def write_folder(folder: Path) -> None:
-    """A folder of two scans that `read_posed_folder` reads."""
+    """A folder of two scans that `radarsdf.io.read` reads."""
     (folder / "radar").mkdir(parents=True, exist_ok=True)
     for time_s in ("100.0", "100.3"):
         (folder / "radar" / f"{time_s}.pcd").write_bytes(clouds()[0])

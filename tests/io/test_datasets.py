@@ -11,7 +11,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.datasets.published import DATASETS, find
-from radarsdf.io.datasets.snail_radar import read_snail_radar
 from scipy.spatial.transform import Rotation
 
 from ..conftest import pose
@@ -217,17 +216,6 @@ def test_viking_hill(tmp_path, kind):
     (folder / "base_T_radar.txt").write_text("\n".join(["1 1 1 1"] * 4))
     with pytest.raises(ValueError, match=r"base_T_radar\.txt does not hold a rigid transform"):
         read(folder)
-
-
-def test_snail_radar(snail):  # noqa: F811 - the fixture
-    assert name_of(snail) == "SNAIL-Radar"
-    expected, scans = read_snail_radar(snail), read(snail)
-    assert_allclose(scans.poses, expected.poses, atol=1e-6)
-    for points, values, scan in zip(expected.points, expected.intensities, scans, strict=True):
-        assert_array_equal(scan.points, points)
-        assert_array_equal(scan.intensities, values)
-    write_pcd(snail / "xt32" / "1706001766.000000000.pcd", radar_cloud([[0, -3, 1]]))
-    assert_allclose(read(snail).ground_truth, read_snail_radar(snail).ground_truth)
 
 
 # The mounting of the ARS548 in the frame of the lidar on the morning of 2023-11-05, as python/view_radar_lidar.py of

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
+from radarsdf.io import read
 from radarsdf.io.clouds.pcd import read_pcd
-from radarsdf.io.datasets.folders import read_posed_folder
-from radarsdf.io.datasets.snail_radar import read_snail_radar
 
 from bench.paper.scenes import load_scene
 
@@ -91,7 +90,8 @@ def posed(tmp_path):
 
 
 def test_posed_folder(posed):
-    scans = read_posed_folder(posed)
+    scans = read(posed)
+    assert scans.notes == []
     assert [p.dtype for p in scans.points] == [np.float32] * 3
     assert_array_equal(scans.points[0], [[1, 2, 3], [4, 5, 6]])
     assert_array_equal(scans.points[1], [[7, 8, 9]])
@@ -110,7 +110,7 @@ def test_mounting_turns_and_shifts_with_the_base(posed):
     (posed / "base_T_radar.txt").write_text(
         "0 -1 0 2\n1 0 0 0\n0 0 1 0.5  # a radar that looks left\n0 0 0 1\n"
     )
-    poses = read_posed_folder(posed).poses
+    poses = read(posed).poses
     assert_allclose(poses[0], pose([12, 0, 1.5], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]), atol=1e-6)
     assert_allclose(poses[2], pose([11, 2, 1.5], [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]), atol=1e-6)
 
@@ -139,14 +139,17 @@ def test_ground_truth(posed, kind):
 
 
 def test_what_is_left_out(posed):
-    write_pcd(posed / "radar" / stamp(-0.1), radar_cloud([[9, 9, 9]], power=[1]))
-    write_pcd(posed / "radar" / stamp(0.5), radar_cloud([[9, 9, 9]], power=[1]))
-    write_pcd(posed / "radar" / stamp(0.1), radar_cloud(np.zeros((0, 3)), power=[]))
     nan = np.nan
-    write_pcd(
-        posed / "radar" / stamp(0.2), radar_cloud([[nan, 8, 9], [7, 8, 9], [1, 1, 1]], power=[1, 2, nan])
-    )
-    scans = read_posed_folder(posed)
+    for time_s, xyz, power in (
+        (-0.1, [[9, 9, 9]], [1]),
+        (0.5, [[9, 9, 9]], [1]),
+        (0.1, [], []),
+        (0.2, [[nan, 8, 9], [7, 8, 9], [1, 1, 1]], [1, 2, nan]),
+    ):
+        write_pcd(
+            posed / "radar" / stamp(time_s), radar_cloud(xyz, doppler=np.zeros(len(power)), power=power)
+        )
+    scans = read(posed)
     assert [len(p) for p in scans.points] == [2, 1, 1]
     assert_array_equal(scans.points[1], [[7, 8, 9]])
     assert_array_equal(scans.intensities[1], [2])
@@ -155,57 +158,7 @@ def test_what_is_left_out(posed):
 def test_without_intensities(posed):
     for path in (posed / "radar").iterdir():
         write_pcd(path, radar_cloud([[1, 2, 3]]))
-    assert read_posed_folder(posed).intensities is None
-
-
-def test_damaged_posed_folders(posed):
-    write_pcd(posed / "radar" / stamp(0.2), radar_cloud([[1, 2, 3]]))
-    with pytest.raises(ValueError, match="lacks the field power"):
-        read_posed_folder(posed)
-    first, *others = sorted((posed / "radar").iterdir())
-    write_pcd(first, radar_cloud([[1, 2, 3]]))  # the other way round
-    write_pcd(others[0], radar_cloud([[1, 2, 3]], power=[1]))
-    with pytest.raises(ValueError, match="has the field power, which scans before it lack"):
-        read_posed_folder(posed)
-    write_pcd(posed / "radar" / stamp(0.2), {"x": np.zeros(1), "power": np.zeros(1)})
-    write_pcd(first, radar_cloud([[1, 2, 3]], power=[1]))
-    with pytest.raises(ValueError, match="lacks the fields y, z"):
-        read_posed_folder(posed)
-    (posed / "radar" / "first.pcd").touch()
-    with pytest.raises(ValueError, match="not named by its time"):
-        read_posed_folder(posed)
-    for path in (posed / "radar").iterdir():
-        path.unlink()
-    with pytest.raises(ValueError, match=r"no \.pcd files"):
-        read_posed_folder(posed)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "not a table of 8 columns"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0", "not a table of 8 columns"),
-        ("0 0 0 0 0 0 0 one\n", "not a table of 8 columns"),
-        ("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n", "finite"),
-        ("0 0 0 0 0 0 0 1\n", "at least two poses"),
-        ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "order of their times"),
-        ("0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1\n", "unit quaternions"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "lies within the poses"),
-    ],
-)
-def test_damaged_poses(posed, text, message):
-    (posed / "poses.txt").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        read_posed_folder(posed)
-
-
-def test_a_gap_between_poses(posed):
-    write_poses(
-        posed / "poses.txt", [(-1, (0, 0, 0), STRAIGHT), (0, (0, 0, 0), STRAIGHT), (9, (9, 0, 0), STRAIGHT)]
-    )
-    with pytest.raises(ValueError, match=r"9\.000 s apart, more than 0\.5 s"):
-        read_posed_folder(posed)
-    assert len(read_posed_folder(posed, frames=1).points) == 1  # at a pose, the gap behind it does not matter
+    assert read(posed).intensities is None
 
 
 @pytest.mark.parametrize(
@@ -214,7 +167,7 @@ def test_a_gap_between_poses(posed):
 def test_damaged_mounting(posed, text):
     (posed / "base_T_radar.txt").write_text(text)
     with pytest.raises(ValueError, match="base_T_radar"):
-        read_posed_folder(posed)
+        read(posed)
 
 
 def test_damaged_ground_truth(posed):
@@ -222,8 +175,9 @@ def test_damaged_ground_truth(posed):
     whole = cloud.export(file_type="ply")
     for size in (len(whole) // 2, 20, 0):
         (posed / "lidar.ply").write_bytes(whole[:size])
+        scans = read(posed)
         with pytest.raises(ValueError, match=r"lidar\.ply"):
-            read_posed_folder(posed)
+            _ = scans.ground_truth
 
 
 UTM = np.array([245821.0, 3380553.0, 20.0])
@@ -253,7 +207,7 @@ def snail(tmp_path):
 
 
 def test_snail_radar(snail):
-    scans = read_snail_radar(snail)
+    scans = read(snail)
     assert_array_equal(scans.points[0], [[5, 0, 0]])
     assert_array_equal(scans.points[1], [[6, 0, 0], [0, 7, 0]])
     assert_array_equal(np.concatenate(scans.intensities), [12.5, 1, 2])
@@ -267,7 +221,7 @@ def test_snail_radar(snail):
 
 def test_snail_radar_with_a_calibration_of_its_own(snail):
     (snail / "body_T_oculii.txt").write_text("1 0 0 1\n0 1 0 2\n0 0 1 3\n0 0 0 1\n")
-    poses = read_snail_radar(snail).poses
+    poses = read(snail).poses
     # 1 m forward, 2 m left and 3 m up of the lidar: to the north, the west and up.
     assert_allclose(poses[0], pose(UTM + [-2, 1, 3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]), rtol=0, atol=1e-5)
 
@@ -288,19 +242,25 @@ def test_snail_radar_lidar_points_move_with_their_own_time(snail):
     write_pcd(snail / "xt32" / stamp(0.0), columns)
     write_pcd(snail / "xt32" / stamp(0.3), radar_cloud([[9, 9, 9]]))  # after the last radar scan
     expected = UTM + [[0, 3, 1], [0.25, 3, 1], [-1.77, -0.02, 0.02]]
-    assert_allclose(read_snail_radar(snail).ground_truth, expected, rtol=0, atol=1e-5)
+    assert_allclose(read(snail).ground_truth, expected, rtol=0, atol=1e-5)
     scene = load_scene(str(snail))
     assert (scene.name, len(scene), scene.min_range_m, scene.max_range_m) == ("data3", 2, 1.0, None)
     assert_allclose(scene.ground_truth, expected, rtol=0, atol=1e-5)
     write_pcd(snail / "lidar.pcd", dict(zip("xyz", UTM[:, None], strict=True)))
-    assert_array_equal(read_snail_radar(snail).ground_truth, UTM[None])
+    assert_array_equal(read(snail).ground_truth, UTM[None])
 
 
 def test_damaged_snail_radar(snail):
     columns = radar_cloud([[5, 5, 5]]) | {"timestamp": np.array([12.0])}
     write_pcd(snail / "xt32" / stamp(0.0), columns)
+    scans = read(snail)
     with pytest.raises(ValueError, match="times of its points"):
-        read_snail_radar(snail)
+        _ = scans.ground_truth
+    wrong = snail / "eagleg7" / "enhanced" / "first.pcd"
+    wrong.touch()
+    with pytest.raises(ValueError, match="not named by its time"):
+        read(snail)
+    wrong.unlink()
     (snail / "utm50r_T_xt32.txt").unlink()
     with pytest.raises(ValueError, match="full_trajs"):
         load_scene(str(snail))

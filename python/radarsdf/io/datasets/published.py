@@ -239,7 +239,7 @@ class VikingHill:
 
 
 class Snail:
-    """A sequence of SNAIL-Radar, or one radar of it; see :func:`radarsdf.io.datasets.snail_radar.read_snail_radar`.
+    """A sequence of SNAIL-Radar, or one radar of it; see :class:`radarsdf.io.datasets.snail_radar.SnailRadar`.
 
     ``data3`` means its Oculii Eagle, ``data3/ars548/points`` its Continental ARS548.
     """

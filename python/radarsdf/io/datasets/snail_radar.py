@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
@@ -21,9 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf._core import cell_keys
 from radarsdf.io.clouds.pcd import read_pcd
-from radarsdf.io.datasets.folders import lidar_map, read_stamped_scans, read_transform, stamped_files, xyz_of
+from radarsdf.io.datasets.folders import lidar_map, read_transform
 from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, read_trajectory
-from radarsdf.io.scans import Scans
 
 RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")
 """Folders of clouds in a sequence: of the Oculii Eagle, and of the Continental ARS548. The first that is there counts."""
@@ -77,8 +77,9 @@ def _parts(folder: Path) -> tuple[Path, str] | None:
     return None
 
 
-def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
-    """Reads a sequence of SNAIL-Radar: the clouds of one of its radars, and the lidar as ground truth.
+@dataclass(frozen=True, eq=False)
+class SnailRadar:
+    """A sequence of SNAIL-Radar and one of its radars.
 
     ::
 
@@ -93,35 +94,7 @@ def read_snail_radar(folder: Path, frames: int | None = None) -> Scans:
     Copy ``utm50r_T_xt32.txt`` from the data set's folder ``full_trajs/<date>/<sequence>``. The calibration of the ARS548
     is that of the date, the name of the folder above. Of the Oculii, only x, y and z are used: its angles are in another
     frame (right, down, forward). ``tf_static.launch`` is not read.
-
-    Parameters
-    ----------
-    folder : Path
-        A folder as above: the Oculii is read, or the ARS548 if it is the only one. Or the folder of one radar in it, such
-        as ``ars548/points``. The same returns and scans are left out as by :func:`radarsdf.io.datasets.folders.read_posed_folder`.
-    frames : int, optional
-        Number of scans to read, from the first. Default: all. Lidar scans are read from the first to the last of them.
-
-    Returns
-    -------
-    Scans
-        As of :func:`radarsdf.io.datasets.folders.read_posed_folder`, with UTM zone 50R as the world frame. The ground truth holds
-        lidar points with a range of 1 to 60 m, at most one in each cell of 5 cm. Each is moved with the pose at its own
-        time, or at the time of its scan if the file has no field ``timestamp``.
-
-    Raises
-    ------
-    ValueError, OSError
-        As :func:`radarsdf.io.datasets.folders.read_posed_folder`.
     """
-    snail = SnailRadar.of(folder)
-    scans, times_s = read_stamped_scans(snail.clouds, snail.trajectory, snail.T_base_radar, frames)
-    return Scans(scans.points, scans.poses, scans.intensities, snail.ground_truth(times_s))
-
-
-@dataclass(frozen=True, eq=False)
-class SnailRadar:
-    """A sequence of SNAIL-Radar and one of its radars; see :func:`read_snail_radar`."""
 
     folder: Path
     radar: str
@@ -147,7 +120,7 @@ class SnailRadar:
 
     def files(self) -> list[tuple[float, Path]]:
         """Times, s, and files of the clouds of the radar."""
-        return stamped_files(self.clouds)
+        return _stamped_files(self.clouds)
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -186,13 +159,16 @@ class SnailRadar:
         T_body_ars548[:3, 3] = _ARS548_POSITION_M
         return T_body_ars548
 
-    def ground_truth(self, times_s: NDArray[np.float64] | None = None) -> NDArray[np.float64] | None:
-        """Lidar points (M, 3), UTM zone 50R, m, from the first to the last of these times, or of all scans."""
+    def ground_truth(self) -> NDArray[np.float64] | None:
+        """Lidar points (M, 3), UTM zone 50R, m, from the first to the last scan; None if there are none.
+
+        Of scans of the lidar, they have a range of 1 to 60 m, and there is at most one in each cell of 5 cm. Each is moved
+        with the pose at its own time, or at the time of its scan if the file has no field ``timestamp``.
+        """
         points = lidar_map(self.folder)
         if points is None and (self.folder / "xt32").is_dir() and (self.folder / _TRAJECTORY).is_file():
-            if times_s is None:
-                times_s = np.array([time_s for time_s, _ in self.files()])
-                times_s = times_s[self.trajectory.covers(times_s)]
+            times_s = np.array([time_s for time_s, _ in self.files()])
+            times_s = times_s[self.trajectory.covers(times_s)]
             if len(times_s):
                 points = _read_lidar_scans(self.folder / "xt32", self.trajectory, times_s[0], times_s[-1])
         return points
@@ -215,11 +191,11 @@ def _read_lidar_scans(
 def _lidar_scans(
     folder: Path, trajectory: Trajectory, first_s: float, last_s: float
 ) -> Iterator[NDArray[np.float64]]:
-    for time_s, path in stamped_files(folder):
+    for time_s, path in _stamped_files(folder):
         if not first_s <= time_s <= last_s:
             continue
         columns = read_pcd(path)
-        xyz = xyz_of(columns, path)
+        xyz = _xyz_of(columns, path)
         times_s = columns.get("timestamp", np.full(len(xyz), time_s)).astype(np.float64)
         ranges_m = np.linalg.norm(xyz, axis=1)
         used = (ranges_m >= _LIDAR_RANGE_M[0]) & (ranges_m <= _LIDAR_RANGE_M[1]) & np.isfinite(times_s)
@@ -228,6 +204,28 @@ def _lidar_scans(
             raise ValueError(msg)
         used &= trajectory.covers(times_s)
         yield trajectory.move(xyz[used], times_s[used], MAX_GAP_S)
+
+
+def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
+    """Times, s, and paths of the PCD files of a folder, in the order of time."""
+    files = []
+    for path in folder.glob("*.pcd"):
+        try:
+            time_s = float(path.stem)
+        except ValueError:
+            time_s = np.nan
+        if not np.isfinite(time_s):
+            msg = f"{path} is not named by its time in seconds"
+            raise ValueError(msg)
+        files.append((time_s, path))
+    return sorted(files)
+
+
+def _xyz_of(columns: dict[str, NDArray[Any]], path: Path) -> NDArray[np.float64]:
+    if missing := [name for name in "xyz" if name not in columns]:
+        msg = f"{path} lacks the fields {', '.join(missing)}: it has {', '.join(columns)}"
+        raise ValueError(msg)
+    return np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1)
 
 
 def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
