@@ -19,7 +19,6 @@ import numpy as np
 import radarsdf
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.io import read
-from radarsdf.io.clouds.pcd import read_pcd
 from radarsdf.io.ground_truth import read_ground_truth
 from radarsdf.io.meshes import read_mesh
 from radarsdf.io.npz import read_scans
@@ -63,10 +62,6 @@ def _scans(path: Path) -> None:
         assert list(map(len, scans.intensities)) == list(map(len, scans.points))
 
 
-def _pcd(path: Path) -> None:
-    assert len({len(column) for column in read_pcd(path).values()}) <= 1
-
-
 def _trajectory(path: Path) -> None:
     trajectory = read_trajectory(path)
     assert len(trajectory.times_s) == len(trajectory.positions) == len(trajectory.rotations) >= 2
@@ -107,12 +102,12 @@ READERS = {
     "eval: mesh": Reader(_mesh, "mesh.ply", samples.meshes),
     "load": Reader(_load, "map.safetensors", samples.maps, samples.hostile_map),
     "read_scans": Reader(_scans, "scans.npz", samples.scans, samples.hostile_scans),
-    "read_pcd": Reader(_pcd, "scan.pcd", samples.clouds),
     "read_trajectory": Reader(_trajectory, "poses.txt", samples.trajectories),
     "folder: scan": Reader(_folder, "radar/100.0.pcd", samples.clouds),
     "folder: poses": Reader(_folder, "poses.txt", samples.trajectories),
     "folder: mounting": Reader(_folder, "base_T_radar.txt", samples.transforms),
     "folder: lidar": Reader(_folder, "lidar.ply", samples.meshes),
+    "read: PCD": Reader(readers.read_one, "scan.pcd", samples.clouds),
     "read: compressed": Reader(readers.read_one, "scan.pcd", readers.compressed),
     "read: array": Reader(readers.read_one, "scan.npy", readers.arrays),
     "read: KITTI": Reader(readers.read_one, "scan.bin", readers.kitti),

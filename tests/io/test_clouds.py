@@ -13,7 +13,6 @@ import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read, read_points
 from radarsdf.io.clouds.lzf import unpack_lzf
-from radarsdf.io.clouds.pcd import read_pcd
 from radarsdf.io.clouds.reading import read_columns
 
 from .test_folders import write_pcd
@@ -63,7 +62,7 @@ def test_pcd(tmp_path, data):
 
 def test_compressed_pcd(tmp_path):
     packed_pcd(tmp_path / "a.pcd", COLUMNS, as_literals)
-    assert {n: c.dtype for n, c in read_pcd(tmp_path / "a.pcd").items()} == {
+    assert {n: c.dtype for n, c in read_columns(tmp_path / "a.pcd").items()} == {
         n: c.dtype for n, c in COLUMNS.items()
     }
     check(tmp_path / "a.pcd")
@@ -78,7 +77,7 @@ def test_compressed_pcd_of_many_points(tmp_path):
     table[1000:2000] = 7  # long references
     cloud = pypcd4.PointCloud.from_points(table, ("x", "y", "z", "power"), (np.float32,) * 4)
     cloud.save(tmp_path / "a.pcd", encoding=pypcd4.Encoding.BINARY_COMPRESSED)
-    columns = read_pcd(tmp_path / "a.pcd")
+    columns = read_columns(tmp_path / "a.pcd")
     assert_array_equal(np.stack(list(columns.values()), axis=1), table)
 
 
@@ -106,8 +105,8 @@ def test_a_compressed_pcd_that_would_unpack_to_gigabytes(tmp_path):
         return b"\x00a" + b"\xe0\xff\x00" * 10
 
     packed_pcd(tmp_path / "a.pcd", COLUMNS, bomb)
-    with pytest.raises(ValueError, match=r"a\.pcd is not a whole PCD file"):
-        read_pcd(tmp_path / "a.pcd")
+    with pytest.raises(ValueError, match=r"a\.pcd is not a whole \.pcd file of points"):
+        read_columns(tmp_path / "a.pcd")
     data = (tmp_path / "a.pcd").read_bytes()
     head, _, _ = data.partition(b"DATA binary_compressed\n")
     head = head.replace(b"WIDTH 2", b"WIDTH 100000000")
@@ -115,7 +114,7 @@ def test_a_compressed_pcd_that_would_unpack_to_gigabytes(tmp_path):
         head + b"DATA binary_compressed\n" + struct.pack("<II", 32, 2_000_000_000) + bytes(32)
     )
     with pytest.raises(ValueError, match="do not fit"):
-        read_pcd(tmp_path / "a.pcd")
+        read_columns(tmp_path / "a.pcd")
 
 
 @pytest.mark.parametrize("width", [4, 5, 7])

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.clouds.pcd import read_pcd
+from radarsdf.io.clouds.reading import read_columns
 
 from bench.paper.scenes import load_scene
 
@@ -277,7 +277,7 @@ COLUMNS = {
 @pytest.mark.parametrize("data", ["ascii", "binary"])
 def test_pcd(data, tmp_path):
     write_pcd(tmp_path / "cloud.pcd", COLUMNS, data)
-    columns = read_pcd(tmp_path / "cloud.pcd")
+    columns = read_columns(tmp_path / "cloud.pcd")
     assert list(columns) == list(COLUMNS)
     for name, expected in COLUMNS.items():
         assert_array_equal(columns[name], expected)
@@ -286,18 +286,18 @@ def test_pcd(data, tmp_path):
 def test_pcd_with_padding_and_fields_of_several_values(tmp_path):
     cloud = {"x": np.ones(2, np.float32), "_": np.zeros(2, np.int64), "z": np.full(2, 3, np.float32)}
     write_pcd(tmp_path / "cloud.pcd", cloud, SIZE="4 1 4", COUNT="1 8 1", TYPE="F U F")
-    assert {name: c.tolist() for name, c in read_pcd(tmp_path / "cloud.pcd").items()} == {
+    assert {name: c.tolist() for name, c in read_columns(tmp_path / "cloud.pcd").items()} == {
         "x": [1, 1],
         "z": [3, 3],
     }
     write_pcd(tmp_path / "cloud.pcd", {"x": np.ones(6, np.float32)}, WIDTH="3", HEIGHT="2", COUNT=None)
-    assert read_pcd(tmp_path / "cloud.pcd")["x"].tolist() == [1] * 6
+    assert read_columns(tmp_path / "cloud.pcd")["x"].tolist() == [1] * 6
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary"])
 def test_empty_pcd(data, tmp_path):
     write_pcd(tmp_path / "cloud.pcd", radar_cloud(np.zeros((0, 3))), data)
-    assert [len(c) for c in read_pcd(tmp_path / "cloud.pcd").values()] == [0, 0, 0]
+    assert [len(c) for c in read_columns(tmp_path / "cloud.pcd").values()] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary"])
@@ -307,8 +307,8 @@ def test_pcd_cut_short(data, tmp_path):
     whole = path.read_bytes()
     for size in (0, 10, 60, whole.index(b"DATA") + 2, len(whole) - (1 if data == "binary" else 3)):
         path.write_bytes(whole[:size])
-        with pytest.raises(ValueError, match="not a whole PCD file"):
-            read_pcd(path)
+        with pytest.raises(ValueError, match=r"not a whole \.pcd file of points"):
+            read_columns(path)
 
 
 @pytest.mark.parametrize(
@@ -332,4 +332,4 @@ def test_pcd_cut_short(data, tmp_path):
 def test_hostile_pcd(header, message, tmp_path):
     write_pcd(tmp_path / "cloud.pcd", COLUMNS, **header)
     with pytest.raises(ValueError, match=message):
-        read_pcd(tmp_path / "cloud.pcd")
+        read_columns(tmp_path / "cloud.pcd")

@@ -69,7 +69,7 @@ def test_reading_is_lazy(tmp_path):
     scans = read(tmp_path, POSES)
     stream = iter(scans)
     assert [len(next(stream)) for _ in range(5)] == [1, 2, 3, 4, 5]
-    with pytest.raises(ValueError, match=r"scan_5\.pcd is not a whole PCD file"):
+    with pytest.raises(ValueError, match=r"scan_5\.pcd is not a whole \.pcd file of points"):
         next(stream)
 
 

@@ -35,19 +35,11 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises
     ------
-    ValueError
-        If the file is not a PCD file, or is cut off.
+    ValueError, KeyError, IndexError, OverflowError
+        If the file is not a PCD file, or is cut off: :func:`radarsdf.io.clouds.reading.read_columns` says so.
     OSError
         If the file cannot be read.
     """
-    try:
-        return _read(path)
-    except (ValueError, KeyError, IndexError, OverflowError) as error:
-        msg = f"{path} is not a whole PCD file: {error}"
-        raise ValueError(msg) from error
-
-
-def _read(path: Path) -> dict[str, NDArray[Any]]:
     with path.open("rb") as file:
         header: dict[str, list[str]] = {}
         for _ in range(_MAX_HEADER_LINES):

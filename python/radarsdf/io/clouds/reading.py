@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,6 @@ from radarsdf.io.origin import origin_of
 from radarsdf.io.text import COMMENTS, check_header, read_text, with_points, without_comment
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
-CLOUD_SUFFIXES = (".pcd", ".ply", ".bin", ".npy", *TEXT_SUFFIXES, ".las", ".laz")
-"""What :func:`read_columns` reads."""
-
 _KITTI_COLUMNS = 4
 _PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
 _SEPARATORS = (";", ",", "\t", None)  # None: any white space
@@ -58,18 +55,11 @@ def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Colu
     """
     check_regular_file(path)
     suffix = path.suffix.lower()
-    if suffix == ".pcd":
-        return read_pcd(path)
-    reader = {".ply": _ply, ".las": _las, ".laz": _las}.get(suffix)
+    if suffix not in CLOUD_SUFFIXES:
+        msg = f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}"
+        raise ValueError(msg)
     try:
-        if reader is not None:
-            return reader(path)
-        if suffix == ".bin":
-            return _bin(path, columns)
-        if suffix == ".npy":
-            return _npy(path, columns)
-        if suffix in TEXT_SUFFIXES:
-            return _text(path, columns)
+        return _NAMED[suffix](path) if suffix in _NAMED else _NAMELESS[suffix](path, columns)
     except (ImportError, MemoryError):
         raise
     except (
@@ -81,8 +71,6 @@ def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Colu
             raise
         msg = f"{path} is not a whole {suffix} file of points: {error}"
         raise ValueError(msg) from error
-    msg = f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}"
-    raise ValueError(msg)
 
 
 def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
@@ -231,3 +219,17 @@ def _las(path: Path) -> Columns:
     for name in header.point_format.extra_dimension_names:
         columns["intensity" if name == RADAR_INTENSITY else str(name)] = np.asarray(cloud[name])
     return columns
+
+
+_NAMED: dict[str, Callable[[Path], Columns]] = {".pcd": read_pcd, ".ply": _ply, ".las": _las, ".laz": _las}
+"""Readers of formats that name their columns."""
+
+_NAMELESS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
+    ".bin": _bin,
+    ".npy": _npy,
+    **dict.fromkeys(TEXT_SUFFIXES, _text),
+}
+"""Readers of formats that may not, and are told the names."""
+
+CLOUD_SUFFIXES = (*_NAMED, *_NAMELESS)
+"""What :func:`read_columns` reads."""

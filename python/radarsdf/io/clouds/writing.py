@@ -22,9 +22,6 @@ from radarsdf.io.records import ply_header, records
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.progress import hides_bar
 
-CLOUD_OUT_SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".npy", ".csv")
-"""What :func:`write_cloud` writes."""
-
 _FLOAT32_SUFFIXES = (".pcd",)
 _CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # as many digits as give the same number back
 _COUNT_BYTES = 20  # of the largest number of points
@@ -197,8 +194,11 @@ def _csv(file: BinaryIO, rows: Rows) -> int:
 _WRITERS: dict[str, Callable[[Any, Rows], int]] = {
     ".ply": _binary(_ply),
     ".pcd": _binary(_pcd),
-    ".npy": _binary(_npy),
-    ".csv": _csv,
     ".las": las_writer(compressed=False),
     ".laz": las_writer(compressed=True),
+    ".npy": _binary(_npy),
+    ".csv": _csv,
 }
+
+CLOUD_OUT_SUFFIXES = tuple(_WRITERS)
+"""What :func:`write_cloud` writes."""

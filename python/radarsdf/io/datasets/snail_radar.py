@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf._core import cell_keys
-from radarsdf.io.clouds.pcd import read_pcd
+from radarsdf.io.clouds.reading import read_columns
 from radarsdf.io.datasets.folders import lidar_map, read_transform
 from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, read_trajectory
 
@@ -194,7 +194,7 @@ def _lidar_scans(
     for time_s, path in _stamped_files(folder):
         if not first_s <= time_s <= last_s:
             continue
-        columns = read_pcd(path)
+        columns = read_columns(path)
         xyz = _xyz_of(columns, path)
         times_s = columns.get("timestamp", np.full(len(xyz), time_s)).astype(np.float64)
         ranges_m = np.linalg.norm(xyz, axis=1)
