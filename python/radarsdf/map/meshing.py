@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,13 +25,19 @@ with whole_import():
     import trimesh
 
 
+class VertexLimits(NamedTuple):
+    """What a mesh leaves out by what is known of a vertex, whatever the rest of the surface is: a tile asks this alone."""
+
+    max_uncertainty: float
+    """m"""
+
+
 class Limits(NamedTuple):
     """What a mesh leaves out; see :meth:`Map.mesh`."""
 
     min_confidence: float | None
     """None: that of the highest expected F-score."""
-    max_uncertainty: float
-    """m"""
+    of_vertices: VertexLimits
     min_component_triangles: int
 
     @classmethod
@@ -58,7 +64,7 @@ class Limits(NamedTuple):
         if min_component_triangles is None:
             min_component_triangles = queries.piece_triangles(voxel_m)
         whole_number(min_component_triangles, "min_component_triangles", 0)
-        return cls(min_confidence, max_uncertainty, min_component_triangles)
+        return cls(min_confidence, VertexLimits(max_uncertainty), min_component_triangles)
 
 
 @dataclass(frozen=True)
@@ -129,9 +135,13 @@ class Surface:
             cells_searched,
         )
 
+    def known(self, limits: VertexLimits) -> NDArray[np.bool_]:
+        """Which of the vertices are known well enough, (V,)."""
+        return np.asarray(np.nan_to_num(self.uncertainty_m, nan=np.inf) <= limits.max_uncertainty, bool)
+
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
         """Which of the faces a mesh keeps, (F,)."""
-        good = np.nan_to_num(self.uncertainty_m, nan=np.inf) <= limits.max_uncertainty
+        good = self.known(limits.of_vertices)
         good &= self.confidence >= self.threshold(limits).min_confidence
         kept = np.asarray(good[self.faces].all(axis=1), bool)
         rows = np.flatnonzero(kept)
@@ -166,17 +176,15 @@ def extract_mesh(
     *,
     box: ArrayLike | None,
     viewpoint: ArrayLike | None,
-    min_confidence: float | None,
-    max_uncertainty: float | None,
-    min_component_triangles: int | None,
     progress: bool | None,
+    **wanted: Any,
 ) -> trimesh.Trimesh:
-    """See :meth:`Map.mesh`."""
+    """See :meth:`Map.mesh`, of which `wanted` are the limits."""
     voxel_size = positive(voxel_size, "voxel_size")
     if voxel_size > MAX_POSITION_M:
         msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
         raise ValueError(msg)
-    limits = Limits.of(contents, voxel_size, min_confidence, max_uncertainty, min_component_triangles)
+    limits = Limits.of(contents, voxel_size, **wanted)
     sensor_position = None if viewpoint is None else check_viewpoint(contents.intensity_scale, viewpoint)
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)

@@ -109,19 +109,15 @@ def _pieces(
     progress: bool | None,
     *,
     box: ArrayLike | None = None,
-    min_confidence: float | None = None,
-    max_uncertainty: float | None = None,
-    min_component_triangles: int | None = None,
+    **wanted: Any,
 ) -> tuple[list[Path], Limits]:
-    """Meshes all tiles: the files of the pieces, and what a mesh of them leaves out."""
+    """Meshes all tiles: the files of the pieces, and what a mesh of them leaves out, as `wanted` of :meth:`Map.mesh`."""
     voxel_size = positive(voxel_size, "voxel_size")
-    limits = Limits.of(
-        city.any_contents, voxel_size, min_confidence, max_uncertainty, min_component_triangles
-    )
+    limits = Limits.of(city.any_contents, voxel_size, **wanted)
     settings = PieceSettings(
         divides(voxel_size, city.config.leaf_size_m),
         None if box is None else tuple(tuple(corner) for corner in check_box(box).tolist()),
-        limits.max_uncertainty,
+        limits.of_vertices,
     )
     tiles = [tile for tile in city.tiles if not piece_path(city, tile.tile, settings).is_file()]
     if executor is None:  # what this map holds in memory serves all tiles

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
-from radarsdf.map.meshing import Surface, renumbered
+from radarsdf.map.meshing import Surface, VertexLimits, renumbered
 from radarsdf.map.threshold import SUMS
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
@@ -40,19 +40,19 @@ class PieceSettings:
     """Along the edge of a leaf cell."""
     box: tuple[tuple[float, ...], ...] | None
     """Lower and upper corner, world, m."""
-    max_uncertainty: float
-    """As of :meth:`Map.mesh`, m."""
+    limits: VertexLimits
+    """What is left out of the mesh of a tile. All else depends on the other tiles."""
 
     def to_json(self) -> str:
         """For arguments of tasks. :meth:`from_json` is its inverse."""
-        return json.dumps(asdict(self))
+        return json.dumps(asdict(self) | {"limits": self.limits._asdict()})
 
     @classmethod
     def from_json(cls, text: str) -> PieceSettings:
         """The settings that :meth:`to_json` wrote."""
         values: dict[str, Any] = json.loads(text)
-        box = values.pop("box")
-        return cls(box=None if box is None else tuple(tuple(corner) for corner in box), **values)
+        box, limits = values.pop("box"), VertexLimits(**values.pop("limits"))
+        return cls(box=None if box is None else tuple(map(tuple, box)), limits=limits, **values)
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,7 @@ def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
         num_threads=threads,
     )
     surface = Surface.told_by(city.any_contents, vertices, faces, city.evidence(vertices), len(cells))
-    good = np.nan_to_num(surface.uncertainty_m, nan=np.inf) <= settings.max_uncertainty
-    kept, faces = renumbered(len(vertices), faces[good[faces].all(axis=1)])
+    kept, faces = renumbered(len(vertices), faces[surface.known(settings.limits)[faces].all(axis=1)])
     vertices = vertices[kept]
     rows, edges = _border(config.lattice.cells(vertices) * steps, city.plan.tile_cells * steps)
     return Piece(
