@@ -14,6 +14,9 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
+NOISE_SETTINGS = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
+"""Settings of returns that say the numbers of :class:`SensorNoise`, in their order."""
+
 # Measured: so many give each deviation to 1 to 3 % of what all returns give, twice as many to 1 to 1.5 %.
 _RETURNS = 20_000
 _MIN_RETURNS = 100  # with fewer, the result is the guess that the estimate starts from
@@ -74,7 +77,7 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
     num_threads : int
         0: as many as OpenMP uses.
     """
-    known = np.array([config.range_noise_m, config.azimuth_noise_rad, config.elevation_noise_rad], np.float64)
+    known = np.array([getattr(config, name) for name in NOISE_SETTINGS], np.float64)
     free = np.isnan(known)
     sigma2 = np.where(free, [0.25 * surfels.cell_size_m, _FIRST_ANGLE_RAD, _FIRST_ANGLE_RAD], known) ** 2
     on_flat = surfels.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()

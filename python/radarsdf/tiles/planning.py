@@ -19,7 +19,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.io.scans import Scan
 from radarsdf.returns.movers import Standing
-from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.noise import NOISE_SETTINGS, SensorNoise
 from radarsdf.returns.plausible import Intensities
 from radarsdf.returns.rays import Rays, check_range, middle_scan, prepare
 from radarsdf.returns.sensor import Sensor
@@ -219,8 +219,7 @@ class Planner:
             rough += surface.surfels.rough_share() * len(rays)
             returns += len(rays)
         noise = SensorNoise(*np.median(noises, axis=0).tolist())
-        names = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
-        known = dict(zip(names, dataclasses.astuple(noise), strict=True))
+        known = dict(zip(NOISE_SETTINGS, dataclasses.astuple(noise), strict=True))
         return dataclasses.replace(
             plan,
             config=plan.config.override(returns=known),
