@@ -45,6 +45,16 @@ def test_a_voxel_that_a_surface_grazes_is_not_free():
     assert grid.free.sum() * 0.2**3 > 190
 
 
+def test_seven_scans_from_one_place_free_what_is_before_a_facade():
+    """Rays that graze the ground pass cells that the field alone would put a cell behind it: it is longer than the distance."""
+    drive = radarsdf.simulate.KINDS["facade"](seed=5, frames=21)
+    config = radarsdf.FitConfig(num_threads=1)
+    radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
+    grid = radar_map.grid([[5, 0, -1], [25, 14.5, 5]], 0.2)
+    assert grid.free.sum() * 0.2**3 > 500
+    assert (grid.at(drive.ground_truth) == 0).mean() < 0.001
+
+
 def test_a_saved_map_has_the_same_grid(grid, sharp_map, tmp_path):
     sharp_map.save(tmp_path / "map.safetensors")
     again = radarsdf.load(tmp_path / "map.safetensors").grid(BOX, 0.2)

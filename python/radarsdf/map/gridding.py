@@ -67,6 +67,8 @@ def passage_odds(contents: MapContents) -> NDArray[np.float64]:
     leaf_m = contents.config.leaf_size_m
     centres = torch.from_numpy(((cells + 0.5) * leaf_m).astype(np.float32))
     distances_m = queries.signed_distance(contents, centres).numpy()
+    # Along flat rays the field is longer than the distance, and where returns are noisy it is shorter; so is its gradient.
+    edge = leaf_m * np.linalg.norm(queries.gradient(contents, centres).numpy(), axis=1)
     confidence = queries.confidence(contents, queries.evidence(contents, centres)).numpy()
     passed = contents.passages.at(cells)
 
@@ -76,7 +78,7 @@ def passage_odds(contents: MapContents) -> NDArray[np.float64]:
         return found
 
     # More scans that passed never make a cell less free: chance is smoothed away from the end on.
-    odds = shares(distances_m < -leaf_m) / shares(distances_m > leaf_m)
+    odds = shares(distances_m < -edge) / shares(distances_m > edge)
     falling: NDArray[np.float64] = np.minimum.accumulate(odds)
     return falling
 
