@@ -92,7 +92,8 @@ def test_with_a_network_the_answer_is_the_mean_of_two(rays):
 
 
 def test_a_network_is_asked_once_for_a_group(rays, monkeypatch):
-    monkeypatch.setattr(reflectance, "_MOST_RETURNS", 1000)
+    for most in ("_MOST_RETURNS", "_MOST_ASKED"):
+        monkeypatch.setattr(reflectance, most, 1000)
     asked = []
 
     def ask(points, directions, ranges_m):

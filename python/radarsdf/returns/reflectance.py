@@ -32,8 +32,9 @@ _KINDS = np.array([
 _TILINGS = 4  # two have 1 to 2 % more error, eight 0 to 1 % less
 _SHRINKAGE = 4.0  # 3 to 10 differ by less than 1 %
 _ROUNDS = 2  # four are no better
-# Of more returns, those that are close and seen alike are one: means of so many would take too long for a quick fit.
-_MOST_RETURNS = 50_000
+# Of more returns, those that are close and seen alike are one, with 1 to 2 % more error: means of each would take 128
+# bytes for a return. A network, which is asked for each, takes longer than means, and leaves less to them.
+_MOST_RETURNS, _MOST_ASKED = 200_000, 50_000
 _GROUPS = np.array([[2.5, 0.25, 0.12]])  # a kind of cells, as above
 _CORRELATION = 0.1  # of the returns in a group: n of them count n / (1 + 0.1 (n - 1)) times
 _LEAST_MEAN = 0.005  # of the range of intensities. A third of the means are smaller: they tell nothing
@@ -195,7 +196,8 @@ class Residuals:
         plane = surfels.flat_planes_at(points, num_threads)
         directions = np.ascontiguousarray(rays.directions)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
-        groups = _Groups.of(points, directions, incidence, leaf_size_m)
+        most = _MOST_RETURNS if ask is None else _MOST_ASKED
+        groups = _Groups.of(points, directions, incidence, leaf_size_m, most)
         if ask is not None:
             answers = ask(groups.points, _unit_vectors(groups.directions), groups.means(rays.ranges_m))
             unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
@@ -251,8 +253,9 @@ class _Groups:
         directions: Float32,
         incidence_rad: Float32,
         leaf_size_m: float,
+        most: int,
     ) -> _Groups:
-        if len(points) <= _MOST_RETURNS:
+        if len(points) <= most:
             return cls(None, points, directions, np.ones(len(points)))
         rows, count = cell_rows(_in_metres(_GROUPS, leaf_size_m), points, directions, incidence_rad)
         counts = np.bincount(rows, minlength=count).astype(np.float64)
