@@ -171,6 +171,25 @@ def test_readers_see_the_map_before_or_after_a_scan():
     assert set(seen) <= known
 
 
+@pytest.mark.parametrize("size", [len, repr, lambda live: live.num_bytes, lambda live: live.sealed_scans])
+def test_sizes_are_not_read_while_a_scan_is_added(size, monkeypatch):
+    """The core changes its tables without Python's lock: what it says of them meanwhile can be anything."""
+    live, found, during = map_of(range(3)), [], []
+    reader = threading.Thread(target=lambda: found.append(size(live)))
+    apply = live._state.apply
+
+    def slowly(change):
+        reader.start()
+        reader.join(0.2)
+        during.extend(found)
+        return apply(change)
+
+    monkeypatch.setattr(live._state, "apply", slowly)
+    live.integrate(SCENE.points[3], SCENE.poses[3], SCENE.intensities[3])
+    reader.join()
+    assert (during, found) == ([], [size(live)])
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

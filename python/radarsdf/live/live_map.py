@@ -107,12 +107,13 @@ class LiveMap:
         self._reading = threading.Lock()  # of its surface, taken first
 
     def __len__(self) -> int:
-        return len(self._state.log)
+        with self._lock:
+            return len(self._state.log)
 
     def __repr__(self) -> str:
-        return (
-            f"LiveMap({len(self)} scans, {self._state.sums.num_cells} cells, {self.num_bytes / 1e6:.1f} MB)"
-        )
+        with self._lock:
+            cells = self._state.sums.num_cells
+            return f"LiveMap({len(self)} scans, {cells} cells, {self.num_bytes / 1e6:.1f} MB)"
 
     @property
     def config(self) -> FitConfig:
@@ -133,12 +134,14 @@ class LiveMap:
     @property
     def sealed_scans(self) -> int:
         """Number of scans that can no longer be moved or taken out."""
-        return self._state.log.sealed
+        with self._lock:
+            return self._state.log.sealed
 
     @property
     def num_bytes(self) -> int:
         """Memory that the map takes, bytes."""
-        return self._state.num_bytes
+        with self._lock:  # tables that grow just now have no size
+            return self._state.num_bytes
 
     def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
         """(4, 4) T_world_sensor of a scan, m. Raises a KeyError if it cannot be taken out."""
