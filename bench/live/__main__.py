@@ -7,17 +7,19 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.live import accuracy, circles, growth, kills, loops, rates, removal, tracking
+from bench.live import accuracy, circles, growth, intensities, kills, loops, rates, readers, removal, tracking
 from bench.rows import kept
 
 _COMMANDS = {
     "rates": rates,
     "accuracy": accuracy,
+    "intensities": intensities,
     "growth": growth,
     "removal": removal,
     "circles": circles,
     "kills": kills,
     "loops": loops,
+    "readers": readers,
     "tracking": tracking,
 }
 
@@ -28,7 +30,7 @@ def main() -> None:
     parser.add_argument(
         "cases",
         nargs="*",
-        help="scenes, of `accuracy` also files, of `circles` a number of scans; default: all",
+        help="scenes, of `accuracy` and `intensities` also files, of `circles` a number of scans; default: all",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the scenes")
     parser.add_argument("--threads", type=int, default=1)

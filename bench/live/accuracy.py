@@ -11,12 +11,13 @@ import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import radarsdf
 import torch
 from radarsdf import FitConfig, LiveMap
 from radarsdf.evaluation import surface_metrics
+from radarsdf.simulate import Simulation
 
 from bench.live.rates import scans_of
 from bench.paper.scenes import Scene, load_scene
@@ -29,7 +30,8 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     torch.set_num_threads(options.threads)
     samples = 20_000 if options.quick else 300_000
     for name in options.cases or ["hugin", "oculii", "wall"]:
-        scans, config = _drive(name, options)
+        drive = drive_of(name, options)
+        scans, config = drive.scans, drive.config
         assert scans.ground_truth is not None
         assert scans.intensities is not None
         live = LiveMap(config)
@@ -61,7 +63,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 for mesh in meshes
             )
             yield {
-                "scene": Path(name).stem,
+                "scene": drive.name,
                 "tenths": tenth,
                 "scans": end,
                 "live, F %": round(kept, 2),
@@ -74,11 +76,19 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             }
 
 
-def _drive(name: str, options: argparse.Namespace) -> tuple[Any, FitConfig]:
-    """Simulated or recorded scans, and settings with the ranges of the recorded ones."""
+class Drive(NamedTuple):
+    """Scans with what they show, and settings with the ranges of the recorded ones."""
+
+    name: str
+    scans: Simulation | Scene
+    config: FitConfig
+
+
+def drive_of(name: str, options: argparse.Namespace) -> Drive:
+    """A simulated scene, or a file of recorded scans with ground truth."""
     config = FitConfig(num_threads=options.threads)
     if not Path(name).is_file():
-        return scans_of(name, options.seed, options.quick), config
-    scene: Scene = load_scene(name)
+        return Drive(name, scans_of(name, options.seed, options.quick), config)
+    scene = load_scene(name)
     ranges = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
-    return scene, config.override(returns=ranges)
+    return Drive(scene.name, scene, config.override(returns=ranges))
