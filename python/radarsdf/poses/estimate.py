@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.poses.groups import Groups
 from radarsdf.poses.motion import Motion
 from radarsdf.poses.planes import Grid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, moved
@@ -17,6 +18,9 @@ from radarsdf.returns.noise import SensorNoise
 
 # Of scans in short windows, the drift is small beside a cell. So each window may be twice as long as the one before.
 _FIRST_WINDOW = 8  # scans
+# Longer windows only say how their parts lie to each other. With as many groups and returns as one of these, all long windows
+# together take no longer than two rounds of all scans, whatever the length of the drive.
+_LONGEST_WINDOW = 64  # scans that each move on their own
 _OF_WINDOWS = (4, 2)  # edges of cells, in those of a map's surfels
 _OF_ALL = (4, 4, 2, 2)  # likewise, once all scans are together
 _MOST_ROUNDS = 12  # with cells as small as a map's surfels
@@ -53,17 +57,20 @@ class PosesEstimate:
     ) -> PosesEstimate:
         """From `given` (F, 4, 4) and what was measured, by Gauss and Newton's method, with planes drawn anew in each round."""
         poses, noise, rounds, motions = given, None, 0, list(motions)
-        for grid in _grids(len(given), cell_m, first_window):
+        for grid in plan_of(len(given), cell_m, first_window):
             # The noise is estimated every other round: with the poses, it changes slowly.
             planes, noise = common_planes(
                 returns, poses, grid, None if rounds % 2 == 0 else noise, config, num_threads
             )
-            diagonal, below, gradient = _prior(motions, poses)
+            groups = Groups(len(given), grid.together)
+            diagonal, below, gradient = groups.prior(_prior(motions, poses), poses)
             increments, inverse, inverse_below, decrement = planes.solve(
                 diagonal, below, gradient, _TOLERANCE, _MOST_ITERATIONS, True, num_threads
             )
-            before, poses = poses, aligned(moved(poses, increments), given)
-            motions = [motion.at(poses).learnt(poses, before, inverse, inverse_below) for motion in motions]
+            before, poses = poses, aligned(moved(poses, groups.increments(increments, poses)), given)
+            motions = [motion.at(poses) for motion in motions]
+            if groups.size == 1:  # or the covariances of steps are not known
+                motions = [motion.learnt(poses, before, inverse, inverse_below) for motion in motions]
             rounds += 1
             finest = grid.window == len(given) and grid.cell_m == cell_m
             if finest and decrement < _SETTLED**2 * increments.size:
@@ -83,7 +90,7 @@ def _prior(motions: Sequence[Motion], poses: Floats) -> tuple[Floats, Floats, Fl
     return diagonal + _WEAK * np.eye(6), below, gradient
 
 
-def _grids(num_scans: int, cell_m: float, window: int) -> Iterator[Grid]:
+def plan_of(num_scans: int, cell_m: float, window: int) -> Iterator[Grid]:
     """Coarse to fine, and from short windows to all scans."""
     plan = []
     while window < num_scans:
@@ -91,4 +98,5 @@ def _grids(num_scans: int, cell_m: float, window: int) -> Iterator[Grid]:
         window *= 2
     plan += [(num_scans, cells) for cells in _OF_ALL] + [(num_scans, 1)] * _MOST_ROUNDS
     for i, (window, cells) in enumerate(plan):
-        yield Grid(window, i % 2 == 1, cells * cell_m)
+        together = max(1, window // _LONGEST_WINDOW) if window < num_scans else 1
+        yield Grid(window, i % 2 == 1, cells * cell_m, together)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CommonPlanes
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.poses.groups import Groups
 from radarsdf.poses.normals import told_normals
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -55,6 +56,14 @@ class SensorReturns:
         """Those of a mask (N,)."""
         return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part])
 
+    def every(self, step: int) -> SensorReturns:
+        """The first one, and each that comes `step` later."""
+        return SensorReturns(
+            np.ascontiguousarray(self.directions[::step]),
+            np.ascontiguousarray(self.ranges_m[::step]),
+            np.ascontiguousarray(self.scans[::step]),
+        )
+
     def posed(self, poses: Floats) -> Rays:
         """As rays of sensors with these poses (F, 4, 4). Their local frame begins at the mean position."""
         origin = poses[:, :3, 3].mean(axis=0)
@@ -86,6 +95,8 @@ class Grid:
     """Whether windows begin in the middle of one."""
     cell_m: float
     """Edge of the cell of a plane, m."""
+    together: int = 1
+    """So many consecutive scans move as one, and have as many returns as one."""
 
 
 def common_planes(
@@ -98,9 +109,10 @@ def common_planes(
 ) -> tuple[CommonPlanes, SensorNoise]:
     """What returns on common planes say of the poses (F, 4, 4), and the noise of the sensor that this supposes.
 
-    `noise` None: as these planes show it. `num_threads` 0: as many as OpenMP uses.
+    Of poses of groups of scans, if `grid` has them together. `noise` None: as these planes show it. `num_threads` 0: as many as OpenMP uses.
     """
-    rays = returns.posed(poses)
+    groups = Groups(len(poses), grid.together)
+    rays = returns.every(grid.together).posed(poses)
     planes = np.full(len(rays), -1, np.int32)
     centres, normals, noises, total = [], [], [], 0
     for low, high in windows(len(poses), grid.window, grid.shifted):
@@ -119,15 +131,15 @@ def common_planes(
         rays.points,
         rays.directions,
         rays.ranges_m,
-        rays.scans,
+        groups.of(rays.scans),
         planes,
-        poses[:, :3, 3] - rays.origin,
-        rays.up_of_scan,
+        poses[groups.middles, :3, 3] - rays.origin,
+        np.ascontiguousarray(rays.up_of_scan[groups.middles]),
         np.concatenate(centres),
         np.ascontiguousarray(np.concatenate(normals)),
         grid.cell_m,
         np.square(dataclasses.astuple(known)).tolist(),
-        min(grid.window, _TOGETHER),
+        min(grid.window // grid.together, _TOGETHER),
         num_threads,
     )
     return common, known
