@@ -16,6 +16,7 @@ from radarsdf.map import queries
 from radarsdf.map.contents import Scene
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import Surface, local
+from radarsdf.map.threshold import areas_round
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks
 
@@ -37,11 +38,12 @@ class _Piece:
     vertices: NDArray[np.float64]  # (V, 3) local, m
     faces: NDArray[np.int32]  # (F, 3)
     evidence: torch.Tensor  # (V, 3) as of queries.EvidenceAt
+    areas_m2: NDArray[np.float64]  # (V,) of the triangles here round each vertex
     border: NDArray[np.int64]  # (B,) rows of vertices that another region may have, too
 
     @property
     def num_bytes(self) -> int:
-        held = (self.vertices, self.faces, self.evidence, self.border)
+        held = (self.vertices, self.faces, self.evidence, self.areas_m2, self.border)
         return sum(array.nbytes for array in held)
 
 
@@ -80,7 +82,8 @@ class GrowingTriangles:
         at = queries.interpolated(evidence, cells["keys"], self._config.leaf_size_m, local(scene, world))
         parts = torch.split(torch.stack(list(at), 1), [len(vertices) for vertices, _ in found.values()])
         for (region, (vertices, faces)), part in zip(found.items(), parts, strict=True):
-            piece = self._pieces[region] = _Piece(vertices, faces, part.clone(), self._border(vertices))
+            areas_m2, border = areas_round(vertices, faces), self._border(vertices)
+            piece = self._pieces[region] = _Piece(vertices, faces, part.clone(), areas_m2, border)
             self.num_bytes += piece.num_bytes
 
     def joined(self, rough_share: float, leaf_cells: int) -> Triangles:
@@ -98,6 +101,7 @@ class GrowingTriangles:
         _, first, which = np.unique(bits, return_index=True, return_inverse=True)
         one = np.arange(len(vertices), dtype=np.int32)
         one[rows] = rows[first][which]
+        areas_m2 = np.concatenate([np.zeros(0), *(piece.areas_m2 for piece in pieces)])
         evidence = torch.cat([torch.zeros((0, 3)), *(piece.evidence for piece in pieces)])
         scene = Scene(self._origin, self._config, rough_share)
         surface = Surface.told_by(
@@ -106,6 +110,7 @@ class GrowingTriangles:
             one[np.concatenate([np.zeros((0, 3), np.int32), *faces])],
             queries.EvidenceAt(*evidence.unbind(1)),
             leaf_cells,
+            np.bincount(one, areas_m2, len(vertices)).astype(np.float64),
         )
         self._joined = Triangles(scene, surface, leaf_cells)
         return self._joined

@@ -115,8 +115,9 @@ class Surface:
         faces: NDArray[np.int32],
         evidence: queries.EvidenceAt,
         cells_searched: int,
+        areas_m2: NDArray[np.float64] | None = None,
     ) -> Surface:
-        """Triangles with the evidence of their vertices; all as of the fields."""
+        """Triangles with the evidence of their vertices; all as of the fields. `areas_m2` (V,): those round the vertices, if known."""
         found = queries.probabilities(scene, evidence)
         confidence = found.confidence.float()
         return cls(
@@ -126,7 +127,7 @@ class Surface:
             confidence.numpy(),
             queries.uncertainty(scene, evidence).numpy(),
             Tally.of(
-                areas_round(vertices, faces),
+                areas_round(vertices, faces) if areas_m2 is None else areas_m2,
                 confidence.double().numpy(),
                 found.covering.numpy(),
                 found.reach.numpy(),
