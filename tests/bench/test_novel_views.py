@@ -17,7 +17,6 @@ from .test_paper import run
 
 LINE = np.column_stack([np.arange(10, 20, 1.0), np.zeros((10, 2))])
 VALUES = np.arange(10.0)
-NO_VALUES = np.full(10, np.nan)
 
 
 def scene(points, poses, intensities=None):

@@ -20,15 +20,13 @@ from .primitives import Box
 from .radar import RadarSensor, generator
 from .scene import Scene
 from .simulation import Simulation, simulate
-from .site import Site, vary
+from .site import Path, Site, vary
 from .terrain import Terrain
 from .trajectory import along_path
 
 __all__ = ["KINDS", "Kind"]
 
 FloatArray = NDArray[np.float64]
-Path = Callable[[FloatArray], FloatArray]
-"""Maps values (N,) in 0..1 to positions (N, 2), world frame, m."""
 
 _LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams of random numbers that no scan has
 _THRESHOLD_DB = 64.0
@@ -217,11 +215,7 @@ def _simulation(kind: Kind, name: str, seed: int = 0, frames: int | None = None)
         site.solids += _facade(rng, float(way[:, 0].max()))
 
     def beside(near: float, far: float) -> tuple[FloatArray, float]:
-        u = rng.uniform(*(_BEYOND if kind.drive == "ahead" else (0, 1)))
-        ahead, here = path(np.array([u + 0.01, u]))
-        yaw = float(np.arctan2(*(ahead - here)[::-1]))
-        side = rng.choice([-1.0, 1.0]) * rng.uniform(near, far)
-        return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
+        return site.beside(path, rng.uniform(*(_BEYOND if kind.drive == "ahead" else (0, 1))), near, far)
 
     for thing, number, limits in kind.things:
         site.fill(int(rng.integers(*number)), getattr(site, thing), partial(beside, *limits))

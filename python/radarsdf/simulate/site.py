@@ -15,9 +15,11 @@ from .materials import Material
 from .primitives import Box, Pole, Primitive
 from .terrain import Terrain
 
-__all__ = ["Site", "vary"]
+__all__ = ["Path", "Site", "vary"]
 
 FloatArray = NDArray[np.float64]
+Path = Callable[[FloatArray], FloatArray]
+"""Maps values (N,), 0..1 for those that are driven, to positions (N, 2), world frame, m."""
 
 _BURIED_M = 1.0  # solids reach this far into the ground, so that they have no gap to the ground on a slope
 
@@ -59,6 +61,13 @@ class Site:
         self, xy: FloatArray, yaw: float, bottom: float, size: FloatArray, material: Material
     ) -> None:
         self.solids.append(Box(np.array([*xy, bottom + size[2] / 2]), size / 2, yaw, material))
+
+    def beside(self, path: Path, u: float, near: float, far: float) -> tuple[FloatArray, float]:
+        """A random place `near` to `far` m to one side of where a path is at `u`, (2,), and its direction there, rad."""
+        ahead, here = path(np.array([u + 0.01, u]))
+        yaw = float(np.arctan2(*(ahead - here)[::-1]))
+        side = self._rng.choice([-1.0, 1.0]) * self._rng.uniform(near, far)
+        return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
 
     def fill(
         self,

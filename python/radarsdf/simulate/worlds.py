@@ -87,11 +87,7 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
     site = Site(rng, terrain, taken=[(x, y, 2.2) for x, y in lane])
 
     def beside(near: float, far: float) -> tuple[FloatArray, float]:
-        u = rng.uniform(0.1, 1.45)
-        ahead, here = path(np.array([u + 0.01, u]))
-        yaw = float(np.arctan2(*(ahead - here)[::-1]))
-        side = rng.choice([-1.0, 1.0]) * rng.uniform(near, far)
-        return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
+        return site.beside(path, rng.uniform(0.1, 1.45), near, far)
 
     site.fill(int(rng.integers(4, 8)), site.building, lambda: beside(13, 20))
     site.fill(int(rng.integers(3, 6)), site.wall, lambda: beside(6, 11))
@@ -230,10 +226,7 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
     site = Site(rng, terrain, taken=[(x, y, 2.8) for x, y in road])
 
     def beside(near: float, far: float) -> tuple[FloatArray, float]:
-        here, ahead = path(rng.uniform(first, last) / length + np.array([0.0, 0.01]))
-        yaw = float(np.arctan2(*(ahead - here)[::-1]))
-        side = rng.choice([-1.0, 1.0]) * rng.uniform(near, far)
-        return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
+        return site.beside(path, rng.uniform(first, last) / length, near, far)
 
     site.fill(int(rng.integers(5, 16)), site.building, lambda: beside(14, 60))
     site.fill(int(rng.integers(2, 12)), site.car, lambda: beside(4, 9))
