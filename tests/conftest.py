@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, _core
+from radarsdf.io import Scans
 
 SEED = 7
 
@@ -72,6 +73,19 @@ def ground_and_wall(scans=6, returns_per_scan=1500, noise_m=0.02, offset=(0.0, 0
         poses.append(T_world_sensor)
         intensities.append((100 - 40 * np.log10(ranges) + rng.normal(0, 0.5, len(ranges))).astype(np.float32))
     return Scene(points, np.stack(poses), intensities)
+
+
+def with_truth(scene):
+    """The scans of a `Scene`, with lidar points on its plane."""
+    truth = np.stack(np.meshgrid(np.arange(9, 19, 0.5), np.arange(-5, 5, 0.5), [0.0]), -1).reshape(-1, 3)
+    return Scans(scene.points, scene.poses, scene.intensities, truth)
+
+
+def draw_small(patch):
+    """Reports with small pictures and few samples of the truth, so that they take less time."""
+    patch.setattr("radarsdf.report.surface._WIDTH", 160)
+    patch.setattr("radarsdf.report.surface._HEIGHT", 100)
+    patch.setattr("radarsdf.report.truth._SAMPLES", 20_000)
 
 
 @pytest.fixture(scope="session", autouse=True)

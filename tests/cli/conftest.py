@@ -4,19 +4,18 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
-from radarsdf.io.npz import Scans, write_scans
+from radarsdf.io.npz import write_scans
 
+from ..conftest import draw_small, with_truth
 from .calls import FAST, call
 
 
 @pytest.fixture(scope="session")
 def scans_file(scene, tmp_path_factory):
     """Six scans of a plane and a wall, with lidar points on the plane."""
-    truth = np.stack(np.meshgrid(np.arange(9, 19, 0.5), np.arange(-5, 5, 0.5), [0.0]), -1).reshape(-1, 3)
     path = tmp_path_factory.mktemp("scans") / "scans.npz"
-    write_scans(path, Scans(scene.points, scene.poses, scene.intensities, truth))
+    write_scans(path, with_truth(scene))
     return path
 
 
@@ -42,9 +41,6 @@ def garbage(tmp_path):
 
 @pytest.fixture
 def small_pictures(monkeypatch):
-    """Reports with small pictures and few samples of the truth, so that they take less time."""
     pytest.importorskip("viser", reason="the extra view is not installed")
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    monkeypatch.setattr("radarsdf.report.surface._WIDTH", 160)
-    monkeypatch.setattr("radarsdf.report.surface._HEIGHT", 100)
-    monkeypatch.setattr("radarsdf.report.truth._SAMPLES", 20_000)
+    draw_small(monkeypatch)

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.io import Scans
 
+from ..conftest import draw_small, with_truth
 from .reading import Page
 
 HOSTILE = """<script>alert("$title")</script>'&amp;.safetensors"""
@@ -20,8 +20,7 @@ def subject(scene, radar_map):
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     from radarsdf.report.subject import Subject  # noqa: PLC0415
 
-    truth = np.stack(np.meshgrid(np.arange(9, 19, 0.5), np.arange(-5, 5, 0.5), [0.0]), -1).reshape(-1, 3)
-    scans = Scans(scene.points, scene.poses, scene.intensities, truth)
+    scans = with_truth(scene)
     train, test = np.arange(1, 6), np.arange(1)
     findings = [radarsdf.Finding("made_up", "warning", "<b>1 of 2</b>", "Mend <i>it</i>.")]
     return Subject(
@@ -38,9 +37,7 @@ def subject(scene, radar_map):
 @pytest.fixture(scope="session", autouse=True)
 def small_pictures():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("radarsdf.report.surface._WIDTH", 160)
-        patch.setattr("radarsdf.report.surface._HEIGHT", 100)
-        patch.setattr("radarsdf.report.truth._SAMPLES", 20_000)
+        draw_small(patch)
         yield
 
 
