@@ -10,7 +10,6 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
-#include <random>
 #include <stdexcept>
 #include <thread>
 #include <vector>
@@ -18,6 +17,7 @@
 #include "field/encodings.hpp"
 #include "field/mlp.hpp"
 #include "field/optimiser.hpp"
+#include "helpers.hpp"
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
 #include "lattice/vertex_table.hpp"
@@ -64,15 +64,6 @@ class Results {
 };
 
 template <typename T>
-std::vector<T> random_numbers(std::int64_t size, double scale, unsigned seed) {
-  std::mt19937 generator(seed);
-  std::normal_distribution<double> normal(0.0, scale);
-  std::vector<T> numbers(static_cast<std::size_t>(size));
-  for (T& number : numbers) number = static_cast<T>(normal(generator));
-  return numbers;
-}
-
-template <typename T>
 radarsdf::VertexTable table_of(const std::vector<T>& points, radarsdf::Encoding encoding, int threads) {
   radarsdf::CellSet cells(0.2);
   cells.insert(points.data(), kPoints, threads);
@@ -81,12 +72,13 @@ radarsdf::VertexTable table_of(const std::vector<T>& points, radarsdf::Encoding 
 
 template <typename T>
 void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
-  const auto points = random_numbers<T>(3 * kPoints, 4.0, 1);
+  const auto points = test::normal_numbers<T>(3 * kPoints, 4.0, 1);
   const radarsdf::VertexTable table = table_of(points, encoding, threads);
   results.add(table.cells().data(), table.num_cells());
 
-  const auto features = random_numbers<T>(8 * table.num_rows(), 1.0, 2);
-  const auto grad = random_numbers<T>(8 * kLevels * kPoints, 1.0, 3), directions = random_numbers<T>(3 * kPoints, 1, 4);
+  const auto features = test::normal_numbers<T>(8 * table.num_rows(), 1.0, 2);
+  const auto grad = test::normal_numbers<T>(8 * kLevels * kPoints, 1.0, 3),
+             directions = test::normal_numbers<T>(3 * kPoints, 1, 4);
   std::vector<std::int32_t> located(kLevels * kPoints), found(kLevels * kPoints);
   std::vector<T> out(grad.size()), points_grad(points.size()), features_grad(features.size());
   const std::int64_t stride = 8 * kLevels;
@@ -113,10 +105,10 @@ void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
 // Two steps of Adam, as a fit makes them.
 template <typename T>
 void adam(radarsdf::Encoding encoding, int threads, Results& results) {
-  const auto points = random_numbers<T>(3 * kPoints, 4.0, 1);
+  const auto points = test::normal_numbers<T>(3 * kPoints, 4.0, 1);
   const radarsdf::VertexTable table = table_of(points, encoding, threads);
-  auto features = random_numbers<T>(8 * table.num_rows(), 1.0, 2);
-  const auto grad = random_numbers<T>(8 * kLevels * kPoints, 1.0, 3);
+  auto features = test::normal_numbers<T>(8 * table.num_rows(), 1.0, 2);
+  const auto grad = test::normal_numbers<T>(8 * kLevels * kPoints, 1.0, 3);
   std::vector<std::int32_t> located(kLevels * kPoints);
   std::vector<radarsdf::RowMark> marks(features.size() / 8);
   radarsdf::locate(table, points.data(), kPoints, located.data(), threads);
@@ -142,10 +134,11 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
 template <typename T>
 void networks(int threads, Results& results) {
   constexpr std::int64_t kHidden = 20, kWide = 7, kNarrow = 5, kOutputs = 3;
-  const auto wide = random_numbers<T>(kWide * kPoints, 1.0, 11), narrow = random_numbers<T>(kNarrow * kPoints, 1.0, 12);
-  const auto first = random_numbers<T>(kHidden * (kWide + kNarrow + 1), 0.3, 13);
-  const auto second = random_numbers<T>(kOutputs * (kHidden + 1), 0.3, 14);
-  const auto grad = random_numbers<T>(kOutputs * kPoints, 1.0, 15);
+  const auto wide = test::normal_numbers<T>(kWide * kPoints, 1.0, 11),
+             narrow = test::normal_numbers<T>(kNarrow * kPoints, 1.0, 12);
+  const auto first = test::normal_numbers<T>(kHidden * (kWide + kNarrow + 1), 0.3, 13);
+  const auto second = test::normal_numbers<T>(kOutputs * (kHidden + 1), 0.3, 14);
+  const auto grad = test::normal_numbers<T>(kOutputs * kPoints, 1.0, 15);
   const std::vector<radarsdf::Layer<T>> layers = {
       {first.data(), first.data() + kHidden * (kWide + kNarrow), kWide + kNarrow, kHidden},
       {second.data(), second.data() + kOutputs * kHidden, kHidden, kOutputs}};
@@ -165,8 +158,8 @@ void networks(int threads, Results& results) {
 
 // Sums over cells, and rays through surfels and through cells.
 void sums_and_rays(int threads, Results& results) {
-  const auto points = random_numbers<float>(3 * kPoints, 3.0, 9);
-  auto directions = random_numbers<float>(3 * kPoints, 1.0, 10);
+  const auto points = test::normal_numbers<float>(3 * kPoints, 3.0, 9);
+  auto directions = test::normal_numbers<float>(3 * kPoints, 1.0, 10);
   for (std::int64_t i = 0; i < kPoints; ++i) {
     float* d = directions.data() + 3 * i;
     const float length = std::sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
@@ -233,8 +226,9 @@ void sums_and_rays(int threads, Results& results) {
 
 // Means in cells, and rays through a soup of triangles.
 void means_and_tracing(int threads, Results& results) {
-  const auto points = random_numbers<float>(3 * kPoints, 3.0, 11),
-             directions = random_numbers<float>(3 * kPoints, 0.6, 12), values = random_numbers<float>(kPoints, 1.0, 13);
+  const auto points = test::normal_numbers<float>(3 * kPoints, 3.0, 11),
+             directions = test::normal_numbers<float>(3 * kPoints, 0.6, 12),
+             values = test::normal_numbers<float>(kPoints, 1.0, 13);
   const radarsdf::Views views{points.data(), directions.data(), values.data(), kPoints};
   const std::vector<radarsdf::CellKind> kinds{{1.0, 0.2, 0.0}, {2.0, 0.0, 0.5}};
   const std::vector<float> weights(kPoints, 1.0F);
@@ -246,7 +240,7 @@ void means_and_tracing(int threads, Results& results) {
       .sums(views, numbers.data(), threads);
   results.add(numbers.data(), kPoints);
 
-  const auto vertices = random_numbers<double>(3 * kPoints, 3.0, 14);
+  const auto vertices = test::normal_numbers<double>(3 * kPoints, 3.0, 14);
   std::vector<std::int32_t> faces(kPoints / 3 * 3);
   for (std::size_t i = 0; i < faces.size(); ++i) faces[i] = static_cast<std::int32_t>(i);
   const radarsdf::SurfaceTracer tracer(vertices.data(), kPoints, faces.data(), kPoints / 3, threads);
@@ -260,9 +254,9 @@ void means_and_tracing(int threads, Results& results) {
 
 // Returns moved onto planes, a sample of columns, cells along rays, and bridges between some of them.
 void before_the_training(int threads, Results& results) {
-  const auto points = random_numbers<float>(3 * kPoints, 3.0, 16);
-  const auto directions = random_numbers<float>(3 * kPoints, 1.0, 17);
-  const auto offsets = random_numbers<float>(5, 0.3, 18);
+  const auto points = test::normal_numbers<float>(3 * kPoints, 3.0, 16);
+  const auto directions = test::normal_numbers<float>(3 * kPoints, 1.0, 17);
+  const auto offsets = test::normal_numbers<float>(5, 0.3, 18);
   radarsdf::CellSet cells(0.2);
   cells.insert_along(points.data(), directions.data(), kPoints, offsets.data(), 5, threads);
   const std::vector<std::uint64_t> keys = cells.sorted_keys(threads);
@@ -287,7 +281,8 @@ void before_the_training(int threads, Results& results) {
   results.add(chosen.data(), kPoints);
 
   constexpr std::int64_t kPlanes = 300, kScans = 7;
-  const auto planes = random_numbers<double>(7 * kPlanes, 1.0, 19), up = random_numbers<double>(3 * kScans, 1.0, 20);
+  const auto planes = test::normal_numbers<double>(7 * kPlanes, 1.0, 19),
+             up = test::normal_numbers<double>(3 * kScans, 1.0, 20);
   const std::vector<float> ranges(kPoints, 6.0F);
   std::vector<std::int32_t> scans(kPoints), of_return(kPoints);
   for (std::int32_t i = 0; i < kPoints; ++i) {
@@ -319,8 +314,8 @@ template <typename T>
 void surfaces(int threads, Results& results) {
   const std::array<std::int64_t, 3> shape{40, 33, 47};
   const std::int64_t size = shape[0] * shape[1] * shape[2];
-  auto volume = random_numbers<T>(size, 1.0, 5);
-  const auto chosen = random_numbers<float>(size, 1.0, 6);
+  auto volume = test::normal_numbers<T>(size, 1.0, 5);
+  const auto chosen = test::normal_numbers<float>(size, 1.0, 6);
   const auto mask = std::make_unique<bool[]>(static_cast<std::size_t>(size));
   for (std::int64_t i = 0; i < size; ++i) mask[static_cast<std::size_t>(i)] = chosen[static_cast<std::size_t>(i)] > -2;
   volume[1000] = static_cast<T>(NAN);
@@ -329,10 +324,10 @@ void surfaces(int threads, Results& results) {
   results.add(radarsdf::marching_cubes_dense(volume.data(), shape, mask.get(), lattice, 0.1, threads));
 
   std::vector<std::int32_t> cells;
-  for (const float number : random_numbers<float>(3 * 60000, 15.0, 7))
+  for (const float number : test::normal_numbers<float>(3 * 60000, 15.0, 7))
     cells.push_back(static_cast<std::int32_t>(number));
   const auto sparse = radarsdf::sparse_lattice(cells.data(), static_cast<std::int64_t>(cells.size()) / 3, threads);
-  const auto values = random_numbers<T>(sparse.num_corners, 1.0, 8);
+  const auto values = test::normal_numbers<T>(sparse.num_corners, 1.0, 8);
   results.add(sparse.cells.get(), 3 * sparse.num_cells);
   results.add(sparse.corners.get(), 3 * sparse.num_corners);
   results.add(sparse.cell_corners.get(), 8 * sparse.num_cells);
