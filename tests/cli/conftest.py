@@ -4,8 +4,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 from radarsdf.io.npz import write_scans
+from radarsdf.render import picture
 
 from ..conftest import draw_small, with_truth
 from .calls import FAST, call
@@ -25,6 +28,12 @@ def map_file(scans_file, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.safetensors"
     assert call("fit", scans_file, "-o", path, "--holdout", 3, *FAST) == 0
     return path
+
+
+@pytest.fixture(autouse=True)
+def small_pictures_of_meshes(monkeypatch):
+    """Most of the time of a command with a picture is that of its pixels."""
+    monkeypatch.setattr(picture, "save_picture", partial(picture.save_picture, width=160, height=100))
 
 
 @pytest.fixture

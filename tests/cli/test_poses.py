@@ -123,15 +123,23 @@ def test_the_poses_that_were_written_are_those_of_the_next_command(drive, drifte
     assert errors(scans.poses, drive.poses)[0] < 0.5 * errors(read_scans(drifted_file).poses, drive.poses)[0]
 
 
-def test_pieces_are_not_joined(drive, motion, tmp_path, capsys):
-    other = radarsdf.simulate.hugin(seed=63, frames=8)
+def test_pieces_are_not_joined(drive, motion, tmp_path, capsys, monkeypatch):
+    odometry, found = radarsdf.odometry, []
+
+    def once(*given, **settings):  # both commands write what was found in the same scans
+        if not found:
+            found.append(odometry(*given, **settings))
+        return found[0]
+
+    monkeypatch.setattr(radarsdf, "odometry", once)
+    other = radarsdf.simulate.wall(seed=63, frames=5)
     later = measured_motion(other)
     path = tmp_path / "two.npz"
     write_scans(
         path,
         Scans(
             drive.points + other.points,
-            np.tile(np.eye(4), (FRAMES + 8, 1, 1)),
+            np.tile(np.eye(4), (FRAMES + len(other.points), 1, 1)),
             doppler_mps=motion.doppler_mps + later.doppler_mps,
             times_s=np.r_[motion.times_s, later.times_s + 60],
         ),
