@@ -202,7 +202,7 @@ def test_a_large_mesh_is_shown_thinned_and_measured_whole(subject, tmp_path, mon
     large = dataclasses.replace(subject)
     assert len(large.shown[0].faces) < faces / 2
     assert len(large.mesh.faces) == faces
-    page = other(subject, tmp_path / "large.html")
+    page = other(subject, tmp_path / "large.html", scans=None, held_out=None)
     assert f"{faces:,}: too many" in page.sections["surface"]
     assert f"{len(large.shown[0].faces):,} triangles" in page.sections["surface"]
 

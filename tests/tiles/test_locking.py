@@ -14,20 +14,20 @@ from radarsdf.tiles import locking
 from radarsdf.tiles.fit_tiles import plan_tiles
 from radarsdf.tiles.plan import Plan
 
+from ..warm_python import warm_python
 from .conftest import CONFIG, TILE_M, scans_of
 
 # Plans, and waits for a line before the last scan.
 PLANNING = f"""
-import sys
+import os, sys
 import radarsdf
-from radarsdf import FitConfig
 from radarsdf.tiles.fit_tiles import plan_tiles
 from tests.tiles.conftest import CONFIG, scans_of
 drive = scans_of(radarsdf.simulate.wall(seed=5, frames=3))
 def slowly():
     for number, scan in enumerate(drive):
         if number == 2:
-            print("begun", flush=True)
+            print(os.getpid(), flush=True)
             sys.stdin.readline()
         yield scan
 plan_tiles(slowly(), sys.argv[1], tile_size={TILE_M}, halo=6.4, config=CONFIG)
@@ -36,11 +36,10 @@ plan_tiles(slowly(), sys.argv[1], tile_size={TILE_M}, halo=6.4, config=CONFIG)
 
 @pytest.fixture
 def planner(tmp_path):
-    """Another process that is about to plan tmp_path / "city"."""
-    command = [sys.executable, "-c", PLANNING, str(tmp_path / "city")]
+    """Another process that is about to plan tmp_path / "city", and its number."""
+    command = [*warm_python(), "-c", PLANNING, str(tmp_path / "city")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline() == "begun\n"
-        yield process
+        yield process, int(process.stdout.readline())
         process.kill()
 
 
@@ -50,10 +49,11 @@ def plan(folder):
 
 
 def test_a_second_plan_waits_for_the_first(planner, tmp_path):
-    with pytest.raises(OSError, match=rf"city is being planned by process {planner.pid} on \S+: wait until"):
+    process, number = planner
+    with pytest.raises(OSError, match=rf"city is being planned by process {number} on \S+: wait until"):
         plan(tmp_path / "city")
-    planner.communicate("go on\n")
-    assert planner.returncode == 0
+    process.communicate("go on\n")
+    assert process.returncode == 0
     made = Plan.load(tmp_path / "city")
     assert plan(tmp_path / "city") == made == plan(tmp_path / "other")
     for tile in made.tiles:
@@ -64,8 +64,9 @@ def test_a_second_plan_waits_for_the_first(planner, tmp_path):
 
 
 def test_a_planner_that_was_killed_keeps_nobody_out(planner, tmp_path):
-    planner.kill()
-    planner.wait()
+    process, _ = planner
+    process.kill()
+    process.wait()
     assert plan(tmp_path / "city") == plan(tmp_path / "other")
 
 
