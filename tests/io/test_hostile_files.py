@@ -29,7 +29,8 @@ FILES = 250
 
 
 @pytest.mark.parametrize("name", files.READERS)
-def test_damaged_files_are_read_or_refused(name, tmp_path):
+def test_damaged_files_are_read_or_refused(name, tmp_path, monkeypatch):
+    monkeypatch.setattr("radarsdf.io.ground_truth._SAMPLES", 1000)  # of each surface that is read
     reader = files.READERS[name]
     path = files.place(reader, tmp_path)
     outcomes = files.Outcomes()
