@@ -109,7 +109,7 @@ def changes(frames: int, path: Path) -> None:
     for day, (poses, center) in enumerate(((first.poses, TAKEN), (beside, PUT))):
         box = Box(np.array(center), np.full(3, 0.5), 0.3, CONCRETE)
         scene = Scene([*first.scene.solids, box], first.scene.terrain)
-        drive = simulate(scene, first.sensor, poses, name="wall", seed=day, lidar_rays=1)
+        drive = simulate(scene, first.sensor, poses, name="wall", seed=day)
         config = radarsdf.FitConfig.quick(returns={"passages": True})
         maps.append(radarsdf.fit(drive.points, drive.poses, config=config))
     mesh = radarsdf.compare(*maps, box=ROUND_BOXES).mesh()

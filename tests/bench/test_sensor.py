@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from radarsdf.simulate import SCENES, simulate, worlds
+from radarsdf.simulate import SCENES, simulate
 from scipy.spatial import cKDTree
 
 from bench.sensor import __main__ as command
@@ -20,15 +20,12 @@ from bench.sensor.figures import deviation, figures, plane_errors
 from ..conftest import recorded_scans
 
 SEEDS = (0, 1, 2)
-without_truth = partial(simulate, lidar_rays=1)  # the lidar of the drives is another
 
 
 @pytest.fixture(scope="module")
 def simulations():
     """For each seed the simulation, the drive and its figures."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worlds, "simulate", without_truth)
-        found = [SCENES["astyx"](seed=seed) for seed in SEEDS]
+    found = [SCENES["astyx"](seed=seed) for seed in SEEDS]
     drives = [with_lidar(simulation) for simulation in found]
     return [(simulation, drive, figures(drive)) for simulation, drive in zip(found, drives, strict=True)]
 
@@ -54,7 +51,7 @@ def test_each_part_of_the_noise_is_needed(simulations, changes, seed, what_fails
     usual, drive, found = simulations[SEEDS.index(seed)]
     assert what_fails not in misfits([found])
     sensor = replace(usual.sensor, **changes)
-    changed = without_truth(usual.scene, sensor, usual.poses, name=usual.name, seed=seed)
+    changed = simulate(usual.scene, sensor, usual.poses, name=usual.name, seed=seed)
     wrong = misfits([figures(with_lidar(changed, same_lidar=drive))])
     assert what_fails in wrong
     assert (wrong[what_fails] > 1) == is_too_large
@@ -80,7 +77,7 @@ def test_the_drive_kept_aside_has_the_same_noise_in_elevation_and_more_false_ret
 def test_the_lidar_of_a_simulation_does_not_depend_on_the_radar():
     usual = SCENES["astyx"](seed=0, frames=2)
     sensor = replace(usual.sensor, weak_noise=0.0)
-    changed = without_truth(usual.scene, sensor, usual.poses, name=usual.name, seed=0)
+    changed = simulate(usual.scene, sensor, usual.poses, name=usual.name, seed=0)
     own, taken = with_lidar(changed), with_lidar(changed, same_lidar=with_lidar(usual))
     assert np.array_equal(own.lidar, taken.lidar)
     assert np.array_equal(own.lidar_frame, taken.lidar_frame)

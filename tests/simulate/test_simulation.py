@@ -183,6 +183,16 @@ def test_lidar_lies_on_what_the_radar_could_see(simulation):
     assert seen.all()
 
 
+def test_the_truth_is_that_of_the_scans_whenever_it_is_asked_for():
+    early, late = (sim.wall(seed=4, frames=2) for _ in range(2))
+    truth = early.ground_truth
+    assert late.lidar.rays == early.lidar.rays > 0
+    assert "points" not in vars(late.lidar)  # nobody asked yet
+    late.poses[:, 0, 3] += 1  # poses that a user moves
+    np.testing.assert_array_equal(late.ground_truth, truth)
+    assert late.ground_truth is late.ground_truth  # made once
+
+
 def test_same_seed_same_bits_other_seed_other_layout(simulation):
     again = sim.SCENES[simulation.name](seed=3, frames=8)
     other = sim.SCENES[simulation.name](seed=4, frames=8)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,49 @@ from radarsdf.checks import check_poses, instance, real_array, whole_number
 from .radar import Origin, RadarSensor, generator, unit_vectors
 from .scene import Scene
 
-__all__ = ["Simulation", "lidar_points", "simulate"]
+__all__ = ["Lidar", "Simulation", "simulate"]
 
 FloatArray = NDArray[np.float64]
 
 _LIDAR_SIGMA_M = 0.01
 _LIDAR_CELL_M = 0.05  # one lidar point per cell: otherwise most would lie on the ground near the sensor
 _LIDAR_STREAM = 2**31  # no scan has this number
+
+
+@dataclass(frozen=True, eq=False)
+class Lidar:
+    """A lidar at some of the radar's poses, with its field of view and range, which sees what the radar can detect."""
+
+    scene: Scene
+    sensor: RadarSensor
+    poses: FloatArray  # (F, 4, 4) T_world_sensor, m
+    seed: int
+    rays: int  # from each pose
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """(M, 3) world frame, m, with a noise of 1 cm along the ray and at most one point in each cell of 5 cm.
+
+        Their rays take as long as the scans, so they are cast only when somebody asks.
+        """
+        rng, sensor = generator(self.seed, _LIDAR_STREAM), self.sensor
+        found = [np.zeros((0, 3))]
+        for T_world_sensor in self.poses[
+            :: max(1, len(self.poses) // 40)
+        ]:  # neighbours see the same surfaces
+            u = rng.uniform(-1, 1, size=(self.rays, 2))
+            elevation = np.arcsin(u[:, 1] * np.sin(sensor.elevation_fov_rad / 2))
+            angles = np.stack([u[:, 0] * sensor.azimuth_fov_rad / 2, elevation], axis=1)
+            directions, origin = unit_vectors(angles) @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]
+            hits = self.scene.raycast(origin, directions, sensor.max_range_m)
+            visible = sensor.echo_power_db(self.scene, origin, directions, hits) >= sensor.threshold_db
+            visible &= hits.range_m >= sensor.min_range_m
+            range_m = hits.range_m[visible] + _LIDAR_SIGMA_M * rng.standard_normal(int(visible.sum()))
+            found.append(origin + range_m[:, None] * directions[visible])
+        points = np.concatenate(found)
+        cells = np.floor(points / _LIDAR_CELL_M).astype(np.int64)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        return points[np.sort(first)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +72,16 @@ class Simulation:
     intensities: list[NDArray[np.float32]]  # F arrays (N_i,), dB
     noiseless_intensities: list[NDArray[np.float32]]  # F arrays (N_i,), dB, as in `Scan`
     origin_kind: list[NDArray[np.int8]]  # F arrays (N_i,), codes of `Origin`
-    ground_truth: FloatArray  # (M, 3) lidar points of the surfaces that the radar can detect, world frame, m
     scene: Scene
     sensor: RadarSensor
     name: str
     seed: int
+    lidar: Lidar
+
+    @property
+    def ground_truth(self) -> FloatArray:
+        """(M, 3) lidar points of the surfaces that the radar can detect, world frame, m."""
+        return self.lidar.points
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -118,43 +160,9 @@ def simulate(
         intensities=[scan.intensities for scan in scans],
         noiseless_intensities=[scan.noiseless_intensities for scan in scans],
         origin_kind=[scan.origin_kind for scan in scans],
-        ground_truth=lidar_points(scene, sensor, poses, seed, lidar_rays),
         scene=scene,
         sensor=sensor,
         name=name,
         seed=seed,
+        lidar=Lidar(scene, sensor, poses.copy(), seed, lidar_rays),
     )
-
-
-def lidar_points(scene: Scene, sensor: RadarSensor, poses: FloatArray, seed: int, rays: int) -> FloatArray:
-    """Dense points of the surfaces that the radar can detect: in its field of view and range, above its threshold.
-
-    Parameters
-    ----------
-    scene, sensor, poses, seed
-        As in `simulate`.
-    rays : int
-        Rays from each pose.
-
-    Returns
-    -------
-    (M, 3) float64
-        World frame, m, with a noise of 1 cm along the ray and at most one point in each cell of 5 cm.
-    """
-    rng = generator(seed, _LIDAR_STREAM)
-    poses = poses[:: max(1, len(poses) // 40)]  # neighbouring poses see the same surfaces
-    found = [np.zeros((0, 3))]
-    for T_world_sensor in poses:
-        u = rng.uniform(-1, 1, size=(rays, 2))
-        elevation = np.arcsin(u[:, 1] * np.sin(sensor.elevation_fov_rad / 2))
-        angles = np.stack([u[:, 0] * sensor.azimuth_fov_rad / 2, elevation], axis=1)
-        directions, origin = unit_vectors(angles) @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]
-        hits = scene.raycast(origin, directions, sensor.max_range_m)
-        visible = sensor.echo_power_db(scene, origin, directions, hits) >= sensor.threshold_db
-        visible &= hits.range_m >= sensor.min_range_m
-        range_m = hits.range_m[visible] + _LIDAR_SIGMA_M * rng.standard_normal(int(visible.sum()))
-        found.append(origin + range_m[:, None] * directions[visible])
-    points = np.concatenate(found)
-    cells = np.floor(points / _LIDAR_CELL_M).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    return points[np.sort(first)]
