@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Fits the numbers of `Map.confidence` and of what surface covers anew, and judges them, leaving out whole kinds of scenes.
 
-    python -m bench.paper.one_probability [FILE.npz …] [--preset quick] [--seed 141] [--judge 172]
+    python -m bench.paper.one_probability [FILE.npz …] [--presets quick default] [--seed 141] [--judge 391]
 
 Learnt are, for each vertex, the probability that it is true, and how much of the truth it covers that no better vertex
 does. FILE are recorded drives with ground truth; each is a kind of its own. Scenes of the seed `--judge` are judged by what
@@ -35,8 +35,11 @@ from .truth import truth_of
 
 FloatArray = NDArray[np.float64]
 
-EVERY = (1, 6)
-"""All scans of a simulated scene, and every sixth: what few scans tell must not be learnt from many."""
+EVERY = 6
+"""Of each scene all scans are learnt from, every sixth, and the beginning: what few scans tell must not be learnt from many."""
+
+_BEGINNING = 1 / 10
+_BEGINNING_OF_DRIVE = 1 / 3  # those with lidar are short
 
 _TRUTH_POINTS = 60_000
 _BEST = 0.98  # of the highest probability round a point of the truth: these vertices share it
@@ -65,7 +68,7 @@ class Example:
     points: NDArray[np.int64]  # (N,) ascending from 0 in steps of 1: the point that each of them is near to
 
     @classmethod
-    def of(cls, kind: str, scene: Scene, preset: str) -> Example:
+    def of(cls, kind: str, scene: Scene, preset: str, part: str) -> Example:
         ranges = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
         config = (FitConfig.quick() if preset == "quick" else FitConfig()).override(returns=ranges)
         contents = fit(scene.without_intensities(), config)._contents
@@ -79,7 +82,7 @@ class Example:
         distance_m = truth_of(scene, np.array(mesh.vertices), normals).distance_m
         return cls(
             kind,
-            f"{kind}, {len(scene)} scans",
+            f"{kind}, {part}, {preset}",
             truth,
             contents,
             _VOXEL_M[preset],
@@ -191,10 +194,19 @@ def logistic_regression(columns: FloatArray, shares: FloatArray, weights: FloatA
     return numbers
 
 
-def simulated(kinds: list[str], seed: int, preset: str) -> list[Example]:
-    """Of each kind, all scans and every sixth."""
-    scenes = [(kind, load_scene(kind, seed=seed)) for kind in kinds]
-    return [Example.of(kind, scene.every_nth(n), preset) for kind, scene in scenes for n in EVERY]
+def examples_of(specs: list[str], seed: int, presets: list[str]) -> list[Example]:
+    """Of each scene, all scans, every sixth, and the beginning."""
+    found = []
+    for spec in specs:
+        scene, kind = load_scene(spec, seed=seed), Path(spec).stem
+        beginning = _BEGINNING if scene.simulation else _BEGINNING_OF_DRIVE
+        parts = {
+            "all": scene,
+            "every sixth": scene.every_nth(EVERY),
+            "beginning": scene.first(max(2, round(beginning * len(scene)))),
+        }
+        found += [Example.of(kind, own, preset, name) for name, own in parts.items() for preset in presets]
+    return found
 
 
 def main() -> None:
@@ -202,21 +214,21 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("files", nargs="*", metavar="FILE", help="recorded drives with ground truth")
-    parser.add_argument("--preset", choices=_VOXEL_M, default="quick")
+    parser.add_argument("--presets", nargs="+", choices=_VOXEL_M, default=["quick"])
     parser.add_argument("--seed", type=int, default=141, help="of the simulated scenes that are learnt from")
-    parser.add_argument("--judge", type=int, default=172, help="seed of those that are judged")
+    parser.add_argument("--judge", type=int, default=391, help="seed of those that are judged")
     parser.add_argument(
         "--kinds", nargs="+", default=[*SCENES, *KINDS], help="simulated scenes; default: all"
     )
     options = parser.parse_args()
     torch.set_num_threads(min(2, torch.get_num_threads()))
-    drives = [Example.of(Path(file).stem, load_scene(file), options.preset) for file in options.files]
-    examples = simulated(options.kinds, options.seed, options.preset) + drives
+    drives = examples_of(options.files, options.seed, options.presets)
+    examples = examples_of(options.kinds, options.seed, options.presets) + drives
     for name, numbers in zip(("confidence", "covering"), models(examples), strict=True):
         print(name, ", ".join(f"{x:.2f}" for x in numbers), flush=True)
     body = [
         judged(e, [other for other in examples if other.kind != e.kind])
-        for e in simulated(options.kinds, options.judge, options.preset) + drives
+        for e in examples_of(options.kinds, options.judge, options.presets) + drives
     ]
     print(markdown(["map", "F-all now", "learnt", "threshold", "worst tenth now", "learnt"], body))
 

@@ -75,6 +75,19 @@ class Scene:
             raise ValueError(msg)
         return self._select(np.arange(0, len(self), n))
 
+    def first(self, n: int) -> Scene:
+        """The first `n` scans with the whole ground truth.
+
+        Raises
+        ------
+        ValueError
+            If `n` is below 1, or there are fewer scans.
+        """
+        if not 1 <= n <= len(self):
+            msg = f"n must be from 1 to {len(self)}, not {n}"
+            raise ValueError(msg)
+        return self._select(np.arange(n))
+
     def without_intensities(self) -> Scene:
         """The scene without intensities."""
         return dataclasses.replace(self, intensities=None)

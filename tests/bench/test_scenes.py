@@ -53,6 +53,17 @@ def test_every_nth_takes_the_simulation_along(wall):
         wall.every_nth(0)
 
 
+def test_first_is_the_beginning(wall):
+    beginning = wall.first(2)
+    assert len(beginning) == len(beginning.simulation) == 2
+    assert_array_equal(beginning.points[1], wall.points[1])
+    assert_array_equal(beginning.poses, wall.poses[:2])
+    assert beginning.ground_truth is wall.ground_truth
+    for n in (0, len(wall) + 1):
+        with pytest.raises(ValueError, match=f"n must be from 1 to {len(wall)}, not {n}"):
+            wall.first(n)
+
+
 def test_split_holds_out_the_first_frame(wall):
     train, test = wall.split()
     assert_array_equal(train.poses, wall.poses[1:])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The probability that a surface is where a map says: from information, detections, looks and the rough share."""
+"""The probability that a surface is where a map says: from information, detections, looks, and what all returns tell."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from radarsdf.map import queries
 from radarsdf.map.queries import EvidenceAt
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence
+from scipy.special import erf
 
 from ..conftest import ground_and_wall
 
@@ -35,14 +36,20 @@ def radar_map(scene):
     return radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(num_threads=2), progress=False)
 
 
-def confidence(radar_map, information, detections, looks, rough_share=0.1):
-    """Of places with this evidence, in a map with this rough share."""
-    contents = dataclasses.replace(radar_map._contents, rough_share=rough_share)
-    columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in (information, detections, looks)))
-    evidence = EvidenceAt(*(torch.from_numpy(np.atleast_1d(column).copy()) for column in columns))
-    found = queries.confidence(contents, evidence)
+def confidence(radar_map, information, detections, looks, rough_share=0.1, returns_per_cell=2.0):
+    """Of places with this evidence, in a map with this rough share, and returns in each cell that has any."""
+    contents = dataclasses.replace(
+        radar_map._contents, rough_share=rough_share, returns_per_cell=returns_per_cell
+    )
+    found = queries.confidence(contents, at(information, detections, looks))
     assert found.dtype == torch.float32
     return found.numpy()
+
+
+def at(information, detections, looks):
+    """The evidence of places."""
+    columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in (information, detections, looks)))
+    return EvidenceAt(*(torch.from_numpy(np.atleast_1d(column).copy()) for column in columns))
 
 
 @pytest.mark.parametrize("rough_share", [0.0, 1e-9, 0.1, 1.0])
@@ -77,7 +84,10 @@ ERROR_OF_A_CELL = 1 / 0.2**2
 
 
 def test_what_raises_it_and_what_lowers_it(radar_map):
-    """Everything else the same: the information and the detections raise it, the looks and the rough share lower it."""
+    """Everything else the same: the information and the detections raise it, the looks and the rough share lower it.
+
+    So do more returns elsewhere, of which more are false.
+    """
     numbers = np.array([1.0, 2, 5, 20, 100, 1000])
     for detections, looks in ((1, 1), (5, 20), (200, 1000)):
         assert (np.diff(confidence(radar_map, numbers * ERROR_OF_A_CELL, detections, looks)) > 0).all()
@@ -86,13 +96,33 @@ def test_what_raises_it_and_what_lowers_it(radar_map):
         assert (np.diff(confidence(radar_map, information, 20, numbers)) < 0).all()
         by_share = [confidence(radar_map, information, 20, 100, share)[0] for share in (0.02, 0.1, 0.4, 1)]
         assert (np.diff(by_share) < 0).all()
+        by_returns = [confidence(radar_map, information, 20, 100, 0.1, n)[0] for n in (1, 2, 5, 50)]
+        assert (np.diff(by_returns) < 0).all()
 
 
-@pytest.mark.parametrize(("error_cells", "most"), [(0.5, 0.9545), (1, 0.6827), (2, 0.3829), (10, 0.0797)])
+@pytest.mark.parametrize(("error_cells", "most"), [(0.5, 0.9545), (1, 0.7518), (2, 0.5858), (10, 0.2850)])
 def test_it_is_at_most_the_share_of_the_errors_within_a_cell(radar_map, error_cells, most):
-    """However many scans saw it. The shares are those of a normal distribution."""
-    found = confidence(radar_map, ERROR_OF_A_CELL / error_cells**2, 1000, 10, rough_share=0.0)
-    assert found == pytest.approx(most, abs=1e-4)
+    """However many scans saw it. The shares are those of a normal distribution, of the error of a surface that bends little."""
+    found = queries.probabilities(radar_map._contents, at(ERROR_OF_A_CELL / error_cells**2, 1000, 10))
+    assert found.reach.item() == pytest.approx(most, abs=1e-4)
+    unlikely = confidence(radar_map, ERROR_OF_A_CELL / error_cells**2, 1000, 10, 0.0, 0.0)
+    assert unlikely <= found.reach.item()
+
+
+def test_neighbours_help_as_a_thin_plate_does(radar_map):
+    """The standard error in the middle of a lattice of independent observations, of which second differences are small."""
+    n, bend_cells = 41, 2.0
+    second = np.diff(np.eye(n), 2, axis=0)
+    first = np.diff(np.eye(n), axis=0)
+    plate = sum(
+        np.kron(a.T @ a, b.T @ b) * weight
+        for a, b, weight in ((second, np.eye(n), 1), (np.eye(n), second, 1), (first, first, 2))
+    )
+    for error_cells in (1.0, 2.0):  # of the nine cells of a surface
+        information = np.eye(n * n) / (9 * error_cells**2) + plate / bend_cells**2
+        expected = np.sqrt(np.linalg.inv(information)[n * n // 2, n * n // 2])
+        reach = queries.probabilities(radar_map._contents, at(ERROR_OF_A_CELL / error_cells**2, 9, 9)).reach
+        assert erf(np.sqrt(0.5) / expected) == pytest.approx(reach.item(), abs=0.04)
 
 
 def test_it_spans_the_probabilities(radar_map):
@@ -114,7 +144,11 @@ def test_twice_the_scans_make_surer_only_what_is_no_surface(radar_map, rough_sha
         often = detections >= looks / 4  # nine cells, of which each answers to one look in 36
         assert np.abs(twice - once)[often].max() < 0.01
         assert (twice <= once)[~often].all()
-        assert twice[~often].max() < 0.7 * once[~often].max()
+        # All the rest of the place has twice the returns, too.
+        twice = confidence(radar_map, information, 2 * detections, 2 * looks, rough_share, 4.0)
+        # Odds, because a probability near 1 hardly falls.
+        odds = [p[~often].max() / (1 - p[~often].max()) for p in (once, twice)]
+        assert odds[1] < 0.3 * odds[0]
 
 
 def test_a_fit_to_scans_given_twice_has_twice_the_evidence(scene):
@@ -146,7 +180,7 @@ def test_places_have_the_evidence_of_their_cells(radar_map):
     assert 0.5 < known.mean() < 1
     np.testing.assert_allclose(
         radar_map.confidence(centres + radar_map.origin)[known],
-        confidence(radar_map, *dataclasses.astuple(evidence), radar_map.rough_share)[known],
+        queries.confidence(contents, at(*dataclasses.astuple(evidence))).numpy()[known],
         atol=1e-3,
     )
 

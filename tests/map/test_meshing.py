@@ -39,6 +39,7 @@ def moved(radar_map, origin):
             config=radar_map.config,
             evidence=radar_map.evidence,
             rough_share=radar_map.rough_share,
+            returns_per_cell=radar_map._contents.returns_per_cell,
             sensor=radar_map.sensor,
             report={},
         )

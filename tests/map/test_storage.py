@@ -112,7 +112,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "10"
+    assert metadata["format_version"] == "11"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -157,7 +157,7 @@ def test_files_of_other_programs(tmp_path):
             radarsdf.load(tmp_path / "other.safetensors")
 
 
-@pytest.mark.parametrize("version", ["4", "5", "9", "11", "", "1.5", "-1", "one"])
+@pytest.mark.parametrize("version", ["4", "9", "10", "12", "", "1.5", "-1", "one"])
 def test_other_versions(saved, tmp_path, version):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "new.safetensors", tensors, metadata | {"format_version": version})
@@ -205,6 +205,14 @@ def test_information_that_cannot_be(saved, tmp_path, value):
 def test_rough_shares_that_cannot_be(saved, tmp_path, value):
     _, _, tensors, metadata = saved
     spoilt = with_description(metadata, lambda d: d.update(rough_share=value))
+    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+        radarsdf.load(write(tmp_path / "wrong.safetensors", tensors, spoilt))
+
+
+@pytest.mark.parametrize("value", [-0.01, math.nan, math.inf, "many", None, [2.5]])
+def test_returns_per_cell_that_cannot_be(saved, tmp_path, value):
+    _, _, tensors, metadata = saved
+    spoilt = with_description(metadata, lambda d: d.update(returns_per_cell=value))
     with pytest.raises(ValueError, match="is not a whole radarsdf map"):
         radarsdf.load(write(tmp_path / "wrong.safetensors", tensors, spoilt))
 
@@ -278,6 +286,7 @@ DAMAGE = {
     "no report": lambda d: d.pop("report"),
     "report a number": lambda d: d.update(report=3),
     "no rough share": lambda d: d.pop("rough_share"),
+    "no returns per cell": lambda d: d.pop("returns_per_cell"),
     "no scale": lambda d: d.pop("intensity_scale"),
     "scale of one number": lambda d: d.update(intensity_scale=[1.0]),
     "scale a word": lambda d: d.update(intensity_scale=["low", "high"]),

@@ -205,3 +205,11 @@ def test_support_counts_the_returns_in_27_cells():
     support = support_at(leaf_keys, leaf_keys, counts)
     np.testing.assert_array_equal(support, expected)
     assert support_at(leaf_keys[:1], leaf_keys[:1], np.array([70_000.0])).tolist() == [65535]
+
+
+def test_returns_per_cell_are_those_of_cells_that_hold_any():
+    # Three cells of 0.4 m, with 4, 1 and 1 returns.
+    places = np.array([[5.0, 0.1, 0.1]] * 4 + [[5.0, 0.5, 0.1], [9.0, 0.1, 0.1]])
+    surfels = Surfels.of(prepare([places[:2], places[2:]], np.tile(np.eye(4), (2, 1, 1))), LEAF_M)
+    assert surfels.returns_per_cell() == pytest.approx(2)
+    assert Surfels.of(prepare([places[:1]], np.eye(4)[None]), LEAF_M).returns_per_cell() == 1

@@ -59,6 +59,8 @@ class FitInput:
     all."""
     rough_share: float | None = None
     """Share of the returns that lie on no thin surface. None: of these returns."""
+    returns_per_cell: float | None = None
+    """Mean number of returns in the cells of surfels. None: of these returns."""
     sensor: Sensor | None = None
     """The radar. None: as these rays and poses show it."""
     box_cells: NDArray[np.int64] | None = None
@@ -216,6 +218,9 @@ def _learn_directly(
         sensor = Sensor.of_rays(rays, given.poses, surface.noise)
     if rough_share is None:
         rough_share = surface.surfels.rough_share()
+    returns_per_cell = given.returns_per_cell
+    if returns_per_cell is None:
+        returns_per_cell = surface.surfels.returns_per_cell()
     contents = MapContents(
         field=field,
         origin=rays.origin,
@@ -226,6 +231,7 @@ def _learn_directly(
         passages=passages,
         echoes=echoes,
         rough_share=rough_share,
+        returns_per_cell=returns_per_cell,
         sensor=sensor,
         report=_report(given, learnt, surface, field, schedule, config, num_threads),
     )

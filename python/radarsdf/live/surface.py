@@ -83,8 +83,8 @@ class GrowingSurface:
             ghosts=np.zeros(0, bool),
         )
         self._ghosts = GrowingGhosts(self._leaves, self._cells, config.leaf_size_m)
-        # Of each region: returns in cells with planes, and in those with flat ones.
-        self._on_planes: dict[int, tuple[float, float]] = {}
+        # Of each region: returns in cells with planes, in those with flat ones, and in all, and the number of these.
+        self._counts: dict[int, tuple[float, float, float, int]] = {}
         self._distances = GrowingDistances(config)
         # Of blocks, by the keys of their first leaf cells.
         self._looks = RegionTable(scans=np.zeros(0, np.uint32))
@@ -126,9 +126,10 @@ class GrowingSurface:
 
     def triangles(self) -> Triangles:
         """All triangles, and what the returns tell of their vertices."""
-        returns = sum(in_all for in_all, _ in self._on_planes.values())
-        flat = sum(on_flat for _, on_flat in self._on_planes.values())
-        return self._triangles.joined(1 - flat / returns if returns else 0.0, self.num_leaves)
+        none = (0.0, 0.0, 0.0, 0)
+        on_planes, on_flat, returns, cells = map(sum, zip(none, *self._counts.values(), strict=True))
+        rough_share = 1 - on_flat / on_planes if on_planes else 0.0
+        return self._triangles.joined(rough_share, returns / max(cells, 1), self.num_leaves)
 
     def _take_sums(self, changes: Changes) -> Keys:
         """The keys of the leaf cells whose sums changed, and of the others in their blocks."""
@@ -202,7 +203,12 @@ class GrowingSurface:
         for region in regions:
             surfels = surfels_of(self._cells.gather(region[None]), self._config.leaf_size_m)
             returns = surfels.counts[surfels.cell_of_plane]
-            self._on_planes[int(region)] = float(returns.sum()), float(returns[surfels.is_flat()].sum())
+            self._counts[int(region)] = (
+                float(returns.sum()),
+                float(returns[surfels.is_flat()].sum()),
+                float(surfels.counts.sum()),
+                len(surfels.keys),
+            )
         return regions
 
     def _count_otherwise(self, of_rays: Keys, of_planes: Keys, changed: Keys, num_threads: int) -> Keys:

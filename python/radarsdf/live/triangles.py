@@ -32,6 +32,11 @@ class Triangles:
     leaf_cells: int
     """Number of leaf cells near the surface."""
 
+    @property
+    def told(self) -> tuple[float, float]:
+        """The numbers that all returns give."""
+        return self.scene.rough_share, self.scene.returns_per_cell
+
 
 @dataclass(frozen=True)
 class _Piece:
@@ -76,7 +81,7 @@ class GrowingTriangles:
         cells, blocks = surface.gather(around), looks.gather(around)
         of_cells = Looks(blocks["keys"] >> BLOCK_BITS, blocks["scans"]).at(cells["keys"])
         evidence = Evidence(cells["information"], cells["detections"], of_cells)
-        scene = Scene(self._origin, self._config, 0.0)
+        scene = Scene(self._origin, self._config, 0.0, 0.0)
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
         world = np.concatenate([vertices for vertices, _ in found.values()]) + self._origin
         at = queries.interpolated(evidence, cells["keys"], self._config.leaf_size_m, local(scene, world))
@@ -86,9 +91,10 @@ class GrowingTriangles:
             piece = self._pieces[region] = _Piece(vertices, faces, part.clone(), areas_m2, border)
             self.num_bytes += piece.num_bytes
 
-    def joined(self, rough_share: float, leaf_cells: int) -> Triangles:
-        """All triangles, those of neighbours with common vertices. `rough_share`: see :class:`Scene`."""
-        if self._joined is not None and self._joined.scene.rough_share == rough_share:
+    def joined(self, rough_share: float, returns_per_cell: float, leaf_cells: int) -> Triangles:
+        """All triangles, those of neighbours with common vertices. The first two numbers: see :class:`Scene`."""
+        told = rough_share, returns_per_cell
+        if self._joined is not None and self._joined.told == told:
             return self._joined
         pieces = [self._pieces[region] for region in sorted(self._pieces)]
         starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
@@ -103,7 +109,7 @@ class GrowingTriangles:
         one[rows] = rows[first][which]
         areas_m2 = np.concatenate([np.zeros(0), *(piece.areas_m2 for piece in pieces)])
         evidence = torch.cat([torch.zeros((0, 3)), *(piece.evidence for piece in pieces)])
-        scene = Scene(self._origin, self._config, rough_share)
+        scene = Scene(self._origin, self._config, *told)
         surface = Surface.told_by(
             scene,
             vertices,

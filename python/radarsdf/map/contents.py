@@ -31,6 +31,8 @@ class Scene:
     """Settings of the fit."""
     rough_share: float
     """Share of the returns that lie on no thin surface, in [0, 1]."""
+    returns_per_cell: float
+    """Mean number of returns in the cells of surfels that hold any; see :meth:`Surfels.returns_per_cell`."""
 
 
 @dataclass(frozen=True)

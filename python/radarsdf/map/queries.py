@@ -36,10 +36,10 @@ _MAX_ERROR_CELLS = 2.0
 _ROUGH_MAX_ERROR_CELLS = 0.27
 # Found by `python -m bench.paper.one_probability`: the logit of the confidence, and that of the covering, are the first number, and
 # the others times the columns of `terms`.
-_CONFIDENCE = (-2.09, -1.01, -1.37, -1.01)
-_COVERING = (-3.58, -0.75, -1.73, -0.51)
+_CONFIDENCE = (2.13, -1.26, -0.86, -8.17, -0.63)
+_COVERING = (-0.86, -0.77, -1.56, -6.39, -0.47)
+_BEND_CELLS = 2.0  # second difference of a distance whose slope turns from -1 to 1; so much distances may bend that are smoothed
 _LEAST_LOGIT = -80.0  # what was seen is not impossible: float32 has this probability
-_MIN_ROUGH_SHARE = 0.01
 # At least so many of the scans that looked at a surface have a return in one of its cells.
 _DETECTION_RATE = 1 / 36
 _SMOOTH = 0.5  # deviations of chance: a few more detections than needed are a little more evidence
@@ -229,21 +229,32 @@ def probabilities(contents: Scene, evidence: EvidenceAt) -> Probabilities:
         .sigmoid()
         for logit in (_CONFIDENCE, _COVERING)
     )
-    reach = torch.erf(math.sqrt(0.5) / columns[:, 1].exp())
+    reach = torch.erf(math.sqrt(0.5) / _smoothed(columns[:, 1].exp()))
     # A surface is no nearer than its position is known.
     return Probabilities(true.minimum(reach), covering, reach)
 
 
 def terms(contents: Scene, evidence: EvidenceAt) -> Tensor:
-    """(N, 4) float64, of which logits are made: 1, the logarithm of the error in leaf cells, how many returns of a surface are
-    missing there, in deviations of chance, and the logarithm of the rough share. Infinite without returns.
+    """(N, 5) float64, of which logits are made: 1, the logarithm of the error in leaf cells, how many returns of a surface are
+    missing there, in deviations of chance, the rough share, and the logarithm of the returns in a cell. Infinite without returns.
     """
     error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
     expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.looks.double()
     deviations = (expected - evidence.detections.double()) / (expected + 1).sqrt()
     missing = (deviations + deviations.square().add(_SMOOTH**2).sqrt()) / 2  # a smooth max(0, deviations)
-    rough_share = torch.full_like(error_cells, max(contents.rough_share, _MIN_ROUGH_SHARE))
-    return torch.stack([torch.ones_like(error_cells), error_cells.log(), missing, rough_share.log()], 1)
+    of_map = (contents.rough_share, math.log(max(contents.returns_per_cell, 1)))
+    rough_share, crowding = (torch.full_like(error_cells, value) for value in of_map)
+    return torch.stack([torch.ones_like(error_cells), error_cells.log(), missing, rough_share, crowding], 1)
+
+
+def _smoothed(error_cells: Tensor) -> Tensor:
+    """(N,) standard errors of a surface that bends little, leaf cells, where the returns round a place alone give `error_cells`.
+
+    A thin plate whose second differences have the deviation b cells, and returns of the density ρ, variances⁻¹ a cell:
+    1 / (8 √(ρ / b²)) is the variance. Where these tell more, its neighbours add nothing.
+    """
+    density = 1 / (CELLS_OF_SURFACE * error_cells.square())
+    return error_cells.minimum((_BEND_CELLS / (8 * density.sqrt())).sqrt())
 
 
 @torch.inference_mode(mode=False)

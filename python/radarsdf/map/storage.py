@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import math
 from os import PathLike
 from typing import Any
 
@@ -31,7 +32,7 @@ from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 10
+FORMAT_VERSION = 11
 _FEATURES = "field.cells.features"
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
@@ -120,6 +121,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "network_share": None if contents.reflectance is None else contents.reflectance.network_share,
         "echo_sigma": contents.echoes.sigma,
         "rough_share": contents.rough_share,
+        "returns_per_cell": contents.returns_per_cell,
         "sensor": contents.sensor.to_dict(),
         "report": contents.report,
     }
@@ -285,6 +287,10 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     if not 0 <= rough_share <= 1:
         msg = f"rough_share must be in [0, 1], not {rough_share}"
         raise ValueError(msg)
+    returns_per_cell = float(description["returns_per_cell"])
+    if not 0 <= returns_per_cell < math.inf:
+        msg = f"returns_per_cell must be finite and at least 0, not {returns_per_cell}"
+        raise ValueError(msg)
     share = description["network_share"]
     reflectance = None if share is None else _reflectance_of(tensors, config.leaf_size_m, float(share))
     # One of the two must answer for intensities, and without them neither can.
@@ -322,5 +328,6 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         passages=passages,
         echoes=echoes,
         rough_share=rough_share,
+        returns_per_cell=returns_per_cell,
         sensor=Sensor.from_dict(description["sensor"]),
     )

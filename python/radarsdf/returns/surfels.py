@@ -93,6 +93,13 @@ class Surfels:
         total = float(returns.sum())
         return 1 - float(returns[self.is_flat()].sum()) / total if total else 0.0
 
+    def returns_per_cell(self) -> float:
+        """Mean number of returns in a cell. 0 without cells.
+
+        It tells how many false returns to expect in a place: as many times more as there are returns.
+        """
+        return float(self.counts.sum()) / len(self.keys) if len(self.keys) else 0.0
+
     def plane_of_cell(self, planes: NDArray[np.int64]) -> NDArray[np.int32]:
         """(C,) row of the surfel of each cell, -1 if it is none of the rows `planes`."""
         plane_of_cell = np.full(len(self.keys), -1, np.int32)

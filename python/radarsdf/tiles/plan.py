@@ -83,6 +83,8 @@ class Plan:
     None: there are none."""
     rough_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the returns that lie on no thin surface, of the largest tiles."""
+    returns_per_cell: Annotated[float, Field(ge=0)]
+    """Mean number of returns in the cells of surfels of these tiles."""
     sensor: Sensor
     """The radar."""
     scans: Annotated[_Count, Field(ge=1)]
@@ -163,6 +165,7 @@ class Plan:
             "halo_m": self.halo_m,
             "intensity_range": self.intensity_range,
             "rough_share": self.rough_share,
+            "returns_per_cell": self.returns_per_cell,
             "sensor": self.sensor.to_dict(),
             "scans": self.scans,
             "input_digest": self.input_digest,

@@ -186,6 +186,7 @@ class Planner:
             halo_m=self._grid.halo_m,
             intensity_range=self._intensity_range(),
             rough_share=0.0,
+            returns_per_cell=0.0,
             sensor=self._sensor(SensorNoise(0.0, 0.0, 0.0)),
             scans=len(positions),
             input_digest=input_digest,
@@ -210,7 +211,7 @@ class Planner:
 
     def _looked_at(self, plan: Plan) -> Plan:
         """The plan with what the largest tiles tell of noise and roughness, and with the cost of each."""
-        noises, rough, returns = [], 0.0, 0
+        noises, rough, returns, cells = [], 0.0, 0, 0
         for tile in sorted(plan.tiles, key=lambda planned: -planned.returns)[:_LOOKED_AT]:
             rays, _ = read_rays(self._folder, plan, tile)
             with Workers(plan.config.num_threads) as workers:
@@ -218,12 +219,14 @@ class Planner:
             noises.append(dataclasses.astuple(surface.noise))
             rough += surface.surfels.rough_share() * len(rays)
             returns += len(rays)
+            cells += len(surface.surfels.keys)
         noise = SensorNoise(*np.median(noises, axis=0).tolist())
         known = dict(zip(NOISE_SETTINGS, dataclasses.astuple(noise), strict=True))
         return dataclasses.replace(
             plan,
             config=plan.config.override(returns=known),
             rough_share=rough / returns,
+            returns_per_cell=returns / max(cells, 1),
             sensor=self._sensor(noise),
             tiles=tuple(self._estimated(plan, tile) for tile in plan.tiles),
         )

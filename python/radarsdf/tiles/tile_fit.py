@@ -66,6 +66,7 @@ def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
             plan.scale,
             inside=inside,
             rough_share=plan.rough_share,
+            returns_per_cell=plan.returns_per_cell,
             sensor=plan.sensor,
             box_cells=plan.box_cells(tile.tile),
         )
