@@ -166,7 +166,7 @@ config = radarsdf.FitConfig(training={"sdf_iterations": 5})
 radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
 # The first mesh imports. Ctrl-C within an import's exec() of a string, as of a dataclass, is remembered by CPython:
 # the process then ends as if by the signal, although the exception was caught.
-radar_map.mesh(0.03)
+radar_map.mesh(0.2)
 print("ready", flush=True)
 try:
     while True:
