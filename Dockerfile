@@ -16,9 +16,11 @@ RUN /opt/radarsdf/bin/pip install --no-cache-dir --no-compile --no-deps -c /sour
       --index-url https://download.pytorch.org/whl/cpu || true
 COPY . /source
 RUN /opt/radarsdf/bin/pip install --no-cache-dir --no-compile -c /source/constraints.txt "/source[plot,view]"
-# What only builds and tests of others need. torch/bin holds a program that `import torch` looks for.
+# What only builds and tests of others need. torch/bin holds a program that `import torch` looks for. A fifth of PyTorch is symbols
+# for debuggers; libraries that were repaired for their wheels, as NumPy's and SciPy's were, do not load without theirs.
 RUN cd /opt/radarsdf/lib/python3*/site-packages \
- && rm -r pip torch/include torch/share torch/test torch/lib/*test*.so torch/bin/*test* \
+ && rm -rf pip torch/include torch/share torch/test torch/lib/*test*.so torch/bin/*test* torch/bin/*Test torch/bin/protoc* \
+ && strip --strip-unneeded torch/lib/libtorch_cpu.so torch/lib/libtorch_python.so \
  && find . -type d \( -name tests -o -name __pycache__ \) -prune -exec rm -r {} +
 
 FROM ${BASE}

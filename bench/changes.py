@@ -22,6 +22,7 @@ import numpy as np
 import radarsdf
 from numpy.typing import NDArray
 from radarsdf.changes.changes import UNSEEN, Changes
+from radarsdf.poses.way import pose_sigmas
 from radarsdf.simulate import KINDS, Box, Scene, Simulation, drifted, materials, simulate
 from scipy.spatial.transform import Rotation
 
@@ -63,6 +64,9 @@ def main() -> None:
         metavar=("M", "DEG"),
         help="walk of a step's poses",
     )
+    parser.add_argument(
+        "--refine", action="store_true", help="refine the poses of both days, as `radarsdf fit --refine` does"
+    )
     parser.add_argument("--out", type=Path, default=ROOT / "bench_results", help="folder of the rows")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -80,12 +84,12 @@ def scenes(
         rng = np.random.default_rng([options.seed, len(kind)])
         ways = first.poses, other_way(first.poses, rng)
         for changes in ([], cubes(first, rng)):
-            compared = compare(first, ways, changes, options.drift, options.seed)
+            compared = compare(first, ways, changes, options)
             false_m2, seen_m2, true_m2 = areas(compared, changes)
             yield {
                 "scene": kind,
                 "seed": options.seed,
-                "drift": " ".join(f"{step:g}" for step in options.drift),
+                "drift": " ".join(f"{step:g}" for step in options.drift) + ", refined" * options.refine,
                 "cubes": len(changes),
                 "false area, %": f"{100 * false_m2 / seen_m2:.3f}",
                 "precision": f"{true_m2 / (true_m2 + false_m2):.2f}" if true_m2 + false_m2 > 0 else "",
@@ -167,9 +171,10 @@ def repainted(kind: str, cube: Box, ground: float, rng: np.random.Generator) -> 
 
 
 def compare(
-    drive: Simulation, ways: tuple[Floats, Floats], changes: list[Change], drift: Any, seed: int
+    drive: Simulation, ways: tuple[Floats, Floats], changes: list[Change], options: argparse.Namespace
 ) -> Changes:
     """Two quick maps of scenes before and after the changes, compared."""
+    drift, seed = options.drift, options.seed
     maps = []
     for day, poses in enumerate(ways):
         boxes = [change.after if day else change.before for change in changes]
@@ -178,6 +183,11 @@ def compare(
         scans = simulate(scene, drive.sensor, poses, name=drive.name, seed=seed + 1000 * day, lidar_rays=1)
         given = drifted(poses, drift[0], np.deg2rad(drift[1]), seed + day) if any(drift) else poses
         config = radarsdf.FitConfig.quick(returns={"passages": True})
+        if options.refine:
+            refined = radarsdf.refine_poses(scans.points, given)
+            sigma_m, sigma_rad = pose_sigmas(refined.covariance)
+            given = refined.poses
+            config = config.override(returns={"pose_sigma_m": sigma_m, "pose_sigma_rad": sigma_rad})
         maps.append(radarsdf.fit(scans.points, given, scans.intensities, config=config))
     return radarsdf.compare(*maps)
 

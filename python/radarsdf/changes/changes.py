@@ -15,6 +15,7 @@ from radarsdf.changes.placed import Floats
 from radarsdf.checks import path_of
 from radarsdf.io.npz import write_arrays
 from radarsdf.map.isosurface import mesh_components
+from radarsdf.map.threshold import across_triangles
 
 if TYPE_CHECKING:
     import trimesh
@@ -53,9 +54,8 @@ class ChangedSurface:
     def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
         """(F,) kind of each face, that of most of its vertices, or the first; and areas, m²."""
         kinds = self.kind[self.faces]
-        a, b, c = self.vertices[self.faces].transpose(1, 0, 2)
-        areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        return np.where(kinds[:, 1] == kinds[:, 2], kinds[:, 1], kinds[:, 0]), areas
+        _, twice_m2 = across_triangles(self.vertices, self.faces)
+        return np.where(kinds[:, 1] == kinds[:, 2], kinds[:, 1], kinds[:, 0]), 0.5 * twice_m2
 
 
 @dataclass(frozen=True)
