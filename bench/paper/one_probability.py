@@ -153,7 +153,7 @@ def judged(example: Example, others: list[Example]) -> list[str]:
     detections = surface.evidence.detections.double().numpy()
     tally = Tally.of(example.areas_m2, p, example.predicted(of_added), example.reach, detections)
     learnt_surface = replace(surface, confidence=p.astype(np.float32), tally=tally)
-    limits = Limits.of(example.contents, example.voxel_m)
+    limits = Limits.of(example.voxel_m)
     scores = [example.f_score(s.kept(limits)) for s in (surface, learnt_surface)]
     rows = np.random.default_rng(0).choice(len(p), _LEARNT, p=example.areas_m2 / example.areas_m2.sum())
     gaps = [

@@ -10,8 +10,9 @@ import math
 import numpy as np
 import pytest
 import radarsdf
+import torch
 from radarsdf import FitConfig
-from radarsdf.map.queries import _floor_m, max_uncertainty_m
+from radarsdf.map.queries import EvidenceAt, _floor_m, confidence
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.noise import SensorNoise
 
@@ -107,24 +108,21 @@ def test_the_mesh_leaves_out_what_is_uncertain(walls):
         certain.vertex_attributes["uncertainty_m"], radar_map.uncertainty(certain.vertices), rtol=1e-4
     )
     default = radar_map.mesh(**kept)
-    limit_m = max_uncertainty_m(radar_map._contents)
-    assert default.vertices[:, 0].max() > 39  # with a standard error of 0.06 m
-    np.testing.assert_array_equal(default.faces, radar_map.mesh(max_uncertainty=limit_m, **kept).faces)
+    np.testing.assert_array_equal(default.faces, everything.faces)
 
 
 def test_clutter_asks_for_more_evidence():
-    """A wall among returns of nothing: the more of these, the surer a surface must be to be meshed."""
+    """A wall among returns of nothing: the more of these, the less is believed of what has the same evidence."""
     rng = np.random.default_rng(1)
-    errors_m = []
+    confidences = []
     for count in (0, 4000):
         points, poses = two_walls(scans=8)
         clutter = rng.uniform([8, -3, -2], [14, 3, 2], (8, count // 8, 3))
         points = [np.concatenate(pair) for pair in zip(points, clutter, strict=True)]
         radar_map = radarsdf.fit(points, poses, config=CONFIG, progress=False)
-        limit_m = max_uncertainty_m(radar_map._contents)
-        errors_m.append(math.sqrt(limit_m**2 - floor_m(radar_map) ** 2))
-    assert errors_m[0] >= LEAF_M
-    assert errors_m[1] < 0.85 * errors_m[0]
+        same = EvidenceAt(*torch.tensor([[1 / LEAF_M**2], [5.0], [8.0]]))
+        confidences.append(confidence(radar_map._contents, same).item())
+    assert confidences[1] < 0.5 * confidences[0]
 
 
 def test_the_rougher_the_less_repetition_helps(walls):
@@ -133,15 +131,13 @@ def test_the_rougher_the_less_repetition_helps(walls):
     contents = radar_map._contents
     information = np.full_like(radar_map.evidence.information, 1e12)
     without_noise = dataclasses.replace(radar_map.evidence, information=information)
-    limits_m, errors_m = [], []
+    errors_m = []
     for rough_share in (0.0, 0.02, 0.1, 0.25):
         rough = dataclasses.replace(contents, evidence=without_noise, rough_share=rough_share)
         errors_m.append(RadarMap(rough).uncertainty([[5.0, -2.0, 0.0]])[0])
-        limits_m.append(max_uncertainty_m(rough))
-        assert RadarMap(rough).mesh().vertices[:, 0].max() > 39  # the limit grows with it
+        assert RadarMap(rough).mesh().vertices[:, 0].max() > 39
     assert errors_m[0] == pytest.approx(0.05 * LEAF_M, rel=1e-4)
     assert (np.diff(errors_m) > 0).all()
-    assert (np.array(limits_m) > errors_m).all()
 
 
 def test_more_scans_make_it_certain():

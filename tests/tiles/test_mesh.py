@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import radarsdf
 import trimesh
-from radarsdf.map import queries
 from radarsdf.map.isosurface import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.meshing import Surface
 from radarsdf.map.threshold import Threshold
@@ -38,7 +37,6 @@ def in_one_go(city, steps, min_triangles):
     contents = city.any_contents
     surface = Surface.told_by(contents, vertices, faces, evidence, 0)
     good = surface.confidence >= surface.tally.threshold().min_confidence
-    good &= np.nan_to_num(surface.uncertainty_m, nan=np.inf) <= queries.max_uncertainty_m(contents)
     faces = faces[good[faces].all(axis=1)]
     labels, sizes = mesh_components(faces, len(vertices))
     return vertices, faces[sizes[labels] >= min_triangles]

@@ -118,7 +118,7 @@ def add_surface(parser: argparse.ArgumentParser) -> None:
         "--max-uncertainty",
         type=float,
         metavar="M",
-        help="leave out the surface whose standard error is above M, m; default: it follows from the returns",
+        help="leave out the surface whose standard error is above M, m; default: there is no limit",
     )
     parser.add_argument(
         "--min-component",

@@ -359,7 +359,7 @@ class LiveMap:
                 self._state.forget_surface()
                 raise
         voxel_m = found.scene.config.leaf_size_m
-        limits = Limits.of(found.scene, voxel_m, min_confidence, max_uncertainty, min_component_triangles)
+        limits = Limits.of(voxel_m, min_confidence, max_uncertainty, min_component_triangles)
         return found.surface.mesh(found.scene.origin, limits, found.leaf_cells)
 
     def map(self) -> RadarMap:

@@ -227,9 +227,8 @@ class Map(MapParts):
             What can be completed is less than all: some of it no scan saw, and of some the position is too uncertain.
             The less that is, the more is kept. 0: all is kept (3QFP).
         max_uncertainty : float, optional
-            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. Default: without
-            its floor at most two leaf cells, and less where much of the returns lies on no thin surface.
-            ``math.inf``: all are kept (3QFP).
+            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. Default: there is no limit;
+            what is uncertain is improbable, too.
         min_component_triangles : int, optional
             Components of fewer triangles are then left out. Default: 30 in voxels of up to 0.1 m, and fewer in larger
             ones, 15 at 0.2 m (3QFP: 300, which on sparse scans costs ten points of completion).

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -43,7 +44,6 @@ class Limits(NamedTuple):
     @classmethod
     def of(
         cls,
-        scene: Scene,
         voxel_m: float,
         min_confidence: float | None = None,
         max_uncertainty: float | None = None,
@@ -55,9 +55,7 @@ class Limits(NamedTuple):
             if not 0 <= min_confidence <= 1:
                 msg = f"min_confidence must be in [0, 1], not {min_confidence}"
                 raise ValueError(msg)
-        if max_uncertainty is None:
-            max_uncertainty = queries.max_uncertainty_m(scene)
-        max_uncertainty = number(max_uncertainty, "max_uncertainty")
+        max_uncertainty = number(math.inf if max_uncertainty is None else max_uncertainty, "max_uncertainty")
         if max_uncertainty < 0:
             msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
             raise ValueError(msg)
@@ -185,7 +183,7 @@ def extract_mesh(
     if voxel_size > MAX_POSITION_M:
         msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
         raise ValueError(msg)
-    limits = Limits.of(contents, voxel_size, **wanted)
+    limits = Limits.of(voxel_size, **wanted)
     sensor_position = None if viewpoint is None else check_viewpoint(contents.intensity_scale, viewpoint)
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)

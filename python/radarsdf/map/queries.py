@@ -31,9 +31,6 @@ _ROUGH_SHARE = 0.27
 # intervals with 0.00 to 0.03 m on smooth simulated scenes, and with 0.20 to 0.29 m on the drives.
 _FLOOR_CELLS = 0.05
 _ROUGH_FLOOR_CELLS = 1.1
-# Up to this error, apart from that part, a surface is meshed, leaf cells: in smooth scenes, and over the rough share.
-_MAX_ERROR_CELLS = 2.0
-_ROUGH_MAX_ERROR_CELLS = 0.27
 # Found by `python -m bench.paper.one_probability`: the logit of the confidence, and that of the covering, are the first number, and
 # the others times the columns of `terms`.
 _CONFIDENCE = (2.13, -1.26, -0.86, -8.17, -0.63)
@@ -181,14 +178,6 @@ def uncertainty(contents: Scene, evidence: EvidenceAt) -> Tensor:
     """(N,) standard error of the surface's position, m. NaN where there are no returns."""
     variance_m2 = 1 / evidence.information + _floor_m(contents) ** 2
     return variance_m2.sqrt().masked_fill(evidence.information <= 0, torch.nan)
-
-
-def max_uncertainty_m(contents: Scene) -> float:
-    """The uncertainty up to which a surface is meshed by default, m. The rougher a scene, the more evidence it takes."""
-    error_cells = _ROUGH_MAX_ERROR_CELLS / max(
-        contents.rough_share, _ROUGH_MAX_ERROR_CELLS / _MAX_ERROR_CELLS
-    )
-    return math.hypot(error_cells * contents.config.leaf_size_m, _floor_m(contents))
 
 
 def roughness(contents: Scene) -> float:

@@ -56,7 +56,7 @@ class TracedSurface:
         check_views(contents.config.max_memory_bytes, cells=len(contents.evidence.looks))
         return cls.of_surface(
             Surface.of(contents, voxel_m),
-            Limits.of(contents, voxel_m),
+            Limits.of(voxel_m),
             lambda points: queries.evidence(contents, torch.from_numpy(points.astype(np.float32))),
         )
 

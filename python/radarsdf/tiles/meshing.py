@@ -113,7 +113,7 @@ def _pieces(
 ) -> tuple[list[Path], Limits]:
     """Meshes all tiles: the files of the pieces, and what a mesh of them leaves out, as `wanted` of :meth:`Map.mesh`."""
     voxel_size = positive(voxel_size, "voxel_size")
-    limits = Limits.of(city.any_contents, voxel_size, **wanted)
+    limits = Limits.of(voxel_size, **wanted)
     settings = PieceSettings(
         divides(voxel_size, city.config.leaf_size_m),
         None if box is None else tuple(tuple(corner) for corner in check_box(box).tolist()),

@@ -61,7 +61,7 @@ def viewed_tiles(
     )
     traced = TracedSurface.of_surface(
         surface,
-        Limits.of(city.any_contents, config.leaf_size_m),
+        Limits.of(config.leaf_size_m),
         lambda points: city.evidence(points + origin),
     )
 
