@@ -57,6 +57,17 @@ def test_the_mesh_is_that_of_all_cells_at_once(city, steps, min_triangles):
     assert len(found) == len(mesh.faces)  # no doubled triangle
 
 
+def test_what_is_too_uncertain_is_left_out_in_every_tile(city):
+    all_of_it = {"min_confidence": 0.0, "min_component_triangles": 0, "progress": False}
+    whole = city.mesh(0.2, max_uncertainty=np.inf, **all_of_it)
+    uncertainty_m = whole.vertex_attributes["uncertainty_m"]
+    limit_m = float(np.nanmedian(uncertainty_m))  # NaN: no return is near
+    mesh = city.mesh(0.2, max_uncertainty=limit_m, **all_of_it)
+    certain = whole.faces[(uncertainty_m <= limit_m)[whole.faces].all(axis=1)]
+    assert 1000 < len(certain) < 0.8 * len(whole.faces)
+    assert triangles(mesh.vertices, mesh.faces) == triangles(whole.vertices, certain)
+
+
 def open_edges(vertices, faces, corner_m):
     """Number of edges with one triangle, of those whose both ends are on a border between tiles."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
