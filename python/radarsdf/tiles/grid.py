@@ -64,10 +64,8 @@ class TileGrid:
         with np.errstate(divide="ignore", invalid="ignore"):
             near, far = (lower - a) / way, (upper - a) / way
         enter, leave = np.minimum(near, far), np.maximum(near, far)
-        along = way == 0  # parallel to the slab: either inside all the way or never
-        within = (a >= lower) & (a <= upper)
-        enter = np.where(along, np.where(within, -np.inf, np.inf), enter)
-        leave = np.where(along, np.inf, leave)
+        along = way == 0  # parallel to the slab, and within: the tiles are those of its own limits
+        enter, leave = np.where(along, -np.inf, enter), np.where(along, np.inf, leave)
         meets: NDArray[np.bool_] = np.maximum(enter.max(axis=1), 0) <= np.minimum(leave.min(axis=1), 1)
         return meets
 
