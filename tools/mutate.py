@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Puts faults into the package at random, one at a time, and says which of them the tests catch.
+
+    python tools/mutate.py --count 100 --seed 1
+
+A fault is one operator, comparison or number that is another one. The tests of the room that it is in run first, and
+all tests if none of those fails (``--room-only``: they do not). What no test catches is printed with its line: a test
+is missing, or the line says the same as before. The work is done in a clone below a temporary folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+OTHER: dict[type[ast.AST], str] = {
+    ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "/",
+    ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==",
+    ast.Is: "is not", ast.IsNot: "is", ast.And: "or", ast.Or: "and", ast.BitAnd: "|", ast.BitOr: "&",
+}  # fmt: skip
+SECONDS = 900
+
+
+class Fault(NamedTuple):
+    """`new` instead of `old`, which begins at a character of a file's source."""
+
+    file: Path
+    line: int
+    begin: int
+    old: str
+    new: str
+
+
+def faults_in(file: Path) -> Iterator[Fault]:
+    """All faults that can be put into a file."""
+    source = file.read_text(encoding="utf-8")
+    starts = [0]
+    for line in source.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+
+    def place(line: int, column_bytes: int) -> int:
+        text = source[starts[line - 1] : starts[line]]
+        return starts[line - 1] + len(text.encode()[:column_bytes].decode())
+
+    def between(left: ast.expr, right: ast.expr, operator: ast.AST, line: int) -> Iterator[Fault]:
+        begin = place(left.end_lineno or 0, left.end_col_offset or 0)
+        end = place(right.lineno, right.col_offset)
+        old = source[begin:end]
+        if type(operator) in OTHER and "#" not in old and "\n" not in old:
+            brackets = [old[: len(old) - len(old.lstrip(") "))], old[len(old.rstrip("( ")) :]]
+            yield Fault(file, line, begin, old, f"{brackets[0]}{OTHER[type(operator)]}{brackets[1]}")
+
+    tree = ast.parse(source)
+    for node in _executed(tree):
+        if isinstance(node, ast.Compare) and len(node.ops) == 1:
+            yield from between(node.left, node.comparators[0], node.ops[0], node.lineno)
+        elif isinstance(node, ast.BinOp) and not isinstance(node.left, ast.JoinedStr):
+            yield from between(node.left, node.right, node.op, node.lineno)
+        elif isinstance(node, ast.BoolOp):
+            yield from between(node.values[0], node.values[1], node.op, node.lineno)
+        elif isinstance(node, ast.Constant) and type(node.value) in (int, float, bool):
+            old = ast.get_source_segment(source, node) or ""
+            new = str(not node.value) if isinstance(node.value, bool) else f"({old} + 1)"
+            yield Fault(file, node.lineno, place(node.lineno, node.col_offset), old, new)
+
+
+def _executed(node: ast.AST) -> Iterator[ast.AST]:
+    """The nodes below `node` without annotations, which nothing executes."""
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                yield child
+                yield from _executed(child)
+
+
+def caught_by(clone: Path, tests: list[str], processes: int) -> str | None:
+    """The first test that fails, or None."""
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        f"--numprocesses={processes}",
+        "--dist=loadfile",
+        *tests,
+    ]
+    environment = {**os.environ, "PYTHONPATH": str(clone / "python")}
+    try:
+        done = subprocess.run(
+            command, cwd=clone, env=environment, capture_output=True, text=True, timeout=SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"more than {SECONDS} s"
+    if done.returncode == 0:
+        return None
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return failed[0].split(" - ")[0] if failed else f"exit {done.returncode}"
+
+
+def main() -> None:
+    """Runs the tests with each fault."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--count", type=int, default=100, help="number of faults [100]")
+    parser.add_argument("--seed", type=int, default=0, help="which faults [0]")
+    parser.add_argument("--processes", type=int, default=2, help="of pytest [2]")
+    parser.add_argument("--room-only", action="store_true", help="run only the tests of the fault's room")
+    options = parser.parse_args()
+    root = Path(__file__).resolve().parents[1]
+    with tempfile.TemporaryDirectory() as folder:
+        clone = Path(folder) / "radarsdf"
+        subprocess.run(["git", "clone", "-q", str(root), str(clone)], check=True)
+        for module in (root / "python/radarsdf").glob("_core*.so"):
+            shutil.copy(module, clone / "python/radarsdf")
+        package = clone / "python/radarsdf"
+        every = [fault for file in sorted(package.rglob("*.py")) for fault in faults_in(file)]
+        missed = 0
+        for number, fault in enumerate(random.Random(options.seed).sample(every, options.count), start=1):
+            source = fault.file.read_text(encoding="utf-8")
+            end = fault.begin + len(fault.old)
+            fault.file.write_text(source[: fault.begin] + fault.new + source[end:], encoding="utf-8")
+            room = clone / "tests" / fault.file.relative_to(package).parts[0]
+            test = caught_by(clone, [str(room)], options.processes) if room.is_dir() else None
+            if test is None and not options.room_only:
+                test = caught_by(clone, [str(clone / "tests")], options.processes)
+            fault.file.write_text(source, encoding="utf-8")
+            missed += test is None
+            where = f"{fault.file.relative_to(clone)}:{fault.line}"
+            print(f"{number:3} {where}: {fault.old!r} -> {fault.new!r}: {test or 'MISSED'}", flush=True)
+        print(f"caught {options.count - missed} of {options.count}")
+
+
+if __name__ == "__main__":
+    main()
