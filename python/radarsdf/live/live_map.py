@@ -74,9 +74,10 @@ class LiveMap:
     >>> live = radarsdf.LiveMap()
     >>> for points, pose in zip(scans.points, scans.poses):
     ...     done = live.integrate(points, pose)
-    >>> mesh = live.mesh()
-    >>> blocks = live.remove(done.scan_id)
-    >>> len(live), len(live.mesh().faces) < len(mesh.faces)
+    >>> len(live), live.mesh().is_empty
+    (8, False)
+    >>> blocks = live.remove(done.scan_id)  # as if it had never been there
+    >>> len(live), len(blocks) > 0
     (7, True)
     """
 

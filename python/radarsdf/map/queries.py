@@ -23,8 +23,8 @@ from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence
 from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
-# From this share of rough returns on, the errors are those of a rough scene. Measured: 0 to 0.07 on simulated scenes
-# without much clutter, 0.27 to 0.44 on five real drives.
+# From this share of rough returns on, the errors are those of a rough scene.
+# Measured: 0 to 0.07 on simulated scenes without much clutter, 0.27 to 0.44 on five real drives.
 _ROUGH_SHARE = 0.27
 # The part of the uncertainty that repetition does not shrink, leaf cells: in smooth scenes, and what rough ones add.
 # Returns that agree there may share an error. Chosen with `python -m bench.paper calibration`: errors are within 95 %
@@ -33,8 +33,9 @@ _FLOOR_CELLS = 0.05
 _ROUGH_FLOOR_CELLS = 1.1
 # Found by `python -m bench.paper.one_probability`: the logit of the confidence, and that of the covering, are the first number, and
 # the others times the columns of `terms`.
-_CONFIDENCE = (2.13, -1.26, -0.86, -8.17, -0.63)
-_COVERING = (-0.86, -0.77, -1.56, -6.39, -0.47)
+_CONFIDENCE = (3.29, -1.25, -0.87, -3.77, -3.50)
+_COVERING = (-0.21, -0.79, -1.47, -2.68, -2.46)
+_CROWDED_RETURNS = 4.0  # so many in a cell have half of the effect that any number has
 _BEND_CELLS = 2.0  # second difference of a distance whose slope turns from -1 to 1; so much distances may bend that are smoothed
 _LEAST_LOGIT = -80.0  # what was seen is not impossible: float32 has this probability
 # At least so many of the scans that looked at a surface have a return in one of its cells.
@@ -225,15 +226,20 @@ def probabilities(contents: Scene, evidence: EvidenceAt) -> Probabilities:
 
 def terms(contents: Scene, evidence: EvidenceAt) -> Tensor:
     """(N, 5) float64, of which logits are made: 1, the logarithm of the error in leaf cells, how many returns of a surface are
-    missing there, in deviations of chance, the rough share, and the logarithm of the returns in a cell. Infinite without returns.
+    missing there, in deviations of chance, how rough the map is, and how crowded its returns are. Infinite without returns.
+
+    The last two are bounded: a map that is rougher or more crowded than any that was learnt from must not lose all surface.
     """
     error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
     expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.looks.double()
     deviations = (expected - evidence.detections.double()) / (expected + 1).sqrt()
     missing = (deviations + deviations.square().add(_SMOOTH**2).sqrt()) / 2  # a smooth max(0, deviations)
-    of_map = (contents.rough_share, math.log(max(contents.returns_per_cell, 1)))
-    rough_share, crowding = (torch.full_like(error_cells, value) for value in of_map)
-    return torch.stack([torch.ones_like(error_cells), error_cells.log(), missing, rough_share, crowding], 1)
+    of_map = (
+        math.tanh(contents.rough_share / _ROUGH_SHARE),
+        contents.returns_per_cell / (contents.returns_per_cell + _CROWDED_RETURNS),
+    )
+    rough, crowded = (torch.full_like(error_cells, value) for value in of_map)
+    return torch.stack([torch.ones_like(error_cells), error_cells.log(), missing, rough, crowded], 1)
 
 
 def _smoothed(error_cells: Tensor) -> Tensor:
