@@ -180,7 +180,7 @@ def compare(
         boxes = [change.after if day else change.before for change in changes]
         solids = [*drive.scene.solids, *(box for box in boxes if box is not None)]
         scene = Scene(solids, drive.scene.terrain)
-        scans = simulate(scene, drive.sensor, poses, name=drive.name, seed=seed + 1000 * day, lidar_rays=1)
+        scans = simulate(scene, drive.sensor, poses, name=drive.name, seed=seed + 1000 * day)
         given = drifted(poses, drift[0], np.deg2rad(drift[1]), seed + day) if any(drift) else poses
         config = radarsdf.FitConfig.quick(returns={"passages": True})
         if options.refine:

@@ -9,7 +9,6 @@ middle of the way. Distances are those of free voxels, beside the true distance 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from radarsdf.grids.grid import Grid
 from radarsdf.simulate import KINDS, SCENES, Simulation
 
 from bench.rows import kept
+from bench.timing import timed
 
 Floats = NDArray[np.float64]
 
@@ -104,20 +104,19 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         config = radarsdf.FitConfig(num_threads=options.threads)
         if options.quick:
             config = radarsdf.FitConfig.quick(num_threads=options.threads, returns={"passages": True})
-        begin = time.process_time()
-        radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
-        fitted = time.process_time()
+        with timed() as fitting:
+            radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
         box = box_of(drive)
-        grid = radar_map.grid(box, VOXEL_M)
-        made = time.process_time()
+        with timed() as gridding:
+            grid = radar_map.grid(box, VOXEL_M)
         places = seen_places(drive, box, options.places, rng)
         yield {
             "scene": name,
             "places": len(places),
             **judged(grid, places),
             **distances(grid, drive, rng),
-            "fit, s": round(fitted - begin, 1),
-            "grid, s": round(made - fitted, 1),
+            "fit, s": round(fitting.cpu_s, 1),
+            "grid, s": round(gridding.cpu_s, 1),
         }
 
 

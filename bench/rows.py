@@ -8,6 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bench.paper.report import provenance, write_json
 
 
@@ -25,3 +28,8 @@ def kept(rows: Iterable[dict[str, Any]], module: str, path: Path) -> list[dict[s
         found.append(row)
         write_json(path, made | {"rows": found})
     return found
+
+
+def quantile(values: list[float] | NDArray[np.float64], share: float) -> float:
+    """The value below which this share of all is, for a row."""
+    return round(float(np.quantile(values, share)), 2)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from radarsdf.checking.check import check_cheaply
 from radarsdf.checking.doppler import velocity_of_poses
 
 from bench.breakages.ways import NEED_DOPPLER, WAYS, Data, with_other_sign
+from bench.timing import timed
 
 SCENES = (
     ("hugin", 120),
@@ -98,11 +98,11 @@ def main() -> None:
         for name, (seeds, lengths) in _GOOD.items():
             good |= {f"{name} {f} seed {s}": simulated(name, f, s) for s in seeds for f in lengths}
     alarms = {}
-    started_s = time.perf_counter()
-    for name, data in good.items():
-        if alarm := [found for found in found_in(data, options.cheap) if found[1] != "note"]:
-            alarms[name] = alarm
-    seconds = (time.perf_counter() - started_s) / len(good)
+    with timed() as taken:
+        for name, data in good.items():
+            if alarm := [found for found in found_in(data, options.cheap) if found[1] != "note"]:
+                alarms[name] = alarm
+    seconds = taken.wall_s / len(good)
     print(
         f"{len(alarms)} of {len(good)} good recordings have a finding worse than a note: {alarms}; {seconds:.2f} s each"
     )

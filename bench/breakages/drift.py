@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import time
 
 import numpy as np
 import radarsdf
@@ -19,6 +18,7 @@ from radarsdf.checking.recording import Recording
 from radarsdf.simulate import measured_motion
 
 from bench.paper.broken_poses import walked
+from bench.timing import timed
 
 _FRAMES = 24
 _WALKS = ((0.02, 0.1), (0.05, 0.25))  # of a step, m and degrees
@@ -50,9 +50,9 @@ def main() -> None:
             doppler_mps = measured_motion(scans, times_s=times_s, seed=seed).doppler_mps
         walk = number // 2 % 2
         for row, poses in ((0, scans.poses), (1 + walk, walked(scans.poses, *_WALKS[walk], seed))):
-            begin_s = time.process_time()
-            findings = check_drift(Recording.of(scans.points, poses, None, doppler_mps, times_s), config)
-            seconds.append(time.process_time() - begin_s)
+            with timed() as taken:
+                findings = check_drift(Recording.of(scans.points, poses, None, doppler_mps, times_s), config)
+            seconds.append(taken.cpu_s)
             found[name][row] += (bool(findings), 1)
     heads = ["good", *(f"{m} m, {degrees}° a step" for m, degrees in _WALKS)]
     print("| scenes | " + " | ".join(heads) + " |\n" + "|---" * 4 + "|")

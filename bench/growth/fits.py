@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-import time
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import radarsdf.fitting.fit  # else the first fit would import it, in what is me
 from radarsdf import FitConfig, RadarMap
 
 from bench.memory import memory_bytes
+from bench.timing import timed
 
 from .street import Street, street
 
@@ -85,18 +86,16 @@ def row(*, returns: int, size_m: float, threads: int, intensities: bool, quick: 
     short = {"sdf_iterations": 60, "intensity_iterations": 120} if quick else {}
     config = FitConfig(num_threads=threads).override(training=short)
     before = memory_bytes("VmHWM")
-    wall_s, cpu_s = time.perf_counter(), time.process_time()
-    radar_map = radarsdf.fit(
-        scans.points,
-        scans.poses,
-        scans.intensities if intensities else None,
-        config=config,
-        progress=False,
-    )
-    wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+    with timed() as taken:
+        radar_map = radarsdf.fit(
+            scans.points,
+            scans.poses,
+            scans.intensities if intensities else None,
+            config=config,
+            progress=False,
+        )
     found = {
-        "wall_s": wall_s,
-        "cpu_s": cpu_s,
+        **asdict(taken),
         "peak_mb": memory_bytes("VmHWM") / 1e6,
         "before_mb": before / 1e6,
     }

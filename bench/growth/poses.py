@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from radarsdf.poses.rigid import steps, turned_by
 
 from bench.memory import memory_bytes
 from bench.paper.broken_poses import walked
+from bench.timing import timed
 
 _APART_M = 500.0  # from a copy to the next: they have no returns in common
 _WALK = 0.02, 0.1  # m and degrees a step
@@ -53,11 +54,11 @@ def row(scans: int, threads: int) -> dict[str, Any]:
     true[:, 0, 3] += _APART_M * (np.arange(scans) // len(drive.poses))
     given, config = walked(true, *_WALK, 0), FitConfig(num_threads=threads)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
-    before, wall_s, processor_s = memory_bytes("VmRSS"), time.perf_counter(), time.process_time()
-    refined = radarsdf.refine_poses(points, given, config=config)
+    before = memory_bytes("VmRSS")
+    with timed() as taken:
+        refined = radarsdf.refine_poses(points, given, config=config)
     found = {
-        "wall_s": time.perf_counter() - wall_s,
-        "cpu_s": time.process_time() - processor_s,
+        **asdict(taken),
         "peak_mb": (memory_bytes("VmHWM") - before) / 1e6,
     }
     errors_deg = [

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +19,7 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.surfels import Surfels
 
 from bench.memory import memory_bytes
+from bench.timing import timed
 
 from .street import street
 
@@ -81,10 +81,11 @@ def _ghosts(rays: Rays, config: FitConfig, threads: int) -> NDArray[np.bool_]:
 
 def _measured(name: str, function: Callable[[], Result]) -> tuple[Result, dict[str, float]]:
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
-    before, wall_s, processor_s = memory_bytes("VmRSS"), time.perf_counter(), time.process_time()
-    result = function()
+    before = memory_bytes("VmRSS")
+    with timed() as taken:
+        result = function()
     return result, {
-        f"{name}_cpu_s": time.process_time() - processor_s,
-        f"{name}_s": time.perf_counter() - wall_s,
+        f"{name}_cpu_s": taken.cpu_s,
+        f"{name}_s": taken.wall_s,
         f"{name}_mb": (memory_bytes("VmHWM") - before) / 1e6,
     }

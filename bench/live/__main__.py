@@ -7,6 +7,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import torch
+
 from bench.live import accuracy, circles, growth, intensities, kills, loops, rates, readers, removal, tracking
 from bench.rows import kept
 
@@ -38,6 +40,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="only show that it runs")
     parser.add_argument("--out", type=Path, default=Path("bench_results"))
     options = parser.parse_intermixed_args()
+    torch.set_num_threads(options.threads)
     options.out.mkdir(parents=True, exist_ok=True)
     made = _COMMANDS[options.what].rows(options)
     rows = kept(made, "bench.live", options.out / f"live-{options.what}.json")

@@ -8,26 +8,24 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import radarsdf
-import torch
 from radarsdf import FitConfig, LiveMap
 from radarsdf.evaluation import surface_metrics
 from radarsdf.simulate import Simulation
 
 from bench.live.rates import scans_of
 from bench.paper.scenes import Scene, load_scene
+from bench.timing import timed
 
 _FINE_M = 0.1  # voxels of a fit; those of a live map are its leaf cells
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each scene and tenth. A case may be a file of recorded scans with ground truth."""
-    torch.set_num_threads(options.threads)
     samples = 20_000 if options.quick else 300_000
     for name in options.cases or ["hugin", "oculii", "wall"]:
         drive = drive_of(name, options)
@@ -49,9 +47,8 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 origin=live.origin,
                 progress=False,
             )
-            begin = time.process_time()
-            grown = live.mesh()
-            mesh_ms = 1e3 * (time.process_time() - begin)
+            with timed() as taken:
+                grown = live.mesh()
             meshes = (
                 grown,
                 fitted.mesh(_FINE_M, progress=False),
@@ -72,7 +69,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 "live, all": round(whole, 2),
                 "fit, all": round(whole_of_fit, 2),
                 "live less fit, all": round(whole - whole_of_fit, 2),
-                "mesh, ms": round(mesh_ms),
+                "mesh, ms": round(1e3 * taken.cpu_s),
             }
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import resource
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,9 @@ import numpy as np
 import radarsdf
 from matplotlib.figure import Figure
 from radarsdf import FitConfig, LiveMap
+
+from bench.rows import quantile
+from bench.timing import timed
 
 _SCANS, _ROWS, _LAP = 100_000, 20, 500
 _NOISE = 0.002  # of a range, new each time
@@ -31,19 +33,18 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     for i in range(count):
         scan = lap.points[i % len(lap)]
         noisy = scan * (1 + rng.normal(0, _NOISE, (len(scan), 1))).astype(np.float32)
-        begin = time.process_time()
-        live.integrate(noisy, lap.poses[i % len(lap)], lap.intensities[i % len(lap)])
-        times.append(1e3 * (time.process_time() - begin))
+        with timed() as taken:
+            live.integrate(noisy, lap.poses[i % len(lap)], lap.intensities[i % len(lap)])
+        times.append(1e3 * taken.cpu_s)
         if (i + 1) % max(1, count // _ROWS) == 0:
-            begin = time.process_time()
-            mesh = live.mesh()
-            mesh_ms = 1e3 * (time.process_time() - begin)
+            with timed() as taken:
+                mesh = live.mesh()
             yield {
                 "scans": i + 1,
-                "integrate p50, ms": round(float(np.median(times)), 2),
-                "p99": round(float(np.percentile(times, 99)), 2),
-                "worst": round(max(times), 2),
-                "mesh, ms": round(mesh_ms),
+                "integrate p50, ms": quantile(times, 0.5),
+                "p99": quantile(times, 0.99),
+                "worst": quantile(times, 1),
+                "mesh, ms": round(1e3 * taken.cpu_s),
                 "triangles": len(mesh.faces),
                 "map, MB": round(live.num_bytes / 1e6, 1),
                 "process at most, MB": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3),

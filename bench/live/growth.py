@@ -5,14 +5,14 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import radarsdf
-import torch
 from radarsdf import FitConfig, LiveMap
+
+from bench.rows import quantile
+from bench.timing import timed
 
 _PLACES, _FRAMES, _LAST = (1, 6), 100, 4  # so many scans of the last place come one by one
 _APART_M = 200.0
@@ -22,7 +22,6 @@ _NOISE = {"range_noise_m": 0.073, "azimuth_noise_rad": 0.0059, "elevation_noise_
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each number of places."""
-    torch.set_num_threads(options.threads)
     frames = 12 if options.quick else _FRAMES
     drives = [radarsdf.simulate.hugin(seed=options.seed + k, frames=frames) for k in range(max(_PLACES))]
     for places in _PLACES:
@@ -35,12 +34,12 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 pose[0, 3] += _APART_M * k
                 live.integrate(drives[k].points[i], pose, drives[k].intensities[i])
                 if k == 0 and i >= frames - _LAST - 1:
-                    begin = time.process_time()
-                    mesh = live.mesh()
-                    times.append(1e3 * (time.process_time() - begin))
+                    with timed() as taken:
+                        mesh = live.mesh()
+                    times.append(1e3 * taken.cpu_s)
         yield {
             "scans": len(live),
             "triangles": len(mesh.faces),
             "whole mesh, ms": round(times[0]),
-            "after one more scan, ms": round(float(np.median(times[1:]))),
+            "after one more scan, ms": quantile(times[1:], 0.5),
         }

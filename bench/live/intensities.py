@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-import torch
 from radarsdf import FitConfig, LiveMap
 from radarsdf.evaluation import holdout
 
@@ -21,7 +20,6 @@ _HELD_OUT_EVERY = 5
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each scene. Mean absolute errors where both maps answer."""
-    torch.set_num_threads(options.threads)
     for name in options.cases or ["hugin", "oculii"]:
         drive = drive_of(name, options)
         scans, config = drive.scans, drive.config

@@ -5,22 +5,20 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import radarsdf
-import torch
 from radarsdf import FitConfig, LiveMap
 from radarsdf.evaluation import surface_metrics
 from radarsdf.poses.rigid import aligned
 
 from bench.paper.broken_poses import walked
+from bench.timing import timed
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each scene."""
-    torch.set_num_threads(options.threads)
     config = FitConfig(num_threads=options.threads)
     for name in options.cases or ["hugin", "oculii", "wall"]:
         scans = radarsdf.simulate.SCENES[name](seed=options.seed, frames=12 if options.quick else None)
@@ -39,10 +37,9 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         live = grown(aligned(given, scans.poses))
         before = score(live)
         refined = radarsdf.refine_poses(scans.points, given, config=config)
-        begin = time.process_time()
-        # The returns do not tell where the whole is: that is not judged.
-        live.move_all(dict(zip(live.scan_ids, aligned(refined.poses, scans.poses), strict=True)))
-        move_s = time.process_time() - begin
+        with timed() as taken:
+            # The returns do not tell where the whole is: that is not judged.
+            live.move_all(dict(zip(live.scan_ids, aligned(refined.poses, scans.poses), strict=True)))
         after, true = score(live), score(grown(scans.poses))
         yield {
             "scene": name,
@@ -50,5 +47,5 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             "moved": round(after, 2),
             "true poses": round(true, 2),
             "moved less true": round(after - true, 2),
-            "move_all, s": round(move_s, 2),
+            "move_all, s": round(taken.cpu_s, 2),
         }

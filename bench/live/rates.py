@@ -6,16 +6,17 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import radarsdf
-import torch
 from radarsdf import FitConfig, LiveMap
 from radarsdf.simulate import Simulation
 from radarsdf.simulate.worlds import HUGIN_A3
+
+from bench.rows import quantile
+from bench.timing import timed
 
 _MESH_EVERY = 10
 _DENSE = "hugin, 20,000 returns a scan"
@@ -32,7 +33,6 @@ def scans_of(name: str, seed: int, quick: bool) -> Simulation:
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each scene and method."""
-    torch.set_num_threads(options.threads)
     for name in options.cases or ["hugin", "oculii", "wall", "astyx", _DENSE]:
         scans = scans_of(name, options.seed, options.quick)
         for method, add, mesh in _methods(options.threads):
@@ -40,29 +40,25 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 continue
             of_scans, of_meshes, wall_ms = [], [], []
             for i in range(len(scans)):
-                begin, begin_wall = time.process_time(), time.perf_counter()
-                add(scans.points[i], scans.poses[i], scans.intensities[i])
-                wall_ms.append(1e3 * (time.perf_counter() - begin_wall))
-                of_scans.append(1e3 * (time.process_time() - begin))
+                with timed() as taken:
+                    add(scans.points[i], scans.poses[i], scans.intensities[i])
+                wall_ms.append(1e3 * taken.wall_s)
+                of_scans.append(1e3 * taken.cpu_s)
                 if i % _MESH_EVERY == _MESH_EVERY - 1:
-                    begin = time.process_time()
-                    mesh()
-                    of_meshes.append(1e3 * (time.process_time() - begin))
+                    with timed() as taken:
+                        mesh()
+                    of_meshes.append(1e3 * taken.cpu_s)
             yield {
                 "scene": name,
                 "returns a scan": int(np.median([len(scan) for scan in scans.points])),
                 "method": method,
-                "integrate p50, ms": _said(np.median(of_scans)),
-                "p99": _said(np.percentile(of_scans, 99)),
-                "worst": _said(max(of_scans)),
-                "p99 by the clock": _said(np.percentile(wall_ms, 99)),
-                f"mesh after {_MESH_EVERY} scans p50, ms": _said(np.median(of_meshes)),
-                "mesh worst": _said(max(of_meshes)),
+                "integrate p50, ms": quantile(of_scans, 0.5),
+                "p99": quantile(of_scans, 0.99),
+                "worst": quantile(of_scans, 1),
+                "p99 by the clock": quantile(wall_ms, 0.99),
+                f"mesh after {_MESH_EVERY} scans p50, ms": quantile(of_meshes, 0.5),
+                "mesh worst": quantile(of_meshes, 1),
             }
-
-
-def _said(value: Any) -> float:
-    return round(float(value), 2)
 
 
 def _methods(threads: int) -> Iterator[tuple[str, Callable[..., Any], Callable[[], Any]]]:

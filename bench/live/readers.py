@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-import torch
 from radarsdf import FitConfig, LiveMap
+
+from bench.rows import quantile
+from bench.timing import timed
 
 _ROUNDS = 3  # of the drive
 _PAUSE_S = 0.01  # of a reader: without one, it would only be measured how Python's lock is shared
@@ -24,7 +26,6 @@ _PAUSE_S = 0.01  # of a reader: without one, it would only be measured how Pytho
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row without readers, and one with them."""
-    torch.set_num_threads(options.threads)
     frames = 12 if options.quick else 60
     for name in options.cases or ["oculii"]:
         scans = radarsdf.simulate.SCENES[name](seed=options.seed, frames=frames)
@@ -73,8 +74,8 @@ def _row(scans: Any, with_readers: bool, options: argparse.Namespace) -> dict[st
         return {
             "readers": len(threads),
             "changes": len(wall_ms),
-            "p50 by the clock, ms": round(float(np.median(wall_ms)), 1),
-            "p99 by the clock": round(float(np.percentile(wall_ms, 99)), 1),
+            "p50 by the clock, ms": quantile(wall_ms, 0.5),
+            "p99 by the clock": quantile(wall_ms, 0.99),
             "meshes, maps, saved, sizes": ", ".join(str(counts[k]) for k in range(len(reads))),
             "errors": "; ".join(map(repr, errors)) or "none",
             "bits of a map of these scans": "equal" if equal else "NOT EQUAL",
@@ -85,20 +86,20 @@ def _written(live: LiveMap, scans: Any, rng: np.random.Generator) -> list[float]
     """Scans come; a third of them move, another third go again. Gives the times of all these changes, ms."""
     times = []
 
-    def timed(act: Callable[[], Any]) -> None:
-        begin = time.perf_counter()
-        act()
-        times.append(1e3 * (time.perf_counter() - begin))
+    def changed(act: Callable[[], Any]) -> None:
+        with timed() as taken:
+            act()
+        times.append(1e3 * taken.wall_s)
 
     for k in range(_ROUNDS * len(scans)):
         i = k % len(scans)
-        timed(lambda: live.integrate(scans.points[i], scans.poses[i], scans.intensities[i], scan_id=k))  # noqa: B023
+        changed(lambda: live.integrate(scans.points[i], scans.poses[i], scans.intensities[i], scan_id=k))  # noqa: B023
         if k % 3 == 1:
             moved = scans.poses[i].copy()
             moved[:3, 3] += rng.normal(0, 0.1, 3)
-            timed(lambda: live.move(k, moved))  # noqa: B023
+            changed(lambda: live.move(k, moved))  # noqa: B023
         elif k % 3 == 2:
-            timed(lambda: live.remove(k))  # noqa: B023
+            changed(lambda: live.remove(k))  # noqa: B023
     return times
 
 

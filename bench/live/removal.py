@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import radarsdf
 from radarsdf import FitConfig, LiveMap
+
+from bench.rows import quantile
+from bench.timing import timed
 
 _SCANS = 1000
 
@@ -54,8 +56,8 @@ def _row(name: str, what: str, ms: list[float], integrate_ms: list[float], equal
         "scene": name,
         "operation": what,
         "times": len(ms),
-        "p50, ms": round(float(np.median(ms)), 2),
-        "worst, ms": round(max(ms), 2),
+        "p50, ms": quantile(ms, 0.5),
+        "worst, ms": quantile(ms, 1),
         "times that of integrate": round(float(np.median(ms) / np.median(integrate_ms)), 2),
         "bits of a map that never saw them": "equal" if equal else "NOT EQUAL",
     }
@@ -64,9 +66,9 @@ def _row(name: str, what: str, ms: list[float], integrate_ms: list[float], equal
 def _times(items: Iterable[int], act: Callable[[int], Any]) -> list[float]:
     found = []
     for i in items:
-        begin = time.process_time()
-        act(i)
-        found.append(1e3 * (time.process_time() - begin))
+        with timed() as taken:
+            act(i)
+        found.append(1e3 * taken.cpu_s)
     return found
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import time
 from collections.abc import Iterator
 from typing import Any
 from unittest import mock
@@ -20,6 +19,9 @@ from radarsdf.poses.rigid import Floats
 from radarsdf.poses.tracking import Tracked, Tracker
 from radarsdf.simulate import measured_motion
 from radarsdf.simulate.worlds import HUGIN_A3, OCULII_EAGLE
+
+from bench.rows import quantile
+from bench.timing import timed
 
 _RETURNS = 2000  # of a scan
 _SENSORS = {"hugin": HUGIN_A3, "oculii": OCULII_EAGLE}
@@ -41,9 +43,9 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 """Keeps what each scan takes, by the processor and by the clock, ms."""
 
                 def follow(self, scan: Floats, expected: ExpectedStep | None, took: Any = took) -> Tracked:
-                    begin, begin_wall = time.process_time(), time.perf_counter()
-                    found = super().follow(scan, expected)
-                    took.append((time.process_time() - begin, time.perf_counter() - begin_wall))
+                    with timed() as taken:
+                        found = super().follow(scan, expected)
+                    took.append((taken.cpu_s, taken.wall_s))
                     return found
 
             with mock.patch.object(drive, "Tracker", Timed):
@@ -53,19 +55,15 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                     times=motion.times_s,
                     config=FitConfig(num_threads=options.threads),
                 )
-            processor_ms, wall_ms = 1e3 * np.array(took).T
+            cpu_ms, wall_ms = 1e3 * np.array(took).T
             yield {
                 "scene": name,
                 "returns a scan": int(np.median([len(scan) for scan in scans.points])),
                 "tracked by": given,
-                "p50, ms": _said(np.median(processor_ms)),
-                "p99": _said(np.percentile(processor_ms, 99)),
-                "worst": _said(processor_ms.max()),
-                "p50 by the clock": _said(np.median(wall_ms)),
-                "p99 by the clock": _said(np.percentile(wall_ms, 99)),
-                "worst by the clock": _said(wall_ms.max()),
+                "p50, ms": quantile(cpu_ms, 0.5),
+                "p99": quantile(cpu_ms, 0.99),
+                "worst": quantile(cpu_ms, 1),
+                "p50 by the clock": quantile(wall_ms, 0.5),
+                "p99 by the clock": quantile(wall_ms, 0.99),
+                "worst by the clock": quantile(wall_ms, 1),
             }
-
-
-def _said(value: Any) -> float:
-    return round(float(value), 1)

@@ -4,22 +4,16 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from radarsdf.evaluation import adjacent_angles, gamma_from_moments
 
-from .experiment import Experiment, Options, Row, Task, groups
+from .experiment import Experiment, Options, Row, for_each_peer, groups
 from .report import figure, markdown
 from .scenes import Scene
 
 _BINS = np.linspace(0, np.pi, 181)
-
-
-def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One task for each peer."""
-    return [Task(f"{scene.name}: {name}", partial(_rows, scene, name, options)) for name in options.peers]
 
 
 def _rows(scene: Scene, name: str, options: Options) -> list[Row]:
@@ -63,4 +57,6 @@ def plot(rows: list[Row], path: Path) -> None:
             ax.set_yscale("log")
 
 
-EXPERIMENT = Experiment("Angles between adjacent triangles", ("hugin", "oculii", "wall"), tasks, table, plot)
+EXPERIMENT = Experiment(
+    "Angles between adjacent triangles", ("hugin", "oculii", "wall"), for_each_peer(_rows), table, plot
+)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,17 @@ class Task:
 
     label: str
     run: Callable[[], Iterable[Row]]
+
+
+def for_each_peer(
+    rows: Callable[[Scene, str, Options], Iterable[Row]],
+) -> Callable[[Scene, Options], list[Task]]:
+    """Tasks of an experiment that asks for the `rows` of each peer by its name."""
+
+    def tasks(scene: Scene, options: Options) -> list[Task]:
+        return [Task(f"{scene.name}: {name}", partial(rows, scene, name, options)) for name in options.peers]
+
+    return tasks
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 import itertools
-from functools import partial
 from pathlib import Path
 
 from scipy.spatial import cKDTree
 
 from .calibration import sampled
-from .experiment import Experiment, Options, Row, Task, groups
+from .experiment import Experiment, Options, Row, for_each_peer, groups
 from .report import figure, markdown
 from .scenes import Scene
 
@@ -19,11 +18,6 @@ NEAR_M = 0.2
 """A point this near to the other surface counts, as for the F-score with nothing discarded."""
 
 _EDGES_M = (2.5, 10.0, 20.0, 30.0, 60.0)
-
-
-def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One task for each peer."""
-    return [Task(f"{scene.name}: {name}", partial(_rows, scene, name, options)) for name in options.peers]
 
 
 def _rows(scene: Scene, name: str, options: Options) -> list[Row]:
@@ -93,5 +87,10 @@ def plot(rows: list[Row], path: Path) -> None:
 
 
 EXPERIMENT = Experiment(
-    "Precision and completion by range", ("hugin", "oculii", "wall"), tasks, table, plot, bases=("default",)
+    "Precision and completion by range",
+    ("hugin", "oculii", "wall"),
+    for_each_peer(_rows),
+    table,
+    plot,
+    bases=("default",),
 )

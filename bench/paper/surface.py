@@ -4,11 +4,10 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from .experiment import Experiment, Options, Row, Task, groups
+from .experiment import Experiment, Options, Row, for_each_peer, groups
 from .report import Column, figure, metric_table
 from .scenes import Scene
 
@@ -26,11 +25,6 @@ COLUMNS: tuple[Column, ...] = (
     ("seconds", "time, s", 1, 1, False),
     ("peak_bytes", "peak memory, MB", 1e-6, 0, False),
 )
-
-
-def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One task for each peer."""
-    return [Task(f"{scene.name}: {name}", partial(_rows, scene, name, options)) for name in options.peers]
 
 
 def _rows(scene: Scene, name: str, options: Options) -> list[Row]:
@@ -66,4 +60,6 @@ def _scatter(ax: Any, rows: list[Row]) -> None:
     ax.grid(alpha=0.3)
 
 
-EXPERIMENT = Experiment("Surface quality (Table I)", ("hugin", "oculii", "wall"), tasks, table, plot)
+EXPERIMENT = Experiment(
+    "Surface quality (Table I)", ("hugin", "oculii", "wall"), for_each_peer(_rows), table, plot
+)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.memory import memory_bytes
+from bench.timing import timed
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ def main() -> None:
             file.get("intensities"),
         )
         queries = (file["query_points"], file["query_sensors"]) if "query_points" in file else None
-    started = time.perf_counter()
-    made = Made(*reconstruct(scans, **json.loads(options)))
-    seconds, peak = time.perf_counter() - started, memory_bytes("VmHWM")
+    with timed() as taken:
+        made = Made(*reconstruct(scans, **json.loads(options)))
+    seconds, peak = taken.wall_s, memory_bytes("VmHWM")
     answers: dict[str, Any] = {}
     if queries is not None and made.intensity is not None:
         answers["intensity"] = made.intensity(*queries)

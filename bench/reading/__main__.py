@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import logging
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +18,7 @@ import numpy as np
 from radarsdf.io import read
 
 from bench.paper.report import ROOT
+from bench.timing import timed
 
 from .formats import FORMATS, Format, make_scans, poses
 
@@ -76,9 +76,9 @@ def _least_s(measured: Callable[[], float], expected: float, repetitions: int) -
     """The least wall-clock time of some calls, s, each of which must give the right sum."""
     times = []
     for _ in range(repetitions):
-        start = time.perf_counter()
-        total = measured()
-        times.append(time.perf_counter() - start)
+        with timed() as taken:
+            total = measured()
+        times.append(taken.wall_s)
         if abs(total - expected) > _TOLERANCE * max(1.0, abs(expected)):
             msg = f"the coordinates add up to {total}, not {expected}"
             raise ArithmeticError(msg)

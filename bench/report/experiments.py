@@ -9,7 +9,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 
 from bench.paper.report import ROOT
 from bench.peers.interface import PEERS, failure
+from bench.timing import timed
 
 from .results import Row
 
@@ -194,11 +194,11 @@ def run(name: str, *, size: str, real: Sequence[Path] = ()) -> Values:
 
 
 def _run(words: Sequence[str], file: str, rows: Callable[[Values], list[Row]]) -> Values:
-    started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", *(word.replace("{folder}", folder) for word in words)]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-        found: Values = {"command": _shown(words), "seconds": round(time.perf_counter() - started, 1)}
+        with timed() as taken:
+            done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        found: Values = {"command": _shown(words), "seconds": round(taken.wall_s, 1)}
         path = Path(folder) / file
         if done.returncode != 0:
             found["why_not"] = _plain(failure(done), folder)

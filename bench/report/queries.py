@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import radarsdf
 
 from bench.paper.report import write_json
+from bench.timing import timed
 
 _ROUNDS = 5
 _COUNT = 1_000_000
@@ -67,9 +67,9 @@ def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
     call()
     seconds, answer = [], None
     for _ in range(_ROUNDS):
-        started = time.perf_counter()
-        answer = call()
-        seconds.append(time.perf_counter() - started)
+        with timed() as taken:
+            answer = call()
+        seconds.append(taken.wall_s)
     return median(seconds), answer
 
 

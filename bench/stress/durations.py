@@ -8,7 +8,6 @@ import dataclasses
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -21,6 +20,7 @@ from scipy.optimize import nnls
 from bench.growth.street import street
 from bench.paper.report import markdown
 from bench.settings import Changes, flat, merged
+from bench.timing import timed
 
 WITHIN = 2.0
 PRESETS: dict[str, Callable[[], FitConfig]] = {
@@ -114,10 +114,9 @@ def _measure(count: int, with_intensities: bool, preset: str, changes: Changes) 
         FitConfig().override(training={"sdf_iterations": 5, "intensity_iterations": 10}),
     )
     radarsdf.fit(small.points, small.poses, small.intensities, config=tiny, progress=False)
-    wall_s, processor_s = time.perf_counter(), time.process_time()
-    radarsdf.fit(*returns, config=config, progress=False)
-    wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s
-    print(json.dumps(dataclasses.asdict(Fit(estimate.seconds, work, wall_s, processor_s))))
+    with timed() as taken:
+        radarsdf.fit(*returns, config=config, progress=False)
+    print(json.dumps(dataclasses.asdict(Fit(estimate.seconds, work, taken.wall_s, taken.cpu_s))))
 
 
 def constants(fits: list[Fit]) -> dict[str, float]:

@@ -20,6 +20,7 @@ from radarsdf import FitConfig, Interrupted
 
 from bench.growth.street import street
 from bench.paper.report import markdown
+from bench.timing import timed
 
 MAX_WAIT_S = 1.0
 
@@ -39,9 +40,9 @@ def waits(work: Callable[[], Any], moments: int) -> tuple[float, np.ndarray, lis
         Line of code at each signal.
     """
     rng = np.random.default_rng(0)
-    started_s = time.perf_counter()
-    work()
-    whole_s = time.perf_counter() - started_s
+    with timed() as taken:
+        work()
+    whole_s = taken.wall_s
     found, maps, places = [], [], []
     for share in (np.arange(moments) + rng.random(moments)) / moments:
         sent_s = 0.0

@@ -22,6 +22,7 @@ from radarsdf.io import Scans
 from radarsdf.view.viewer import Viewer
 
 from bench.paper.report import ROOT
+from bench.timing import timed
 
 from .client import PlainClient, Received
 from .page import camera_of, drawn, open_page, pixel_of, why_no_browser
@@ -59,9 +60,8 @@ def main(arguments: list[str] | None = None) -> None:
 def _plain(viewer: Viewer, seconds: float) -> dict[str, str]:
     """What a client receives that draws nothing."""
     with PlainClient(viewer.host, viewer.port) as client:
-        began_s = time.perf_counter()
-        client.wait_for(_is_mesh)
-        start_s = time.perf_counter() - began_s
+        with timed() as starting:
+            client.wait_for(_is_mesh)
         _settled(client)
         before = len(client.received())
         began_s, ended_s = client.drag(seconds)
@@ -74,7 +74,7 @@ def _plain(viewer: Viewer, seconds: float) -> dict[str, str]:
         gaps_s = np.diff([m.at_s for m in updates])
         frames = {m.at_s: m.frame_bytes for m in received if m.at_s <= ended_s}
         return {
-            "until the first mesh": f"{start_s:.2f} s",
+            "until the first mesh": f"{starting.wall_s:.2f} s",
             "updates a second": f"{len(updates) / (ended_s - began_s):.1f}",
             "between two updates, median, worst": f"{np.median(gaps_s):.3f}, {gaps_s.max():.3f} s",
             "an update": f"{statistics.median(m.frame_bytes for m in updates) / 1e3:.0f} kB",
@@ -88,10 +88,9 @@ def _browser(viewer: Viewer, seconds: float, out: Path) -> dict[str, str]:
     """What a browser draws."""
     server: Any = viewer._server
     with open_page(f"http://127.0.0.1:{viewer.port}") as page:
-        began_s = time.perf_counter()
-        page.wait_until(lambda: drawn(page.screenshot()) > 0)
-        before = page.settle()
-        start_s = time.perf_counter() - began_s
+        with timed() as starting:
+            page.wait_until(lambda: drawn(page.screenshot()) > 0)
+            before = page.settle()
         camera, sensor = camera_of(server), np.array(viewer._gizmo.position)
         arrow = sensor + [0.6 * viewer._gizmo.scale, 0, 0]
         first = drawn(before)
@@ -103,9 +102,8 @@ def _browser(viewer: Viewer, seconds: float, out: Path) -> dict[str, str]:
             steps=round(seconds / 0.05),
             step_s=0.05,
         )
-        ended_s = time.perf_counter()
-        page.wait_until(lambda: viewer._canvas.sent > meshes and not viewer._canvas.coarse)
-        swapped_s = time.perf_counter() - ended_s
+        with timed() as swapping:
+            page.wait_until(lambda: viewer._canvas.sent > meshes and not viewer._canvas.coarse)
         page.settle()
         frames = page.stop_recording()
     counts = [drawn(frame) for _, frame in frames]
@@ -113,9 +111,9 @@ def _browser(viewer: Viewer, seconds: float, out: Path) -> dict[str, str]:
         _save(out / f"viewing_{name}.png", frames[number][1])
     moved_m = float(np.linalg.norm(np.array(viewer._gizmo.position) - sensor))
     return {
-        "until it is drawn": f"{start_s:.1f} s",
+        "until it is drawn": f"{starting.wall_s:.1f} s",
         "the sensor was dragged": f"{moved_m:.1f} m",
-        "from the drag's end until the mesh is drawn": f"{swapped_s:.2f} s",
+        "from the drag's end until the mesh is drawn": f"{swapping.wall_s:.2f} s",
         "frames during drag and swap": str(len(frames)),
         "pixels of the scene before, least, most": f"{first}, {min(counts)}, {max(counts)}",
         "blank frames": str(sum(count < first / 2 for count in counts)),

@@ -18,7 +18,7 @@ def drives_past(before, after):
     other[:, 1, 3] += 0.3
     scenes = [Scene([*drive.scene.solids, *extra], drive.scene.terrain) for extra in (before, after)]
     return [
-        simulate(scene, drive.sensor, poses, name="wall", seed=seed, lidar_rays=1)
+        simulate(scene, drive.sensor, poses, name="wall", seed=seed)
         for scene, poses, seed in ((scenes[0], drive.poses, 1), (scenes[0], other, 2), (scenes[1], other, 3))
     ]
 
