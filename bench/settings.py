@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Changes of a configuration as nested dicts, which go through JSON: put together, and as words."""
+"""Configurations of fits by their names, and changes of them as nested dicts: put together, and as words."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ import ast
 from collections.abc import Iterable
 from typing import Any
 
+from radarsdf import FitConfig
+
 Changes = dict[str, Any]
-"""Settings of the top of a `FitConfig`, and for each group a dict of those of its settings that change."""
+"""Settings of the top of a `FitConfig`, and for each group a dict of those of its settings that change; goes through JSON."""
+
+PRESETS = {"default": FitConfig(), "quick": FitConfig.quick(), "paper": FitConfig.paper()}
 
 
 def merged(*changes: Changes) -> Changes:

@@ -87,5 +87,4 @@ def drive_of(name: str, options: argparse.Namespace) -> Drive:
     if not Path(name).is_file():
         return Drive(name, scans_of(name, options.seed, options.quick), config)
     scene = load_scene(name)
-    ranges = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
-    return Drive(scene.name, scene, config.override(returns=ranges))
+    return Drive(scene.name, scene, config.override(returns=scene.ranges))

@@ -50,8 +50,7 @@ class Options:
 
     def config(self, base: str, scene: Scene, **changes: Any) -> FitConfig:
         """The configuration `base` with the ranges of the scene and other changes."""
-        config = FitConfig.paper() if base == "paper" else FitConfig()
-        config = config.override(returns={"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m})
+        config = scene.config(base)
         return config.override(**merged(_SHORT if self.quick else {}, changes))
 
     def reconstruct(self, method: str | Peer, scene: Scene, held_out: Scene | None = None) -> Reconstruction:
@@ -64,8 +63,7 @@ class Options:
             scene.points,
             scene.poses,
             scene.intensities,
-            min_range_m=scene.min_range_m,
-            max_range_m=scene.max_range_m,
+            **scene.ranges,
             queries=None if held_out is None else world_returns(held_out)[:2],
         )
 
@@ -149,13 +147,7 @@ def fit(scene: Scene, config: FitConfig) -> RadarMap:
 
 def rays_of(scene: Scene) -> Rays:
     """The returns within the ranges of the scene."""
-    return prepare(
-        scene.points,
-        scene.poses,
-        scene.intensities,
-        min_range_m=scene.min_range_m,
-        max_range_m=scene.max_range_m,
-    )
+    return prepare(scene.points, scene.poses, scene.intensities, **scene.ranges)
 
 
 def world_returns(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

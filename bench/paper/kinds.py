@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from radarsdf import FitConfig
 from radarsdf.evaluation import confidence_metrics
 from radarsdf.simulate import KINDS, SCENES
 
@@ -51,9 +50,7 @@ def _judged(scene: Scene, options: Options, name: str, repetition: int) -> list[
     row: Row = {"scene": scene.name, "method": f"{name}, confidence", "repetition": repetition}
     if scene.simulation is None and scene.ground_truth is None:
         return [row | {"why_not": "the scene has no ground truth"}]
-    config = options.config("default", scene)
-    if name.endswith("quick"):
-        config = FitConfig.quick().override(returns=config.to_dict()["returns"])
+    config = scene.config("quick") if name.endswith("quick") else options.config("default", scene)
     radar_map = fit(scene.without_intensities(), config)
     leaf_m = radar_map.config.leaf_size_m
     mesh = radar_map.mesh(leaf_m, **WHOLE, progress=False)

@@ -62,8 +62,7 @@ def _rows(scene: Scene, options: Options, base: str) -> list[Row]:
 def returns_of(scene: Scene, frame: int) -> Returns:
     """The returns of a scan within the ranges of its scene."""
     points = np.asarray(scene.points[frame], np.float64)
-    ranges_m = np.linalg.norm(points, axis=1)
-    kept = (ranges_m >= scene.min_range_m) & (ranges_m <= (scene.max_range_m or np.inf))
+    kept = scene.is_used(frame)
     values = np.full(len(points), np.nan) if scene.intensities is None else scene.intensities[frame]
     return points[kept], np.asarray(values, np.float64)[kept]
 

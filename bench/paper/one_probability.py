@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from radarsdf import FitConfig
 from radarsdf.evaluation import confidence_metrics, surface_metrics
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
@@ -30,7 +29,7 @@ from scipy.special import expit
 
 from .experiment import fit
 from .report import markdown
-from .scenes import Scene, load_scene
+from .scenes import VOXEL_M, Scene, load_scene
 from .truth import truth_of
 
 FloatArray = NDArray[np.float64]
@@ -47,7 +46,6 @@ _LEARNT = 20_000  # vertices of a map
 _SAMPLES = 300_000
 _STEPS = 50
 _ACCURATE = 1e-9
-_VOXEL_M = {"quick": 0.2, "default": 0.1}
 
 
 @dataclass(frozen=True)
@@ -69,10 +67,9 @@ class Example:
 
     @classmethod
     def of(cls, kind: str, scene: Scene, preset: str, part: str) -> Example:
-        ranges = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
-        config = (FitConfig.quick() if preset == "quick" else FitConfig()).override(returns=ranges)
+        config = scene.config(preset)
         contents = fit(scene.without_intensities(), config)._contents
-        surface = Surface.of(contents, _VOXEL_M[preset])
+        surface = Surface.of(contents, VOXEL_M[preset])
         mesh = surface.part(contents.origin, np.ones(len(surface.faces), bool))
         assert scene.ground_truth is not None
         leaf_m, truth = config.leaf_size_m, scene.ground_truth
@@ -85,7 +82,7 @@ class Example:
             f"{kind}, {part}, {preset}",
             truth,
             contents,
-            _VOXEL_M[preset],
+            VOXEL_M[preset],
             surface,
             queries.terms(contents, surface.evidence).numpy(),
             queries.probabilities(contents, surface.evidence).reach.numpy(),
@@ -214,7 +211,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("files", nargs="*", metavar="FILE", help="recorded drives with ground truth")
-    parser.add_argument("--presets", nargs="+", choices=_VOXEL_M, default=["quick"])
+    parser.add_argument("--presets", nargs="+", choices=VOXEL_M, default=["quick"])
     parser.add_argument("--seed", type=int, default=141, help="of the simulated scenes that are learnt from")
     parser.add_argument("--judge", type=int, default=391, help="seed of those that are judged")
     parser.add_argument(

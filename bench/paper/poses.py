@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterable
 from functools import partial
@@ -12,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-from radarsdf import FitConfig
-from radarsdf.evaluation import holdout, intensity_metrics, surface_metrics, trajectory_metrics
+from radarsdf.evaluation import intensity_metrics, surface_metrics, trajectory_metrics
 from radarsdf.poses.rigid import aligned
 from radarsdf.simulate import SCENES, measured_motion
 
 from .broken_poses import BREAKAGES, Poses
-from .experiment import Experiment, Options, Row, Task, groups, mean_and_deviation
+from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, world_returns
 from .report import figure, markdown
 from .scenes import Scene, load_scene
 
@@ -150,9 +150,7 @@ def _map_errors(scene: Scene, poses: Poses, name: str, options: Options) -> Row:
     """F-score with nothing discarded, and the error of held-out intensities, of quick maps with these poses."""
     if scene.ground_truth is None:
         return {}
-    config = FitConfig.quick().override(
-        returns={"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
-    )
+    config = scene.config("quick")
     whole = radarsdf.fit(scene.points, poses, config=config, progress=False)
     metrics = surface_metrics(
         whole.mesh(), scene.ground_truth, box=scene.box, samples=min(options.samples, 1_000_000)
@@ -160,24 +158,10 @@ def _map_errors(scene: Scene, poses: Poses, name: str, options: Options) -> Row:
     row: Row = {f"f_{name}": 100 * metrics["f_score_all"]}
     if scene.intensities is None or name == "given":
         return row
-    train, test = holdout(len(scene), scene.holdout_every)
-    intensities = scene.intensities
-    part = radarsdf.fit(
-        [scene.points[i] for i in train],
-        poses[train],
-        [intensities[i] for i in train],
-        config=config,
-        progress=False,
-    )
-    points, sensors, measured = [], [], []
-    for i in test:
-        ranges = np.linalg.norm(scene.points[i], axis=1)
-        kept = (ranges >= scene.min_range_m) & (ranges <= (scene.max_range_m or np.inf))
-        points.append(scene.points[i][kept] @ poses[i, :3, :3].T + poses[i, :3, 3])
-        sensors.append(np.broadcast_to(poses[i, :3, 3], points[-1].shape))
-        measured.append(intensities[i][kept])
-    predicted = part.intensity(np.concatenate(points), np.concatenate(sensors), extrapolate=True)
-    return row | {f"mae_{name}": intensity_metrics(predicted, np.concatenate(measured))["mae"]}
+    train, test = dataclasses.replace(scene, poses=poses).split()
+    points, sensors, measured = world_returns(test)
+    predicted = fit(train, config).intensity(points, sensors, extrapolate=True)
+    return row | {f"mae_{name}": intensity_metrics(predicted, measured)["mae"]}
 
 
 def table(rows: list[Row]) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from radarsdf import FitConfig
 from radarsdf.evaluation import holdout
 from radarsdf.io import read
 from radarsdf.io.datasets.snail_radar import is_snail_radar
@@ -19,8 +20,13 @@ from radarsdf.returns.rays import prepare
 from radarsdf.simulate import KINDS, SCENES, Simulation
 from scipy.spatial import cKDTree
 
+from bench.settings import PRESETS
+
 SEEN_BY_RADAR_M = 1.0
 """A lidar sees in all directions. Lidar points farther than this from every return do not count as ground truth."""
+
+VOXEL_M = {"default": 0.1, "quick": 0.2}
+"""Edge of the voxels in which meshes of maps of each kind are judged, m."""
 
 _MIN_RANGE_M = 2.5
 _MIN_RANGE_OCULII_M = 1.0
@@ -61,6 +67,21 @@ class Scene:
     def __len__(self) -> int:
         """Number of scans."""
         return len(self.points)
+
+    @property
+    def ranges(self) -> dict[str, Any]:
+        """The settings of the returns that a fit uses."""
+        return {"min_range_m": self.min_range_m, "max_range_m": self.max_range_m}
+
+    def config(self, preset: str, **changes: Any) -> FitConfig:
+        """One of `PRESETS` with the ranges of the scene, and with changes of other settings."""
+        return PRESETS[preset].override(returns=self.ranges, **changes)
+
+    def is_used(self, frame: int) -> NDArray[np.bool_]:
+        """(N_i,) whether the returns of a scan are within the ranges."""
+        range_m = np.linalg.norm(self.points[frame].astype(np.float64), axis=1)
+        used: NDArray[np.bool_] = (range_m >= self.min_range_m) & (range_m <= (self.max_range_m or np.inf))
+        return used
 
     def every_nth(self, n: int) -> Scene:
         """The scans 0, n, 2n, … with the whole ground truth.
@@ -223,7 +244,7 @@ def _seen_by_both(scene: Scene) -> NDArray[np.float64] | None:
     lidar = scene.ground_truth
     if lidar is None:
         return None
-    rays = prepare(scene.points, scene.poses, min_range_m=scene.min_range_m, max_range_m=scene.max_range_m)
+    rays = prepare(scene.points, scene.poses, **scene.ranges)
     distance, _ = cKDTree(rays.points + rays.origin).query(lidar, distance_upper_bound=SEEN_BY_RADAR_M)
     seen: NDArray[np.float64] = lidar[distance <= SEEN_BY_RADAR_M]
     return seen

@@ -77,11 +77,8 @@ def _angle_deg(sensors: np.ndarray, place: np.ndarray) -> np.ndarray:
 def _noiseless(scene: Scene) -> np.ndarray:
     """Noiseless intensities of the simulated returns within the ranges of the scene; NaN for false returns."""
     assert scene.simulation is not None
-    ranges = [np.linalg.norm(p, axis=1) for p in scene.points]
-    furthest = np.inf if scene.max_range_m is None else scene.max_range_m
-    kept = [(r >= scene.min_range_m) & (r <= furthest) for r in ranges]
-    values = zip(scene.simulation.noiseless_intensities, kept, strict=True)
-    return np.concatenate([value[k] for value, k in values])
+    values = enumerate(scene.simulation.noiseless_intensities)
+    return np.concatenate([of_scan[scene.is_used(frame)] for frame, of_scan in values])
 
 
 def _error(row: Row, selected: np.ndarray) -> str:

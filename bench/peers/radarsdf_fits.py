@@ -11,20 +11,15 @@ import radarsdf
 import radarsdf.fitting.fit  # else the first fit and the first mesh would import these, in the measured time
 import radarsdf.map.meshing
 
+from bench.settings import PRESETS
 from bench.timing import timed
 
 from .child import Made, ScanArrays
 
-_BASES = {
-    "default": radarsdf.FitConfig(),
-    "paper": radarsdf.FitConfig.paper(),
-    "quick": radarsdf.FitConfig.quick(),
-}
-
 
 def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], mesh: dict[str, Any]) -> Made:
-    """Fit and mesh. `base` is one of `_BASES`, `mesh` has arguments of the mesh; intensities are used where there are any."""
-    config = _BASES[base].override(**changes)
+    """Fit and mesh. `base` is one of `PRESETS`, `mesh` has arguments of the mesh; intensities are used where there are any."""
+    config = PRESETS[base].override(**changes)
     frames = [np.flatnonzero(scans.frame == i) for i in range(len(scans.poses))]
     radar_map = radarsdf.fit(
         [scans.points[own] for own in frames],

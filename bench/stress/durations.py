@@ -8,7 +8,6 @@ import dataclasses
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 
 import numpy as np
 import radarsdf
@@ -19,15 +18,10 @@ from scipy.optimize import nnls
 
 from bench.growth.street import street
 from bench.paper.report import markdown
-from bench.settings import Changes, flat, merged
+from bench.settings import PRESETS, Changes, flat, merged
 from bench.timing import timed
 
 WITHIN = 2.0
-PRESETS: dict[str, Callable[[], FitConfig]] = {
-    "default": FitConfig,
-    "quick": FitConfig.quick,
-    "paper": FitConfig.paper,
-}
 SHORT: Changes = {"training": {"sdf_iterations": 100, "intensity_iterations": 300}}
 CASES: list[tuple[int, bool, str, Changes]] = [
     (10_000, True, "default", {}),
@@ -91,7 +85,7 @@ def measured(count: int, with_intensities: bool, preset: str, changes: Changes, 
 def _measure(count: int, with_intensities: bool, preset: str, changes: Changes) -> None:
     scene = street(count)
     returns = (scene.points, scene.poses, scene.intensities if with_intensities else None)
-    config = PRESETS[preset]().override(**changes)
+    config = PRESETS[preset].override(**changes)
     estimate = radarsdf.estimate(*returns, config=config)
     schedule = Schedule.of(
         config,

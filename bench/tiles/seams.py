@@ -43,10 +43,8 @@ def _scene(name: str, quick: bool) -> tuple[Scans, FitConfig]:
         made = street(count, num_hits=count)  # all of them: the truth must be denser than the mesh
         return Scans(made.points, made.poses, made.intensities, made.hits), config
     scene = load_scene(name)
-    limits = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
-    return Scans(scene.points, scene.poses, scene.intensities, scene.ground_truth), config.override(
-        returns=limits
-    )
+    scans = Scans(scene.points, scene.poses, scene.intensities, scene.ground_truth)
+    return scans, config.override(returns=scene.ranges)
 
 
 def _row(

@@ -25,7 +25,7 @@ from radarsdf import FitConfig
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 
 from bench.paper.experiment import world_returns
-from bench.paper.scenes import Scene, load_scene
+from bench.paper.scenes import VOXEL_M, Scene, load_scene
 
 from ..conftest import recorded_scans
 
@@ -36,7 +36,6 @@ SCENE_SEED = 7  # the figures of BENCHMARK.md, by which the defaults were chosen
 # With 20 frames of the wall, one quick fit in six is far off at the first frame, which is held out and at the path's end.
 FRAMES = {"hugin": 20, "oculii": 20, "wall": 40}
 MESH_SAMPLES = 300_000
-VOXEL_M = {"default": 0.1, "quick": 0.2}
 
 
 @dataclass(frozen=True)
@@ -200,8 +199,7 @@ def load(name: str) -> Scene:
 
 def config_of(kind: str, scene: Scene, seed: int = 0) -> FitConfig:
     """The configuration under test, with nothing changed but the scene's ranges and the seed."""
-    ranges = {"min_range_m": scene.min_range_m, "max_range_m": scene.max_range_m}
-    return (FitConfig.quick() if kind == "quick" else FitConfig()).override(seed=seed, returns=ranges)
+    return scene.config(kind, seed=seed)
 
 
 def measure(
