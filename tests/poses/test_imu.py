@@ -156,7 +156,6 @@ def test_the_world_is_levelled(ride, up):
 def test_a_walk_ends_where_it_began():
     pytest.importorskip("rosbags", reason="the extra ros is not installed")
     scans = radarsdf.io.read(recorded_file("ti_iwr6843/ti_mmwave_rospkg_demo.bag"), UNPOSED)
-    scans = scans.select_range(slice(130, 360))  # before and after, it stands
     found = radarsdf.odometry(scans)
     way = found.poses[-1, :3, 3] - found.poses[0, :3, 3]
     assert np.linalg.norm(way) < 0.01 * found.report["length_m"]

@@ -4,12 +4,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Scans
-from radarsdf.poses.rigid import aligned, turned_by
+from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.drive import Drive
+from radarsdf.poses.rigid import aligned, rotation, turned_by
+from radarsdf.poses.tracking import Tracked
 from radarsdf.simulate import Simulation, drifted, measured_motion
 
 from .drift import position_error_m
@@ -231,6 +236,30 @@ def test_wrong_arguments_are_refused(drive, motion):
             angular_velocity=rates,
             angular_velocity_times=times + 1e9,
         )
+
+
+def test_scans_of_a_sensor_that_stands_do_not_count_again(drive):
+    """They have the same returns with the same errors. Slow or on the spot, a sensor does not stand."""
+    speeds = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.2])  # m/s
+    turned = np.array([0.0, 0.0, 0.02, 0.5, 0.5, 0.5, 0.8, 0.8])  # rad
+    velocities = Velocities(
+        np.column_stack([speeds, 0 * speeds, 0 * speeds]),
+        np.tile(0.02**2 * np.eye(3), (8, 1, 1)),
+        np.ones(3),
+        [np.ones(len(scan), bool) for scan in drive.points[:8]],
+        np.ones(8, bool),
+    )
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, :3, :3] = rotation(np.column_stack([0 * turned, 0 * turned, turned]))
+    tracked = [Tracked(pose, 0.02**2 * np.eye(6), 1.0, 0, np.zeros(3)) for pose in poses]
+    followed = Drive(list(drive.points[:8]), np.arange(8.0), velocities, None)
+
+    def told(by, rows):
+        return [len(scan) > 0 for scan in by.told_anew(tracked, rows)]
+
+    assert told(followed, slice(0, 8)) == [True, False, False, True, True, False, True, True]
+    assert told(followed, slice(1, 4)) == [True, False, True]  # another piece has no other scan of this place
+    assert all(told(dataclasses.replace(followed, velocities=None), slice(0, 8)))
 
 
 def test_a_simulated_motion_is_that_of_the_poses():

@@ -16,7 +16,7 @@ from radarsdf.poses.expected import ExpectedStep
 from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion
 from radarsdf.poses.rates import Habits, Rate
-from radarsdf.poses.rigid import Floats, rotation
+from radarsdf.poses.rigid import Floats, rotation, rotation_vector
 from radarsdf.poses.tracking import Tracked, Tracker
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 
@@ -25,6 +25,7 @@ from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 _TURNS = Habits(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 _MOVES = Habits(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 _PASSES = 3
+_NO_CHANCE = 3.0  # standard deviations
 _TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until the estimate finds them
 
 
@@ -85,6 +86,27 @@ class Drive:
             DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns),
         ]
 
+    def told_anew(self, tracked: Sequence[Tracked], rows: slice) -> list[Floats]:
+        """The scans (N_i, 3) among these, without the returns of those that the sensor took while it stood.
+
+        They are those of the first such scan again, with the same errors: counted as new, they would draw all poses to these errors.
+        """
+        scans = list(self.scans[rows])
+        if self.velocities is None:
+            return scans
+        means, covariance = self.velocities.mean_mps[rows], self.velocities.covariance[rows]
+        stands = _squared_deviations(means, covariance) < _NO_CHANCE**2
+        first: Floats | None = None  # orientation, since which it stands
+        for i, (found, stood) in enumerate(zip(tracked[rows], stands, strict=True)):
+            R = found.pose[:3, :3]
+            if first is not None and stood:
+                turn = rotation_vector(np.einsum("ij,kj->ik", R, first))
+                if _squared_deviations(turn, found.covariance[3:, 3:]) < _NO_CHANCE**2:
+                    scans[i] = scans[i][:0]
+                    continue
+            first = R if stood else None
+        return scans
+
     def learnt(self, found: _Pass) -> Drive:
         """With what a pass shows of it."""
         durations_s = np.diff(self.times_s)
@@ -130,6 +152,12 @@ class _Pass:
             if rate is not None:
                 turns[i], covariance[i] = rate.mean * duration_s, rate.covariance * duration_s**2
         return turns, covariance
+
+
+def _squared_deviations(values: Floats, covariance: Floats) -> Floats:
+    """(...) squares of values (..., 3) in standard deviations."""
+    found: Floats = np.einsum("...i,...ij,...j->...", values, np.linalg.inv(covariance), values)
+    return found
 
 
 def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rate]:

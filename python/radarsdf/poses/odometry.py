@@ -194,7 +194,7 @@ def _together(
     covariance = np.zeros((len(poses), 6, 6))
     limits, cell_m = config.returns, LEAVES_PER_SURFEL * config.leaf_size_m
     for rows in pieces_of(tracked):
-        returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m)
+        returns = SensorReturns.of(drive.told_anew(tracked, rows), limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
         motions = drive.motions(tracked, rows)
