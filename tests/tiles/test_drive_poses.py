@@ -80,6 +80,18 @@ def test_a_second_call_has_the_same_poses(drive, folder, tmp_path, monkeypatch):
     assert again.digest == plan.digest == Plan.load(folder).digest
 
 
+def test_a_plan_that_is_there_is_compared_in_one_pass(drive, folder):
+    passes = []
+
+    class Counted:
+        def __iter__(self):
+            passes.append(len(passes))
+            yield from drive
+
+    assert plan_tiles(Counted(), folder, refine=True, **GRID).digest == Plan.load(folder).digest
+    assert passes == [0]
+
+
 def test_other_scans_or_settings_are_refused(drive, folder):
     with pytest.raises(ValueError, match="another plan: scans differ"):
         plan_tiles(drive.select(np.arange(40)), folder, refine=True, **GRID)

@@ -248,3 +248,11 @@ class FitConfig:
     def from_dict(cls, values: Mapping[str, Any]) -> FitConfig:
         """The inverse of :meth:`to_dict`. Missing settings have defaults; unknown ones raise a ValueError."""
         return cls().override(**by_name(values, "the settings"))
+
+
+def settings_of_results(config: FitConfig) -> dict[str, Any]:
+    """As :meth:`FitConfig.to_dict`, without what changes no result: two fits of the same scans that agree in these are one."""
+    settings = config.to_dict()
+    for name in ("num_threads", "max_memory_bytes"):
+        del settings[name]
+    return settings

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.checks import path_of
-from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors
@@ -27,7 +27,6 @@ FORMAT = "radarsdf.checkpoint"
 _EVERY_S = 30.0  # seconds between two files, at least
 _NONE = object()  # where one of two configurations lacks a setting
 _SHARE = 0.02  # largest share of the time that is spent on writing
-_SETTINGS_NOT_COMPARED = ("num_threads", "max_memory_bytes")  # none of them changes the result
 
 
 class Resumable(Protocol):
@@ -67,10 +66,12 @@ class Checkpoint:
         self, path: str | PathLike[str], rays: Rays, scale: IntensityScale | None, config: FitConfig
     ) -> None:
         self._path = path_of(path, "checkpoint")
-        settings = {k: v for k, v in config.to_dict().items() if k not in _SETTINGS_NOT_COMPARED}
-        self._identity: dict[str, Any] = json.loads(
-            json.dumps({"version": _core.__version__, "scans": _digest(rays, scale), "config": settings})
-        )
+        identity = {
+            "version": _core.__version__,
+            "scans": _digest(rays, scale),
+            "config": settings_of_results(config),
+        }
+        self._identity: dict[str, Any] = json.loads(json.dumps(identity))
         self._next_s = time.monotonic() + _EVERY_S
         if self._path.exists():
             check_regular_file(self._path)

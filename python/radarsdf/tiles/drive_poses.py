@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check_poses
-from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.io.imu import Imu
 from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.io.poses.writing import write_poses
@@ -29,7 +29,6 @@ from radarsdf.tiles.plan import within
 POSES = "poses.npz"
 TRAJECTORY = "poses.tum"
 _FORMAT, _VERSION = "radarsdf.tiles.poses", 1
-_WITHOUT_EFFECT = ("num_threads", "max_memory_bytes")  # on poses
 
 
 @dataclass(frozen=True)
@@ -40,13 +39,6 @@ class Drive:
     imu: Imu | None
     find: bool
     """Whether their own poses are not used."""
-
-    def key(self, config: FitConfig) -> str:
-        """Of all that their poses follow from."""
-        seen = _Seen(self)
-        for _ in seen:
-            pass
-        return seen.key(config)
 
 
 class _Seen:
@@ -63,14 +55,17 @@ class _Seen:
             yield scan
 
     def key(self, config: FitConfig) -> str:
-        settings = {name: value for name, value in config.to_dict().items() if name not in _WITHOUT_EFFECT}
+        """Of all that the poses follow from."""
         imu = None
         if self._drive.find and self._drive.imu is not None:
             imu = {
                 name: None if array is None else array.tolist()
                 for name, array in vars(self._drive.imu).items()
             }
-        text = json.dumps([self._digest.hex(), self.times_s, imu, settings, self._drive.find], sort_keys=True)
+        text = json.dumps(
+            [self._digest.hex(), self.times_s, imu, settings_of_results(config), self._drive.find],
+            sort_keys=True,
+        )
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
@@ -94,7 +89,7 @@ class DrivePoses:
             If the folder cannot be written.
         """
         known = cls.load(folder)
-        if known is not None and known.key == drive.key(config):
+        if known is not None and known.digest(drive, config):
             return known
         seen = _Seen(drive)
         if drive.find:
@@ -104,6 +99,12 @@ class DrivePoses:
         made = cls(posed, seen.key(config))
         made.save(folder, seen.times_s[posed.rows])
         return made
+
+    def digest(self, drive: Drive, config: FitConfig) -> str:
+        """Of the scans with these poses. Empty if they are not those of this drive with these settings; it is read once."""
+        seen = _Seen(drive)
+        digest = InputDigest.of(self.scans(seen))
+        return digest if seen.key(config) == self.key else ""
 
     def scans(self, given: Iterable[Scan]) -> Iterator[Scan]:
         """The scans with these poses, without those that have none."""

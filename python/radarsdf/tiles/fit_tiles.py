@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from radarsdf.checks import flag, instance, one_for_each_scan, path_of, positive
-from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.io.files import write_whole
 from radarsdf.io.poses.reading import UNPOSED, NoPoses
 from radarsdf.io.read import read
@@ -35,7 +35,6 @@ from radarsdf.tiles.tiled_map import TiledMap
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
 _OURS = {PLAN, LOCK, POSES, TRAJECTORY, "tiles", "scans.npy"}
-_NOT_COMPARED = ("num_threads", "max_memory_bytes")
 
 
 def fit_tiles(
@@ -156,9 +155,7 @@ def plan_tiles(
     if planned is None or drive is None:
         _check_same(folder, plan, config, grid, InputDigest.of(given))
     else:
-        same = planned.key == drive.key(config)
-        config = planned.posed.config(config)
-        _check_same(folder, plan, config, grid, InputDigest.of(planned.scans(given)) if same else "")
+        _check_same(folder, plan, planned.posed.config(config), grid, planned.digest(drive, config))
     return plan
 
 
@@ -173,13 +170,13 @@ def _given(
             scans = read(path, UNPOSED if find else None)
         except NoPoses:
             scans, find = read(path, UNPOSED), True
+    checked = _Checked(scans)
     if not (refine or find):
-        return None, _checked(scans)
+        return None, checked
     if iter(scans) is scans:
         msg = "poses can be refined or found of scans that can be read again: give a path, Scans or a list"
         raise ValueError(msg)
-    again = _Checked(scans)
-    return Drive(again, scans.imu if isinstance(scans, Scans) else None, find), again
+    return Drive(checked, scans.imu if isinstance(scans, Scans) else None, find), checked
 
 
 def run_fits(
@@ -230,24 +227,20 @@ def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> Til
 
 
 class _Checked:
-    """Scans that can be read again."""
+    """Scans, checked one after another each time that they are read."""
 
     def __init__(self, scans: Iterable[Any]) -> None:
         self._scans = scans
 
     def __iter__(self) -> Iterator[Scan]:
-        return _checked(self._scans)
-
-
-def _checked(scans: Iterable[Any]) -> Iterator[Scan]:
-    for i, scan in enumerate(one_for_each_scan(scans, "scans")):
-        if not isinstance(scan, Scan):
-            msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
-            raise TypeError(msg)
-        if np.shape(scan.T_world_sensor) != (4, 4):
-            msg = f"scan {i} has no pose: T_world_sensor must be (4, 4), not {np.shape(scan.T_world_sensor)}"
-            raise ValueError(msg)
-        yield scan
+        for i, scan in enumerate(one_for_each_scan(self._scans, "scans")):
+            if not isinstance(scan, Scan):
+                msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
+                raise TypeError(msg)
+            if np.shape(scan.T_world_sensor) != (4, 4):
+                msg = f"scan {i} has no pose: T_world_sensor must be (4, 4), not {np.shape(scan.T_world_sensor)}"
+                raise ValueError(msg)
+            yield scan
 
 
 def _check_same(folder: Path, plan: Plan, config: FitConfig, grid: TileGrid, digest: str) -> None:
@@ -256,11 +249,11 @@ def _check_same(folder: Path, plan: Plan, config: FitConfig, grid: TileGrid, dig
         for field in dataclasses.fields(config.returns)
         if field.name.endswith(("noise_m", "noise_rad")) and getattr(config.returns, field.name) is None
     }
-    ours, theirs = config.override(returns=known).to_dict(), plan.config.to_dict()
+    ours, theirs = (settings_of_results(own) for own in (config.override(returns=known), plan.config))
     if config.num_threads not in (0, plan.config.num_threads):
         msg = f"{folder} was planned for {plan.config.num_threads} threads a tile, not {config.num_threads}"
         raise ValueError(msg)
-    different = [name for name in ours if name not in _NOT_COMPARED and ours[name] != theirs[name]]
+    different = [name for name in ours if ours[name] != theirs[name]]
     different += ["tile_size"] * (grid.tile_m != plan.tile_m) + ["halo"] * (grid.halo_m != plan.halo_m)
     different += ["scans"] * (digest != plan.input_digest)
     if different:
