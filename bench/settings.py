@@ -4,11 +4,11 @@
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Iterable
 from typing import Any
 
 from radarsdf import FitConfig
+from radarsdf.cli.options import setting_of
 
 Changes = dict[str, Any]
 """Settings of the top of a `FitConfig`, and for each group a dict of those of its settings that change; goes through JSON."""
@@ -39,14 +39,5 @@ def flat(changes: Changes) -> Changes:
 
 
 def parsed(words: Iterable[str]) -> Changes:
-    """Of words such as ``training.joint=False``. A value that is not a Python literal, such as octree, is a string."""
-    found: Changes = {}
-    for word in words:
-        name, _, text = word.partition("=")
-        try:
-            value = ast.literal_eval(text)
-        except (SyntaxError, ValueError):
-            value = text
-        group, dot, own = name.partition(".")
-        found = merged(found, {group: {own: value}} if dot else {group: value})
-    return found
+    """Of words such as ``training.joint=False``, as ``--set`` of radarsdf takes them."""
+    return merged(*map(setting_of, words))

@@ -19,7 +19,6 @@ from radarsdf.cli.scans_in import add_scans, scans_of, words_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from radarsdf import Finding, FitConfig
     from radarsdf.io.scans import Scans
 
 
@@ -34,8 +33,10 @@ def run(options: argparse.Namespace) -> int:
     """Print the findings, the worst first, and the command to run next. The status is 1 if one is an error."""
     import dataclasses
 
+    from radarsdf import check
+
     config = config_of(options)
-    findings = findings_of(scans_of(options), config)
+    findings = check(scans_of(options), config=config)
     failed = any(finding.severity == "error" for finding in findings)
     # Here, and not beside the data: those may be on a disk that nobody should write to.
     target = shlex.quote(Path(os.path.abspath(options.scans)).stem + MAP_SUFFIX)  # noqa: PTH100 - links keep their names
@@ -48,13 +49,6 @@ def run(options: argparse.Namespace) -> int:
     results.add(f"next: {'mend the errors, then ' if failed else ''}{following}")
     results.end()
     return int(failed)
-
-
-def findings_of(scans: Scans, config: FitConfig) -> list[Finding]:
-    """All findings about scans, the worst first."""
-    from radarsdf import check
-
-    return check(scans, config=config)
 
 
 def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None:

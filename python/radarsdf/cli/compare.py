@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from radarsdf.cli.map_in import add_map, is_map, load_map
 from radarsdf.cli.options import add_address, add_box, add_json, box_of, check_address
 from radarsdf.cli.results import Results
-from radarsdf.cli.saying import say
+from radarsdf.cli.saying import say, until_stopped
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
 
 if TYPE_CHECKING:
@@ -84,19 +84,7 @@ def run(options: argparse.Namespace) -> None:
         results.add(
             f"{region.words}: {region.area_m2:.2f} m2 round {x:.1f} {y:.1f} {z:.1f}, probability {region.probability:.2f}"
         )
-    results.add(
-        regions=[
-            {
-                "kind": region.kind,
-                "box": region.box,
-                "area_m2": region.area_m2,
-                "probability": region.probability,
-                "moved_m": region.moved_m,
-                "intensity_change": region.intensity_change,
-            }
-            for region in regions
-        ]
-    )
+    results.add(regions=[vars(region) for region in regions])
     if options.out is not None:
         changes.save(options.out)
         results.add(f"{options.out} written", out=options.out)
@@ -119,7 +107,4 @@ def _show(changes: Changes, regions: Sequence[Region], edge_m: float, options: a
 
     with ChangesView(changes, regions, edge_m, host=options.host, port=options.port) as view:
         say(f"what changed is on {url_of(view.host, view.port)}; Ctrl-C ends it")
-        try:
-            view.wait()
-        except KeyboardInterrupt:  # the way to end it, and no failure
-            say("stopped")
+        until_stopped(view)

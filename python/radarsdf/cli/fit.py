@@ -131,11 +131,11 @@ def _report(
     parts: tuple[Scans, Scans | None],
 ) -> None:
     """Writes the page. `parts`: the scans of the fit, and those that were held out."""
-    from radarsdf.cli.check import findings_of
+    from radarsdf import check
     from radarsdf.cli.report import add_report
     from radarsdf.report.subject import Subject
 
-    findings = findings_of(every_scan, radar_map.config)
+    findings = check(every_scan, config=radar_map.config)
     subject = Subject(radar_map, options.out.name, *parts, findings, progress=progress_of(options))
     add_report(results, options.report, subject)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from radarsdf.cli.options import add_address, add_fit_options, add_json, check_address, config_of, progress_of
 from radarsdf.cli.results import Results, counted
 from radarsdf.cli.saving import save_map
-from radarsdf.cli.saying import say
+from radarsdf.cli.saying import say, until_stopped
 from radarsdf.cli.scans_in import add_scans, inputs_of, scans_of
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> None:
             results.add(f"trajectory {options.trajectory}", trajectory=options.trajectory)
         results.end()
         if shown is not None:
-            shown.wait()
+            until_stopped(shown.view)
 
 
 def _read(options: argparse.Namespace) -> tuple[Scans, bool]:
@@ -140,7 +140,7 @@ class _Shown:
     def __init__(self, live: LiveMap, view: GrowingView) -> None:
         from radarsdf.view.serving import url_of
 
-        self._live, self._view = live, view
+        self._live, self.view = live, view
         self._path: Any = None
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -149,11 +149,6 @@ class _Shown:
 
     def on_scan(self, done: Replay) -> None:
         self._path = [pose[:3, 3] for pose in done.poses]
-
-    def wait(self) -> None:
-        """Until Ctrl-C."""
-        with contextlib.suppress(KeyboardInterrupt):
-            self._view.wait()
 
     def stop(self) -> None:
         self._ended.set()
@@ -165,4 +160,4 @@ class _Shown:
         while not self._ended.wait(_SHOWN_EVERY_S):
             path, self._path = self._path, None
             if path is not None:
-                self._view.show(self._live.mesh(), np.array(path))
+                self.view.show(self._live.mesh(), np.array(path))

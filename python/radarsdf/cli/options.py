@@ -57,7 +57,7 @@ def config_of(options: argparse.Namespace) -> FitConfig:
     if options.config is not None:
         config = config.override(**read_toml(options.config))
     for text in options.set:
-        config = config.override(**_setting(text))
+        config = config.override(**setting_of(text))
     return config
 
 
@@ -70,7 +70,7 @@ def config_words(options: argparse.Namespace) -> list[str]:
     return words
 
 
-def _setting(text: str) -> dict[str, Any]:
+def setting_of(text: str) -> dict[str, Any]:
     """One ``NAME=VALUE`` or ``GROUP.NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
     path, equals, value = text.partition("=")
     if not equals:

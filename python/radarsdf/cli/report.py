@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
         msg = "--holdout needs the scans"
         raise ValueError(msg)
 
-    from radarsdf.cli.check import findings_of
+    from radarsdf import check
     from radarsdf.evaluation import holdout
     from radarsdf.io.files import check_outputs
     from radarsdf.report.subject import Subject
@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> None:
     scans = findings = held_out = None
     if options.scans is not None:
         scans = scans_of(options)
-        findings = findings_of(scans, radar_map.config)
+        findings = check(scans, config=radar_map.config)
         if options.holdout is not None:
             train, test = holdout(len(scans.points), options.holdout)
             scans, held_out = scans.select(train), scans.select(test)

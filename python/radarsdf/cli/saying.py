@@ -7,7 +7,10 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import suppress
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from radarsdf.view.page import Page
 
 
 def say(text: str = "", end: str = "\n") -> None:
@@ -35,6 +38,14 @@ def complain(text: str) -> None:
     """Print to standard error at once, if there is one that can be written: the exit status says it too."""
     with suppress(OSError):
         _print(sys.stderr, text, "\n")
+
+
+def until_stopped(page: Page) -> None:
+    """Wait until Ctrl-C, and say that it ended."""
+    try:
+        page.wait()
+    except KeyboardInterrupt:  # the way to end it, and no failure
+        say("stopped")
 
 
 def _print(stream: TextIO | None, text: str, end: str) -> None:

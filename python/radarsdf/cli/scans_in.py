@@ -77,36 +77,37 @@ def inputs_of(options: argparse.Namespace) -> list[Path]:
 
 def scans_of(options: argparse.Namespace, poses: StampedPoses | None = None) -> Scans:
     """The scans of the command, with `poses` in place of theirs. What was assumed or left out is said on standard error."""
-    from radarsdf.io.poses.trajectory import read_table
     from radarsdf.io.read import read
 
     given: Any = options.poses if poses is None else poses
-    extrinsic = None
-    if options.extrinsic is not None:
-        try:
-            extrinsic = read_table(options.extrinsic, 4)
-        except ValueError as error:
-            msg = f"{options.extrinsic} is no extrinsic: that is a 4 x 4 matrix T_base_sensor, four lines of four numbers"
-            raise ValueError(msg) from error
     return read(
         options.scans,
         given,
-        extrinsic=extrinsic,
+        extrinsic=_matrix(
+            options.extrinsic,
+            4,
+            "extrinsic: that is a 4 x 4 matrix T_base_sensor, four lines of four numbers",
+        ),
         topic=options.topic,
         pose_topic=options.pose_topic,
         imu_topic=options.imu_topic,
-        R_sensor_imu=None if options.imu_rotation is None else _rotation(options.imu_rotation),
+        R_sensor_imu=_matrix(
+            options.imu_rotation,
+            3,
+            "rotation: that is a 3 x 3 matrix R_sensor_imu, three lines of three numbers",
+        ),
         fields=dict(_field(text) for text in options.field) or None,
     )
 
 
-def _rotation(path: Path) -> Any:
+def _matrix(path: Path | None, size: int, what: str) -> Any:
+    """What a file holds, if there is one. `what` it should be is said if it is no square of this size."""
     from radarsdf.io.poses.trajectory import read_table
 
     try:
-        return read_table(path, 3)
+        return None if path is None else read_table(path, size)
     except ValueError as error:
-        msg = f"{path} is no rotation: that is a 3 x 3 matrix R_sensor_imu, three lines of three numbers"
+        msg = f"{path} is no {what}"
         raise ValueError(msg) from error
 
 

@@ -69,7 +69,6 @@ def add_step_arguments(parser: argparse.ArgumentParser, step: str) -> None:
         add_surface(parser)
     if step in ("plan", "fit", "mesh"):
         _add_where(parser)
-    if step in ("plan", "fit", "mesh"):
         add_quiet(parser)
     add_json(parser)
 

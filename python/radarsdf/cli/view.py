@@ -18,7 +18,7 @@ from radarsdf.cli.options import (
     limits_of,
     progress_of,
 )
-from radarsdf.cli.saying import say
+from radarsdf.cli.saying import say, until_stopped
 from radarsdf.cli.scans_in import add_scans, scans_of
 
 if TYPE_CHECKING:
@@ -85,7 +85,4 @@ def show(radar_map: Map, scans: Scans | None, *, open_page: bool, **arguments: A
             import webbrowser
 
             webbrowser.open(url)
-        try:
-            viewer.wait()
-        except KeyboardInterrupt:  # the way to end it, and no failure
-            say("stopped")
+        until_stopped(viewer)
