@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Puts faults into the package at random, one at a time, and says which of them the tests catch.
+"""Puts faults into the package or the core at random, one at a time, and says which of them the tests catch.
 
     python tools/mutate.py --count 100 --seed 1
+    python tools/mutate.py --count 10 --seed 1 --core
 
-A fault is one operator, comparison or number that is another one. The tests of the room that it is in run first, and
-all tests if none of those fails (``--room-only``: they do not). What no test catches is printed with its line: a test
-is missing, or the line says the same as before. The work is done in a clone below a temporary folder.
+A fault is one operator, comparison or number that is another one. The tests of the module that it is in run first, then
+those of its room, and all tests if none of those fails (``--room-only``: they do not). What no test catches is printed
+with its line: a test is missing, or the line says the same as before. The work is done in a clone below a temporary
+folder. With ``--core``, each fault is compiled there, and ``tests/core`` runs, too.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import argparse
 import ast
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -28,6 +31,15 @@ OTHER: dict[type[ast.AST], str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==",
     ast.Is: "is not", ast.IsNot: "is", ast.And: "or", ast.Or: "and", ast.BitAnd: "|", ast.BitOr: "&",
 }  # fmt: skip
+OTHER_IN_CORE = {
+    "+": "-", "-": "+", "*": "/", "/": "*", "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==",
+    "&&": "||", "||": "&&",
+}  # fmt: skip
+# clang-format puts spaces round operators, and none beside pointers and arguments of templates.
+_IN_CORE = re.compile(
+    r"(?<=[\w)\]]) (?P<operator>[-+*/]|[<>]=?|[!=]=|&&|\|\|) (?=[\w(!-])"
+    r"|(?<![\w.<])(?P<number>\d+(\.\d+)?(e-?\d+)?[fu]?)(?![\w.>])"
+)
 SECONDS = 900
 
 
@@ -85,6 +97,50 @@ def _executed(node: ast.AST) -> Iterator[ast.AST]:
                 yield from _executed(child)
 
 
+def faults_in_core(file: Path) -> Iterator[Fault]:
+    """As :func:`faults_in`, for a file of C++. Lines with texts are left out."""
+    begin = 0
+    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(keepends=True), start=1):
+        code = line.split("//")[0]
+        if '"' not in code and not code.lstrip().startswith(("#", "static_assert")):
+            for match in _IN_CORE.finditer(code):
+                kind = match.lastgroup or "number"
+                old = match[kind]
+                new = OTHER_IN_CORE[old] if kind == "operator" else f"({old} + 1)"
+                yield Fault(file, number, begin + match.start(kind), old, new)
+        begin += len(line)
+
+
+def compiled(clone: Path) -> bool:
+    """Whether the core of the clone compiles. The package in it finds what was compiled."""
+    build = clone / "build/dev"
+    if not build.exists():
+        pybind11 = subprocess.check_output(
+            [sys.executable, "-m", "pybind11", "--cmakedir"], text=True
+        ).strip()
+        options = [f"-Dpybind11_DIR={pybind11}", f"-DPython_EXECUTABLE={sys.executable}"]
+        subprocess.run(
+            ["cmake", "-S", clone, "-B", build, "-G", "Ninja", *options], check=True, capture_output=True
+        )
+    if subprocess.run(["cmake", "--build", build], check=False, capture_output=True).returncode:
+        return False
+    for module in (build / "csrc/bindings").glob("_core*.so"):
+        shutil.copy(module, clone / "python/radarsdf")
+    return True
+
+
+def tests_of(fault: Fault, clone: Path) -> Iterator[list[str]]:
+    """The tests of the fault's module, then those of its room; of a fault in the core, those of the core, too."""
+    in_core = fault.file.suffix != ".py"
+    room = fault.file.relative_to(clone / ("csrc" if in_core else "python/radarsdf")).parts[0]
+    folders = [clone / "tests" / name for name in (["core", room] if in_core else [room])]
+    for files in (sorted(folder.glob(f"test_{fault.file.stem}.py")) for folder in folders):
+        if files:
+            yield [str(file) for file in files]
+    if rooms := [str(folder) for folder in folders if folder.is_dir()]:
+        yield rooms
+
+
 def caught_by(clone: Path, tests: list[str], processes: int) -> str | None:
     """The first test that fails, or None."""
     command = [
@@ -119,29 +175,39 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="which faults [0]")
     parser.add_argument("--processes", type=int, default=2, help="of pytest [2]")
     parser.add_argument("--room-only", action="store_true", help="run only the tests of the fault's room")
+    parser.add_argument("--core", action="store_true", help="put the faults into the core")
     options = parser.parse_args()
     root = Path(__file__).resolve().parents[1]
     with tempfile.TemporaryDirectory() as folder:
         clone = Path(folder) / "radarsdf"
         subprocess.run(["git", "clone", "-q", str(root), str(clone)], check=True)
-        for module in (root / "python/radarsdf").glob("_core*.so"):
-            shutil.copy(module, clone / "python/radarsdf")
-        package = clone / "python/radarsdf"
-        every = [fault for file in sorted(package.rglob("*.py")) for fault in faults_in(file)]
-        missed = 0
-        for number, fault in enumerate(random.Random(options.seed).sample(every, options.count), start=1):
+        if options.core:
+            every = [
+                fault for file in sorted(clone.glob("csrc/*/*.[ch]pp")) for fault in faults_in_core(file)
+            ]
+        else:
+            for module in (root / "python/radarsdf").glob("_core*.so"):
+                shutil.copy(module, clone / "python/radarsdf")
+            files = sorted(clone.glob("python/radarsdf/**/*.py"))
+            every = [fault for file in files for fault in faults_in(file)]
+        tried = missed = 0
+        for fault in random.Random(options.seed).sample(every, options.count):
             source = fault.file.read_text(encoding="utf-8")
             end = fault.begin + len(fault.old)
             fault.file.write_text(source[: fault.begin] + fault.new + source[end:], encoding="utf-8")
-            room = clone / "tests" / fault.file.relative_to(package).parts[0]
-            test = caught_by(clone, [str(room)], options.processes) if room.is_dir() else None
-            if test is None and not options.room_only:
-                test = caught_by(clone, [str(clone / "tests")], options.processes)
+            test: str | None = "does not compile, and does not count"
+            if not options.core or compiled(clone):
+                tests = list(tests_of(fault, clone))
+                if not options.room_only:
+                    tests.append([str(clone / "tests")])
+                found = (caught_by(clone, some, options.processes) for some in tests)
+                test = next(filter(None, found), None)
+                tried += 1
+                missed += test is None
             fault.file.write_text(source, encoding="utf-8")
-            missed += test is None
             where = f"{fault.file.relative_to(clone)}:{fault.line}"
-            print(f"{number:3} {where}: {fault.old!r} -> {fault.new!r}: {test or 'MISSED'}", flush=True)
-        print(f"caught {options.count - missed} of {options.count}")
+            print(f"{where}: {fault.old!r} -> {fault.new!r}: {test or 'MISSED'}", flush=True)
+        print(f"caught {tried - missed} of {tried}")
 
 
 if __name__ == "__main__":
