@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import subprocess
 import sys
@@ -84,6 +85,7 @@ def imports_of(path, name):
         yield from (found.removeprefix("radarsdf.") for found in names if found.startswith("radarsdf."))
 
 
+@functools.cache
 def graph():
     known = dict(modules())
     found = {}

@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import ast
 import subprocess
-import sys
 from pathlib import Path
 
 import radarsdf
 from radarsdf import threads
+
+from .warm_python import warm_python
 
 ROOT = Path(radarsdf.__file__).parent
 # What of PyTorch's has vectors, and in the last bits depends on who computes it. Not sqrt and norm, which IEEE 754 defines.
@@ -39,7 +40,8 @@ def test_all_that_are_used_are_called_first_by_one_thread():
 
 
 def run(code):
-    subprocess.run([sys.executable, "-c", code], check=True)
+    """In a process that has imported PyTorch, and called nothing of it."""
+    subprocess.run([*warm_python(), "-c", code], check=True)
 
 
 RECORDED = """

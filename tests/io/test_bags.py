@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import bz2
-import contextlib
 import tracemalloc
 
 import numpy as np
@@ -332,6 +331,7 @@ def test_choices_that_are_not_clear(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_bags(tmp_path, kind):
+    """Cut off. Bytes that are others are in test_hostile_files.py."""
     path = scans_and(tmp_path, kind, odometry)
     file = path if kind == "ros1" else next(p for p in path.iterdir() if p.suffix in (".db3", ".mcap"))
     whole = file.read_bytes()
@@ -345,14 +345,6 @@ def test_damaged_bags(tmp_path, kind):
             assert "('" not in str(error.value)
             if size == sizes[2] and kind != "sqlite3":  # as a recording that was cut off
                 assert "reindex" in str(error.value) if kind == "ros1" else "mcap recover" in str(error.value)
-    rng = np.random.default_rng(0)
-    for _ in range(300):
-        data = bytearray(whole)
-        for at in rng.integers(len(data), size=8):
-            data[at] = rng.integers(256)
-        file.write_bytes(data)
-        with contextlib.suppress(ValueError, OSError):  # read or refused; nothing else
-            list(read(file, max_gap_s=1e9))
     if kind != "ros1":
         file.unlink()
         with pytest.raises(ValueError, match="is not a whole bag"):

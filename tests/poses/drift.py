@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -27,6 +28,15 @@ def trajectory(count):
 def position_error_m(poses, true):
     """Root mean square, m."""
     return float(np.sqrt(((poses - true)[:, :3, 3] ** 2).sum(axis=1).mean()))
+
+
+def first(simulation, count):
+    """Its first scans. A shorter drive of the same kind would go the same way in longer steps."""
+    of_scans = {
+        name: getattr(simulation, name)[:count]
+        for name in ("points", "poses", "intensities", "noiseless_intensities", "origin_kind")
+    }
+    return dataclasses.replace(simulation, **of_scans)
 
 
 @functools.cache
