@@ -14,6 +14,7 @@ import pytest
 import radarsdf
 from radarsdf.io import Scans
 from radarsdf.map.colors import intensity_colors
+from radarsdf.view.framing import look_at_all
 from radarsdf.view.light import shaded
 from radarsdf.view.serving import start_server
 from radarsdf.view.viewer import Viewer
@@ -220,7 +221,7 @@ def test_the_view_is_reset_for_who_asks(client, viewer):
         image_height=800, image_width=400, look_at=(0.0, 0.0, 1.0), up_direction=(0.0, 0.0, 1.0),
     )  # fmt: skip
     slide(client, "Reset view", value=True)
-    look = viewer._look(0.5)
+    look = look_at_all(viewer._extent, aspect=0.5)
     moved = client.wait_for(lambda m: m.kind == "SetCameraPositionMessage", before)
     np.testing.assert_allclose(moved.message["position"], look.position)
     turned = client.wait_for(

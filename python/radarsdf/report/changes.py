@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
-from radarsdf.render.picture import eye_around, middle_of
 from radarsdf.report.extras import require_extras
 from radarsdf.report.page import (
     Section,
@@ -28,9 +27,8 @@ from radarsdf.report.page import (
 )
 from radarsdf.report.scene import scene_page
 from radarsdf.report.subject import MOST_VERTICES
-from radarsdf.report.surface import FRAME_ASPECT, SIDES, picture
+from radarsdf.report.surface import HINT, first_look, from_all_sides, picture
 from radarsdf.view.changed import MEANING, place_of
-from radarsdf.view.framing import look_at_all
 from radarsdf.view.thinning import thinned
 
 _LISTED = 50  # changes, the largest first
@@ -123,20 +121,12 @@ def _surface(mesh: Any) -> Section:
         return Section("surface", "Surface", [paragraph("There is no surface here.")])
     vertices, colors = np.asarray(mesh.vertices, np.float64), colors_of(mesh.vertex_attributes["kind"])
     local = vertices - vertices.mean(axis=0)
-    look = look_at_all(local, eye_around(local, *SIDES["One long side"]) - middle_of(local)[0], FRAME_ASPECT)
-    scene = scene_page(local, np.asarray(mesh.faces, np.int32), colors, None, look)
+    scene = scene_page(local, np.asarray(mesh.faces, np.int32), colors, None, first_look(local, local))
     body = [
         frame(scene, "What changed, in three dimensions"),
         color_key(MEANING),
-        note(
-            "Drag to turn it, scroll or pinch to come nearer, drag with the right button or two fingers to move it."
-        ),
-        grid(
-            *(
-                image(picture(mesh, colors, side), f"What changed. View: {side.lower()}.", f"{side}.")
-                for side in SIDES
-            )
-        ),
+        note(HINT),
+        from_all_sides(mesh, colors, "What changed."),
         paragraph(
             "The later surface, and of the earlier one what is gone or moved. Frame: world of the earlier map, with z up."
         ),

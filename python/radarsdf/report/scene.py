@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.view.framing import FOV_RAD, Look
+from radarsdf.view.framing import Look
 from radarsdf.view.glb import glb
+from radarsdf.view.page import begin_at
 from radarsdf.view.serving import free_port, start_server, stop_server
 
 _HOST = "127.0.0.1"
@@ -59,8 +60,7 @@ def scene_page(
                 point_shape="circle",
                 precision="float32",
             )
-        server.initial_camera.fov = FOV_RAD
-        server.initial_camera.position, server.initial_camera.look_at = map(tuple, look)
+        begin_at(server, look)
         document: str = server.get_scene_serializer().as_html()
     finally:
         stop_server(server)

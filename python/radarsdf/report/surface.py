@@ -16,10 +16,10 @@ from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.report.page import Section, color_bar, frame, grid, image, note, paragraph
 from radarsdf.report.scene import scene_page
 from radarsdf.report.subject import Subject
-from radarsdf.view.framing import look_at_all
+from radarsdf.view.framing import Look, look_at_all
 
 _WIDTH, _HEIGHT = 1040, 650  # pixels
-FRAME_ASPECT = 8 / 5  # of the frame of the 3D scene on any screen, as in the page's style
+_FRAME_ASPECT = 8 / 5  # of the frame of the 3D scene on any screen, as in the page's style
 _JPEG_QUALITY = 82
 SIDES = {
     "One long side": (25.0, 36.0),
@@ -27,6 +27,10 @@ SIDES = {
     "Steeply from above": (0.0, 70.0),  # not straight: walls would be lines
 }
 """Names of the sides, and turn and rise of each, degrees."""
+HINT = (
+    "Drag to turn it, scroll or pinch to come nearer, drag with the right button or two fingers to move it."
+)
+"""Below a scene."""
 
 
 def surface_section(subject: Subject) -> Section:
@@ -44,20 +48,8 @@ def surface_section(subject: Subject) -> Section:
     body = [
         frame(_scene(subject, colors), "The surface in three dimensions"),
         legend,
-        note(
-            "Drag to turn it, scroll or pinch to come nearer, drag with the right button or two fingers to move it. "
-            + ("Blue points are positions of the sensor." if subject.scans is not None else "")
-        ),
-        grid(
-            *(
-                image(
-                    picture(mesh, colors, name),
-                    f"The surface, {painted}. View: {name.lower()}.",
-                    f"{name}.",
-                )
-                for name in SIDES
-            )
-        ),
+        note(HINT + (" Blue points are positions of the sensor." if subject.scans is not None else "")),
+        from_all_sides(mesh, colors, f"The surface, {painted}."),
         paragraph(f"The surface is {painted}. Frame: world, with z up."),
         paragraph(f"It is {Threshold.of_mesh(subject.mesh.metadata)}."),
     ]
@@ -87,6 +79,19 @@ def colored(
     return intensity_colors(values, float(low), float(high))[:, :3], bar
 
 
+def from_all_sides(mesh: Any, colors: NDArray[np.uint8], text: str) -> str:
+    """Pictures of a mesh from :data:`SIDES`; `text` says what they show."""
+    return grid(
+        *(image(picture(mesh, colors, side), f"{text} View: {side.lower()}.", f"{side}.") for side in SIDES)
+    )
+
+
+def first_look(points: NDArray[np.float64], vertices: NDArray[np.float64]) -> Look:
+    """At all `points` (N, 3), from where the first picture of a mesh with these vertices (V, 3) is taken."""
+    to_eye = eye_around(vertices, *SIDES["One long side"]) - middle_of(vertices)[0]
+    return look_at_all(points, to_eye, _FRAME_ASPECT)
+
+
 def picture(
     mesh: Any,
     colors: NDArray[np.uint8],
@@ -113,13 +118,11 @@ def _scene(subject: Subject, colors: NDArray[np.uint8]) -> str:
     origin = subject.radar_map.origin
     vertices = np.asarray(mesh.vertices, np.float64) - origin
     sensors = None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin
-    center, _ = middle_of(vertices)
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
-    look = look_at_all(everything, eye_around(vertices, *SIDES["One long side"]) - center, FRAME_ASPECT)
     return scene_page(
         vertices,
         np.asarray(mesh.faces, np.int32),
         colors if len(colors) else np.full((len(vertices), 3), NEUTRAL, np.uint8),
         sensors,
-        look,
+        first_look(everything, vertices),
     )

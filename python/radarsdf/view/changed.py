@@ -14,7 +14,7 @@ from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import glb
 from radarsdf.view.legends import key, paragraph, table
 from radarsdf.view.light import shaded
-from radarsdf.view.page import Page
+from radarsdf.view.page import Page, begin_at
 from radarsdf.view.surface import lightness_of
 from radarsdf.view.thinning import thinned
 
@@ -26,8 +26,6 @@ MEANING = {
 """What the colours mean, and what they are: sRGB."""
 _MOST_VERTICES = 500_000
 _LISTED = 12  # changes, the largest first
-_TO_EYE = np.array([-0.33, -0.57, 0.5])  # of the first view
-_ASPECT = 1.3
 
 
 class ChangesView(Page):
@@ -79,10 +77,9 @@ class ChangesView(Page):
             np.asarray(mesh.faces, np.int32),
             shaded(colors_of(mesh.vertex_attributes["kind"]), lightness),
         )
-        look = look_at_all(local, _TO_EYE, _ASPECT)
         self._start()
         server = self._server
-        self._begin_at(look)
+        begin_at(server, look_at_all(local))
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
         server.gui.add_html(key(MEANING))
         server.gui.add_html(paragraph(changes.report["alignment"]))

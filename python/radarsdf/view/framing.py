@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 FOV_RAD = 0.85
 """Vertical field of view of the first look: less than viser's, so that walls stay upright."""
+TO_EYE = np.array([-0.33, -0.57, 0.5])
+"""From what is seen to the eye, in the first look of a page."""
+ASPECT = 1.3
+"""Width of the frame of a page over its height, until it tells its own."""
 _MARGIN = 1.08
 _STEPS = 4
 
@@ -27,7 +31,9 @@ class Look(NamedTuple):
     """(3,) what is in the middle, and turned round, m."""
 
 
-def look_at_all(points: _Floats, to_eye: _Floats, aspect: float, fov_rad: float = FOV_RAD) -> Look:
+def look_at_all(
+    points: _Floats, to_eye: _Floats = TO_EYE, aspect: float = ASPECT, fov_rad: float = FOV_RAD
+) -> Look:
     """The nearest look in a direction in which all points are seen.
 
     Parameters

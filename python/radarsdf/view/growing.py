@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.view.framing import look_at_all
-from radarsdf.view.page import Page
+from radarsdf.view.page import Page, begin_at
 
 if TYPE_CHECKING:
     import trimesh
 
-_TO_EYE = np.array([-0.33, -0.57, 0.5])  # of the first view
-_ASPECT = 1.3
 _SURFACE_COLOR, _PATH_COLOR = (150, 160, 170), (0, 190, 255)
 
 
@@ -51,8 +49,7 @@ class GrowingView(Page):
         server = self._server
         if self._origin is None:  # of the page, which is in float32
             self._origin = path[0].copy()
-            look = look_at_all(vertices - self._origin, _TO_EYE, _ASPECT)
-            self._begin_at(look)
+            begin_at(server, look_at_all(vertices - self._origin))
         with server.atomic():
             server.scene.add_mesh_simple(
                 "/surface",

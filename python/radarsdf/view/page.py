@@ -15,6 +15,13 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+def begin_at(server: Any, look: Look) -> None:
+    """From where, and at what, pages of a server look when they are opened."""
+    camera = server.initial_camera
+    camera.fov = FOV_RAD
+    camera.position, camera.look_at = map(tuple, look)
+
+
 class Page:
     """What all pages have in common. The port is chosen first, so that one that is taken is said before any work.
 
@@ -33,12 +40,6 @@ class Page:
 
     def _start(self) -> None:
         self._server: Any = start_server(self.host, self.port)
-
-    def _begin_at(self, look: Look) -> None:
-        """From where, and at what, pages look when they are opened."""
-        camera = self._server.initial_camera
-        camera.fov = FOV_RAD
-        camera.position, camera.look_at = map(tuple, look)
 
     def wait(self) -> None:
         """Wait until Ctrl-C."""

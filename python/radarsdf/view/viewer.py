@@ -14,15 +14,13 @@ from radarsdf.map.map import Map
 from radarsdf.view.canvas import SurfaceCanvas
 from radarsdf.view.controls import Controls
 from radarsdf.view.framing import FOV_RAD, Look, look_at_all
-from radarsdf.view.page import Page
+from radarsdf.view.page import Page, begin_at
 from radarsdf.view.painter import HELD_S, SLID_S, Painter, Wish
 from radarsdf.view.picking import first_hit
 from radarsdf.view.quantities import Colors, quantities_of
 from radarsdf.view.surface import ShownSurface
 from radarsdf.view.walk import Walk
 
-_TO_EYE = np.array([-0.33, -0.57, 0.5])  # of the first view
-_ASPECT = 1.3  # of the frame until a page tells its own
 _GIZMO_SHARE = 0.06  # size of the handles of the sensor in diagonals of the surface
 _MARK_SHARE = 0.012  # radius of the mark of a click in distances to it: so large on the screen, near and far
 _MARK_COLOR = (0, 190, 255)  # not one of a scale
@@ -113,7 +111,7 @@ class Viewer(Page):
         self._extent = np.concatenate([vertices - origin, path])
         size_m = float(np.linalg.norm(np.ptp(self._extent, axis=0)))
         server = self._server
-        self._begin_at(self._look(_ASPECT))
+        begin_at(server, look_at_all(self._extent))
         start = origin if scans is None else scans.poses[0, :3, 3]
         first = (float(start[0]), float(start[1]), float(start[2]))
         self.quantities = quantities_of(self._map, self.surface, scans, first)
@@ -146,13 +144,10 @@ class Viewer(Page):
         server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
 
-    def _look(self, aspect: float) -> Look:
-        return look_at_all(self._extent, _TO_EYE, aspect)
-
     def _look_at_all(self, client: Any) -> Look:
         """Let a page show all that there is."""
         camera = client.camera
-        look = self._look(_aspect(camera))
+        look = look_at_all(self._extent, aspect=_aspect(camera))
         with client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
             camera.fov = FOV_RAD
@@ -162,7 +157,7 @@ class Viewer(Page):
     # Coroutines, because viser would run functions in several threads, in any order.
     async def _on_connect(self, client: Any) -> None:
         """Let a new page show all, also after its frame has changed, until somebody looks elsewhere."""
-        first = self._look(_ASPECT)  # which a page may take after it was told a better one
+        first = look_at_all(self._extent)  # which a page may take after it was told a better one
         aspect, look = _aspect(client.camera), self._look_at_all(client)
 
         async def on_update(camera: Any) -> None:
