@@ -7,17 +7,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.changes.placed import Floats, PlacedMap
-from radarsdf.changes.probability import posterior, share_of_changes
+from radarsdf.changes.probability import REACH_CELLS, odds_of_differences, posterior, share_of_changes
 from radarsdf.map.map import Map
 from radarsdf.poses.expected import ExpectedStep
 from radarsdf.poses.rates import Rate
 from radarsdf.poses.rigid import moved, skew
 from radarsdf.poses.tracking import Tracker
-from radarsdf.poses.verdict import Verdict, means_of
+from radarsdf.poses.verdict import Verdict
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
@@ -27,7 +26,6 @@ _ITERATIONS = 15
 _MOST_VERTICES = 20_000  # that are looked at, evenly spread
 _PATCH_M = 4.0  # vertices of a patch have errors in common: patches judge, as scans do of poses
 _LEAST_M = 1e-3
-_REACH_CELLS = 2.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     as_given_m = far_m(np.eye(4))
     gains = [np.log(as_given_m / far_m(pose)) for pose, _ in found]
     best = int(np.argmax([gain.mean() for gain in gains]))
-    verdict = _verdict(gains[best], patches.reshape(-1)[judge])
+    verdict = Verdict.by_groups(gains[best], patches.reshape(-1)[judge])
     pose, covariance = found[best]
     there = after.at(pose)
     moved_m = float(np.sqrt(((there.to_common(vertices) - vertices) ** 2).sum(1).mean()))
@@ -129,8 +127,7 @@ def _settled(
         known = np.isfinite(distance_m) & np.isfinite(sigma)
         if known.sum() < CELLS_OF_SURFACE:
             break
-        z = distance_m[known] / sigma[known]
-        odds = 0.5 * z**2 + np.log(sigma[known] * np.sqrt(2 * np.pi) / (2 * _REACH_CELLS * before.leaf_m))
+        odds = odds_of_differences(distance_m[known], sigma[known], REACH_CELLS * before.leaf_m)
         weights = (1 - posterior(odds, share_of_changes(odds))) / sigma[known] ** 2
         rows = _jacobian(there[known] - middle, normals[known])
         information = np.einsum("ni,n,nj->ij", rows, weights, rows) / CELLS_OF_SURFACE
@@ -152,10 +149,3 @@ def _jacobian(from_centre: Floats, normals: Floats) -> Floats:
     """(N, 6) by how much places move along their normals if all are shifted, and turned about a centre."""
     turns = np.einsum("ni,nij->nj", normals, -skew(from_centre))
     return np.concatenate([normals, turns], axis=1)
-
-
-def _verdict(gains: Floats, patches: NDArray[np.int64]) -> Verdict:
-    means = means_of(gains, patches)
-    if len(means) < 2:
-        return Verdict(0.0, np.inf, len(means))
-    return Verdict(float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means))), len(means))

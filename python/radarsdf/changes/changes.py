@@ -133,11 +133,13 @@ class Changes:
         """
         import trimesh  # noqa: PLC0415 - slow to import
 
+        from radarsdf.map.meshing import renumbered  # noqa: PLC0415 - it imports trimesh
+
         of_faces, _ = self.before.of_faces()
         lost = self.before.faces[(of_faces == GONE) | (of_faces == MOVED)]
-        used, rows = np.unique(lost, return_inverse=True)
+        used, lost = renumbered(len(self.before.vertices), lost)
         vertices = np.concatenate([self.after.vertices, self.before.vertices[used]])
-        faces = np.concatenate([self.after.faces, rows.reshape(-1, 3) + len(self.after.vertices)])
+        faces = np.concatenate([self.after.faces, lost + np.int32(len(self.after.vertices))])
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         for name in ("kind", "probability", "moved_m", "intensity_change"):
             mesh.vertex_attributes[name] = np.concatenate(

@@ -36,6 +36,7 @@ from radarsdf.changes.reflectance import Differences
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.io.scans import Scans
+from radarsdf.map.gridding import check_passages
 from radarsdf.map.map import Map
 from radarsdf.map.meshing import check_box
 
@@ -101,19 +102,16 @@ def compare(
     elif poses is not None or intensities is not None:
         msg = "poses and intensities belong to new scans: a map has its own"
         raise ValueError(msg)
-    for name, radar_map in (("before", before), ("after", after)):
-        if not radar_map.config.returns.passages:
-            msg = f"{name} does not keep what rays passed: fit it with returns.passages, which FitConfig() has and quick() has not"
-            raise ValueError(msg)
+    check_passages(before, "before")
+    check_passages(after, "after")
     corners = None if box is None else check_box(box)
     earlier, later = PlacedMap.of(before), PlacedMap.of(after)
     alignment = align(earlier, later) if align_frames else unaligned()
     later = later.at(alignment.T_before_after)
-    of_before, of_after = (
+    sides = (
         _Side.of(earlier, later, alignment, corners),
         _Side.of(later, earlier, alignment, corners),
     )
-    sides = of_before, of_after
     errors = errors_of([side.beside for side in sides])
     found = [side.beside.absence(errors) for side in sides]
     share = share_of_changes(np.concatenate([absence.absent for absence in found]))
@@ -129,7 +127,7 @@ def compare(
         )
         kinds, probability, moved_m = told[1]
         same = kinds == SAME
-        changes[1], repainted = differences.apart_from(changed).probability(of_after.vertices, same)
+        changes[1], repainted = differences.apart_from(changed).probability(sides[1].vertices, same)
         told[1] = (
             np.where(repainted > _PROBABLE, REPAINTED, kinds).astype(np.int8),
             np.where(same, np.maximum(probability, repainted), probability),

@@ -11,7 +11,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter
 
+from radarsdf.map.gridding import plane_at
 from radarsdf.map.map import Map
+from radarsdf.map.meshing import renumbered
 from radarsdf.products import turned
 
 Floats = NDArray[np.float64]
@@ -84,19 +86,13 @@ class PlacedMap:
             return vertices, faces
         lower, upper = np.asarray(box, np.float64)
         inside = ((vertices >= lower) & (vertices <= upper)).all(axis=1)
-        faces = faces[inside[faces].all(axis=1)]
-        used, rows = np.unique(faces, return_inverse=True)
-        return vertices[used], rows.reshape(-1, 3).astype(np.int32)
+        used, faces = renumbered(len(vertices), faces[inside[faces].all(axis=1)])
+        return vertices[used], faces
 
     def distance(self, x: Floats) -> tuple[Floats, Floats]:
         """`distance_m` and `normals` of :class:`Told` at places (N, 3)."""
-        own = self.to_own(x)
-        gradient = self.radar_map.gradient(own)
-        length = np.sqrt(np.einsum("ni,ni->n", gradient, gradient))
-        # Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
-        distance_m = self.radar_map.sdf(own) / np.maximum(length, 1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return distance_m, turned(gradient / length[:, None], self.T_common_map[:3, :3])
+        distance_m, normals = plane_at(self.radar_map, self.to_own(x))
+        return distance_m, turned(normals, self.T_common_map[:3, :3])
 
     def told(self, x: Floats, facing: Floats | None = None) -> Told:
         """All that the map tells of places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""

@@ -18,8 +18,8 @@ from scipy.special import betaln, expit, gammaln, stdtr
 
 from radarsdf.changes.placed import Floats, Told
 
-# A field knows distances about so far from its surface: returns scatter into the next cells.
-_REACH_CELLS = 2.0
+REACH_CELLS = 2.0
+"""A field knows distances about so far from its surface: returns scatter into the next cells."""
 _LEAST_SHARE, _MOST_SHARE = 1e-6, 0.5
 _ROUNDS, _SETTLED = 50, 1e-4  # of the share
 # Returns of a scan in cells side by side have causes in common: so many of them count once. Chosen on facade, hall and
@@ -98,7 +98,7 @@ class Beside:
     @classmethod
     def of(cls, own: Told, other: Told, other_leaf_m: float, own_sigma_m: Floats) -> Beside:
         """`own_sigma_m` (N,): errors of the own surface, with those of the alignment, m."""
-        return cls(own, other, np.hypot(own_sigma_m, other.sigma_m), _REACH_CELLS * other_leaf_m)
+        return cls(own, other, np.hypot(own_sigma_m, other.sigma_m), REACH_CELLS * other_leaf_m)
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -141,6 +141,15 @@ def _passed(own: Told, other: Told) -> Floats:
     changed = betaln(0.5 + hits, 0.5 + passes) - betaln(0.5, 0.5)
     fewer = hits < (hits + passes) * hit / (hit + missed)
     found: Floats = np.where(fewer, changed - same, np.minimum(changed - same, 0))
+    return found
+
+
+def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Floats:
+    """(N,) logarithm of how much more likely differences (N,) are by a change than by errors with deviations (N,).
+
+    A change may make any difference within reach.
+    """
+    found: Floats = 0.5 * (differences / sigma) ** 2 + np.log(sigma * np.sqrt(2 * np.pi) / (2 * reach))
     return found
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.changes.placed import Floats, PlacedMap
-from radarsdf.changes.probability import posterior, share_of_changes
+from radarsdf.changes.probability import odds_of_differences, posterior, share_of_changes
 from radarsdf.products import turned
 from radarsdf.returns.echoes import PLACE_CELLS, EchoesAt, rows_of_views
 
@@ -149,9 +149,7 @@ class Differences:
         ratio = np.sqrt(np.maximum(np.maximum(of_day, of_change), 1))
         sigma = (between.sigma * ratio)[known]
         # A change is as likely by any difference that the range of intensities has room for.
-        odds = 0.5 * (between.mean[known] / sigma) ** 2 + np.log(
-            sigma * np.sqrt(2 * np.pi) / (2 * self.width)
-        )
+        odds = odds_of_differences(between.mean[known], sigma, self.width)
         changed[known] = posterior(odds, share_of_changes(odds))
         return between.mean, changed
 

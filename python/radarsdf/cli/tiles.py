@@ -151,18 +151,13 @@ def _check_first(scans: Any) -> None:
     """A city of wrong poses would take hours."""
     import itertools
 
-    import numpy as np
-
     from radarsdf.cli.check import warn_or_refuse
-    from radarsdf.io import Scans
+    from radarsdf.io.scans import scans_in_memory
 
     some = list(itertools.islice(iter(scans), _FIRST_SCANS))
-    if len(some) < 2:
-        return
-    given = [scan.intensities for scan in some if scan.intensities is not None]
-    values = given if len(given) == len(some) else None
-    first = Scans([scan.points for scan in some], np.stack([scan.T_world_sensor for scan in some]), values)
-    warn_or_refuse(first, values)
+    if len(some) > 1:
+        first = scans_in_memory(some)
+        warn_or_refuse(first, first.intensities)
 
 
 def _without_intensities(scan: Any) -> Any:

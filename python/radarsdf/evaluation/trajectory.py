@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check_poses, positive, real_array
-from radarsdf.poses.rigid import Floats, aligned, between, steps, turned_by
+from radarsdf.poses.rigid import Floats, aligned, between, nearest_rotation, placed, steps, turned_by
 
 TRAJECTORY_PROTOCOL = "radarsdf-trajectory-1"
 """Name and version of the definitions in `trajectory_metrics`."""
@@ -122,14 +122,9 @@ def _brought(poses: Floats, true: Floats, align: Alignment) -> Floats:
     if align == "first":
         whole = true[0] @ np.linalg.inv(poses[0])
     elif align == "positions":
-        middle, middle_true = poses[:, :3, 3].mean(axis=0), true[:, :3, 3].mean(axis=0)
-        left, _, right = np.linalg.svd(
-            np.einsum("fi,fj->ij", true[:, :3, 3] - middle_true, poses[:, :3, 3] - middle)
-        )
-        # No reflection: the weakest axis turns round.
-        left[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
-        whole[:3, :3] = left @ right
-        whole[:3, 3] = middle_true - whole[:3, :3] @ middle
+        from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (poses, true))
+        whole[:3, :3] = nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle))
+        whole = placed(whole, poses, true)
     found: Floats = np.einsum("ij,fjk->fik", whole, poses)
     return found
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from radarsdf.checks import one_for_each_scan
 from radarsdf.io.imu import Imu
 
 _LOG = logging.getLogger("radarsdf.io")
+_Value = TypeVar("_Value")
 
 TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
 """Where ground truth comes from: the lidar of a recording, a simulator, or the user."""
@@ -325,10 +326,24 @@ class Scans:
         self._points = [scan.points for scan in scans]
 
 
+def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
+    """Scans one after another as one, with what all of them have."""
+    times_s = _all_or_none([scan.time_s for scan in scans])
+    return Scans(
+        [scan.points for scan in scans],
+        np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
+        _all_or_none([scan.intensities for scan in scans]),
+        doppler_mps=_all_or_none([scan.doppler_mps for scan in scans]),
+        times_s=None if times_s is None else np.array(times_s, np.float64),
+        sigmas=_all_or_none([scan.sigma for scan in scans]),
+        imu=imu,
+    )
+
+
 def _listed(arrays: Sequence[NDArray[Any]] | None, name: str) -> list[NDArray[Any]] | None:
     return None if arrays is None else list(one_for_each_scan(arrays, name))
 
 
-def _all_or_none(arrays: list[NDArray[Any] | None]) -> list[NDArray[Any]] | None:
-    given = [array for array in arrays if array is not None]
-    return given if given and len(given) == len(arrays) else None
+def _all_or_none(values: list[_Value | None]) -> list[_Value] | None:
+    given = [value for value in values if value is not None]
+    return given if given and len(given) == len(values) else None

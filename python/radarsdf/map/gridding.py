@@ -83,6 +83,23 @@ def passage_odds(contents: MapContents) -> NDArray[np.float64]:
     return falling
 
 
+def check_passages(radar_map: Map, name: str) -> None:
+    """Raises a ValueError if a map does not keep what rays passed. `name`: by which the message calls it."""
+    if not radar_map.config.returns.passages:
+        msg = f"{name} does not keep what rays passed: fit it with returns.passages, which FitConfig() has and quick() has not"
+        raise ValueError(msg)
+
+
+def plane_at(radar_map: Map, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The surface round positions (N, 3), world, m, as planes: signed distances (N,), m, and normals (N, 3), towards free space.
+
+    Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
+    """
+    gradient = np.asarray(radar_map.gradient(x), np.float64)
+    length = np.linalg.norm(gradient, axis=1)
+    return radar_map.sdf(x) / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
+
+
 def make_grid(
     radar_map: Map,
     box: ArrayLike,
@@ -91,9 +108,7 @@ def make_grid(
     free_to: float,
 ) -> Grid:
     """See :meth:`Map.grid`."""
-    if not radar_map.config.returns.passages:
-        msg = "this map does not keep what rays passed: fit it with returns.passages, which FitConfig() has and quick() has not"
-        raise ValueError(msg)
+    check_passages(radar_map, "this map")
     corners = check_box(box)
     size = positive(voxel_size, "voxel_size")
     if not 0 < free_to < occupied_from < 1:
@@ -173,15 +188,12 @@ class _Planes:
     @classmethod
     def of(cls, radar_map: Map, x: NDArray[np.float64]) -> _Planes:
         """The planes at positions (N, 3), world, m."""
-        gradient = np.asarray(radar_map.gradient(x), np.float64)
-        length = np.linalg.norm(gradient, axis=1)
-        # Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
-        distance_m = (radar_map.sdf(x) / np.maximum(length, 1)).astype(np.float32)
+        distance_m, normals = plane_at(radar_map, x)
         unknown = np.isnan(distance_m)
         sigma_m = np.nan_to_num(radar_map.uncertainty(x), nan=radar_map.config.leaf_size_m).astype(np.float64)
         return cls(
-            distance_m,
-            gradient / length[:, None].clip(1e-9),
+            distance_m.astype(np.float32),
+            normals,
             sigma_m,
             np.where(unknown, 0, radar_map.confidence(x)).astype(np.float64),
         )

@@ -24,7 +24,7 @@ from radarsdf.io.imu import Imu
 from radarsdf.poses.by_doppler import Velocities
 from radarsdf.poses.gyroscope import FIRST_BIAS_RAD_S
 from radarsdf.poses.inertia import Inertia
-from radarsdf.poses.rigid import Floats, rotation, skew
+from radarsdf.poses.rigid import Floats, nearest_rotation, rotation, skew
 
 _WINDOW_S, _WINDOW_SCANS = (
     4.0,
@@ -144,8 +144,7 @@ def _first_state(imu: Imu, velocities: Velocities, times_s: Floats) -> _State | 
     matrix, gravity = fits[best][1]
     R = imu.R_sensor_imu
     if R is None:
-        u, _, vt = np.linalg.svd(matrix)
-        R = np.einsum("ij,j,jk->ik", u, [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))], vt)
+        R = nearest_rotation(matrix)
     drive_s = imu.times_s[-1] - imu.times_s[0]
     parts = int(np.clip(drive_s // _SEGMENT_S, 1, _SEGMENTS))
     return _State(R, gravity, float(late[best]), np.zeros(3), np.zeros(3), np.zeros((parts, 3)))

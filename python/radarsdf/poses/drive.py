@@ -50,22 +50,14 @@ class Drive:
         if self.gyroscope is not None:
             by = self.gyroscope.step(i - 1)
         else:
-            rate = (
-                Rate(np.zeros(3), np.diag(self.turns.usual))
-                if turn is None
-                else self.turns.after(turn, elapsed_s)
-            )
+            rate = self.turns.after(turn, elapsed_s)
             by = Rate(rate.mean * duration_s, rate.covariance * duration_s**2)
         if self.velocities is not None:
             begin, end = self.velocities.mean_mps[i - 1 : i + 1]
             return ExpectedStep(
                 by, begin, end, self.velocities.step_covariance(i - 1, duration_s), duration_s
             )
-        rate = (
-            Rate(np.zeros(3), np.diag(self.moves.usual))
-            if move is None
-            else self.moves.after(move, elapsed_s)
-        )
+        rate = self.moves.after(move, elapsed_s)
         return ExpectedStep(by, rate.mean, rate.mean, rate.covariance * duration_s**2, duration_s)
 
     def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
 from radarsdf.poses.rates import Rate
-from radarsdf.poses.rigid import Floats
+from radarsdf.poses.rigid import Floats, nearest_rotation
 
 # What a gyroscope begins with: the bias and the noise of cheap ones. The drive itself replaces them.
 FIRST_BIAS_RAD_S = 0.02
@@ -134,8 +134,7 @@ def _wahba(measured: Floats, found: Floats, spans: Floats, weights: Floats) -> t
     """
     share = weights * spans / (weights * spans**2).sum()
     a, b = (x - spans[:, None] * np.einsum("f,fi->i", share, x) for x in (measured, found))
-    u, _, vt = np.linalg.svd(np.einsum("f,fi,fj->ij", weights, b, a))
-    R = np.einsum("ij,j,jk->ik", u, [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))], vt)
+    R = nearest_rotation(np.einsum("f,fi,fj->ij", weights, b, a))
     off = b - np.einsum("ij,fj->fi", R, a)
     cost = float(np.einsum("f,fi,fi->", weights, off, off))
     information = np.einsum("f,fi,fi->", weights, a, a) * np.eye(3) - np.einsum("f,fi,fj->ij", weights, a, a)

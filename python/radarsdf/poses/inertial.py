@@ -15,7 +15,7 @@ from radarsdf.io.imu import Imu
 from radarsdf.poses.alignment import Alignment
 from radarsdf.poses.by_doppler import Velocities
 from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope
-from radarsdf.poses.rigid import Floats
+from radarsdf.poses.rigid import Floats, covariance_in
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,6 @@ def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Flo
     turn, _ = Rotation.align_vectors([[0, 0, 1.0]], [now])
     if now[2] < 0 and np.hypot(now[0], now[1]) < 1e-9 * -now[2]:
         turn = Rotation.from_rotvec([np.pi, 0, 0])  # upside down: any axis would do
-    whole = np.eye(6)
-    whole[:3, :3] = whole[3:, 3:] = turn.as_matrix()
-    found = poses.copy()
-    found[:, :3] = np.einsum("ij,fjk->fik", whole[:3, :3], poses[:, :3])
-    return found, np.einsum("ij,fjk,lk->fil", whole, covariance, whole)
+    R, found = turn.as_matrix(), poses.copy()
+    found[:, :3] = np.einsum("ij,fjk->fik", R, poses[:, :3])
+    return found, covariance_in(covariance, R)

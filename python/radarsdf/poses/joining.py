@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.poses.rigid import Floats, alignment, moved, placed
+from radarsdf.poses.rigid import Floats, alignment, covariance_in, moved, placed
 
 _NOWHERE = -1  # piece of a scan that has no pose
 
@@ -72,7 +72,7 @@ class JoinedPoses:
         # From one window's poses to the other's bit by bit: at its ends, a window knows least.
         shares = np.arange(1, common - first + 1) / (common - first + 1)
         self.poses[rows] = _between(before, there[first:common], shares)
-        turned = _turned(covariance, T)
+        turned = covariance_in(covariance, T[:3, :3])
         later = shares > 0.5
         self.covariance[rows][later] = turned[first:common][later]
         numbers = piece + pieces[common:] - pieces[common - 1]
@@ -86,7 +86,8 @@ class JoinedPoses:
         numbers = int(self._pieces[:begin].max(initial=_NOWHERE)) + 1 + pieces
         for name in ("poses", "covariance", "agreeing", "_pieces"):
             setattr(self, name, getattr(self, name)[:begin])
-        self._extend(np.einsum("ij,fjk->fik", T, poses), _turned(covariance, T), numbers, agreeing)
+        turned = covariance_in(covariance, T[:3, :3])
+        self._extend(np.einsum("ij,fjk->fik", T, poses), turned, numbers, agreeing)
 
     def _extend(self, poses: Floats, covariance: Floats, pieces: NDArray[np.int64], agreeing: Floats) -> None:
         self.poses = np.concatenate([self.poses, poses])
@@ -108,11 +109,3 @@ def _between(first: Floats, second: Floats, shares: Floats) -> Floats:
     turns = np.einsum("fij,fkj->fik", second[:, :3, :3], first[:, :3, :3])
     ways = np.concatenate([(second - first)[:, :3, 3], Rotation.from_matrix(turns).as_rotvec()], axis=1)
     return moved(first, shares[:, None] * ways)
-
-
-def _turned(covariance: Floats, T: Floats) -> Floats:
-    """Covariances (K, 6, 6) in the axes of another world."""
-    whole = np.zeros((6, 6))
-    whole[:3, :3] = whole[3:, 3:] = T[:3, :3]
-    found: Floats = np.einsum("ij,fjk,lk->fil", whole, covariance, whole)
-    return found

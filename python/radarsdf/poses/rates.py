@@ -27,8 +27,10 @@ class Habits:
     back, a sparse simulated drive without Doppler was 4.8 m off instead of 0.25; with turns that stay, a real one 7.9 m
     instead of 1."""
 
-    def after(self, rate: Rate, elapsed_s: float) -> Rate:
-        """The rate once `elapsed_s` have gone by."""
+    def after(self, rate: Rate | None, elapsed_s: float) -> Rate:
+        """The rate once `elapsed_s` have gone by. None: it was not known."""
+        if rate is None:
+            return Rate(np.zeros(3), np.diag(self.usual))
         if not self.settles:
             return Rate(rate.mean, rate.covariance + np.diag(self.change) * elapsed_s)
         share = float(np.exp(-0.5 * elapsed_s * self.change.sum() / self.usual.sum()))

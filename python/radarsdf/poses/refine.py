@@ -20,7 +20,7 @@ from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.recording import Recording
-from radarsdf.poses.rigid import Floats, steps, turned_by
+from radarsdf.poses.rigid import Floats, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 from radarsdf.threads import Workers
@@ -142,8 +142,7 @@ def refine_poses(
         "sigma_m": steps_given.sigma_m,
         "sigma_rad": steps_given.sigma_rad,
         "bias": steps_given.bias.tolist(),
-        "moved_m": float(np.sqrt(((found.poses - given)[:, :3, 3] ** 2).sum(axis=1).mean())),
-        "moved_rad": float(np.sqrt((turned_by(given, found.poses) ** 2).mean())),
+        **moved_by(given, found.poses),
         "noise": vars(found.noise).copy(),
         "notes": recording.notes,
         "movers": recording.movers,

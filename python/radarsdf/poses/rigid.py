@@ -63,6 +63,29 @@ def turned_by(poses: Floats, others: Floats) -> Floats:
     return found
 
 
+def moved_by(before: Floats, after: Floats) -> dict[str, float]:
+    """By how much poses (F, 4, 4) differ, root mean square, for a report: `moved_m` and `moved_rad`."""
+    return {
+        "moved_m": float(np.sqrt(((after - before)[:, :3, 3] ** 2).sum(axis=1).mean())),
+        "moved_rad": float(np.sqrt((turned_by(before, after) ** 2).mean())),
+    }
+
+
+def nearest_rotation(matrix: Floats) -> Floats:
+    """(3, 3) rotation, not a reflection, that is nearest to a matrix: of sums b aᵀ, the one that best turns each a to its b (Kabsch)."""
+    u, _, vt = np.linalg.svd(matrix)
+    found: Floats = np.einsum("ij,j,jk->ik", u, [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))], vt)
+    return found
+
+
+def covariance_in(covariance: Floats, R: Floats) -> Floats:
+    """Covariances (F, 6, 6) of translations and rotation vectors in the axes of a frame that is turned by R (3, 3)."""
+    whole = np.zeros((6, 6))
+    whole[:3, :3] = whole[3:, 3:] = R
+    found: Floats = np.einsum("ij,fjk,lk->fil", whole, covariance, whole)
+    return found
+
+
 def skew(vectors: Floats) -> Floats:
     """(N, 3, 3) matrices that are the cross products with `vectors` (N, 3)."""
     x, y, z = vectors.T

@@ -75,19 +75,20 @@ class Verdict:
         edge_m = _PLACE * float(np.median(asked.ranges_m))
         cells = np.floor(asked.posed(before).points / edge_m)
         places = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
-        means = means_of(gains, asked.scans)
-        parts = min(len(means), int(places.max()) + 1)
+        by_scans = cls.by_groups(gains, asked.scans)
+        parts = min(by_scans.parts, int(places.max()) + 1)
         if parts < 2:
             return cls(0.0, np.inf, parts)
-        of_scans = float(means.std(ddof=1) / np.sqrt(len(means)))
-        return cls(float(means.mean()), max(of_scans, _error_of_places(gains, places)), parts)
+        return cls(by_scans.gain, max(by_scans.error, _error_of_places(gains, places)), parts)
 
-
-def means_of(gains: Floats, groups: NDArray[np.integer[Any]]) -> Floats:
-    """(G,) mean of the gains (N,) of each group that has some. `groups` (N,): the number of the group of each."""
-    counts = np.bincount(groups)
-    found: Floats = np.bincount(groups, gains)[counts > 0] / counts[counts > 0]
-    return found
+    @classmethod
+    def by_groups(cls, gains: Floats, groups: NDArray[np.integer[Any]]) -> Verdict:
+        """Of gains (N,) of which those of a group have errors in common. `groups` (N,): the number of the group of each."""
+        counts = np.bincount(groups)
+        means = np.bincount(groups, gains)[counts > 0] / counts[counts > 0]
+        if len(means) < 2:
+            return cls(0.0, np.inf, len(means))
+        return cls(float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means))), len(means))
 
 
 def _error_of_places(gains: Floats, places: NDArray[np.int64]) -> float:

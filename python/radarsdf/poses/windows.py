@@ -16,11 +16,11 @@ from tqdm import tqdm
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
-from radarsdf.io.scans import Scan, Scans
+from radarsdf.io.scans import Scan, Scans, scans_in_memory
 from radarsdf.poses.joining import JoinedPoses
 from radarsdf.poses.odometry import NotToldError, Odometry, odometry
 from radarsdf.poses.refine import RefinedPoses, refine_poses
-from radarsdf.poses.rigid import Floats, aligned, steps, turned_by
+from radarsdf.poses.rigid import Floats, aligned, moved_by, steps
 from radarsdf.progress import hides_bar
 
 # Of one window, whichever is reached first. Measured, an estimate takes 0.6 kB a return: a quarter of a GB at most.
@@ -41,17 +41,7 @@ class Window:
 
     def whole(self, imu: Imu | None) -> Scans:
         """In memory, with what all of them have."""
-        points, poses = [scan.points for scan in self.scans], [scan.T_world_sensor for scan in self.scans]
-        doppler = [scan.doppler_mps for scan in self.scans if scan.doppler_mps is not None]
-        times_s = [scan.time_s for scan in self.scans if scan.time_s is not None]
-        count = len(points)
-        return Scans(
-            points,
-            np.stack(poses),
-            doppler_mps=doppler if len(doppler) == count else None,
-            times_s=np.array(times_s) if len(times_s) == count else None,
-            imu=imu,
-        )
+        return scans_in_memory(self.scans, imu)
 
     @property
     def words(self) -> str:
@@ -114,8 +104,7 @@ def refine_in_windows(
         "verdict": _verdict(len(better), len(answers)),
         "windows": [answer.improved for answer in answers],
         **of_steps,
-        "moved_m": float(np.sqrt(((poses - before)[:, :3, 3] ** 2).sum(axis=1).mean())),
-        "moved_rad": float(np.sqrt((turned_by(before, poses) ** 2).mean())),
+        **moved_by(before, poses),
         "notes": _once(answer.report.get("notes", []) for answer in answers),
         "scans": len(poses),
         "seconds": time.perf_counter() - begin_s,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from radarsdf.budget.estimate import estimate_rays
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.surface import SurfaceReturns
-from radarsdf.io.scans import Scan
+from radarsdf.io.scans import Scan, scans_in_memory
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.noise import NOISE_SETTINGS, SensorNoise
 from radarsdf.returns.plausible import Intensities
@@ -121,14 +121,11 @@ class Planner:
             raise
 
     def _prepared(self, scans: list[Scan]) -> Rays:
-        points = [scan.points for scan in scans]
-        values = [scan.intensities for scan in scans if scan.intensities is not None] or None
-        doppler = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
-        standing = Standing.of(
-            points, values, doppler if len(doppler) == len(scans) else None, self._config.returns
+        held = scans_in_memory(scans)
+        standing = Standing.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
+        return prepare(
+            standing.points, held.poses, standing.intensities, whole=False, **self._config.preparation
         )
-        poses = np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans])
-        return prepare(standing.points, poses, standing.intensities, whole=False, **self._config.preparation)
 
     def _keep_scans(self, scans: list[Scan]) -> None:
         poses = np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans])
