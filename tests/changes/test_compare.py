@@ -15,6 +15,7 @@ from radarsdf.poses.rigid import transform
 from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
+from ..conftest import draw_small
 from .conftest import drives_past
 
 TAKEN, PUT = np.array([2.5, 2.5, 0.5]), np.array([2.5, -3.0, 0.5])
@@ -112,6 +113,7 @@ def test_the_command_writes_a_page_and_shows_what_changed(maps, tmp_path, capsys
         assert view.port > 0
         raise KeyboardInterrupt
 
+    draw_small(monkeypatch)
     monkeypatch.setattr(changed.ChangesView, "wait", stop)
     for number, name in ((0, "a"), (2, "b")):
         maps[number].save(tmp_path / f"{name}.safetensors")

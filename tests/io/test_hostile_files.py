@@ -25,7 +25,7 @@ from radarsdf.io.npz import read_scans
 from bench.stress import files, samples
 from bench.stress.mutations import boundaries
 
-FILES = 250
+FILES = 120
 
 
 @pytest.mark.parametrize("name", files.READERS)
