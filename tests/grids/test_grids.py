@@ -33,6 +33,15 @@ def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
     assert grid.at([[np.nan, 0, 0], [1e9, 0, 0]]).tolist() == [-1, -1]
 
 
+def test_probabilities_agree_with_the_states(sharp_map):
+    grid = sharp_map.grid(BOX, 0.2, occupied_from=0.8, free_to=0.02)
+    known = grid.probability[np.isfinite(grid.probability)]
+    assert 0 <= known.min() < known.max() <= 1
+    assert grid.probability[grid.occupied].min() >= 0.8
+    # Rays alone leave less than 0.02; a surface that is nearby adds to it.
+    assert np.median(grid.probability[grid.free]) < 0.02
+
+
 def test_a_voxel_that_a_surface_grazes_is_not_free():
     """No return is in it, for they were moved onto the surface, and rays pass it above the ground often enough."""
     drive = radarsdf.simulate.KINDS["tunnel"](seed=5, frames=12)

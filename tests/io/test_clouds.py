@@ -229,6 +229,18 @@ def test_las(tmp_path, suffix):
         read_points(path)
 
 
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_laz_in_several_chunks(tmp_path, point_format):
+    """Of 50,000 points each. Those of the newer format are in layers, whose sizes are checked before they are unpacked."""
+    laspy = pytest.importorskip("laspy", reason="the extra las is not installed")
+    header = laspy.LasHeader(point_format=point_format, version="1.4")
+    header.scales = [0.001] * 3
+    cloud, points = laspy.LasData(header), np.random.default_rng(0).integers(-9000, 9000, (120_001, 3)) / 1000
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.write(tmp_path / "a.laz")
+    assert_allclose(read_points(tmp_path / "a.laz"), points, rtol=0, atol=1e-6)
+
+
 def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     for name in ("laspy", "rosbags"):
         monkeypatch.setitem(sys.modules, name, None)

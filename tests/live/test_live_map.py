@@ -201,7 +201,7 @@ def test_sizes_are_not_read_while_a_scan_is_added(size, monkeypatch):
         ({"pose": 2 * np.eye(4)}, "rigid"),
         ({"intensities": None}, "intensities"),
         ({"intensities": np.zeros(3)}, "shape"),
-        ({"doppler_mps": np.zeros(3)}, "shape"),
+        ({"doppler_mps": np.zeros(3)}, "doppler_mps of scan 0 must have shape"),
     ],
 )
 def test_a_bad_scan_leaves_the_map_as_it_was(change, words):

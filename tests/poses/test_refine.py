@@ -150,6 +150,7 @@ def test_hardly_any_returns_keep_their_poses(counts):
     given = np.tile(np.eye(4), (len(counts), 1, 1))
     found = radarsdf.refine_poses(scans, given)
     assert not found.improved
+    assert found.report.get("gain", 0.0) == 0
     assert found.covariance.shape == (len(counts), 6, 6)
     np.testing.assert_array_equal(found.poses, given)
 

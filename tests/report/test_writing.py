@@ -13,6 +13,8 @@ import pytest
 import radarsdf
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 from radarsdf.io import Scans
+from radarsdf.map.colors import NEUTRAL
+from radarsdf.report.surface import colored
 
 from ..warm_python import warm_python
 from .conftest import HOSTILE
@@ -259,3 +261,14 @@ for data in (
 assert settings() == before and "matplotlib.pyplot" not in sys.modules
 """
     subprocess.run([*warm_python(), "-c", code], check=True, timeout=120)
+
+
+def test_a_legend_has_the_colours_of_the_surface():
+    values = np.linspace(3.0, 7.0, 9)
+    colors, bar = colored(np.append(values, np.nan), "height, m", (3.0, 7.0))
+    assert re.findall(r"rgb\((\d+) (\d+) (\d+)\)", bar) == [
+        tuple(map(str, row)) for row in colors[:-1].tolist()
+    ]
+    assert re.findall(r"<span>(.*?)</span>", bar) == ["3", "7", "height, m"]
+    assert tuple(colors[-1]) == NEUTRAL
+    assert colored(np.full(3, np.nan), "height, m")[1] == ""

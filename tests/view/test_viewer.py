@@ -70,6 +70,9 @@ def test_a_new_client_gets_the_scene(client, viewer):
     assert {CLOUD, "/sensor", "/scans/path", "/scans/measured", "/scans/predicted"} <= nodes
     mesh = mesh_of(client.wait_for(is_mesh))
     assert len(mesh.faces) == len(viewer.surface.faces)
+    themes = [m.message for m in client.received() if m.kind == "ThemeConfigurationMessage"]
+    assert themes
+    assert not themes[-1]["show_share_button"]  # it would make the page public
 
 
 def test_a_drag_recolours_few_points_and_then_the_mesh(client, viewer, sharp_map):
