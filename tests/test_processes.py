@@ -95,7 +95,9 @@ def answers(radar_map, x):
 
 def test_a_map_goes_to_spawned_workers(radar_map):
     pieces = np.array_split(X[:2000], 4)
-    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        1, mp_context=multiprocessing.get_context("spawn")
+    ) as pool:  # each imports PyTorch
         found = list(pool.map(answers, [radar_map] * 4, pieces))
     for there, here in zip(zip(*found, strict=True), answers(radar_map, X[:2000]), strict=True):
         np.testing.assert_array_equal(np.concatenate(there), here)

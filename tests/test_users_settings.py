@@ -61,8 +61,7 @@ CONFIGS = {
     "core": {},
     "autograd": {"training": {"gradients": "autograd"}},
     "normals": {"networks": {"normals": True}},
-    "all rows": {"training": {"row_updates": False}},
-    "octree": {"encoding": {"kind": "octree"}},
+    "all rows of an octree": {"training": {"row_updates": False}, "encoding": {"kind": "octree"}},
 }
 
 

@@ -24,6 +24,8 @@ import trimesh
 from bench.settings import Changes, merged
 
 ROOT = Path(__file__).resolve().parents[2]
+PYTHON = [sys.executable]
+"""The command that runs a peer, unless that needs another Python."""
 VDBFUSION_ENVIRONMENT = ROOT / "build" / "peers" / "vdbfusion"
 ODOMETRY_ENVIRONMENT = ROOT / "build" / "peers" / "odometry"
 INSTALL = {
@@ -170,7 +172,7 @@ def reconstruct(
     with tempfile.TemporaryDirectory() as folder:
         scans_path, result_path = Path(folder) / "scans.npz", Path(folder) / "result.npz"
         np.savez(scans_path, **arrays)
-        command = [python, "-m", "bench.peers.child", peer.method, json.dumps(options)]
+        command = [*python, "-m", "bench.peers.child", peer.method, json.dumps(options)]
         try:
             done = subprocess.run(
                 [*command, str(scans_path), str(result_path)],
@@ -196,17 +198,17 @@ def reconstruct(
 
 
 @cache
-def _interpreter(needs: str) -> tuple[str | None, str]:
-    """A Python that can import `needs`, or None and the reason."""
-    candidates = [sys.executable]
+def _interpreter(needs: str) -> tuple[list[str] | None, str]:
+    """The command of a Python that can import `needs`, or None and the reason."""
+    candidates = [PYTHON]
     if needs == "vdbfusion":
-        candidates += [str(VDBFUSION_ENVIRONMENT / "bin" / "python")]
+        candidates += [[str(VDBFUSION_ENVIRONMENT / "bin" / "python")]]
     why_not = ""
     for python in candidates:
-        if not Path(python).exists():
+        if not Path(python[0]).exists():
             continue
         done = subprocess.run(
-            [python, "-c", f"import {needs}"], cwd=ROOT, capture_output=True, text=True, check=False
+            [*python, "-c", f"import {needs}"], cwd=ROOT, capture_output=True, text=True, check=False
         )
         if done.returncode == 0:
             return python, ""

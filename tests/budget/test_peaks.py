@@ -18,7 +18,7 @@ OCTREE = {"encoding": {"kind": "octree"}}
 NORMALS = {"networks": {"normals": True}, "training": {"sdf_iterations": 10, "intensity_iterations": 12}}
 ALL_ROWS = {"training": {"row_updates": False}}
 # As the preset has it, in spite of the settings that the measurement brings along.
-QUICK = FitConfig.quick(training={"intensity_iterations": 72}).to_dict()
+QUICK = FitConfig.quick(training={"intensity_iterations": 24}).to_dict()
 CASES = {
     "quick": QUICK,
     "normals, 1 thread": NORMALS | {"num_threads": 1},

@@ -306,7 +306,9 @@ def lattice(radar_map, voxel_size):
 def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
     voxels, corners, voxel_corners = lattice(sharp_map, voxel_size)
     values = _corner_distances(sharp_map._contents, voxel_size, voxels, corners, voxel_corners, False)
-    centres = (voxels + 0.5) * voxel_size
+    some = np.random.default_rng(0).permutation(len(voxels))[:10_000]
+    voxel_corners = voxel_corners[some]
+    centres = (voxels[some] + 0.5) * voxel_size
     inner = corners[voxel_corners] * voxel_size
     inner = inner + 0.01 * (centres[:, None] - inner)
     nearby = sharp_map.sdf(inner.reshape(-1, 3) + sharp_map.origin).reshape(-1, 8)
