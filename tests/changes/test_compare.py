@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import radarsdf
 import trimesh
 from radarsdf.changes.changes import APPEARED, GONE, UNSEEN
-from radarsdf.changes.probability import share_of_changes
+from radarsdf.changes.probability import _passed, share_of_changes
 from radarsdf.cli import main
 from radarsdf.poses.rigid import transform
 from radarsdf.simulate import Box
@@ -151,3 +153,18 @@ def test_the_share_of_changes_is_found_and_chance_makes_none():
     assert share_of_changes(np.where(none > 1, -0.1, none - 2)) < 1e-3
     mixed = np.where(rng.random(20_000) < 0.1, 8.0, -8.0)
     assert abs(share_of_changes(mixed) - (mixed > 0).mean()) < 0.005
+
+
+def test_rays_that_pass_tell_that_a_surface_went():
+    def told(hits, passes):
+        return SimpleNamespace(hits=2.0 * np.array(hits), passes=2.0 * np.array(passes))
+
+    # A wall that twenty scans hit; a fence that two of twenty hit.
+    own = told([20.0] * 3 + [2.0] * 2, [0.0] * 3 + [18.0] * 2)
+    other = told([0.0, 0, 20, 0, 1], [0.0, 20, 0, 5, 9])
+    unseen, through, hit, fence, as_before = _passed(own, other)
+    assert unseen == pytest.approx(0, abs=1e-12)
+    assert through > 10
+    assert hit < 0
+    assert abs(fence) < 1
+    assert as_before < 0

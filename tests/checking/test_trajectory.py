@@ -72,19 +72,21 @@ def test_copies_of_scans_are_named(good):
 
 
 @pytest.mark.parametrize(
-    ("name", "broken"),
+    ("name", "broken", "words"),
     [
-        ("poses_transposed", lambda poses: poses.transpose(0, 2, 1)),
-        ("mirrored", lambda poses: poses @ np.diag([1.0, -1, 1, 1])),
-        ("poses_not_rigid", lambda poses: poses * [2.0, 2, 2, 1]),
-        ("poses_not_rigid", lambda poses: poses * np.nan),
-        ("poses_not_rigid", lambda poses: poses + 1e-2 * np.eye(4)[3]),
+        ("poses_transposed", lambda poses: poses.transpose(0, 2, 1), ""),
+        ("mirrored", lambda poses: poses @ np.diag([1.0, -1, 1, 1]), ""),
+        ("poses_not_rigid", lambda poses: poses * [2.0, 2, 2, 1], "its rotation is multiplied by 2."),
+        ("poses_not_rigid", lambda poses: poses * [0.5, 0.5, 0.5, 1], "its rotation is multiplied by 0.5."),
+        ("poses_not_rigid", lambda poses: poses * np.nan, ""),
+        ("poses_not_rigid", lambda poses: poses + 1e-2 * np.eye(4)[3], "its last row is not 0 0 0 1"),
     ],
 )
-def test_matrices_that_are_no_poses_are_named(good, name, broken):
+def test_matrices_that_are_no_poses_are_named(good, name, broken, words):
     points, poses = good
     found = radarsdf.check(points, broken(poses))
     assert [(finding.name, finding.severity) for finding in found] == [(name, "error")]
+    assert words in found[0].evidence
 
 
 def test_returns_and_scans_that_are_none_are_named(good):

@@ -44,6 +44,14 @@ def test_a_turn_that_is_too_sharp_has_the_error_of_its_length():
     assert metrics["length_m"] == pytest.approx(100)
 
 
+def test_parts_are_those_of_kitti_or_tenths_of_a_shorter_way():
+    true = np.tile(np.eye(4), (802, 1, 1))
+    true[:, 0, 3] = np.arange(802)
+    assert trajectory_metrics(true, true)["relative_lengths_m"] == list(range(100, 900, 100))
+    shorter = trajectory_metrics(true[:101], true[:101])["relative_lengths_m"]
+    assert shorter == pytest.approx([10, 20, 30, 40, 50])
+
+
 def test_alignment_of_positions_makes_no_mirror():
     true = trajectory(30)
     true[:, 2, 3] = 0

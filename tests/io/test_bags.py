@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
+from radarsdf.io.bags.messages import _Cursor
 from radarsdf.io.unpacking import unpack
 
 from ..conftest import pose
@@ -395,6 +396,14 @@ def test_bags_are_unpacked_with_a_bound(tmp_path, monkeypatch, kind, packed):
     with pytest.raises(ValueError, match=r"is not a whole bag: .* would unpack to .* bytes or more"):
         list(read(bomb))
     check(read(path))
+
+
+@pytest.mark.parametrize(
+    "raw", [b"", b"\0\1", b"\0\0\0\0" + bytes(20)], ids=["nothing", "cut off", "big-endian"]
+)
+def test_other_encodings_are_refused(raw):
+    with pytest.raises(ValueError, match="it is not little-endian CDR"):
+        _Cursor(raw, cdr=True)
 
 
 def test_rosbags_itself_is_left_as_it_is(tmp_path, monkeypatch):

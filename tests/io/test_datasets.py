@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
+from radarsdf.io.datasets import snail_radar
 from radarsdf.io.datasets.published import DATASETS, find
 from scipy.spatial.transform import Rotation
 
@@ -259,6 +260,14 @@ def test_the_ars548_of_snail_radar(ars548):
     (afternoon / "data4" / "body_T_ars548.txt").write_text("1 0 0 1\n0 1 0 2\n0 0 1 3\n0 0 0 1\n")
     # The body looks forward, along -y of the lidar, which looks left, back and up.
     check(read(afternoon / "data4"), POSES @ pose([2, -1, 3], -np.pi / 2))
+
+
+def test_the_published_mountings_are_rigid():
+    orientations = np.array([quaternion for _, quaternion in snail_radar._ARS548_ORIENTATIONS])
+    assert_allclose(np.linalg.norm(orientations, axis=1), 1, atol=1e-8)
+    for mounting in (snail_radar._BODY_T_XT32, snail_radar._BODY_T_OCULII):
+        assert_allclose(mounting[:3, :3].T @ mounting[:3, :3], np.eye(3), atol=1e-8)
+        assert np.linalg.det(mounting) == pytest.approx(1)
 
 
 def test_radars_of_snail_radar_are_chosen_by_their_folders(ars548):

@@ -138,7 +138,7 @@ def test_products_of_many_small_turns():
     np.testing.assert_allclose(found[-1], at, atol=1e-12)
 
 
-@pytest.mark.parametrize("up", [(0.6, 0.0, 0.8), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
+@pytest.mark.parametrize("up", [(0.6, 0.0, 0.8), (0.6, 0.0, -0.8), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
 def test_the_world_is_levelled(ride, up):
     _, poses, _ = ride
     up = np.array(up)

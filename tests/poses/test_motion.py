@@ -8,9 +8,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from radarsdf.poses.by_doppler import DopplerMotion, Velocities
 from radarsdf.poses.motion import Motion, unsteadiness
-from radarsdf.poses.rigid import aligned, moved, steps, turned_by
+from radarsdf.poses.rigid import aligned, moved, steps, transform, turned_by
 from radarsdf.simulate import drifted
+from scipy.spatial.transform import Rotation
 
 from .drift import trajectory
 
@@ -91,6 +93,39 @@ def test_a_bias_that_is_not_told_is_not_learnt():
     learnt = motion.learnt(poses, poses, loose, np.zeros((29, 6, 6)))
     assert learnt.bias[:3] == pytest.approx(0, abs=1e-9)
     assert learnt.bias[5] == pytest.approx(-0.01, rel=0.2)
+
+
+def test_a_bias_is_believed_as_far_as_it_is_told():
+    motion = Motion.of(trajectory(6), 0.1, 0.02)
+    bias = np.array([0.05, 0.1, 0.2, 0.01, 0.02, 0.05])
+    shares = np.stack(
+        [motion._told(bias, share * np.repeat(motion.variances, 3)) for share in (0, 0.3, 0.6, 1, 2)]
+    )
+    np.testing.assert_allclose(shares[[0, -2, -1]], [[1] * 6, [0] * 6, [0] * 6], atol=1e-12)
+    assert (np.diff(shares[:4], axis=0) < 0).all()
+    # One that is as large as the errors of steps, half of whose variance is left.
+    half = motion._told(np.sqrt(np.repeat(motion.variances, 3)), 0.5 * np.repeat(motion.variances, 3))
+    np.testing.assert_allclose(half, 0.5)
+
+
+def test_velocities_lead_from_pose_to_pose():
+    times_s = np.arange(12) * 0.1
+    h = 1e-4
+
+    def pose(time_s):
+        """A curve that turns and gains speed."""
+        turn = Rotation.from_euler("zyx", [0.5 * time_s**2, 0.2 * np.sin(time_s), 0.1 * time_s]).as_rotvec()
+        return transform(turn, np.array([3 * time_s**2, np.sin(2 * time_s), 0.2 * time_s]))
+
+    poses = np.stack([pose(t) for t in times_s])
+    mean = np.stack([pose(t)[:3, :3].T @ (pose(t + h) - pose(t - h))[:3, 3] / (2 * h) for t in times_s])
+    count = len(times_s)
+    velocities = Velocities(
+        mean, np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.ones(3), [], np.ones(count, bool)
+    )
+    found = DopplerMotion.by(velocities, times_s, poses)
+    # Between scans its velocity is taken to change evenly, in its own frame. That of a neighbour would be off by 0.05 m.
+    np.testing.assert_allclose(found.steps, steps(poses), atol=2e-3)
 
 
 def test_steps_of_a_slow_source_are_unsteady():

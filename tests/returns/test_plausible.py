@@ -66,6 +66,12 @@ def test_what_is_wild_is_left_out_and_nothing_else(case):
     np.testing.assert_array_equal(np.flatnonzero(~held), np.sort(rows))
 
 
+@pytest.mark.parametrize("fourths", [3, 3.5, 5, 8])
+def test_an_exponential_tail_reaches_as_far_as_it_says(fourths):
+    distances = -3.0 * np.log1p(-(np.arange(4**6) / 4**6))
+    assert plausible._reach(distances, 4.0**-fourths) == pytest.approx(3 * np.log(4) * fourths)
+
+
 def test_few_returns_do_not_tell():
     intensities = np.append(np.arange(100, dtype=np.float32), np.float32(1e9))
     assert Plausible.of(intensities).holds(intensities).all()
