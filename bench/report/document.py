@@ -93,7 +93,7 @@ def _real(rows: list[Row], _part: dict[str, Any]) -> str:
         verdict = f"On all {drives} drives the published octree, SHINE, is still ahead of this package"
     else:
         verdict = f"On {ahead} of {drives} drives the published octree, SHINE, is ahead of this package"
-    text = f"{verdict}. The figures are F-all, in %."
+    text = f"{verdict}. F-all, %:"
     return "\n\n".join(
         ["## Surface from a real radar", tables.wrapped(text), tables.real(rows), *_reasons(rows)]
     )
