@@ -83,3 +83,15 @@ def test_the_way_along_a_wall_is_not_guessed():
     with pytest.raises(Lost, match="do not tell how the sensor moves"):
         follow()
     assert len(live) < len(scans)
+
+
+def test_a_sensor_that_stands_leaves_the_sign_of_its_doppler_open(drive):
+    scans, motion = drive
+    live, rng = LiveMap(SETTINGS), np.random.default_rng(0)
+    for i in range(6):
+        noisy = scans.points[0] + rng.normal(0, 0.02, scans.points[0].shape)
+        live.integrate(noisy, doppler_mps=rng.normal(0, 0.05, len(noisy)), time=motion.times_s[i])
+        assert live._follower._sign == 0
+    for i in range(1, 25):
+        live.integrate(scans.points[i], doppler_mps=-motion.doppler_mps[i], time=motion.times_s[i] + 0.5)
+    assert live._follower._sign == -1

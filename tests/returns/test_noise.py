@@ -32,6 +32,18 @@ def test_the_noise_is_found_in_the_data(range_m, angle_rad):
     assert noise.angle_rad == pytest.approx(angle_rad, rel=0.35)
 
 
+def test_returns_far_beside_a_plane_are_no_noise_of_the_sensor():
+    points, poses, _ = a_wall(0.03, 0.001)
+    usual = noise_of(prepare(points, poses))
+    rng = np.random.default_rng(0)
+    for scan in points:
+        rows = rng.choice(len(scan), len(scan) // 25, replace=False)
+        ranges_m = np.linalg.norm(scan[rows], axis=1, keepdims=True)
+        scan[rows] *= 1 + 0.35 * rng.choice([-1, 1], (len(rows), 1)) / ranges_m
+    noise = noise_of(prepare(points, poses))
+    assert noise.range_m == pytest.approx(usual.range_m, rel=0.35)
+
+
 @pytest.mark.parametrize("roll_rad", [0.0, 0.5 * np.pi])
 def test_elevation_is_told_from_azimuth(roll_rad):
     """A sensor that lies on its side has its azimuth where others have their elevation."""
