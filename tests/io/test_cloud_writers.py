@@ -88,6 +88,14 @@ def test_columns_that_scans_lack(tmp_path):
     )
 
 
+def test_las_has_times_and_no_colours(tmp_path):
+    laspy = pytest.importorskip("laspy", reason="the extra las is not installed")
+    write_cloud(tmp_path / "cloud.las", lazily(np.zeros(3))[0])
+    names = set(laspy.read(tmp_path / "cloud.las").point_format.dimension_names)
+    assert "gps_time" in names
+    assert not names & {"red", "green", "blue", "nir"}  # viewers would draw all points black
+
+
 def test_an_origin_of_an_older_file_does_not_stay(tmp_path):
     path = tmp_path / "cloud.pcd"
     write_cloud(path, lazily(UTM_M)[0])
