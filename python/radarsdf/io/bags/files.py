@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import heapq
 import re
-from collections.abc import Generator, Iterator
+from collections.abc import Collection, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from radarsdf.extras import require
+from radarsdf.io.bags.messages import read_message
 from radarsdf.io.files import check_regular_file, in_utf8
 from radarsdf.io.unpacking import bound_ros1, bounded, check_zstd_files, unpack_zstd
 
@@ -43,6 +44,20 @@ class Message:
     cdr: bool
     """Whether it is of ROS 2."""
     bag: Path
+
+    def read(self) -> Any:
+        """What it says; see :func:`radarsdf.io.bags.messages.read_message`.
+
+        Raises
+        ------
+        ValueError
+            If its bytes do not have the layout of its type.
+        """
+        try:
+            return read_message(self.raw, self.message_type, self.cdr)
+        except ValueError as error:
+            msg = f"{self.bag}: a message of {self.topic} is not a whole {self.message_type}: {error}"
+            raise ValueError(msg) from error
 
 
 def is_bag(path: Path) -> bool:
@@ -75,6 +90,11 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
                     connection.topic, connection.msgtype, before + connection.msgcount
                 )
     return topics
+
+
+def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
+    """Those that have messages of these types."""
+    return {name: topic for name, topic in topics.items() if topic.message_type in types and topic.count}
 
 
 def messages_of(paths: list[Path], names: set[str]) -> Generator[Message, None, None]:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from radarsdf.io.bags.files import Topic, messages_of
-from radarsdf.io.bags.messages import IMU, TRANSFORM_TYPES, Header, read_imu
+from radarsdf.io.bags.files import Topic, messages_of, topics_with
+from radarsdf.io.bags.messages import IMU, TRANSFORM_TYPES, Header, ImuMessage
 from radarsdf.io.bags.poses import static_between
 from radarsdf.io.imu import Imu
 from radarsdf.io.sources import Request
@@ -26,7 +26,7 @@ def imu_topic(topics: dict[str, Topic], request: Request) -> Topic | None:
     ValueError
         If the wanted one is no topic of an IMU.
     """
-    fitting = {name: t for name, t in topics.items() if t.message_type == IMU and t.count}
+    fitting = topics_with([IMU], topics)
     listed = ", ".join(sorted(fitting))
     if request.imu_topic is not None:
         if request.imu_topic not in fitting:
@@ -56,11 +56,7 @@ def imu_in_bags(
     stamps_s, recorded_s, rates, forces = (array("d") for _ in range(4))
     first: Header | None = None
     for message in messages_of(paths, {topic.name}):
-        try:
-            measured = read_imu(message.raw, message.cdr)
-        except ValueError as error:
-            msg = f"{message.bag}: a message of {topic.name} is not a whole {topic.message_type}: {error}"
-            raise ValueError(msg) from error
+        measured: ImuMessage = message.read()
         if measured.angular_velocity is None:
             request.notes.add(f"{topic.name} has no angular velocity: it is not used")
             return None
@@ -87,7 +83,7 @@ def imu_in_bags(
     has_force = np.isfinite(table).all() and table[:, 3:].any()
     R_sensor_imu = request.R_sensor_imu
     if R_sensor_imu is None and first is not None:
-        transforms = {name for name, t in topics.items() if t.message_type in TRANSFORM_TYPES and t.count}
-        T_imu_sensor = static_between(paths, transforms, first.frame, sensor_frame)
+        transforms = topics_with(TRANSFORM_TYPES, topics)
+        T_imu_sensor = static_between(paths, set(transforms), first.frame, sensor_frame)
         R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
     return Imu(times_s[finite], table[:, :3], table[:, 3:] if has_force else None, R_sensor_imu)

@@ -251,68 +251,37 @@ POINT_A_MESSAGE = "ti_mmwave_rospkg/msg/RadarScan"
 PATH = "nav_msgs/msg/Path"
 IMU = "sensor_msgs/msg/Imu"
 
-_CLOUDS: dict[str, Callable[[_Cursor], CloudMessage]] = {
+_CLOUDS = {
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
     "sensor_msgs/msg/PointCloud": _point_cloud,
     "radar_msgs/msg/RadarScan": _radar_scan,
     POINT_A_MESSAGE: _ti_radar_scan,
 }
-_POSES: dict[str, Callable[[_Cursor], list[PoseMessage]]] = {
+_POSES = {
     "nav_msgs/msg/Odometry": _odometry,
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_with_covariance,
     "geometry_msgs/msg/TransformStamped": _transform_stamped,
     PATH: _path,
 }
-_TRANSFORMS: dict[str, Callable[[_Cursor], list[PoseMessage]]] = {
-    "tf2_msgs/msg/TFMessage": _transforms,
-    "tf/msg/tfMessage": _transforms,
-}
+_TRANSFORMS = {"tf2_msgs/msg/TFMessage": _transforms, "tf/msg/tfMessage": _transforms}
+_LAYOUTS: dict[str, Callable[[_Cursor], Any]] = {**_CLOUDS, **_POSES, **_TRANSFORMS, IMU: _imu}
 CLOUD_TYPES = tuple(_CLOUDS)
 POSE_TYPES = tuple(_POSES)
 TRANSFORM_TYPES = tuple(_TRANSFORMS)
 
 
-def read_cloud(raw: bytes | memoryview, message_type: str, cdr: bool) -> CloudMessage:
-    """A message with points, of `CLOUD_TYPES`.
+def read_message(raw: bytes | memoryview, message_type: str, cdr: bool) -> Any:
+    """What a message says: a `CloudMessage`, a list of `PoseMessage` or an `ImuMessage`, by its type.
 
     Raises
     ------
     ValueError
         If its bytes do not have the layout of its type.
     """
-    cloud: CloudMessage = _read(raw, _CLOUDS[message_type], cdr)
-    return cloud
-
-
-def read_pose_messages(raw: bytes | memoryview, message_type: str, cdr: bool) -> list[PoseMessage]:
-    """The poses of a message of `POSE_TYPES` or `TRANSFORM_TYPES`.
-
-    Raises
-    ------
-    ValueError
-        If its bytes do not have the layout of its type.
-    """
-    poses: list[PoseMessage] = _read(raw, (_POSES | _TRANSFORMS)[message_type], cdr)
-    return poses
-
-
-def read_imu(raw: bytes | memoryview, cdr: bool) -> ImuMessage:
-    """A message of type `IMU`.
-
-    Raises
-    ------
-    ValueError
-        If its bytes do not have the layout of its type.
-    """
-    message: ImuMessage = _read(raw, _imu, cdr)
-    return message
-
-
-def _read(raw: bytes | memoryview, parse: Callable[[_Cursor], Any], cdr: bool) -> Any:
     try:
         cursor = _Cursor(raw, cdr)
-        message = parse(cursor)
+        message = _LAYOUTS[message_type](cursor)
         cursor.end()
     except struct.error as error:
         msg = "it is cut off"

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.io.bags.files import Message, Topic, messages_of, topics_of
-from radarsdf.io.bags.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage, read_pose_messages
+from radarsdf.io.bags.files import Topic, messages_of, topics_of, topics_with
+from radarsdf.io.bags.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage
 from radarsdf.io.poses.reading import FIND_POSES, NoPoses, StampedPoses, TransformChain, trajectory_of
 from radarsdf.io.poses.trajectory import Trajectory
 from radarsdf.io.sources import Request
@@ -101,7 +101,7 @@ def poses_in_bags(
         If there are no poses, or several topics that could be meant.
     """
     topics = topics_of(paths)
-    transforms = {name for name, t in topics.items() if t.message_type in TRANSFORM_TYPES and t.count}
+    transforms = set(topics_with(TRANSFORM_TYPES, topics))
     topic = _pose_topic(topics, transforms, request.pose_topic, preferred, paths[0])
     if topic is None:
         tree = _tree(paths, transforms)
@@ -109,7 +109,7 @@ def poses_in_bags(
     track = _Track("")
     child = ""
     for message in messages_of(paths, {topic.name}):
-        poses = _read(message)
+        poses: list[PoseMessage] = message.read()
         if topic.message_type == PATH:  # each message holds the whole path so far: the last one counts
             track = _Track("")
         for pose in poses:
@@ -130,7 +130,7 @@ def _pose_topic(
     topics: dict[str, Topic], transforms: set[str], wanted: str | None, preferred: str | None, path: Path
 ) -> Topic | None:
     """The topic of the poses; None means TF."""
-    fitting = {name: t for name, t in topics.items() if t.message_type in POSE_TYPES and t.count}
+    fitting = topics_with(POSE_TYPES, topics)
     if wanted is not None:
         if wanted in fitting:
             return fitting[wanted]
@@ -157,7 +157,7 @@ def _tree(paths: list[Path], transforms: set[str]) -> dict[str, _Track]:
     tree: dict[str, _Track] = {}
     for message in messages_of(paths, transforms):
         static = _STATIC in message.topic
-        for pose in _read(message):
+        for pose in message.read():
             track = tree.get(pose.child)
             if track is None or track.parent != pose.header.frame:
                 track = tree[pose.child] = _Track(pose.header.frame, static=static)
@@ -257,11 +257,3 @@ def _product(tree: dict[str, _Track], upwards: list[str]) -> NDArray[np.float64]
     for frame in upwards:
         pose = tree[frame].matrix() @ pose
     return pose
-
-
-def _read(message: Message) -> list[PoseMessage]:
-    try:
-        return read_pose_messages(message.raw, message.message_type, message.cdr)
-    except ValueError as error:
-        msg = f"{message.bag}: a message of {message.topic} is not a whole {message.message_type}: {error}"
-        raise ValueError(msg) from error

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.bags.files import Message, Topic, bags_in, is_bag, messages_of, topics_of
+from radarsdf.io.bags.files import Topic, bags_in, is_bag, messages_of, topics_of, topics_with
 from radarsdf.io.bags.imu import imu_in_bags, imu_topic
-from radarsdf.io.bags.messages import CLOUD_TYPES, POINT_A_MESSAGE, CloudMessage, read_cloud
+from radarsdf.io.bags.messages import CLOUD_TYPES, POINT_A_MESSAGE, CloudMessage
 from radarsdf.io.bags.poses import poses_in_bags
 from radarsdf.io.clouds.reading import Columns
 from radarsdf.io.imu import Imu
@@ -88,7 +88,7 @@ def _is_bag_of_poses(poses: Any) -> bool:
 def _scan_topic(topics: dict[str, Topic], wanted: str | None, paths: list[Path]) -> Topic:
     """The topic of the scans: the wanted one, or the only one that can be meant."""
     where = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
-    fitting = {name: t for name, t in topics.items() if t.message_type in CLOUD_TYPES and t.count}
+    fitting = topics_with(CLOUD_TYPES, topics)
     listed = ", ".join(f"{name} ({t.message_type})" for name, t in sorted(fitting.items()))
     if wanted is not None:
         if wanted in fitting:
@@ -118,7 +118,7 @@ def _peek(paths: list[Path], topic: Topic) -> list[CloudMessage]:
     """The first messages of a topic, as many as it takes to know its clock."""
     count = _PEEKED_POINTS if topic.message_type == POINT_A_MESSAGE else _PEEKED_SCANS
     with closing(messages_of(paths, {topic.name})) as messages:
-        peeked = [_read(message) for message in itertools.islice(messages, count)]
+        peeked = [message.read() for message in itertools.islice(messages, count)]
     if not peeked:
         msg = f"{paths[0]}: the topic {topic.name} has no messages"
         raise ValueError(msg)
@@ -144,7 +144,7 @@ def _raw_scans(paths: list[Path], topic: Topic, by_record: bool) -> Iterator[Raw
         yield from _grouped(paths, topic, by_record)
         return
     for number, message in enumerate(messages_of(paths, {topic.name})):
-        cloud = _read(message)
+        cloud: CloudMessage = message.read()
         time_s = message.recorded_s if by_record else cloud.header.stamp_s
         yield RawScan(cloud.columns, time_s, f"{message.bag}: message {number} of {topic.name}")
 
@@ -154,7 +154,7 @@ def _grouped(paths: list[Path], topic: Topic, by_record: bool) -> Iterator[RawSc
     points: list[CloudMessage] = []
     last, last_s, start_s, number = -1, 0.0, 0.0, 0
     for message in messages_of(paths, {topic.name}):
-        cloud = _read(message)
+        cloud: CloudMessage = message.read()
         point_id = -1 if cloud.point_id is None else cloud.point_id
         if points and (point_id <= last or message.recorded_s > last_s + _PAUSE_S):
             yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}")
@@ -173,11 +173,3 @@ def _joined(points: list[CloudMessage], time_s: float, name: str) -> RawScan:
         return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}
 
     return RawScan(columns, time_s, name)
-
-
-def _read(message: Message) -> CloudMessage:
-    try:
-        return read_cloud(message.raw, message.message_type, message.cdr)
-    except ValueError as error:
-        msg = f"{message.bag}: a message of {message.topic} is not a whole {message.message_type}: {error}"
-        raise ValueError(msg) from error
