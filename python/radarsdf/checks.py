@@ -18,6 +18,7 @@ MAX_POSITION_M = 1e12
 _Kind = TypeVar("_Kind")
 
 _MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; scaled or sheared ones do not
+_RIGID = "rotation, translation, last row 0 0 0 1"
 
 
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
@@ -113,17 +114,31 @@ MISSING_POSES = "poses are missing: T_world_sensor (4, 4) of each scan; radarsdf
 """What is said where poses are None."""
 
 
-def pose_matrices(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
+def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
     """`poses` as (F, 4, 4) float64, of any numbers. Raises a ValueError if the shape is wrong."""
     T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")
+    if num_scans is None:
+        num_scans = len(T_world_sensor) if T_world_sensor.ndim else 0
     if T_world_sensor.shape != (num_scans, 4, 4):
         msg = f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
         raise ValueError(msg)
     return T_world_sensor
 
 
-def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
-    """`poses` as (F, 4, 4) float64 T_world_sensor, m.
+def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
+    """`pose` as (4, 4) float64 T_a_b, m. Raises a ValueError if it is not a rigid transform."""
+    matrix: NDArray[np.float64] = real_array(pose, name)
+    if matrix.shape != (4, 4):
+        msg = f"{name} must have shape (4, 4), not {matrix.shape}"
+        raise ValueError(msg)
+    if not _are_rigid(matrix[None]).all():
+        msg = f"{name} is not a rigid transform ({_RIGID})"
+        raise ValueError(msg)
+    return matrix
+
+
+def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
+    """`poses` as (F, 4, 4) float64 T_world_sensor, m: as many as scans, where their number is given.
 
     Raises
     ------
@@ -131,21 +146,25 @@ def check_poses(poses: ArrayLike, num_scans: int) -> NDArray[np.float64]:
         If the shape is wrong, or a pose is not a rigid transform. The error names the first such pose.
     """
     T_world_sensor = pose_matrices(poses, num_scans)
-    rotation = T_world_sensor[:, :3, :3]
-    with np.errstate(all="ignore"):  # poses that are not finite are refused below
-        rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        rigid = (
-            (np.abs(T_world_sensor) <= MAX_POSITION_M).all(axis=(1, 2))
-            & (rotation_error < _MAX_ROTATION_ERROR)
-            & (np.linalg.det(rotation) > 0)
-            & (T_world_sensor[:, 3] == [0, 0, 0, 1]).all(axis=1)
-        )
+    rigid = _are_rigid(T_world_sensor)
     if not rigid.all():
-        msg = (
-            f"pose {int(np.argmin(rigid))} is not a rigid transform (rotation, translation, last row 0 0 0 1)"
-        )
+        msg = f"pose {int(np.argmin(rigid))} is not a rigid transform ({_RIGID})"
         raise ValueError(msg)
     return T_world_sensor
+
+
+def _are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mask (F,) of the matrices (F, 4, 4) that are rigid transforms."""
+    rotation = poses[:, :3, :3]
+    with np.errstate(all="ignore"):  # those that are not finite are none
+        rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        rigid: NDArray[np.bool_] = (
+            (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
+            & (rotation_error < _MAX_ROTATION_ERROR)
+            & (np.linalg.det(rotation) > 0)
+            & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
+        )
+    return rigid
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:

@@ -193,7 +193,10 @@ def test_extrinsic(tmp_path):
         "\n".join(" ".join(map(repr, row)) for row in mounting.tolist())
     )
     assert_allclose(read(tmp_path, POSES[:2]).poses, POSES[:2] @ mounting)
-    for wrong, message in ((np.eye(3), r"T_base_sensor \(4, 4\)"), (2 * np.eye(4), "not a rigid transform")):
+    for wrong, message in (
+        (np.eye(3), r"T_base_sensor must have shape \(4, 4\)"),
+        (2 * np.eye(4), "not a rigid transform"),
+    ):
         with pytest.raises(ValueError, match=message):
             read(tmp_path, POSES[:2], extrinsic=wrong)
 

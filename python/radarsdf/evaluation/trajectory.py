@@ -91,8 +91,7 @@ def trajectory_metrics(
     if align not in _ALIGNMENTS:
         msg = f"align must be one of {', '.join(_ALIGNMENTS)}, not {align!r:.50}"
         raise ValueError(msg)
-    true = real_array(true_poses, "true_poses")
-    true = check_poses(true, len(true) if true.ndim else 0)
+    true = check_poses(real_array(true_poses, "true_poses"))
     found = check_poses(poses, len(true))
     at = _brought(found, true, align)
     true_steps = steps(true)

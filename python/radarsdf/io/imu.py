@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import check_poses, real_array
+from radarsdf.checks import check_pose, real_array
 
 FloatArray = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class Imu:
             if getattr(self, name) is not None:
                 checked[name] = _checked(getattr(self, name), name, len(times_s))
         if self.R_sensor_imu is not None:
-            checked["R_sensor_imu"] = checked_rotation(self.R_sensor_imu, "R_sensor_imu")
+            checked["R_sensor_imu"] = checked_rotation(self.R_sensor_imu)
         for name, array in checked.items():
             object.__setattr__(self, name, array)
 
@@ -54,26 +54,25 @@ class Imu:
         return len(self.times_s)
 
 
-def checked_rotation(rotation: ArrayLike, name: str) -> FloatArray:
-    """`rotation` as a rotation (3, 3); of a rigid transform (4, 4), its rotation.
+def checked_rotation(R_sensor_imu: ArrayLike) -> FloatArray:
+    """`R_sensor_imu` as a rotation (3, 3); of a rigid transform (4, 4), its rotation.
 
     Raises
     ------
     ValueError
         If it is neither.
     """
-    matrix: FloatArray = real_array(rotation, name)
+    matrix: FloatArray = real_array(R_sensor_imu, "R_sensor_imu")
     whole = np.eye(4)
     if matrix.shape not in ((3, 3), (4, 4)):
-        msg = f"{name} must be a rotation (3, 3), not {matrix.shape}"
+        msg = f"R_sensor_imu must be a rotation (3, 3), not {matrix.shape}"
         raise ValueError(msg)
     whole[:3, :3] = matrix[:3, :3]
     try:
-        checked: FloatArray = check_poses(whole[None], 1)[0, :3, :3]
+        return check_pose(whole, "R_sensor_imu")[:3, :3]
     except ValueError as error:
-        msg = f"{name} is no rotation matrix (orthogonal, with determinant 1)"
+        msg = "R_sensor_imu is no rotation matrix (orthogonal, with determinant 1)"
         raise ValueError(msg) from error
-    return checked
 
 
 def _checked(values: Any, name: str, rows: int | None) -> FloatArray:

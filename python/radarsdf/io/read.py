@@ -5,13 +5,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from radarsdf.checks import path_of, positions, positive
 from radarsdf.io.bags.reading import bags_in, is_bag, read_bags
@@ -36,11 +36,11 @@ from radarsdf.io.sources import (
     NOT_FINITE,
     WITHOUT_POSES,
     Request,
+    Truth,
     cloud_files,
-    files_source,
     in_order_of_time,
-    posed,
     scan_poses,
+    scans_of_files,
 )
 
 _STAMPS = (None, "header", "record")
@@ -143,58 +143,58 @@ def read(
         topic=topic,
         pose_topic=pose_topic,
         imu_topic=imu_topic,
-        R_sensor_imu=None if R_sensor_imu is None else checked_rotation(R_sensor_imu, "R_sensor_imu"),
+        R_sensor_imu=None if R_sensor_imu is None else checked_rotation(R_sensor_imu),
         world_frame=world_frame,
         stamps=stamps,
         fields=fields,
         columns=columns,
         max_gap_s=positive(max_gap_s, "max_gap_s"),
+        truth=_truth(ground_truth),
         notes=Notes(str(path) if isinstance(path, (str, PathLike)) else "the bags"),
     )
-    truth = _truth(ground_truth)
     if isinstance(poses, (str, PathLike)):
         _check_exists(Path(poses))
     if not isinstance(path, (str, PathLike)):
         paths = [path_of(part, "path") for part in (path if isinstance(path, Iterable) else [path])]
         for part in paths:
             _check_exists(part)
-        found = read_bags(paths, request, truth)
+        found = read_bags(paths, request)
     else:
-        found = _read(Path(path), request, truth)
-    if truth is not None:
+        found = _read(Path(path), request)
+    if request.truth is not None:
         found.truth_kind = "given"
     return found
 
 
-def _read(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
+def _read(path: Path, request: Request) -> Scans:
     _check_exists(path)
     if is_bag(path):
-        return read_bags([path], request, truth)
+        return read_bags([path], request)
     if path.is_dir():
         dataset = published.find(path)
         if dataset is not None:
-            return dataset.read(path, request, truth)
+            return dataset.read(path, request)
         if found := bags_in(path):
             beside = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
             if request.poses is None and request.pose_topic is None and beside is not None:
                 request.notes.add(f"poses: of {beside.name}")
                 request = dataclasses.replace(request, poses=beside)
-            return read_bags(found, request, truth)
-        return _folder(path, request, truth)
+            return read_bags(found, request)
+        return _folder(path, request)
     if path.suffix.lower() == ".npz":
-        return _npz(path, request, truth)
+        return _npz(path, request)
     if path.suffix.lower() in CLOUD_SUFFIXES:
-        return _files([path], path.parent, request, truth or (lambda: None))
+        return _files([path], path.parent, request)
     msg = f"{path} is of no kind that can be read: .npz, .bag, .mcap, .db3, {', '.join(CLOUD_SUFFIXES)}, or a folder of them"
     raise ValueError(msg)
 
 
-def _folder(folder: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
+def _folder(folder: Path, request: Request) -> Scans:
     files = cloud_files(folder)
     if not files:
         msg = f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}"
         raise ValueError(msg)
-    return _files(files, folder, request, truth or (lambda: lidar_map(folder)))
+    return _files(files, folder, request, lambda: lidar_map(folder))
 
 
 def _refuse_choices_of_bags(path: Path, request: Request) -> None:
@@ -205,9 +205,7 @@ def _refuse_choices_of_bags(path: Path, request: Request) -> None:
             raise ValueError(msg)
 
 
-def _files(
-    files: list[Path], folder: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None]
-) -> Scans:
+def _files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
     """Scans of files with poses."""
     _refuse_choices_of_bags(files[0], request)
     places = dict.fromkeys((folder, files[0].parent, files[0].parent.parent))
@@ -226,12 +224,10 @@ def _files(
     given = poses_of(poses, request.notes, calibrations)
     files, times_s, given = in_order_of_time(files, given, request.notes)
     T_base_sensor = request.extrinsic if request.extrinsic is not None else base_T_radar(folder)
-    matched, known_s = scan_poses(given, len(files), times_s, T_base_sensor, request)
-    source = posed(files_source(files, known_s, request), matched, request)
-    return Scans.of_source(source, request.notes, truth)
+    return scans_of_files(files, times_s, given, T_base_sensor, request, truth)
 
 
-def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] | None] | None) -> Scans:
+def _npz(path: Path, request: Request) -> Scans:
     given = None if request.poses is UNPOSED else request.poses
     if given is None and request.extrinsic is not None:
         msg = f"{path} has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
@@ -242,7 +238,7 @@ def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] |
     _refuse_choices_of_bags(path, request)
     scans = read_scans(path)
     matched = None if given is None else _other_poses(given, scans, path, request)
-    if matched is not None and truth is None and scans.ground_truth is not None:
+    if matched is not None and request.truth is None and scans.ground_truth is not None:
         request.notes.add(
             f"the ground truth of {path.name} is left out: it lies in the world of the poses there"
         )
@@ -267,7 +263,7 @@ def _npz(path: Path, request: Request, truth: Callable[[], NDArray[np.float64] |
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
     own_truth = None if matched is not None else scans.ground_truth
-    found = Scans.of_source(source, request.notes, truth or (lambda: own_truth), lambda: imu)
+    found = Scans.of_source(source, request.notes, request.truth or (lambda: own_truth), lambda: imu)
     found.truth_kind = scans.truth_kind
     return found
 
@@ -281,7 +277,7 @@ def _other_poses(given: Any, scans: Scans, path: Path, request: Request) -> Scan
     return matched
 
 
-def _truth(ground_truth: Any) -> Callable[[], NDArray[np.float64] | None] | None:
+def _truth(ground_truth: Any) -> Truth | None:
     if ground_truth is None:
         return None
     if isinstance(ground_truth, (str, PathLike)):

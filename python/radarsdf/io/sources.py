@@ -17,7 +17,7 @@ from radarsdf.io.clouds.fields import Fields
 from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_columns
 from radarsdf.io.poses.reading import POSE_FILES, ScanPoses, StampedPoses
 from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, in_seconds
-from radarsdf.io.scans import Notes, Scan
+from radarsdf.io.scans import Notes, Scan, Scans
 from radarsdf.io.text import number_rows
 
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
@@ -48,6 +48,10 @@ _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 _UNITS = ((17, 1e-9), (14, 1e-6), (11, 1e-3))  # more digits than this: the unit of a time without a point, s
 
 
+Truth = Callable[[], NDArray[np.float64] | None]
+"""Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
+
+
 @dataclass(frozen=True, eq=False)
 class Request:
     """How a user wants scans to be read; see :func:`radarsdf.io.read`."""
@@ -63,6 +67,8 @@ class Request:
     max_gap_s: float = MAX_GAP_S
     stamps: str | None = None
     world_frame: str | None = None
+    truth: Truth | None = None
+    """None: what lies beside the scans."""
     notes: Notes = field(default_factory=Notes)
 
 
@@ -259,17 +265,29 @@ def scan_poses(
     raise ValueError(msg)
 
 
-def files_source(
-    files: list[Path], times_s: Sequence[float] | None, request: Request
-) -> Callable[[], Iterator[RawScan]]:
-    """The scans in these files, one a file."""
+def scans_of_files(
+    files: list[Path],
+    times_s: Sequence[float] | None,
+    poses: StampedPoses | NDArray[np.float64],
+    T_base_sensor: NDArray[np.float64] | None,
+    request: Request,
+    truth: Truth = lambda: None,
+) -> Scans:
+    """Scans of one file each, with poses; `truth` is that beside them, if the request has none.
+
+    Raises
+    ------
+    ValueError
+        As :func:`scan_poses`.
+    """
+    matched, known_s = scan_poses(poses, len(files), times_s, T_base_sensor, request)
 
     def raw_scans() -> Iterator[RawScan]:
         for i, path in enumerate(files):
             yield RawScan(
                 lambda path=path: read_columns(path, request.columns),  # type: ignore[misc]
-                None if times_s is None else times_s[i],
+                None if known_s is None else known_s[i],
                 str(path),
             )
 
-    return raw_scans
+    return Scans.of_source(posed(raw_scans, matched, request), request.notes, request.truth or truth)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import (
+    check_pose,
     check_poses,
     instance,
     not_negative,
@@ -189,7 +190,7 @@ class LiveMap:
             before.
         """
         scan = checked_scan(points, intensities, doppler_mps, self._state.config.returns)
-        given = None if pose is None else check_poses([real_array(pose, "pose")], 1)[0].copy()
+        given = None if pose is None else check_pose(pose, "pose").copy()
         time_s = None if time is None else finite_time(time)
         if given is None and time_s is None:
             msg = "a scan needs a pose, or a time"

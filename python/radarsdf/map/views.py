@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import cell_keys
 from radarsdf.budget.estimate import check_views
-from radarsdf.checks import check_poses, flag, instance, number, real_array, whole_number
+from radarsdf.checks import check_pose, flag, instance, number, whole_number
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
@@ -138,11 +138,7 @@ def view_from(
     seed: Any = 0,
 ) -> View:
     """See :meth:`Map.render`."""
-    pose = real_array(T_world_sensor, "T_world_sensor")
-    if pose.shape != (4, 4):
-        msg = f"T_world_sensor must have shape (4, 4), not {pose.shape}"
-        raise ValueError(msg)
-    pose = check_poses(pose[None], 1)[0]
+    pose = check_pose(T_world_sensor, "T_world_sensor")
     surface = viewed.surface
     sensor = viewed.sensor if sensor is None else instance(sensor, Sensor, "sensor")
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")

@@ -74,12 +74,11 @@ def measured_imu(
     (2001, (2001, 3), True)
     """
     at_s: FloatArray = real_array(times_s, "times_s")
-    way = real_array(poses, "poses")
-    way = check_poses(way, len(way) if way.ndim else 0)
+    way = check_poses(poses)
     if len(way) < 2 or at_s.shape != (len(way),) or not (np.diff(at_s) > 0).all():
         msg = f"a motion has two poses or more, and an ascending time for each: {len(way)} poses, times {at_s.shape}"
         raise ValueError(msg)
-    R_imu = np.eye(3) if R_sensor_imu is None else checked_rotation(R_sensor_imu, "R_sensor_imu")
+    R_imu = np.eye(3) if R_sensor_imu is None else checked_rotation(R_sensor_imu)
     count = int(np.floor((at_s[-1] - at_s[0]) * positive(rate_hz, "rate_hz") + 1e-6)) + 1
     times = at_s[0] + np.arange(count) / rate_hz
     turning = RotationSpline(at_s, Rotation.from_matrix(way[:, :3, :3]))

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import check_poses, instance, real_array, whole_number
+from radarsdf.checks import check_poses, instance, whole_number
 
 from .radar import Origin, RadarSensor, generator, unit_vectors
 from .scene import Scene
@@ -151,8 +151,7 @@ def simulate(
     instance(scene, Scene, "scene")
     instance(sensor, RadarSensor, "sensor")
     whole_number(lidar_rays, "lidar_rays", 0)
-    poses = real_array(poses, "poses")
-    poses = check_poses(poses, len(poses) if poses.ndim else 0)
+    poses = check_poses(poses)
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
     return Simulation(
         points=[scan.points for scan in scans],

@@ -149,7 +149,7 @@ class DrivePoses:
         try:
             arrays = arrays_of(path, ("poses", "described"))
             poses, described = arrays["poses"], json.loads(arrays["described"].tobytes())
-            return cls(_posed(check_poses(poses, len(poses)), described), str(described["key"]))
+            return cls(_posed(check_poses(poses), described), str(described["key"]))
         except Exception as error:  # damaged files raise exceptions of many kinds
             msg = f"{path} does not hold the poses of a plan: {error}"
             raise ValueError(msg) from error

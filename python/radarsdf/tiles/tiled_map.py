@@ -16,7 +16,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import check_poses, instance, path_of, real_array
+from radarsdf.checks import check_pose, instance, path_of
 from radarsdf.map import queries, storage
 from radarsdf.map.map import Map
 from radarsdf.returns.echoes import EchoesAt
@@ -189,7 +189,7 @@ class TiledMap(TileBlend, Map):
         from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
         from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - likewise
 
-        pose = check_poses(np.asarray(real_array(T_world_sensor, "T_world_sensor"))[None], 1)[0]
+        pose = check_pose(T_world_sensor, "T_world_sensor")
         range_m = (self.sensor if sensor is None else instance(sensor, Sensor, "sensor")).range_m[1]
         # Of a pose far away from all tiles, any will do to see nothing.
         tiles = tiles_within(self, pose[:3, 3], range_m) or [self.tiles[0].tile]

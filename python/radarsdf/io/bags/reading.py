@@ -5,14 +5,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf.io.bags.files import Topic, bags_in, is_bag, messages_of, topics_of, topics_with
 from radarsdf.io.bags.imu import imu_in_bags, imu_topic
@@ -38,9 +37,7 @@ _PAUSE_S = 0.02  # the points of a scan are sent at once; scans are 30 ms apart 
 _PEEKED_SCANS, _PEEKED_POINTS = 10, 400  # messages that are looked at for the clock: several scans
 
 
-def read_bags(
-    paths: list[Path], request: Request, truth: Callable[[], NDArray[np.float64] | None] | None = None
-) -> Scans:
+def read_bags(paths: list[Path], request: Request) -> Scans:
     """Scans of one drive in one or several bags; see :func:`radarsdf.io.read`."""
     if not paths:
         msg = "there is no bag to read: the list is empty"
@@ -78,7 +75,8 @@ def read_bags(
             return None
         return imu_in_bags(paths, topics, of_imu, peeked[0].header.frame, by_record, request)
 
-    return Scans.of_source(posed(raw_scans, matched, request), request.notes, truth or (lambda: None), imu)
+    truth = request.truth or (lambda: None)
+    return Scans.of_source(posed(raw_scans, matched, request), request.notes, truth, imu)
 
 
 def _is_bag_of_poses(poses: Any) -> bool:

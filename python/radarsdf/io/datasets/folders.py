@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import check_poses
+from radarsdf.checks import check_pose
 from radarsdf.io.clouds.reading import read_points
 from radarsdf.io.poses.trajectory import read_table
 
@@ -37,9 +37,7 @@ def read_transform(path: Path, default: NDArray[np.float64]) -> NDArray[np.float
         return default
     matrix = read_table(path, 4)
     try:
-        poses = check_poses(matrix[None], 1)
+        return check_pose(matrix, "the matrix")
     except ValueError as error:
         msg = f"{path} does not hold a rigid transform: {error}"
         raise ValueError(msg) from error
-    transform: NDArray[np.float64] = poses[0]
-    return transform

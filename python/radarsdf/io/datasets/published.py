@@ -10,26 +10,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import check_poses
+from radarsdf.checks import check_pose
 from radarsdf.io.bags.files import bags_in
 from radarsdf.io.bags.reading import read_bags
-from radarsdf.io.clouds.reading import read_columns
 from radarsdf.io.datasets.folders import BASE_T_RADAR, base_T_radar
 from radarsdf.io.datasets.snail_radar import SnailRadar, is_snail_radar
-from radarsdf.io.poses.reading import ScanPoses, poses_of, read_calibration, trajectory_of
+from radarsdf.io.poses.reading import poses_of, read_calibration, trajectory_of
 from radarsdf.io.poses.trajectory import read_table
 from radarsdf.io.scans import Scans
-from radarsdf.io.sources import RawScan, Request, files_source, natural, posed, scan_poses
+from radarsdf.io.sources import Request, natural, scans_of_files
 from radarsdf.io.text import read_text
-
-Truth = Callable[[], NDArray[np.float64] | None] | None
 
 
 class Dataset(Protocol):
@@ -40,7 +36,7 @@ class Dataset(Protocol):
     def fits(self, folder: Path) -> bool:
         """Whether a folder has the shape of this data set."""
 
-    def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
+    def read(self, folder: Path, request: Request) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
 
 
@@ -57,12 +53,12 @@ class NTU4DRadLM:
         """Whether a folder has the shape of this data set."""
         return (folder / "gt_odom.txt").is_file() and bool(self._bags(folder))
 
-    def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
+    def read(self, folder: Path, request: Request) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
         if request.poses is None:
             request = dataclasses.replace(request, poses=folder / "gt_odom.txt")
         _say_without_extrinsic(self.name, "gt_odom.txt", request)
-        return read_bags(self._bags(folder), request, truth)
+        return read_bags(self._bags(folder), request)
 
     def _bags(self, folder: Path) -> list[Path]:
         return [path for path in bags_in(folder) if path.stem != "gt_odom"]
@@ -83,7 +79,7 @@ class MscRad4R:
             folder / "3_RADAR" / "timestamp_radar.txt"
         ).is_file()
 
-    def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
+    def read(self, folder: Path, request: Request) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
         if request.poses is None:
             msg = f"{folder}: MSC-RAD4R has positions but no poses: give poses, such as a TUM file of lidar odometry"
@@ -94,7 +90,7 @@ class MscRad4R:
         if len(times_s) != len(files):
             msg = f"{folder}: timestamp_radar.txt has {len(times_s)} lines for {len(files)} scans"
             raise ValueError(msg)
-        return _of_files(files, times_s, None, request, truth)
+        return _of_files(files, times_s, request.extrinsic, request)
 
 
 class ColoRadar:
@@ -111,7 +107,7 @@ class ColoRadar:
         """Whether a folder has the shape of this data set."""
         return (folder / "single_chip" / "pointclouds" / "data").is_dir()
 
-    def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
+    def read(self, folder: Path, request: Request) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
         clouds = folder / "single_chip" / "pointclouds"
         files = sorted((clouds / "data").glob("radar_pointcloud_*.bin"), key=natural)
@@ -141,7 +137,7 @@ class ColoRadar:
             else:
                 T_base_sensor = _translation_and_quaternion(file)
         request = dataclasses.replace(request, poses=poses, columns=request.columns or 5)
-        return _of_files(files, times_s, T_base_sensor, request, truth)
+        return _of_files(files, times_s, T_base_sensor, request)
 
 
 class ViewOfDelft:
@@ -166,7 +162,7 @@ class ViewOfDelft:
                 return radar / "training", poses / "training"
         return None
 
-    def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
+    def read(self, folder: Path, request: Request) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
         parts = self._parts(folder)
         assert parts is not None
@@ -174,7 +170,7 @@ class ViewOfDelft:
         files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
         request = dataclasses.replace(request, columns=request.columns or 7)
         if request.poses is not None:
-            return _of_files(files, None, request.extrinsic, request, truth)
+            return _of_files(files, None, request.extrinsic, request)
         posed_files = [path for path in files if (lidar / "pose" / f"{path.stem}.json").is_file()]
         if not posed_files:
             msg = f"{lidar / 'pose'} has a pose for none of the {len(files)} scans in {radar / 'velodyne'}"
@@ -182,14 +178,8 @@ class ViewOfDelft:
         if len(posed_files) < len(files):
             request.notes.add(f"{len(files) - len(posed_files)} scans left out: they have no file of a pose")
         request.notes.add("the scans have no times; the world is the map frame of View-of-Delft")
-
-        def raw_scans() -> Iterator[RawScan]:
-            for path in posed_files:
-                yield RawScan(lambda path=path: read_columns(path, request.columns), None, str(path))  # type: ignore[misc]
-
         poses = np.stack([self._pose(path.stem, radar, lidar, request.extrinsic) for path in posed_files])
-        matched = ScanPoses(poses, np.eye(4), request.max_gap_s)
-        return Scans.of_source(posed(raw_scans, matched, request), request.notes, truth or (lambda: None))
+        return scans_of_files(posed_files, None, poses, None, request)
 
     def _pose(
         self, frame: str, radar: Path, lidar: Path, extrinsic: NDArray[np.float64] | None
@@ -204,7 +194,7 @@ class ViewOfDelft:
             if T_map_camera is None:
                 msg = "it lacks mapToCamera"
                 raise ValueError(msg)
-            T_map_camera = check_poses(T_map_camera[None], 1)[0]
+            T_map_camera = check_pose(T_map_camera, "mapToCamera")
         except (ValueError, TypeError, RecursionError) as error:
             msg = f"{path} is not a pose of View-of-Delft: {error}"
             raise ValueError(msg) from error
@@ -231,11 +221,11 @@ class VikingHill:
         """Whether a folder has the shape of this data set."""
         return (folder / BASE_T_RADAR).is_file() and bool(bags_in(folder))
 
-    def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
+    def read(self, folder: Path, request: Request) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
         if request.extrinsic is None:
             request = dataclasses.replace(request, extrinsic=base_T_radar(folder))
-        return read_bags(bags_in(folder), request, truth)
+        return read_bags(bags_in(folder), request)
 
 
 class Snail:
@@ -250,7 +240,7 @@ class Snail:
         """Whether a folder has the shape of this data set."""
         return is_snail_radar(folder)
 
-    def read(self, folder: Path, request: Request, truth: Truth) -> Scans:
+    def read(self, folder: Path, request: Request) -> Scans:
         """Its scans; see :func:`radarsdf.io.read`."""
         snail = SnailRadar.of(folder)
         if snail.others() and folder.resolve() == snail.folder:
@@ -259,13 +249,8 @@ class Snail:
         files = snail.files()
         poses = snail.trajectory if request.poses is None else request.poses
         extrinsic = snail.T_base_radar if request.extrinsic is None else request.extrinsic
-        return _of_files(
-            [path for _, path in files],
-            [time_s for time_s, _ in files],
-            extrinsic,
-            dataclasses.replace(request, poses=poses),
-            truth or snail.ground_truth,
-        )
+        request = dataclasses.replace(request, poses=poses, truth=request.truth or snail.ground_truth)
+        return _of_files([path for _, path in files], [time_s for time_s, _ in files], extrinsic, request)
 
 
 DATASETS: tuple[Dataset, ...] = (Snail(), ViewOfDelft(), ColoRadar(), MscRad4R(), NTU4DRadLM(), VikingHill())
@@ -305,17 +290,12 @@ def _of_files(
     times_s: list[float] | None,
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
-    truth: Truth,
 ) -> Scans:
     """Scans of one file each, with the poses of the request."""
     if not files:
         msg = "the folder of the scans is empty"
         raise ValueError(msg)
-    extrinsic = request.extrinsic if request.extrinsic is not None else T_base_sensor
-    poses: Any = poses_of(request.poses, request.notes)
-    matched, known_s = scan_poses(poses, len(files), times_s, extrinsic, request)
-    source = posed(files_source(files, known_s, request), matched, request)
-    return Scans.of_source(source, request.notes, truth or (lambda: None))
+    return scans_of_files(files, times_s, poses_of(request.poses, request.notes), T_base_sensor, request)
 
 
 def _say_without_extrinsic(name: str, poses: str, request: Request) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checks import check_poses, real_array
+from radarsdf.checks import check_pose, check_poses, real_array
 from radarsdf.io.files import check_regular_file
 from radarsdf.io.poses.trajectory import Trajectory, in_seconds, trajectory_of_table
 from radarsdf.io.scans import Notes
@@ -114,18 +114,7 @@ def extrinsic_of(extrinsic: Any) -> NDArray[np.float64] | None:
     ValueError
         If it is not a rigid transform.
     """
-    if extrinsic is None:
-        return None
-    matrix = real_array(extrinsic, "extrinsic")
-    if matrix.shape != (4, 4):
-        msg = f"extrinsic must be T_base_sensor (4, 4), not {matrix.shape}"
-        raise ValueError(msg)
-    try:
-        checked: NDArray[np.float64] = check_poses(matrix[None], 1)[0]
-    except ValueError as error:
-        msg = "extrinsic is not a rigid transform T_base_sensor (rotation, translation, last row 0 0 0 1)"
-        raise ValueError(msg) from error
-    return checked
+    return None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor")
 
 
 def poses_of(
@@ -141,7 +130,7 @@ def poses_of(
     if matrices.ndim != 3:
         msg = f"poses must be (F, 4, 4) T_world_sensor, or a file of poses, not an array {matrices.shape}"
         raise ValueError(msg)
-    return check_poses(matrices, len(matrices))
+    return check_poses(matrices)
 
 
 def read_poses(
@@ -288,7 +277,7 @@ def _checked(poses: NDArray[Any], path: Path) -> NDArray[np.float64]:
         msg = f"{path} must hold poses (F, 4, 4), not {poses.dtype} {poses.shape}"
         raise ValueError(msg)
     try:
-        return check_poses(poses, len(poses))
+        return check_poses(poses)
     except ValueError as error:
         msg = f"{path}: {error}"
         raise ValueError(msg) from error

@@ -56,8 +56,7 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | 
     """
     check_pose_suffix(path)
     suffix = path_of(path, "path").suffix.lower()
-    matrices = real_array(poses, "poses")
-    matrices = check_poses(matrices, len(matrices) if matrices.ndim else 0)
+    matrices = check_poses(poses)
     text = io.BytesIO()
     if suffix == ".npy":
         np.save(text, matrices)
