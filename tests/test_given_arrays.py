@@ -12,7 +12,8 @@ from radarsdf import FitConfig, marching_cubes, simulate
 from radarsdf.checks import real_array
 from radarsdf.cli import main
 from radarsdf.evaluation import gamma_from_moments, holdout, intensity_metrics
-from radarsdf.io.npz import Scans, write_scans
+from radarsdf.io.npz import write_scans
+from radarsdf.io.scans import Scans
 from radarsdf.map.colors import intensity_colors
 from radarsdf.render.picture import render
 

@@ -17,7 +17,8 @@ import pytest
 import radarsdf
 import trimesh
 from radarsdf import FitConfig
-from radarsdf.io.npz import Scans, write_scans
+from radarsdf.io.npz import write_scans
+from radarsdf.io.scans import Scans
 
 from .cli.calls import call
 from .warm_python import warm_python

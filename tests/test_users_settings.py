@@ -14,7 +14,8 @@ import radarsdf
 import torch
 import trimesh
 from radarsdf import FitConfig, evaluation
-from radarsdf.io.npz import Scans, read_scans, write_scans
+from radarsdf.io.npz import read_scans, write_scans
+from radarsdf.io.scans import Scans
 from radarsdf.render.picture import save_picture
 
 from .conftest import ground_and_wall

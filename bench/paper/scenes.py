@@ -15,7 +15,8 @@ from radarsdf import FitConfig
 from radarsdf.evaluation import holdout
 from radarsdf.io import read
 from radarsdf.io.datasets.snail_radar import is_snail_radar
-from radarsdf.io.npz import Scans, read_scans
+from radarsdf.io.npz import read_scans
+from radarsdf.io.scans import Scans
 from radarsdf.returns.rays import prepare
 from radarsdf.simulate import KINDS, SCENES, Simulation
 from scipy.spatial import cKDTree

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from radarsdf.io.npz import Scans, read_scans, write_scans
+from radarsdf.io.npz import read_scans, write_scans
+from radarsdf.io.scans import Scans
 from radarsdf.simulate import SCENES
 from scipy.spatial import cKDTree
 

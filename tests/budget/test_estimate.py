@@ -14,7 +14,8 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.budget import estimate as budget
 from radarsdf.cli import main
-from radarsdf.io.npz import Scans, write_scans
+from radarsdf.io.npz import write_scans
+from radarsdf.io.scans import Scans
 from radarsdf.returns.rays import prepare
 
 from bench.growth.street import street

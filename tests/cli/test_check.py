@@ -9,7 +9,8 @@ import json
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.io.npz import Scans, write_scans
+from radarsdf.io.npz import write_scans
+from radarsdf.io.scans import Scans
 
 from .calls import FAST, call, refusal
 

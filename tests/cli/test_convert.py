@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import radarsdf
 import trimesh
-from radarsdf.io.npz import Scans, read_scans, write_scans
+from radarsdf.io.npz import read_scans, write_scans
+from radarsdf.io.scans import Scans
 
 from .calls import call, refusal, values
 

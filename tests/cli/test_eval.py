@@ -12,7 +12,8 @@ import trimesh
 from radarsdf.evaluation import KNNIntensity
 from radarsdf.io.clouds.writing import write_cloud
 from radarsdf.io.ground_truth import read_ground_truth
-from radarsdf.io.npz import Scans, read_scans, write_scans
+from radarsdf.io.npz import read_scans, write_scans
+from radarsdf.io.scans import Scans
 
 from .calls import call, refusal, values
 

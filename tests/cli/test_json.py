@@ -14,7 +14,8 @@ import radarsdf
 from radarsdf.checking.doppler import velocity_of_poses
 from radarsdf.cli import COMMANDS, whole_parser
 from radarsdf.cli.results import Results
-from radarsdf.io.npz import Scans, write_scans
+from radarsdf.io.npz import write_scans
+from radarsdf.io.scans import Scans
 
 from .calls import FAST, call, refusal, values
 

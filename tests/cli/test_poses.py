@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.io.npz import Scans, read_scans, write_scans
+from radarsdf.io.npz import read_scans, write_scans
+from radarsdf.io.scans import Scans
 from radarsdf.simulate import MeasuredMotion, drifted, measured_motion
 
 from ..poses.drift import position_error_m

@@ -19,7 +19,8 @@ from radarsdf import Diverged, FitConfig, Interrupted, _core
 from radarsdf.fitting.core_gradients import CoreGradients
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
-from radarsdf.io.npz import Scans, write_scans
+from radarsdf.io.npz import write_scans
+from radarsdf.io.scans import Scans
 
 from ..conftest import ground_and_wall
 from ..warm_python import warm_python

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.io.npz import Scans, arrays_of, read_scans, write_arrays, write_scans
+from radarsdf.io.npz import arrays_of, read_scans, write_arrays, write_scans
+from radarsdf.io.scans import Scans
 
 from ..conftest import pose
 

@@ -9,7 +9,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
-from radarsdf.io.npz import Scans
+from radarsdf.io.scans import Scans
 from radarsdf.returns.movers import Movers, Standing
 
 from tests.conftest import recorded_scans

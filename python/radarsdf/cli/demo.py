@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from radarsdf import RadarMap
-    from radarsdf.io.npz import Scans
+    from radarsdf.io.scans import Scans
 
 SCENES = ("hugin", "oculii", "wall", "astyx")
 """The names in `radarsdf.simulate.SCENES`, which is not imported for a help text."""
@@ -58,9 +58,9 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.cli.held_out import add_intensity_errors
     from radarsdf.cli.saving import save_map
     from radarsdf.evaluation import holdout
+    from radarsdf.io import Scans, write_scans
     from radarsdf.io.files import check_outputs
     from radarsdf.io.meshes import write_mesh
-    from radarsdf.io.npz import Scans, write_scans
     from radarsdf.render.picture import save_picture
 
     shown = ends_with_viewer(options)

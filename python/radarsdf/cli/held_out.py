@@ -13,7 +13,7 @@ from radarsdf.tiles.any_map import predicted
 
 if TYPE_CHECKING:
     from radarsdf.cli.results import Results
-    from radarsdf.io.npz import Scans
+    from radarsdf.io.scans import Scans
 
 
 def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: Scans) -> None:

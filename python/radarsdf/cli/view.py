@@ -22,7 +22,7 @@ from radarsdf.cli.saying import say, until_stopped
 from radarsdf.cli.scans_in import add_scans, scans_of
 
 if TYPE_CHECKING:
-    from radarsdf.io.npz import Scans
+    from radarsdf.io.scans import Scans
     from radarsdf.map.map import Map
 
 

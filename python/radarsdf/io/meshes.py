@@ -16,7 +16,7 @@ from radarsdf.checks import path_of
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.origin import origin_for, origin_of, write_origin
-from radarsdf.io.records import Columns, ply_header, records
+from radarsdf.io.records import Columns, face_records, ply_header, records
 
 if TYPE_CHECKING:
     import trimesh
@@ -143,12 +143,5 @@ def _ply(mesh: trimesh.Trimesh) -> bytes:
         colors = np.asarray(visual.vertex_colors, np.uint8)
         columns |= dict(zip(("red", "green", "blue", "alpha"), colors.T, strict=True))
     vertices = records(columns)
-    faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
-    faces["count"], faces["rows"] = 3, mesh.faces
-    lines = [
-        *ply_header(vertices.dtype, len(vertices)),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
-    return ("\n".join(lines) + "\n").encode("ascii") + vertices.tobytes() + faces.tobytes()
+    header = ply_header(vertices.dtype, len(vertices), len(mesh.faces))
+    return header + vertices.tobytes() + face_records(mesh.faces).tobytes()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans in ``.npz`` files."""
+"""Scans in ``.npz`` files, and arrays in those of any kind."""
 
 from __future__ import annotations
 
@@ -17,10 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import instance, path_of
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.imu import Imu
-from radarsdf.io.scans import Scan, Scans
+from radarsdf.io.scans import Scans
 from radarsdf.io.unpacking import check_unpacked
-
-__all__ = ["Scan", "Scans", "read_scans", "write_scans"]
 
 _IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu
 _ARRAYS = (
@@ -135,6 +133,25 @@ def _imu(arrays: dict[str, NDArray[Any]], path: str | PathLike[str]) -> Imu | No
     except ValueError as error:
         msg = f"{path}: {error}"
         raise ValueError(msg) from error
+
+
+def array_in(path: Path) -> NDArray[Any]:
+    """The array of an ``.npy`` file, as a memory map: a header that claims more than the file holds is refused.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file, or damaged.
+    OSError
+        If it cannot be read.
+    """
+    check_regular_file(path)
+    try:
+        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        msg = f"{path} is not a whole .npy file: {error}"
+        raise ValueError(msg) from error
+    return array
 
 
 def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Named columns as the binary records of files, little-endian."""
+"""Named columns and triangles as the binary records of files, little-endian."""
 
 from __future__ import annotations
 
@@ -24,8 +24,21 @@ def records(columns: Columns) -> NDArray[Any]:
     return rows
 
 
-def ply_header(dtype: np.dtype[Any], count: int) -> list[str]:
-    """The first lines of a binary PLY file of `count` such records: up to the properties of its vertices."""
-    lines = ["ply", "format binary_little_endian 1.0", "comment radarsdf: world frame, m"]
-    lines += [f"element vertex {count}"]
-    return lines + [f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
+def face_records(faces: NDArray[np.integer[Any]]) -> NDArray[Any]:
+    """(T,) one record for each triangle (T, 3), as in a binary PLY file."""
+    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
+    rows["count"], rows["rows"] = 3, faces
+    return rows
+
+
+def ply_header(
+    dtype: np.dtype[Any], count: int, num_faces: int | None = None, comment: str | None = None
+) -> bytes:
+    """The header of a binary PLY file of `count` such records, and of triangles if it is a mesh."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [] if comment is None else [f"comment {comment}"]
+    lines += ["comment radarsdf: world frame, m", f"element vertex {count}"]
+    lines += [f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
+    if num_faces is not None:
+        lines += [f"element face {num_faces}", "property list uchar int vertex_indices"]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")

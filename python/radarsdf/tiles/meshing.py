@@ -16,7 +16,7 @@ from radarsdf.budget.estimate import check_triangles
 from radarsdf.checks import path_of, positive
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import whole_file
-from radarsdf.io.records import ply_header, records
+from radarsdf.io.records import face_records, ply_header, records
 from radarsdf.map.meshing import Limits, check_box
 from radarsdf.map.threshold import Threshold
 from radarsdf.tiles.blend import TileBlend
@@ -73,16 +73,13 @@ def export_mesh(
         welded = _welded(city, voxel_size, executor, progress, **limits)
         columns = ("x", "y", "z", "confidence", "uncertainty_m")
         types = ["<f8"] * 3 + ["<f4"] * 2
-        header = ply_header(np.dtype(list(zip(columns, types, strict=True))), welded.num_vertices)
-        header += [f"element face {welded.num_faces}", "property list uchar int vertex_indices", "end_header"]
-        file.write(("\n".join(header) + "\n").encode("ascii"))
+        dtype = np.dtype(list(zip(columns, types, strict=True)))
+        file.write(ply_header(dtype, welded.num_vertices, welded.num_faces))
         for part in welded.parts():
             values = (*part.vertices.T, part.confidence, part.uncertainty_m)
             file.write(records(dict(zip(columns, values, strict=True))).data)
         for part in welded.parts():
-            faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
-            faces["count"], faces["rows"] = 3, part.faces
-            file.write(faces.data)
+            file.write(face_records(part.faces).data)
     return welded.num_vertices, welded.num_faces
 
 

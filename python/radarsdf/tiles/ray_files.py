@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from radarsdf._core import cell_keys
 from radarsdf.checks import MAX_POSITION_M
 from radarsdf.io.files import check_regular_file
+from radarsdf.io.npz import array_in
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.plausible import Plausible
 from radarsdf.returns.rays import Rays, rays_from
@@ -94,7 +95,7 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
         msg = f"{path} has {found:g} rays instead of {tile.rays}: make the plan again"
         raise ValueError(msg)
     rows = np.fromfile(path, _RECORD)
-    table = _table_of_scans(within(folder, folder / _SCANS))
+    table = array_in(within(folder, folder / _SCANS))  # of which few rows are needed
     if (
         table.shape != (plan.scans, 6)
         or table.dtype != np.float64
@@ -131,17 +132,6 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
         (cells >= lower) & (cells < lower + plan.tile_cells + 2 * halo), axis=1
     )
     return rays, inside
-
-
-def _table_of_scans(path: Path) -> NDArray[np.float64]:
-    """What :func:`write_scans` wrote, in the file."""
-    check_regular_file(path)
-    try:
-        # A memory map: few rows are needed, and a header that claims more than the file holds is refused.
-        return np.load(path, mmap_mode="r", allow_pickle=False)  # type: ignore[no-any-return]
-    except (ValueError, EOFError) as error:
-        msg = f"{path} is not a whole .npy file: {error}"
-        raise ValueError(msg) from error
 
 
 def read_intensities(folder: Path, tile: Tile) -> NDArray[np.float32]:

@@ -127,10 +127,8 @@ def _columns(scan: Scan, number: int) -> dict[str, NDArray[Any]]:
 
 
 def _ply(dtype: np.dtype[Any], count: int) -> bytes:
-    lines = ply_header(dtype, count)
     # The number of points is known in the end: the header keeps its length, as its comment makes up for the digits.
-    lines.insert(2, "comment " + "." * (_COUNT_BYTES - len(str(count))))
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+    return ply_header(dtype, count, comment="." * (_COUNT_BYTES - len(str(count))))
 
 
 def _pcd(dtype: np.dtype[Any], count: int) -> bytes:

@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check_pose, check_poses, real_array
 from radarsdf.io.files import check_regular_file
-from radarsdf.io.poses.trajectory import Trajectory, in_seconds, trajectory_of_table
+from radarsdf.io.npz import array_in
+from radarsdf.io.poses.trajectory import Trajectory, in_seconds, read_table, trajectory_of_table
 from radarsdf.io.scans import Notes
-from radarsdf.io.text import number_rows, read_text
+from radarsdf.io.text import read_text
 
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 """Names of files of poses that are found beside scans."""
@@ -171,8 +172,8 @@ def read_poses(
     """
     check_regular_file(path)
     if path.suffix.lower() == ".npy":
-        return _checked(_npy(path), path)
-    table = _table(path)
+        return _checked(np.array(array_in(path)), path)
+    table = read_table(path)
     if table.shape[1] == _TUM_COLUMNS:
         table[:, 0] = in_seconds(table[:, 0], path, notes)
         return trajectory_of_table(table, path)
@@ -249,27 +250,6 @@ def trajectory_of(
         msg = f"{name} holds poses that are not finite, or without a unit quaternion"
         raise ValueError(msg)
     return Trajectory(times, xyz, Rotation.from_quat(quats), name)
-
-
-def _table(path: Path) -> NDArray[np.float64]:
-    """(R, columns) float64 of a text file of numbers."""
-    try:
-        table = np.array(number_rows(path), np.float64)
-    except ValueError as error:
-        msg = f"{path} is not a table of poses: {error}"
-        raise ValueError(msg) from error
-    if table.ndim != 2 or len(table) == 0 or not np.isfinite(table).all():
-        msg = f"{path} is not a table of poses, of finite numbers in rows of one length"
-        raise ValueError(msg)
-    return table
-
-
-def _npy(path: Path) -> NDArray[Any]:
-    try:
-        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (ValueError, EOFError) as error:
-        msg = f"{path} is not a whole .npy file: {error}"
-        raise ValueError(msg) from error
 
 
 def _checked(poses: NDArray[Any], path: Path) -> NDArray[np.float64]:

@@ -201,8 +201,8 @@ def trajectory_of_table(table: NDArray[np.float64], path: Path) -> Trajectory:
     return Trajectory(table[:, 0], table[:, 1:4], Rotation.from_quat(table[:, 4:]), str(path))
 
 
-def read_table(path: Path, columns: int) -> NDArray[np.float64]:
-    """Reads a text file of finite numbers, (R, columns) float64, with comments after ``#``.
+def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
+    """Reads a text file of finite numbers, (R, columns) float64, with comments after ``#``; None: of any poses.
 
     Raises
     ------
@@ -211,12 +211,13 @@ def read_table(path: Path, columns: int) -> NDArray[np.float64]:
     OSError
         If the file cannot be read.
     """
+    wanted = "poses" if columns is None else f"{columns} columns of numbers"
     try:
         table = np.array(number_rows(path), np.float64)
     except ValueError as error:
-        msg = f"{path} is not a table of {columns} columns of numbers: {error}"
+        msg = f"{path} is not a table of {wanted}: {error}"
         raise ValueError(msg) from error
-    if table.ndim != 2 or table.shape[1] != columns or not np.isfinite(table).all():
-        msg = f"{path} is not a table of {columns} columns of finite numbers"
+    if table.ndim != 2 or columns not in (None, table.shape[1]) or not np.isfinite(table).all():
+        msg = f"{path} is not a table of {wanted}, all finite and in rows of one length"
         raise ValueError(msg)
     return table
