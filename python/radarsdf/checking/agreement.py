@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from radarsdf.poses.rigid import between
+
 FloatArray = NDArray[np.float64]
 
 _NEIGHBOURS = 4  # returns of the same scan whose mean distance is the spacing at a return
@@ -135,16 +137,20 @@ def choose_pairs(
     ways = sorted({min(lag, most) for lag in lags} | {lag * stride for lag in lags if lag * stride <= most})
     found = []
     for lag in ways:
-        last = len(usable) - lag
-        firsts = np.unique(np.linspace(0, last - 1, min(last, -(-count // len(ways)))).round().astype(int))
-        found.append(np.stack([usable[firsts], usable[firsts + lag]], 1))
+        found.append(pairs_apart(usable, lag, -(-count // len(ways))))
     return np.concatenate(found)
+
+
+def pairs_apart(scans: NDArray[np.int64], lag: int, count: int) -> NDArray[np.int64]:
+    """Pairs (P, 2) of scans (K,), `lag` of them apart: about `count`, at equal steps."""
+    last = len(scans) - lag
+    firsts = np.unique(np.linspace(0, last - 1, min(last, count)).round().astype(int))
+    return np.stack([scans[firsts], scans[firsts + lag]], 1)
 
 
 def relative(T_world_sensor: FloatArray, pairs: NDArray[np.int64]) -> FloatArray:
     """(P, 4, 4) motions T_j_i of the pairs (P, 2) of poses (F, 4, 4), each from scan i to scan j."""
-    motions: FloatArray = inverse(T_world_sensor[pairs[:, 1]]) @ T_world_sensor[pairs[:, 0]]
-    return motions
+    return between(T_world_sensor[pairs[:, 1]], T_world_sensor[pairs[:, 0]])
 
 
 def inverse(T_a_b: FloatArray) -> FloatArray:

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checking.agreement import LAGS, MIN_RETURNS, Agreement, Comparison, choose_pairs, relative
+from radarsdf.checking.agreement import (
+    LAGS,
+    MIN_RETURNS,
+    Agreement,
+    Comparison,
+    choose_pairs,
+    pairs_apart,
+    relative,
+)
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.hypotheses import Hypothesis, hypotheses, standing_still
 from radarsdf.checking.recording import FloatArray, Recording
@@ -58,15 +66,13 @@ def check_frames(recording: Recording, effort: Effort = FULL) -> list[Finding]:
 
     Poses must be rigid transforms.
     """
-    poses = _near_origin(recording.poses)
+    poses = recording.poses
     pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
     if len(pairs) < _MIN_PAIRS:
         return []
     agreement = Agreement(recording.points, effort.returns, effort.queries)
-    # Inverted poses, and points in the world frame, need the poses as they are, not moved to the origin.
-    guesses = hypotheses(recording.poses, pairs, all_axes=effort.all_axes)
-    given = relative(poses, pairs)
-    scores = agreement.scores(pairs, np.stack([given, *(guess.T_j_i for guess in guesses)]))
+    guesses = hypotheses(poses, pairs, all_axes=effort.all_axes)
+    scores = agreement.scores(pairs, np.stack([relative(poses, pairs), *(guess.T_j_i for guess in guesses)]))
     best = _best(recording, pairs, guesses, scores)
     if best is None:
         return []
@@ -92,9 +98,7 @@ def check_still(recording: Recording, effort: Effort = FULL) -> list[Finding]:
     # Neighbours, and scans that are half of the recording apart.
     scores = []
     for lag in (1, max(1, len(usable) // 2)):
-        last = len(usable) - lag
-        firsts = np.unique(np.linspace(0, last - 1, min(last, effort.pairs // 2)).round().astype(int))
-        pairs = np.stack([usable[firsts], usable[firsts + lag]], 1)
+        pairs = pairs_apart(usable, lag, effort.pairs // 2)
         scores.append(agreement.scores(pairs, relative(recording.poses, pairs)[None])[0])
     near, far = scores
     change = float(far.mean() - near.mean())
@@ -122,7 +126,7 @@ def check_clock(recording: Recording, effort: Effort = FULL) -> list[Finding]:
     count = len(recording)
     if count < 2 * _MIN_PAIRS:
         return []
-    poses = _near_origin(recording.poses)
+    poses = recording.poses
     clocks = [(np.arange(count, dtype=np.float64), "steps between scans")]
     if recording.ascending_times_s is not None:
         clocks.insert(0, (recording.ascending_times_s, "s"))
@@ -264,13 +268,6 @@ def _centre(scan: FloatArray) -> FloatArray:
 def _mean_direction(scan: FloatArray) -> FloatArray:
     direction: FloatArray = (scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]).mean(axis=0)
     return direction
-
-
-def _near_origin(T_world_sensor: FloatArray) -> FloatArray:
-    """Poses moved so that the first sensor is at the origin: UTM coordinates would cost digits."""
-    moved = T_world_sensor.copy()
-    moved[:, :3, 3] -= T_world_sensor[0, :3, 3]
-    return moved
 
 
 def _at(T_world_sensor: FloatArray, times: FloatArray, wanted: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.agreement import inverse, relative
+from radarsdf.poses.rigid import turned_by
 
 FloatArray = NDArray[np.float64]
 
@@ -216,7 +217,7 @@ def _angles(T_world_sensor: FloatArray) -> Iterator[tuple[str, FloatArray]]:
             "the angles of the poses are taken for rad, not degrees",
             with_rotations(Rotation.from_rotvec(vectors)),
         )
-    if len(rotations) < 3 or np.median((rotations[:-1].inv() * rotations[1:]).magnitude()) < _FAST_RAD:
+    if len(rotations) < 3 or np.median(turned_by(T_world_sensor[:-1], T_world_sensor[1:])) < _FAST_RAD:
         return
     # Angles in degrees, taken for rad, have lost whole turns. Steps are small, so the turns between scans are known.
     angles = np.radians(np.unwrap(rotations.as_euler("ZYX"), axis=0))

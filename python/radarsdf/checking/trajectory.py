@@ -4,14 +4,16 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
 from radarsdf.checking.finding import Finding, Severity
 from radarsdf.checking.frames import FULL, Effort
 from radarsdf.checking.recording import FloatArray, Recording
+from radarsdf.poses.rigid import steps, turned_by
 from radarsdf.returns.doppler import folding_interval_mps, sensor_velocity
 
 _MAX_ROTATION_ERROR = 1e-3  # as of the poses that a fit accepts
@@ -126,8 +128,8 @@ def check_times(recording: Recording) -> list[Finding]:
         return [Finding("times", "error", "Some times are not finite.", "Leave out these scans.")]
     if recording.ascending_times_s is not None:
         return []
-    steps = np.diff(times)
-    if (steps == 0).all():
+    waits = np.diff(times)
+    if (waits == 0).all():
         return [
             Finding(
                 "times",
@@ -140,7 +142,7 @@ def check_times(recording: Recording) -> list[Finding]:
         Finding(
             "times",
             "warning",
-            f"{int((steps <= 0).sum())} of {len(steps)} times are not later than the one before.",
+            f"{int((waits <= 0).sum())} of {len(waits)} times are not later than the one before.",
             "Sort scans, poses and times together, and leave out scans that come twice.",
         )
     ]
@@ -172,13 +174,13 @@ def check_duplicates(recording: Recording) -> list[Finding]:
         return found
     same_pose = (recording.poses[1:] == recording.poses[:-1]).all(axis=(1, 2))
     same_pose[[later - 1 for earlier, later in repeated if later == earlier + 1]] = False
-    steps = _steps_m(recording)
-    moving = steps[~same_pose]
+    lengths = _steps_m(recording)
+    moving = lengths[~same_pose]
     if not same_pose.any() or not len(moving):
         return found
     # A sensor that stands still has such poses too. One whose poses are held catches up with a leap.
-    after = steps[1:][same_pose[:-1] & ~same_pose[1:]]
-    plain = steps[1:][~same_pose[:-1] & ~same_pose[1:]]
+    after = lengths[1:][same_pose[:-1] & ~same_pose[1:]]
+    plain = lengths[1:][~same_pose[:-1] & ~same_pose[1:]]
     usual = float(np.median(plain)) if len(plain) >= _ROUND else float(np.median(moving)) / 2
     held = len(after) >= 2 and float(np.median(after)) > _CAUGHT_UP * usual > 0
     found.append(
@@ -211,8 +213,8 @@ def check_jumps(recording: Recording, effort: Effort = FULL) -> list[Finding]:
     durations = np.ones(count - 1)
     if recording.ascending_times_s is not None:
         durations = np.diff(recording.ascending_times_s)
-    sizes = _sizes(poses, recording) / durations
-    changes = _changes(poses, recording, durations)
+    sizes = _sizes(recording) / durations
+    changes = _changes(recording, durations)
     usual = float(np.median(changes))
     suspects = np.flatnonzero(changes > _JUMP * max(usual, 0.1 * float(np.median(sizes)))).tolist()
     suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
@@ -228,7 +230,7 @@ def check_jumps(recording: Recording, effort: Effort = FULL) -> list[Finding]:
         return []
     worst = max(confirmed, key=lambda k: changes[k])
     step = float(np.linalg.norm(poses[worst + 1, :3, 3] - poses[worst, :3, 3]))
-    turn = float(np.degrees(_turns(poses)[worst]))
+    turn = float(np.degrees(_turns(recording)[worst]))
     return [
         Finding(
             "pose_jumps",
@@ -267,7 +269,7 @@ def _agree_without(
     ]
     if not near:
         return False
-    motions = np.linalg.inv(poses[:-1]) @ poses[1:]
+    motions = steps(poses)
     replaced = motions.copy()
     for k in {jump, *(s for s in suspects if abs(s - jump) <= 1)}:
         nearest = min(near, key=lambda n: abs(n - k))
@@ -291,7 +293,7 @@ def _agree_without(
         if len(chosen) < 2:
             continue
         pairs = np.array(chosen, np.int64)
-        other = np.stack([_chain(replaced[i:j]) for i, j in chosen])
+        other = np.stack([functools.reduce(np.matmul, replaced[i:j]) for i, j in chosen])
         scores = agreement.scores(pairs, np.stack([relative(poses, pairs), np.linalg.inv(other)]))
         comparison = Comparison.of(scores[0], scores[1:])
         gain = float(comparison.gains[0])
@@ -301,12 +303,12 @@ def _agree_without(
     return False
 
 
-def _changes(T_world_sensor: FloatArray, recording: Recording, durations: FloatArray) -> FloatArray:
+def _changes(recording: Recording, durations: FloatArray) -> FloatArray:
     """(F - 1,) how far each motion is off the median of those round it, for one unit of time, m.
 
     Turns count as ways of the returns at a typical range.
     """
-    motions = np.linalg.inv(T_world_sensor[:-1]) @ T_world_sensor[1:]
+    motions = steps(recording.poses)
     turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec() * _typical_range_m(recording)
     vectors = np.concatenate([motions[:, :3, 3], turns], axis=1) / durations[:, None]
     changes = np.zeros(len(vectors))
@@ -316,30 +318,20 @@ def _changes(T_world_sensor: FloatArray, recording: Recording, durations: FloatA
     return changes
 
 
-def _chain(motions: FloatArray) -> FloatArray:
-    """The product (4, 4) of motions (K, 4, 4)."""
-    product = np.eye(4)
-    for motion in motions:
-        product = product @ motion
-    return product
-
-
 def _steps_m(recording: Recording) -> FloatArray:
     """(F - 1,) lengths of the steps between poses."""
     lengths: FloatArray = np.linalg.norm(np.diff(recording.poses[:, :3, 3], axis=0), axis=1)
     return lengths
 
 
-def _turns(T_world_sensor: FloatArray) -> NDArray[np.float64]:
+def _turns(recording: Recording) -> FloatArray:
     """(F - 1,) angles between poses, rad."""
-    rotations = Rotation.from_matrix(T_world_sensor[:, :3, :3])
-    angles: NDArray[np.float64] = (rotations[:-1].inv() * rotations[1:]).magnitude()
-    return angles
+    return turned_by(recording.poses[:-1], recording.poses[1:])
 
 
-def _sizes(T_world_sensor: FloatArray, recording: Recording) -> FloatArray:
+def _sizes(recording: Recording) -> FloatArray:
     """(F - 1,) lengths of the steps, with turns as ways of the returns at a typical range, m."""
-    return np.hypot(_steps_m(recording), _typical_range_m(recording) * _turns(T_world_sensor))
+    return np.hypot(_steps_m(recording), _typical_range_m(recording) * _turns(recording))
 
 
 def _typical_range_m(recording: Recording) -> float:
