@@ -167,6 +167,20 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
         raise ValueError(msg) from error
 
 
+def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[Any, ...]]) -> None:
+    """Raises a ValueError unless the wanted arrays are there, each of its type and shape. A length of None is any."""
+    for name, (dtype, *shape) in wanted.items():
+        array = arrays.get(name)
+        fits = array is not None and array.dtype == dtype and array.ndim == len(shape)
+        if (
+            array is None
+            or not fits
+            or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True))
+        ):
+            msg = f"{name} is missing, or of another type or shape"
+            raise ValueError(msg)
+
+
 def write_arrays(
     path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
 ) -> None:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from radarsdf.io.npz import arrays_of, write_arrays
 
 ScanId = Hashable
-_FIELDS = ("points", "intensities", "doppler_mps", "standing")
+FIELDS = ("points", "intensities", "doppler_mps", "standing")
+"""What a `LoggedScan` holds beside its pose, in this order."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class LoggedScan:
     @property
     def num_bytes(self) -> int:
         """Memory that it takes, bytes."""
-        arrays = [self.pose, *(getattr(self, name) for name in _FIELDS)]
+        arrays = [self.pose, *(getattr(self, name) for name in FIELDS)]
         held: int = sum(array.nbytes for array in arrays if array is not None)
         return held + _BYTES_OF_SCAN
 
@@ -178,16 +179,16 @@ class ScanLog:
 
 
 def _arrays(scan: LoggedScan) -> dict[str, NDArray[Any]]:
-    given = {name: getattr(scan, name) for name in ("pose", *_FIELDS)}
+    given = {name: getattr(scan, name) for name in ("pose", *FIELDS)}
     return {name: array for name, array in given.items() if array is not None}
 
 
 def _read(found: _OnDisk) -> LoggedScan:
-    arrays = arrays_of(found.path, ("pose", *_FIELDS))
+    arrays = arrays_of(found.path, ("pose", *FIELDS))
     if not {"pose", "points"} <= set(arrays):
         msg = f"{found.path} is not a scan of this map"
         raise ValueError(msg)
-    return LoggedScan(found.pose, arrays["points"], *(arrays.get(name) for name in _FIELDS[1:]))
+    return LoggedScan(found.pose, arrays["points"], *(arrays.get(name) for name in FIELDS[1:]))
 
 
 def compact(points: NDArray[np.float64]) -> NDArray[Any]:

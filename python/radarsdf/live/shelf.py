@@ -58,7 +58,7 @@ class Shelf:
             path = self._paths[region]
             try:
                 read.append(checked_sums(arrays_of(path, tuple(SUMS))))
-            except (KeyError, ValueError) as error:
+            except ValueError as error:
                 msg = f"{path} is no region of this map, or it is damaged: {error}"
                 raise ValueError(msg) from error
         joined = {name: np.concatenate([arrays[name] for arrays in read]) for name in SUMS}

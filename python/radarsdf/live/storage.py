@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import check_poses
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.io.npz import arrays_of, write_arrays
-from radarsdf.live.scan_log import LoggedScan, ScanId
+from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
+from radarsdf.live.scan_log import FIELDS, LoggedScan, ScanId
 from radarsdf.returns.noise import SensorNoise
 
 _FORMAT = 1
-_COLUMNS = ("points", "intensities", "doppler_mps", "standing")
 
 
 @dataclass(frozen=True)
@@ -44,12 +43,12 @@ class Stored:
     looks: NDArray[np.uint32]
 
 
-SUMS: dict[str, tuple[Any, tuple[int | None, ...]]] = {
-    "keys": (np.uint64, (None,)),
-    "sums": (np.int64, (None, 14)),
-    "scans_of_cells": (np.uint32, (None,)),
-    "look_keys": (np.uint64, (None,)),
-    "looks": (np.uint32, (None,)),
+SUMS: dict[str, tuple[Any, ...]] = {
+    "keys": (np.uint64, None),
+    "sums": (np.int64, None, 14),
+    "scans_of_cells": (np.uint32, None),
+    "look_keys": (np.uint64, None),
+    "looks": (np.uint32, None),
 }
 """Types and shapes of what is kept of cells and blocks, in the order in which the core takes it. None: any length."""
 
@@ -72,14 +71,14 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
         "sealed": stored.sealed,
         "ids": list(stored.scans),
         "held": [
-            [name for name in _COLUMNS if getattr(scan, name) is not None] for scan in stored.scans.values()
+            [name for name in FIELDS if getattr(scan, name) is not None] for scan in stored.scans.values()
         ],
     }
     scans = list(stored.scans.values())
     arrays: dict[str, NDArray[Any]] = {name: getattr(stored, name) for name in SUMS}
     arrays["poses"] = np.stack([scan.pose for scan in scans]) if scans else np.zeros((0, 4, 4))
     arrays["counts"] = np.array([len(scan.points) for scan in scans], np.int64)
-    for name in _COLUMNS:
+    for name in FIELDS:
         held = [array for array in (getattr(scan, name) for scan in scans) if array is not None]
         if held:
             arrays[name] = np.concatenate(held)
@@ -91,7 +90,7 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
 
 def load_state(path: str | PathLike[str]) -> Stored:
     """The state that :func:`save_state` wrote. Raises a ValueError if the file is none, or damaged."""
-    names = ("described", "poses", "counts", *SUMS, *_COLUMNS, *(f"{name}_single" for name in _COLUMNS))
+    names = ("described", "poses", "counts", *SUMS, *FIELDS, *(f"{name}_single" for name in FIELDS))
     arrays = arrays_of(Path(path), names)
     try:
         return _state_of(arrays)
@@ -101,16 +100,9 @@ def load_state(path: str | PathLike[str]) -> Stored:
 
 
 def checked_sums(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The arrays of :data:`SUMS`. Raises a KeyError or a ValueError if they are none."""
-    sums = {}
-    for name, (dtype, shape) in SUMS.items():
-        array = sums[name] = np.ascontiguousarray(arrays[name])
-        fits = array.ndim == len(shape) and all(
-            n in (None, m) for m, n in zip(array.shape, shape, strict=True)
-        )
-        if array.dtype != dtype or not fits:
-            msg = f"{name} is of another type or shape"
-            raise ValueError(msg)
+    """The arrays of :data:`SUMS`. Raises a ValueError if they are none."""
+    check_arrays(arrays, SUMS)
+    sums = {name: np.ascontiguousarray(arrays[name]) for name in SUMS}
     if (np.diff(sums["keys"].astype(np.float64)) < 0).any() or (sums["sums"][:, 0] < 1).any():
         msg = "its sums are none"
         raise ValueError(msg)
@@ -125,9 +117,9 @@ def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
     sums = checked_sums(arrays)
     ids, held, counts = described["ids"], described["held"], arrays["counts"].tolist()
     poses = check_poses(arrays["poses"], len(ids)) if ids else np.zeros((0, 4, 4))
-    columns = {name: _parts(arrays, name, held, counts) for name in _COLUMNS}
+    columns = {name: _parts(arrays, name, held, counts) for name in FIELDS}
     scans = {
-        scan_id: LoggedScan(poses[i].copy(), *(columns[name][i] for name in _COLUMNS))
+        scan_id: LoggedScan(poses[i].copy(), *(columns[name][i] for name in FIELDS))
         for i, scan_id in enumerate(ids)
     }
     if any(scan.points is None or scan.points.shape[1:] != (3,) for scan in scans.values()):

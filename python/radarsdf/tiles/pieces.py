@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf.io.npz import arrays_of, write_arrays
+from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import Surface, VertexLimits, renumbered
 from radarsdf.map.threshold import SUMS
@@ -80,7 +80,7 @@ class Piece:
     @classmethod
     def load(cls, path: Path) -> Piece:
         """Reads what :func:`mesh_tile` wrote. Raises a ValueError if the file is damaged."""
-        piece = cls(**_checked(path, _ARRAYS))
+        piece = cls(**_read(path, _ARRAYS))
         count, borders = len(piece.vertices), len(piece.border_rows)
         if (
             {count} != {len(piece.confidence), len(piece.uncertainty_m)}
@@ -95,16 +95,16 @@ class Piece:
 
 def tally_sums(path: Path) -> NDArray[np.float64]:
     """The `tally` of the piece in a file, of which nothing else is read. Raises as :meth:`Piece.load`."""
-    return _checked(path, ["tally"])["tally"]
+    return _read(path, ["tally"])["tally"]
 
 
-def _checked(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+def _read(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     arrays = arrays_of(path, names)
-    for name in names:
-        array, (dtype, *shape) = arrays.get(name), _ARRAYS[name]
-        if array is None or array.dtype != dtype or not _has_shape(array, shape):
-            msg = f"{path} is not a whole piece of a mesh: {name} is missing, or of another type or shape"
-            raise ValueError(msg)
+    try:
+        check_arrays(arrays, {name: _ARRAYS[name] for name in names})
+    except ValueError as error:
+        msg = f"{path} is not a whole piece of a mesh: {error}"
+        raise ValueError(msg) from error
     return arrays
 
 
@@ -119,10 +119,6 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
     "tally": (np.float64, SUMS),
 }
 """Type and shape of each array of a `Piece`. None: any length."""
-
-
-def _has_shape(array: NDArray[Any], shape: list[int | None]) -> bool:
-    return array.ndim == len(shape) and all(n in (None, m) for m, n in zip(array.shape, shape, strict=True))
 
 
 def piece_path(city: TileBlend, tile: Tile, settings: PieceSettings) -> Path:
