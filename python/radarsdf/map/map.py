@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries
@@ -304,7 +305,6 @@ class Map(MapParts):
 
         return make_grid(self, box, voxel_size, occupied_from, free_to)
 
-    @abstractmethod
     def render(
         self,
         T_world_sensor: ArrayLike,
@@ -337,7 +337,8 @@ class Map(MapParts):
         Returns
         -------
         View
-            The first call for a map prepares its surface, which takes about a second for each million leaf cells.
+            The first call for a map prepares its surface, which takes about a second for each million leaf cells. Of a
+            map in tiles, that within the sensor's range is held until a view needs others.
 
         Raises
         ------
@@ -346,6 +347,12 @@ class Map(MapParts):
         MemoryError
             If the view would take more memory than there is. At most 10^6 beams are traced, and a patch has one return.
         """
+        from radarsdf.map.views import view_from  # noqa: PLC0415 - as above
+
+        pose = check_pose(T_world_sensor, "T_world_sensor")
+        sensor = self.sensor if sensor is None else instance(sensor, Sensor, "sensor")
+        viewed = self._viewed_from(pose[:3, 3], sensor.range_m[1])
+        return view_from(viewed, pose, sensor, returns, noise=noise, seed=seed)
 
     @abstractmethod
     def save(self, path: str | PathLike[str]) -> None:

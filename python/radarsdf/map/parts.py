@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,10 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from radarsdf.map import queries
+from radarsdf.map.contents import MapContents
 from radarsdf.returns.echoes import EchoesAt
 
 if TYPE_CHECKING:
     from radarsdf.map.gridding import CellsInBox
+    from radarsdf.map.views import ViewedMap
 
 
 class MapParts(ABC):
@@ -31,8 +34,15 @@ class MapParts(ABC):
 
     @property
     @abstractmethod
+    def any_contents(self) -> MapContents:
+        """The parts of the map, or of one of its tiles, for what all have in common."""
+
+    @cached_property
     def passage_odds(self) -> NDArray[np.float64]:
         """(8,) how much more often 0 to 7 or more scans pass a leaf cell behind a surface than one before it."""
+        from radarsdf.map.gridding import passage_odds  # noqa: PLC0415 - it imports trimesh, which is slow
+
+        return passage_odds(self.any_contents)
 
     @abstractmethod
     def echoes(self) -> EchoesAt:
@@ -50,14 +60,18 @@ class MapParts(ABC):
     def _observed(self, world: Tensor) -> Tensor:
         """:meth:`Map.observed` there, (N,) bool."""
 
-    @abstractmethod
     def _uncertainty(self, world: Tensor) -> Tensor:
         """:meth:`Map.uncertainty` there, (N,)."""
+        return queries.uncertainty(self.any_contents, self.evidence_at(world))
 
-    @abstractmethod
     def _confidence(self, world: Tensor) -> Tensor:
         """:meth:`Map.confidence` there, (N,)."""
+        return queries.confidence(self.any_contents, self.evidence_at(world))
 
     @abstractmethod
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         """:meth:`Map.intensity` there, (N,), for sensors at (N, 3)."""
+
+    @abstractmethod
+    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
+        """What views from a position (3,), world, m, need of the map within a range. It is held for the next view."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from radarsdf.map.gridding import CellsInBox
     from radarsdf.map.traced_surface import TracedSurface
-    from radarsdf.map.views import View
+    from radarsdf.map.views import ViewedMap
 
 
 class RadarMap(Map):
@@ -54,14 +54,12 @@ class RadarMap(Map):
     def _observed(self, world: Tensor) -> Tensor:
         return queries.observed(self._contents, queries.to_local(self._contents, world))
 
-    def _uncertainty(self, world: Tensor) -> Tensor:
-        return queries.uncertainty(self._contents, self.evidence_at(world))
-
-    def _confidence(self, world: Tensor) -> Tensor:
-        return queries.confidence(self._contents, self.evidence_at(world))
-
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         return self._answers_at(queries.intensity, world, sensors, extrapolate=extrapolate)
+
+    @property
+    def any_contents(self) -> MapContents:
+        return self._contents
 
     def _answers_at(self, query: Callable[..., Tensor], *positions: Tensor, extrapolate: bool) -> Tensor:
         local = (queries.to_local(self._contents, given) for given in positions)
@@ -103,31 +101,10 @@ class RadarMap(Map):
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
         return queries.evidence(self._contents, queries.to_local(self._contents, world))
 
-    @cached_property
-    def passage_odds(self) -> NDArray[np.float64]:
-        from radarsdf.map.gridding import passage_odds  # noqa: PLC0415 - as above
+    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - it is of all
+        from radarsdf.map.views import ViewedMap  # noqa: PLC0415 - as above
 
-        return passage_odds(self._contents)
-
-    def render(
-        self,
-        T_world_sensor: ArrayLike,
-        sensor: Sensor | None = None,
-        *,
-        returns: float | None = None,
-        noise: bool = False,
-        seed: int | np.random.Generator = 0,
-    ) -> View:
-        from radarsdf.map.views import ViewedMap, view_from  # noqa: PLC0415 - it imports trimesh, which is slow
-
-        return view_from(
-            ViewedMap.of(self._contents, self._traced),
-            T_world_sensor,
-            sensor,
-            returns=returns,
-            noise=noise,
-            seed=seed,
-        )
+        return ViewedMap.of(self._contents, self._traced)
 
     @cached_property
     def _traced(self) -> TracedSurface:

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
 from radarsdf.budget.estimate import check_views
-from radarsdf.checks import check_pose, flag, instance, number, whole_number
+from radarsdf.checks import flag, number, whole_number
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
@@ -99,8 +99,6 @@ class ViewedMap:
     """What beams meet, local frame."""
     origin: _Floats
     """(3,) of the local frame, world, m."""
-    sensor: Sensor
-    """The radar that made the map."""
     roughness: float
     """See :func:`radarsdf.map.queries.roughness`."""
     intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None
@@ -121,7 +119,6 @@ class ViewedMap:
         return cls(
             surface,
             contents.origin,
-            contents.sensor,
             queries.roughness(contents),
             None if contents.intensity_scale is None else intensity,
             contents.config.max_memory_bytes,
@@ -129,18 +126,10 @@ class ViewedMap:
 
 
 def view_from(
-    viewed: ViewedMap,
-    T_world_sensor: ArrayLike,
-    sensor: Sensor | None = None,
-    *,
-    returns: float | None = None,
-    noise: bool = False,
-    seed: Any = 0,
+    viewed: ViewedMap, pose: _Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
 ) -> View:
-    """See :meth:`Map.render`."""
-    pose = check_pose(T_world_sensor, "T_world_sensor")
+    """See :meth:`Map.render`. `pose`: (4, 4) T_world_sensor, m."""
     surface = viewed.surface
-    sensor = viewed.sensor if sensor is None else instance(sensor, Sensor, "sensor")
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
     if not 0 <= wanted <= 1e8:
         msg = f"returns must be in [0, 10^8], not {returns}"

@@ -16,11 +16,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import check_pose, instance, path_of
+from radarsdf.checks import path_of
 from radarsdf.map import queries, storage
 from radarsdf.map.map import Map
 from radarsdf.returns.echoes import EchoesAt
-from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.blend import Share, TileBlend, averages, distance
 from radarsdf.tiles.drive_poses import DrivePoses
 from radarsdf.tiles.plan import map_path
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
     from radarsdf.map.gridding import CellsInBox
     from radarsdf.map.threshold import Threshold
-    from radarsdf.map.views import View, ViewedMap
+    from radarsdf.map.views import ViewedMap
     from radarsdf.tiles.grid import Tile
 
 _Floats = NDArray[np.float64]
@@ -96,12 +95,6 @@ class TiledMap(TileBlend, Map):
     def _observed(self, world: Tensor) -> Tensor:
         return torch.from_numpy(self.seen(_contiguous(world)))
 
-    def _uncertainty(self, world: Tensor) -> Tensor:
-        return queries.uncertainty(self.any_contents, self.evidence_at(world))
-
-    def _confidence(self, world: Tensor) -> Tensor:
-        return queries.confidence(self.any_contents, self.evidence_at(world))
-
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         positions, places = _contiguous(world), _contiguous(sensors)
 
@@ -162,37 +155,11 @@ class TiledMap(TileBlend, Map):
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
         return self.evidence(_contiguous(world))
 
-    @cached_property
-    def passage_odds(self) -> _Floats:
-        from radarsdf.map.gridding import passage_odds  # noqa: PLC0415 - as above
+    def _viewed_from(self, position: _Floats, range_m: float) -> ViewedMap:
+        from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - as above
 
-        return passage_odds(self.any_contents)
-
-    def render(
-        self,
-        T_world_sensor: ArrayLike,
-        sensor: Sensor | None = None,
-        *,
-        returns: float | None = None,
-        noise: bool = False,
-        seed: int | np.random.Generator = 0,
-    ) -> View:
-        """The returns that a radar would get from a pose; see :meth:`Map.render`.
-
-        The surface of the tiles within the sensor's range is held until a view needs others.
-
-        Raises
-        ------
-        ValueError
-            If the pose is not a rigid transform, or a number is out of range.
-        """
-        from radarsdf.map.views import view_from  # noqa: PLC0415 - it imports trimesh, which is slow
-        from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - likewise
-
-        pose = check_pose(T_world_sensor, "T_world_sensor")
-        range_m = (self.sensor if sensor is None else instance(sensor, Sensor, "sensor")).range_m[1]
         # Of a pose far away from all tiles, any will do to see nothing.
-        tiles = tiles_within(self, pose[:3, 3], range_m) or [self.tiles[0].tile]
+        tiles = tiles_within(self, position, range_m) or [self.tiles[0].tile]
         held = self._viewed
         if held is None or held[0] != tiles:
 
@@ -201,7 +168,7 @@ class TiledMap(TileBlend, Map):
 
             viewed = viewed_tiles(self, tiles, intensity if self.has_intensity else None)
             held = self._viewed = tiles, viewed
-        return view_from(held[1], pose, sensor, returns=returns, noise=noise, seed=seed)
+        return held[1]
 
     def export(
         self,

@@ -72,7 +72,6 @@ def viewed_tiles(
     return ViewedMap(
         traced,
         origin,
-        city.sensor,
         queries.roughness(city.any_contents),
         None if intensity is None else local_intensity,
         config.max_memory_bytes,
