@@ -11,7 +11,7 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.estimate import plan_of
 from radarsdf.poses.groups import Groups
 from radarsdf.poses.motion import Motion
-from radarsdf.poses.planes import Grid, SensorReturns, common_planes
+from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import aligned, moved
 from radarsdf.simulate import Leg, drifted
 
@@ -67,7 +67,7 @@ def test_groups_with_a_share_of_the_returns_close_a_loop():
     returns = SensorReturns.of(laps.points, 0.5, None)
     errors_m = []
     for together in (1, 4):
-        grid, groups = Grid(len(true), False, 2.0, together), Groups(len(true), together)
+        grid, groups = PlaneGrid(len(true), False, 2.0, together), Groups(len(true), together)
         planes, _ = common_planes(returns, given, grid, None, ReturnsConfig(), 1)
         prior = groups.prior(Motion.of(given, 0.1, 0.01).prior(given), given)
         found = planes.solve(*prior, 1e-4, 100, False, 1)[0]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED
-from radarsdf.poses.alignment import Alignment
 from radarsdf.poses.by_doppler import Velocities
 from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope, UnknownAxesError
-from radarsdf.poses.inertia import cumulated
+from radarsdf.poses.imu_alignment import ImuAlignment
+from radarsdf.poses.imu_motion import cumulated
 from radarsdf.poses.inertial import levelled
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
@@ -64,7 +64,7 @@ def tilt(poses, up):
 
 def test_velocities_tell_how_it_sits_there(ride, imu):
     times_s, poses, velocities = ride
-    found = Alignment.of(imu, velocities, times_s + LATE_S)
+    found = ImuAlignment.of(imu, velocities, times_s + LATE_S)
     assert angle(found.R_sensor_imu, R_SENSOR_IMU) < min(3, 3 * np.degrees(found.sigma_rad))
     assert found.late_s == pytest.approx(LATE_S, abs=0.01)
     np.testing.assert_allclose(found.lever_m, LEVER_M, atol=0.1)
@@ -78,7 +78,7 @@ def test_velocities_tell_how_it_sits_there(ride, imu):
 def test_axes_that_are_given_stay(ride, imu):
     times_s, poses, velocities = ride
     given = dataclasses.replace(imu, R_sensor_imu=R_SENSOR_IMU)
-    found = Alignment.of(given, velocities, times_s)
+    found = ImuAlignment.of(given, velocities, times_s)
     np.testing.assert_array_equal(found.R_sensor_imu, given.R_sensor_imu)
     assert found.sigma_rad == 0
     assert abs(found.late_s) < 0.01
@@ -93,7 +93,7 @@ def test_another_motion_tells_nothing(ride, imu):
         ),
         dataclasses.replace(imu, specific_force=imu.specific_force + np.sin(3 * imu.times_s)[:, None]),
     ):
-        assert Alignment.of(other, velocities, times_s) is None
+        assert ImuAlignment.of(other, velocities, times_s) is None
 
 
 def test_a_sensor_that_goes_straight_on_leaves_it_open():
@@ -105,7 +105,7 @@ def test_a_sensor_that_goes_straight_on_leaves_it_open():
     velocities = Velocities(
         [1, 0, 0] + rng.normal(0, 0.02, (200, 3)), covariance, np.ones(3), [], np.ones(200, bool)
     )
-    assert Alignment.of(measured_imu(poses, times_s), velocities, times_s) is None
+    assert ImuAlignment.of(measured_imu(poses, times_s), velocities, times_s) is None
 
 
 def test_turns_tell_it_without_an_accelerometer(ride):

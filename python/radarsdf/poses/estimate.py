@@ -12,7 +12,7 @@ import numpy as np
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.groups import Groups
 from radarsdf.poses.motion import Motion
-from radarsdf.poses.planes import Grid, SensorReturns, common_planes
+from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, moved
 from radarsdf.returns.noise import SensorNoise
 
@@ -90,7 +90,7 @@ def _prior(motions: Sequence[Motion], poses: Floats) -> tuple[Floats, Floats, Fl
     return diagonal + _WEAK * np.eye(6), below, gradient
 
 
-def plan_of(num_scans: int, cell_m: float, window: int) -> Iterator[Grid]:
+def plan_of(num_scans: int, cell_m: float, window: int) -> Iterator[PlaneGrid]:
     """Coarse to fine, and from short windows to all scans."""
     plan = []
     while window < num_scans:
@@ -99,4 +99,4 @@ def plan_of(num_scans: int, cell_m: float, window: int) -> Iterator[Grid]:
     plan += [(num_scans, cells) for cells in _OF_ALL] + [(num_scans, 1)] * _MOST_ROUNDS
     for i, (window, cells) in enumerate(plan):
         together = max(1, window // _LONGEST_WINDOW) if window < num_scans else 1
-        yield Grid(window, i % 2 == 1, cells * cell_m, together)
+        yield PlaneGrid(window, i % 2 == 1, cells * cell_m, together)

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from radarsdf.io.imu import Imu
-from radarsdf.poses.alignment import Alignment
 from radarsdf.poses.by_doppler import Velocities
 from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope
+from radarsdf.poses.imu_alignment import ImuAlignment
 from radarsdf.poses.rigid import Floats, covariance_in
 
 
@@ -24,7 +24,7 @@ class Inertial:
 
     gyroscope: Gyroscope | None
     """None: there is none, or it is not used."""
-    alignment: Alignment | None = None
+    alignment: ImuAlignment | None = None
     """How the IMU sits on the radar, by its accelerometer and Doppler. None: they do not tell."""
     notes: tuple[str, ...] = ()
 
@@ -37,7 +37,7 @@ class Inertial:
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             note = "The IMU is not used: it measured before or after all scans. Are both times of one clock?"
             return cls(None, notes=(note,))
-        alignment = None if velocities is None else Alignment.of(imu, velocities, times_s)
+        alignment = None if velocities is None else ImuAlignment.of(imu, velocities, times_s)
         if alignment is not None:
             measured = (alignment.angular_velocity, alignment.times_s)
             return cls(Gyroscope.of(*measured, times_s, alignment.bias_rad_s), alignment)

@@ -18,12 +18,12 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import doppler_sign
+from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.drive import Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import Gyroscope, UnknownAxesError
 from radarsdf.poses.inertial import Inertial, levelled
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.recording import Recording
 from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
 from radarsdf.returns.rays import within_ranges
@@ -132,25 +132,23 @@ def odometry(
     """
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    recording = Recording.of(points, doppler_mps, times)
-    if recording.times_s is None:
+    checked = CheckedScans.of(points, doppler_mps, times)
+    if checked.times_s is None:
         msg = "times are missing: when each scan was taken, s"
         raise ValueError(msg)
-    times_s, velocities, sign = recording.times_s, recording.velocities, 1
+    times_s, velocities, sign = checked.times_s, checked.velocities, 1
     if velocities is not None:
-        sign = doppler_sign(recording.scans, velocities, times_s)
+        sign = doppler_sign(checked.scans, velocities, times_s)
         velocities = velocities.turned if sign < 0 else velocities
     if angular_velocity is not None:
         at = times_s if angular_velocity_times is None else angular_velocity_times
-        inertial = Inertial(Gyroscope.of(*_checked_rates(angular_velocity, at, recording), times_s))
+        inertial = Inertial(Gyroscope.of(*_checked_rates(angular_velocity, at, checked), times_s))
     else:
         used = points.imu if imu is None and isinstance(points, Scans) else imu
-        inertial = Inertial.of(used, velocities, times_s, recording.begin_s)
+        inertial = Inertial.of(used, velocities, times_s, checked.begin_s)
     limits = config.returns
     with Workers(config.num_threads) as workers:
-        scans = [
-            scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in recording.scans
-        ]
+        scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
         try:
             drive, tracked = followed(drive, config, workers.num_threads)
@@ -177,8 +175,8 @@ def odometry(
         "gyroscope": inertial.gyroscope is not None,
         "gyroscope_bias": None if drive.gyroscope is None else drive.gyroscope.bias.mean.tolist(),
         "imu": inertial.report,
-        "movers": recording.movers,
-        "notes": [*recording.notes, *inertial.notes],
+        "movers": checked.movers,
+        "notes": [*checked.notes, *inertial.notes],
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
     }
@@ -235,18 +233,20 @@ def _words(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: 
     return f"{whole} The drive was lost before the scans {', '.join(map(str, begins))}: {len(begins) + 1} pieces, which do not belong together."
 
 
-def _checked_rates(angular_velocity: ArrayLike, at: ArrayLike, recording: Recording) -> tuple[Floats, Floats]:
+def _checked_rates(
+    angular_velocity: ArrayLike, at: ArrayLike, checked: CheckedScans
+) -> tuple[Floats, Floats]:
     """Rates (G, 3) and their times (G,) from the first scan on."""
     rates: Floats = real_array(angular_velocity, "angular_velocity")
     at_s: Floats = real_array(at, "angular_velocity_times")
-    at_s = at_s if at is recording.times_s else at_s - recording.begin_s
+    at_s = at_s if at is checked.times_s else at_s - checked.begin_s
     if rates.ndim != 2 or rates.shape[1] != 3 or at_s.shape != (len(rates),):
         msg = f"angular_velocity must have shape (G, 3), and one time for each rate, not {rates.shape} and {at_s.shape}"
         raise ValueError(msg)
     if not (np.isfinite(rates).all() and np.isfinite(at_s).all()) or (np.diff(at_s) < 0).any():
         msg = "angular_velocity and its times must be finite, and the times ascend"
         raise ValueError(msg)
-    times_s = recording.times_s
+    times_s = checked.times_s
     assert times_s is not None
     if at_s[0] > times_s[-1] or at_s[-1] < 0:
         msg = "angular_velocity was measured before or after all scans: are both times of one clock?"

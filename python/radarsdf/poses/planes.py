@@ -86,7 +86,7 @@ def windows(num_scans: int, size: int, shifted: bool) -> list[tuple[int, int]]:
 
 
 @dataclass(frozen=True)
-class Grid:
+class PlaneGrid:
     """How returns are put together to planes."""
 
     window: int
@@ -102,7 +102,7 @@ class Grid:
 def common_planes(
     returns: SensorReturns,
     poses: Floats,
-    grid: Grid,
+    grid: PlaneGrid,
     noise: SensorNoise | None,
     config: ReturnsConfig,
     num_threads: int = 0,

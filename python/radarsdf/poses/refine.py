@@ -16,10 +16,10 @@ from radarsdf.checks import MISSING_POSES, check_poses, instance, not_negative
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import DopplerMotion
+from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.recording import Recording
 from radarsdf.poses.rigid import Floats, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
@@ -110,8 +110,8 @@ def refine_poses(
         poses = points.poses
     if poses is None:
         raise ValueError(MISSING_POSES)
-    recording = Recording.of(points, doppler_mps, times)
-    scans, times_s, velocities = recording.scans, recording.times_s, recording.velocities
+    checked = CheckedScans.of(points, doppler_mps, times)
+    scans, times_s, velocities = checked.scans, checked.times_s, checked.velocities
     given = check_poses(poses, len(scans))
     known = sigma_m is not None, sigma_rad is not None
     unsteady_m, unsteady_rad = unsteadiness(given, times_s)
@@ -144,8 +144,8 @@ def refine_poses(
         "bias": steps_given.bias.tolist(),
         **moved_by(given, found.poses),
         "noise": vars(found.noise).copy(),
-        "notes": recording.notes,
-        "movers": recording.movers,
+        "notes": checked.notes,
+        "movers": checked.movers,
         "scans": len(scans),
         "returns": len(returns),
         "rounds": found.rounds,

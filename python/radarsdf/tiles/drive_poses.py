@@ -32,7 +32,7 @@ _FORMAT, _VERSION = "radarsdf.tiles.poses", 1
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveToPose:
     """Scans whose poses are refined or found. They are read more than once."""
 
     scans: Iterable[Scan]
@@ -44,7 +44,7 @@ class Drive:
 class _Seen:
     """The scans of a drive, once. What has been seen is known by its key."""
 
-    def __init__(self, drive: Drive) -> None:
+    def __init__(self, drive: DriveToPose) -> None:
         self._drive, self._digest = drive, InputDigest()
         self.times_s: list[float | None] = []
 
@@ -78,7 +78,7 @@ class DrivePoses:
     """Of the scans as given, the settings, and whether poses were refined or found."""
 
     @classmethod
-    def of(cls, drive: Drive, config: FitConfig, folder: Path, progress: bool | None) -> DrivePoses:
+    def of(cls, drive: DriveToPose, config: FitConfig, folder: Path, progress: bool | None) -> DrivePoses:
         """Those in the folder, if they are of the same scans and settings. Else they are made, and written there.
 
         Raises
@@ -100,7 +100,7 @@ class DrivePoses:
         made.save(folder, seen.times_s[posed.rows])
         return made
 
-    def digest(self, drive: Drive, config: FitConfig) -> str:
+    def digest(self, drive: DriveToPose, config: FitConfig) -> str:
         """Of the scans with these poses. Empty if they are not those of this drive with these settings; it is read once."""
         seen = _Seen(drive)
         digest = InputDigest.of(self.scans(seen))

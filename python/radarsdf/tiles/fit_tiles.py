@@ -22,7 +22,7 @@ from radarsdf.io.files import write_whole
 from radarsdf.io.poses.reading import UNPOSED, NoPoses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
-from radarsdf.tiles.drive_poses import POSES, TRAJECTORY, Drive, DrivePoses
+from radarsdf.tiles.drive_poses import POSES, TRAJECTORY, DrivePoses, DriveToPose
 from radarsdf.tiles.grid import TileGrid
 from radarsdf.tiles.input_digest import InputDigest
 from radarsdf.tiles.locking import LOCK, only_planner
@@ -161,7 +161,7 @@ def plan_tiles(
 
 def _given(
     scans: str | PathLike[str] | Scans | Iterable[Scan], *, refine: bool, find: bool
-) -> tuple[Drive | None, Iterable[Scan]]:
+) -> tuple[DriveToPose | None, Iterable[Scan]]:
     """The scans, checked one after another as they are read, and how their poses are made. None: they are as given."""
     refine, find = flag(refine, "refine"), flag(find, "find")
     if isinstance(scans, (str, PathLike)):
@@ -176,7 +176,7 @@ def _given(
     if iter(scans) is scans:
         msg = "poses can be refined or found of scans that can be read again: give a path, Scans or a list"
         raise ValueError(msg)
-    return Drive(checked, scans.imu if isinstance(scans, Scans) else None, find), checked
+    return DriveToPose(checked, scans.imu if isinstance(scans, Scans) else None, find), checked
 
 
 def run_fits(

@@ -14,7 +14,7 @@ from radarsdf.poses.rigid import Floats
 
 
 @dataclass(frozen=True)
-class Inertia:
+class ImuMotion:
     """The motion of an IMU, integrated."""
 
     times_s: Floats
@@ -28,7 +28,7 @@ class Inertia:
     """(G,) number of the part of the drive."""
 
     @classmethod
-    def of(cls, imu: Imu, rate_bias: Floats, force_bias: Floats) -> Inertia:
+    def of(cls, imu: Imu, rate_bias: Floats, force_bias: Floats) -> ImuMotion:
         assert imu.specific_force is not None
         parts = len(rate_bias)
         elapsed = imu.times_s - imu.times_s[0]

@@ -21,7 +21,7 @@ NO_VELOCITY = "The Doppler is not used: less than half of the scans agree on a v
 
 
 @dataclass(frozen=True)
-class Recording:
+class CheckedScans:
     """F scans of one drive."""
 
     scans: list[Floats]
@@ -43,7 +43,7 @@ class Recording:
         points: Iterable[ArrayLike] | Scans,
         doppler_mps: Sequence[ArrayLike] | None,
         times: ArrayLike | None,
-    ) -> Recording:
+    ) -> CheckedScans:
         """Of scans (N_i, 3), Doppler (N_i,) and times (F,). Raises TypeError or ValueError where they are none."""
         if isinstance(points, Scans):
             of_scans, points = points, points.points  # first: it reads all there is, in one pass

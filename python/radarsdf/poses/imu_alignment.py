@@ -23,7 +23,7 @@ import numpy as np
 from radarsdf.io.imu import Imu
 from radarsdf.poses.by_doppler import Velocities
 from radarsdf.poses.gyroscope import FIRST_BIAS_RAD_S
-from radarsdf.poses.inertia import Inertia
+from radarsdf.poses.imu_motion import ImuMotion
 from radarsdf.poses.rigid import Floats, nearest_rotation, rotation, skew
 
 _WINDOW_S, _WINDOW_SCANS = (
@@ -48,7 +48,7 @@ _ROBUST = 3.0  # deviations from which on a velocity counts less
 
 
 @dataclass(frozen=True)
-class Alignment:
+class ImuAlignment:
     """How an IMU and a radar belong together."""
 
     R_sensor_imu: Floats
@@ -75,7 +75,7 @@ class Alignment:
         return f"The IMU's axes were {how}, scans are {self.late_s:.3f} s late in its clock, and its accelerometer says which way is up."
 
     @classmethod
-    def of(cls, imu: Imu, velocities: Velocities, times_s: Floats) -> Alignment | None:
+    def of(cls, imu: Imu, velocities: Velocities, times_s: Floats) -> ImuAlignment | None:
         """Of velocities at `times_s` (F,), ascending, by the clock of `imu`. None: they do not tell, or not for sure."""
         if imu.specific_force is None or len(times_s) < 2 * _WINDOW_SCANS or len(imu) < 2:
             return None
@@ -123,14 +123,14 @@ def _windows(times_s: Floats) -> list[slice]:
 
 def _first_state(imu: Imu, velocities: Velocities, times_s: Floats) -> _State | None:
     """By linear least squares at many times between the clocks; None if chance explains the motions as well."""
-    inertia = Inertia.of(imu, np.zeros((1, 3)), np.zeros(3))
-    ways = inertia.integral(np.einsum("gij,gj->gi", inertia.turns, inertia.forces))
+    motion = ImuMotion.of(imu, np.zeros((1, 3)), np.zeros(3))
+    ways = motion.integral(np.einsum("gij,gj->gi", motion.turns, motion.forces))
     windows = _windows(times_s)
     if not windows:
         return None
     # A drive that stands still for the most part has the same rotations and velocities at many times.
     late = np.arange(-_LATEST_S, _LATEST_S + 1e-9, _LATE_STEP_S)
-    fits = [_linear_fit(inertia, ways, velocities, times_s - s, windows, imu.R_sensor_imu) for s in late]
+    fits = [_linear_fit(motion, ways, velocities, times_s - s, windows, imu.R_sensor_imu) for s in late]
     best = int(np.argmin([cost for cost, _ in fits]))
     span_s = times_s[-1] - times_s[0]
     if span_s < 4 * _UNRELATED_S:
@@ -138,7 +138,7 @@ def _first_state(imu: Imu, velocities: Velocities, times_s: Floats) -> _State | 
     away = np.linspace(_UNRELATED_S, span_s - _UNRELATED_S, _UNRELATED)
     begin_s = times_s[0]
     others = (begin_s + (times_s - begin_s + s) % span_s for s in away)
-    costs = [_linear_fit(inertia, ways, velocities, at_s, windows, imu.R_sensor_imu)[0] for at_s in others]
+    costs = [_linear_fit(motion, ways, velocities, at_s, windows, imu.R_sensor_imu)[0] for at_s in others]
     if fits[best][0] >= min(costs):
         return None
     matrix, gravity = fits[best][1]
@@ -151,7 +151,7 @@ def _first_state(imu: Imu, velocities: Velocities, times_s: Floats) -> _State | 
 
 
 def _linear_fit(
-    inertia: Inertia,
+    motion: ImuMotion,
     ways: Floats,
     velocities: Velocities,
     at_s: Floats,
@@ -159,7 +159,7 @@ def _linear_fit(
     R_known: Floats | None,
 ) -> tuple[float, tuple[Floats, Floats]]:
     """Residual sum of squares, and R (3, 3), any matrix, and gravity (3,)."""
-    turns, forced = inertia.turns_at(at_s), inertia.at(ways, at_s)
+    turns, forced = motion.turns_at(at_s), motion.at(ways, at_s)
     # Unknowns: the entries of Rᵀ row by row, then gravity.
     rows = np.zeros((len(at_s), 3, 12))
     for axis in range(3):
@@ -213,16 +213,16 @@ class _Rows:
 def _linearised(
     imu: Imu, velocities: Velocities, times_s: Floats, state: _State, windows: list[slice]
 ) -> Iterator[_Rows]:
-    inertia = Inertia.of(imu, state.rate_bias, state.force_bias)
-    forces = np.einsum("gij,gj->gi", inertia.turns, inertia.forces)
-    ways, turns = inertia.integral(forces), inertia.integral(inertia.turns)
-    bent = inertia.integral(np.einsum("gij,gjk->gik", skew(forces), turns))
+    motion = ImuMotion.of(imu, state.rate_bias, state.force_bias)
+    forces = np.einsum("gij,gj->gi", motion.turns, motion.forces)
+    ways, turns = motion.integral(forces), motion.integral(motion.turns)
+    bent = motion.integral(np.einsum("gij,gjk->gik", skew(forces), turns))
     borders = np.linspace(imu.times_s[0], imu.times_s[-1], len(state.rate_bias) + 1)
-    turns_b, ways_b, bent_b = (inertia.at(values, borders[:-1]) for values in (turns, ways, bent))
+    turns_b, ways_b, bent_b = (motion.at(values, borders[:-1]) for values in (turns, ways, bent))
     for window in windows:
         at_s = times_s[window] - state.late_s
-        Q, forced = inertia.turns_at(at_s), inertia.at(ways, at_s)
-        rates = inertia.at(inertia.rates, at_s)
+        Q, forced = motion.turns_at(at_s), motion.at(ways, at_s)
+        rates = motion.at(motion.rates, at_s)
         of_radar = np.einsum("ji,fj->fi", state.R, velocities.mean_mps[window])
         velocity = of_radar - np.cross(rates, state.lever_m)
         y = np.einsum("fij,fj->fi", Q, velocity)
@@ -230,15 +230,15 @@ def _linearised(
         jacobian = np.zeros((len(at_s), 3, 13 + 3 * len(state.rate_bias)))
         jacobian[:, :, :3] = -np.einsum("fij,fjk->fik", Q, skew(of_radar))
         jacobian[:, :, 3:6] = -elapsed_s[:, None, None] * np.eye(3)
-        jacobian[:, :, 6:9] = inertia.at(turns, at_s)
+        jacobian[:, :, 6:9] = motion.at(turns, at_s)
         jacobian[:, :, 9:12] = -np.einsum("fij,fjk->fik", Q, skew(rates))
         turning = np.einsum("fij,fj->fi", Q, np.cross(rates, velocity))
-        jacobian[:, :, 12] = -(turning - inertia.at(forces, at_s) - state.gravity)
+        jacobian[:, :, 12] = -(turning - motion.at(forces, at_s) - state.gravity)
         for j in range(len(state.rate_bias)):
             inside = np.clip(at_s, borders[j], borders[j + 1])
-            turned = inertia.at(turns, inside) - turns_b[j]
-            ways_in = inertia.at(ways, inside)
-            by_force = inertia.at(bent, inside) - bent_b[j]
+            turned = motion.at(turns, inside) - turns_b[j]
+            ways_in = motion.at(ways, inside)
+            by_force = motion.at(bent, inside) - bent_b[j]
             by_force -= np.einsum("fij,jk->fik", skew(ways_in - ways_b[j]), turns_b[j])
             by_force += np.einsum("fij,fjk->fik", skew(forced - ways_in), turned)
             jacobian[:, :, 13 + 3 * j : 16 + 3 * j] = np.einsum("fij,fjk->fik", skew(y), turned) - by_force
@@ -270,7 +270,7 @@ def _prior(state: _State) -> tuple[Floats, Floats]:
     return matrix, gradient
 
 
-def _fitted(imu: Imu, velocities: Velocities, times_s: Floats, state: _State) -> Alignment | None:
+def _fitted(imu: Imu, velocities: Velocities, times_s: Floats, state: _State) -> ImuAlignment | None:
     """By Gauss and Newton's method, robust. None: it does not explain the velocities, or leaves the rotation open."""
     windows, R_known = _windows(times_s), imu.R_sensor_imu is not None
     windows = windows[:: 1 + len(times_s) // _MOST_SCANS]
@@ -297,16 +297,16 @@ def _fitted(imu: Imu, velocities: Velocities, times_s: Floats, state: _State) ->
     sigma_rad = 0.0 if R_known else float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(state.late_s) > 2 * _LATEST_S:
         return None
-    inertia = Inertia.of(imu, state.rate_bias, state.force_bias)
-    turns = inertia.turns_at(times_s - state.late_s)
+    motion = ImuMotion.of(imu, state.rate_bias, state.force_bias)
+    turns = motion.turns_at(times_s - state.late_s)
     # Against gravity, Qᵀ g in the axes of the IMU.
     up = -np.einsum("ij,fkj,k->fi", state.R, turns, state.gravity)
-    return Alignment(
+    return ImuAlignment(
         state.R,
         sigma_rad,
         state.late_s,
         state.lever_m,
-        np.einsum("ij,gj->gi", state.R, inertia.rates),
+        np.einsum("ij,gj->gi", state.R, motion.rates),
         float(np.sqrt(covariance.diagonal()[13:].max())),
         imu.times_s + state.late_s,
         up / np.linalg.norm(up, axis=1, keepdims=True),
