@@ -27,17 +27,6 @@ def merged(*changes: Changes) -> Changes:
     return found
 
 
-def flat(changes: Changes) -> Changes:
-    """Values by names such as ``training.joint``."""
-    found: Changes = {}
-    for name, value in changes.items():
-        inner = (
-            {f"{name}.{key}": own for key, own in value.items()} if isinstance(value, dict) else {name: value}
-        )
-        found |= inner
-    return found
-
-
 def parsed(words: Iterable[str]) -> Changes:
     """Of words such as ``training.joint=False``, as ``--set`` of radarsdf takes them."""
     return merged(*map(setting_of, words))

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from radarsdf.config.fit_config import flat_settings
 from radarsdf.evaluation import confidence_metrics, uncertainty_metrics
 from scipy.spatial import cKDTree
 
 from bench.sensor.figures import deviation
-from bench.settings import Changes, flat
+from bench.settings import Changes
 
 from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, rays_of
 from .report import figure, markdown
@@ -68,7 +69,7 @@ def tasks(scene: Scene, options: Options) -> list[Task]:
 
 
 def _name(changes: Changes) -> str:
-    return ", ".join(f"{key}={value}" for key, value in flat(changes).items()) or "defaults"
+    return ", ".join(f"{key}={value}" for key, value in flat_settings(changes).items()) or "defaults"
 
 
 def _rows(scene: Scene, options: Options, base: str, changes: Changes, repetition: int) -> list[Row]:

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from radarsdf.config.fit_config import flat_settings
 
 from bench.peers.interface import PEERS, Peer
-from bench.settings import Changes, flat
+from bench.settings import Changes
 
 from . import surface
 from .experiment import Experiment, Options, Row, Task, groups
@@ -74,7 +75,7 @@ def _methods(options: Options) -> list[tuple[str, str, Peer]]:
             peer = PEERS[line].with_changes(**budget(_FACTORS[factor]))
             found.append((line, f"{line}, × {factor}", peer))
     for changes in (*(_LEVERS[:1] if options.quick else _LEVERS), *options.levers):
-        name = ", ".join(f"{key}={value}" for key, value in flat(changes).items())
+        name = ", ".join(f"{key}={value}" for key, value in flat_settings(changes).items())
         found.append(("lever", name, PEERS[_OURS[1]].with_changes(**changes)))
     # The fits of this package are in the lines already, with a budget of 1.
     found += [("peer", name, PEERS[name]) for name in options.peers if name not in _OURS]

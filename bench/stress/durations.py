@@ -14,11 +14,12 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.budget import durations
 from radarsdf.budget.schedule import Schedule
+from radarsdf.config.fit_config import flat_settings
 from scipy.optimize import nnls
 
 from bench.growth.street import street
 from bench.paper.report import markdown
-from bench.settings import PRESETS, Changes, flat, merged
+from bench.settings import PRESETS, Changes, merged
 from bench.timing import timed
 
 WITHIN = 2.0
@@ -132,7 +133,7 @@ def run(largest: int, repetitions: int) -> bool:
     anew = constants(fits)
     rows, good = [], True
     for (count, with_intensities, preset, changes), fit in zip(cases, fits, strict=True):
-        settings = ", ".join([preset, *(f"{k} {v}" for k, v in flat(changes).items())])
+        settings = ", ".join([preset, *(f"{k} {v}" for k, v in flat_settings(changes).items())])
         estimated_s, anew_s = (
             sum(seconds[kind] * fit.work[kind] for kind in seconds) for seconds in (durations.SECONDS, anew)
         )

@@ -15,11 +15,12 @@ import numpy as np
 import radarsdf
 import radarsdf.fitting.fit  # else the first fit would import it, in what is measured
 from radarsdf import Estimate, FitConfig
+from radarsdf.config.fit_config import flat_settings
 
 from bench.growth.street import street
 from bench.memory import memory_bytes, return_freed_memory
 from bench.paper.report import markdown
-from bench.settings import Changes, flat, merged
+from bench.settings import Changes, merged
 
 CASES: list[tuple[int, bool, Changes]] = [
     (10_000, True, {}),
@@ -87,7 +88,7 @@ def run(largest: int, fits: int) -> bool:
         if count <= largest:
             estimate, peak = peak_of_a_fit(count, with_intensities, changes)
             good &= 1 / WITHIN < estimate.peak_memory_bytes / peak < WITHIN
-            settings = ", ".join(f"{k} {v}" for k, v in flat(changes).items()) or "default"
+            settings = ", ".join(f"{k} {v}" for k, v in flat_settings(changes).items()) or "default"
             rows.append(
                 [f"{count:,}", "yes" if with_intensities else "no", settings, f"{estimate.leaf_cells:,}"]
                 + [f"{peak / 1e6:.0f}", f"{estimate.peak_memory_bytes / 1e6:.0f}"]

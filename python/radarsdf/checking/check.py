@@ -17,7 +17,7 @@ from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
 from radarsdf.checks import MISSING_POSES, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.io.scans import Scans
+from radarsdf.io.scans import Scans, filled
 
 
 def check(
@@ -70,15 +70,12 @@ def check(
     ('poses_inverted', 'error')
     """
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    if isinstance(points, Scans):
-        scans, points = points, points.points  # first: it reads all there is, in one pass
-        poses = scans.poses if poses is None else poses
-        intensities = scans.intensities if intensities is None else intensities
-        doppler_mps = scans.doppler_mps if doppler_mps is None else doppler_mps
-        times_s = scans.times_s if times_s is None else times_s
+    scans, poses, intensities, doppler_mps, times_s = filled(
+        points, poses=poses, intensities=intensities, doppler_mps=doppler_mps, times_s=times_s
+    )
     if poses is None:
         raise ValueError(MISSING_POSES)
-    recording = Recording.of(points, poses, intensities, doppler_mps, times_s)
+    recording = Recording.of(scans, poses, intensities, doppler_mps, times_s)
     return _sorted(_find(recording, config, frames.FULL))
 
 

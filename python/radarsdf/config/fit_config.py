@@ -256,3 +256,15 @@ def settings_of_results(config: FitConfig) -> dict[str, Any]:
     for name in ("num_threads", "max_memory_bytes"):
         del settings[name]
     return settings
+
+
+def flat_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings, or changes of some, by names such as training.learning_rate."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= (
+            {f"{name}.{own}": inner for own, inner in value.items()}
+            if isinstance(value, dict)
+            else {name: value}
+        )
+    return flat

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf.checks import path_of
-from radarsdf.config.fit_config import FitConfig, settings_of_results
+from radarsdf.config.fit_config import FitConfig, flat_settings, settings_of_results
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors
@@ -152,7 +152,7 @@ class Checkpoint:
             )
             raise ValueError(msg)
         if identity["config"] != self._identity["config"]:
-            ours, theirs = _flat(self._identity["config"]), _flat(identity["config"])
+            ours, theirs = flat_settings(self._identity["config"]), flat_settings(identity["config"])
             names = sorted(
                 k for k in ours.keys() | theirs.keys() if ours.get(k, _NONE) != theirs.get(k, _NONE)
             )
@@ -161,17 +161,6 @@ class Checkpoint:
         if identity["scans"] != self._identity["scans"]:
             msg = f"{self._path} is a checkpoint of other scans, poses or intensities"
             raise ValueError(msg)
-
-
-def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings by names such as training.learning_rate."""
-    flat: dict[str, Any] = {}
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            flat |= {f"{name}.{own}": inner for own, inner in value.items()}
-        else:
-            flat[name] = value
-    return flat
 
 
 def _digest(rays: Rays, scale: IntensityScale | None) -> str:

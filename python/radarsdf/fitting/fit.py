@@ -13,7 +13,7 @@ from radarsdf.checks import MISSING_POSES, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.steps import FitInput, fit_rays
-from radarsdf.io.scans import Scans
+from radarsdf.io.scans import Scans, filled
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.movers import Standing
 from radarsdf.returns.rays import prepare
@@ -98,7 +98,11 @@ def fit(
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
 
     def read() -> FitInput:
-        scans, poses_, intensities_, doppler_mps_ = _given(points, poses, intensities, doppler_mps)
+        scans, poses_, intensities_, doppler_mps_ = filled(
+            points, poses=poses, intensities=intensities, doppler_mps=doppler_mps
+        )
+        if poses_ is None:
+            raise ValueError(MISSING_POSES)
         standing = Standing.of(scans, intensities_, doppler_mps_, config.returns)
         rays = prepare(standing.points, poses_, standing.intensities, origin=origin, **config.preparation)
         scale = IntensityScale.of(rays.intensities)
@@ -107,20 +111,3 @@ def fit(
         return FitInput(rays, scale, poses_, standing.movers, standing.why_none)
 
     return fit_rays(read, config, progress=progress, checkpoint=checkpoint)
-
-
-def _given(
-    points: Iterable[ArrayLike] | Scans,
-    poses: ArrayLike | None,
-    intensities: Iterable[ArrayLike] | None,
-    doppler_mps: Sequence[ArrayLike] | None,
-) -> tuple[Iterable[ArrayLike], ArrayLike, Iterable[ArrayLike] | None, Sequence[ArrayLike] | None]:
-    """The same, with what is not given taken from the scans."""
-    if isinstance(points, Scans):
-        scans, points = points, points.points  # first: it reads all there is, in one pass
-        poses = scans.poses if poses is None else poses
-        intensities = scans.intensities if intensities is None else intensities
-        doppler_mps = scans.doppler_mps if doppler_mps is None else doppler_mps
-    if poses is None:
-        raise ValueError(MISSING_POSES)
-    return points, poses, intensities, doppler_mps

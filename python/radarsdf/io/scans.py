@@ -340,6 +340,14 @@ def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
     )
 
 
+def filled(points: Any, **given: Any) -> tuple[Any, ...]:
+    """The points, and the `given` arrays, named as in :class:`Scans`. If points are `Scans`, what is None is theirs."""
+    if not isinstance(points, Scans):
+        return points, *given.values()
+    arrays = points.points  # first: it reads all there is, in one pass
+    return arrays, *(getattr(points, name) if values is None else values for name, values in given.items())
+
+
 def _listed(arrays: Sequence[NDArray[Any]] | None, name: str) -> list[NDArray[Any]] | None:
     return None if arrays is None else list(one_for_each_scan(arrays, name))
 

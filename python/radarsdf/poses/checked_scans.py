@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import real_array
-from radarsdf.io.scans import Scans
+from radarsdf.io.scans import Scans, filled
 from radarsdf.poses.by_doppler import Velocities
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.movers import checked_doppler
@@ -45,15 +45,11 @@ class CheckedScans:
         times: ArrayLike | None,
     ) -> CheckedScans:
         """Of scans (N_i, 3), Doppler (N_i,) and times (F,). Raises TypeError or ValueError where they are none."""
-        if isinstance(points, Scans):
-            of_scans, points = points, points.points  # first: it reads all there is, in one pass
-            doppler_mps = of_scans.doppler_mps if doppler_mps is None else doppler_mps
-            times = of_scans.times_s if times is None else times
-            doppler_mps = None if times is None else doppler_mps
-        elif doppler_mps is not None and times is None:
+        if doppler_mps is not None and times is None and not isinstance(points, Scans):
             msg = "Doppler needs times: when each scan was taken, s"
             raise ValueError(msg)
-        scans, _ = check_scans(points)
+        given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
+        scans, _ = check_scans(given)
         times_s = None if times is None else _checked_times(times, len(scans))
         begin_s = 0.0 if times_s is None else float(times_s[0])
         times_s = None if times_s is None else times_s - begin_s

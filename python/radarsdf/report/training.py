@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.fit_config import FitConfig, flat_settings
 from radarsdf.config.toml import to_toml
 from radarsdf.report import plots
 from radarsdf.report.page import Section, folded, grid, image, items, note, paragraph, table
@@ -125,7 +125,7 @@ def findings_section(subject: Subject) -> Section:
 def configuration_section(subject: Subject) -> Section:
     """What differs from the defaults, and all settings."""
     config = subject.radar_map.config
-    ours, default = _flat(config.to_dict()), _flat(FitConfig().to_dict())
+    ours, default = flat_settings(config.to_dict()), flat_settings(FitConfig().to_dict())
     changed = [
         (name, str(value), str(default[name])) for name, value in ours.items() if value != default[name]
     ]
@@ -135,14 +135,6 @@ def configuration_section(subject: Subject) -> Section:
         folded("All settings, as a file for --config", to_toml(config)),
     ]
     return Section("configuration", "Configuration", body)
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings by names such as training.learning_rate."""
-    flat: dict[str, Any] = {}
-    for name, value in settings.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat
 
 
 def versions_section() -> Section:
