@@ -44,11 +44,11 @@ def _rows(name: str, count: int, options: argparse.Namespace) -> Iterator[dict[s
     live, integrate_ms = grown(range(count), scans.poses)
     move_ms = _times(chosen, lambda i: live.move(i, moved[i]))
     other, _ = grown(rng.permutation(count).tolist(), poses)
-    yield _row(name, "move", move_ms, integrate_ms, _state(live) == _state(other))
+    yield _row(name, "move", move_ms, integrate_ms, state(live) == state(other))
     rng.shuffle(chosen)
     remove_ms = _times(chosen, live.remove)
     other, _ = grown(sorted(set(range(count)) - set(chosen)), poses)
-    yield _row(name, "remove", remove_ms, integrate_ms, _state(live) == _state(other))
+    yield _row(name, "remove", remove_ms, integrate_ms, state(live) == state(other))
 
 
 def _row(name: str, what: str, ms: list[float], integrate_ms: list[float], equal: bool) -> dict[str, Any]:
@@ -72,6 +72,7 @@ def _times(items: Iterable[int], act: Callable[[int], Any]) -> list[float]:
     return found
 
 
-def _state(live: LiveMap) -> list[bytes]:
+def state(live: LiveMap) -> list[bytes]:
+    """The bits of all sums."""
     keys = live._state.sums.block_keys()
     return [array.tobytes() for array in (*live._state.sums.sums_of(keys), *live._state.sums.looks_of(keys))]

@@ -24,7 +24,7 @@ from radarsdf.view.viewer import Viewer
 from bench.paper.report import ROOT
 from bench.timing import timed
 
-from .client import PlainClient, Received
+from .client import PlainClient, is_mesh
 from .page import camera_of, drawn, open_page, pixel_of, why_no_browser
 
 _VOXEL_M = 0.0712  # about 400,000 vertices of hugin
@@ -61,11 +61,11 @@ def _plain(viewer: Viewer, seconds: float) -> dict[str, str]:
     """What a client receives that draws nothing."""
     with PlainClient(viewer.host, viewer.port) as client:
         with timed() as starting:
-            client.wait_for(_is_mesh)
+            client.wait_for(is_mesh)
         _settled(client)
         before = len(client.received())
         began_s, ended_s = client.drag(seconds)
-        mesh = client.wait_for(_is_mesh, before)
+        mesh = client.wait_for(is_mesh, before)
         received = client.received(before)
         updates = [m for m in received if m.changes(_CLOUD, "colors") and m.at_s <= ended_s]
         if len(updates) < 2:
@@ -118,10 +118,6 @@ def _browser(viewer: Viewer, seconds: float, out: Path) -> dict[str, str]:
         "pixels of the scene before, least, most": f"{first}, {min(counts)}, {max(counts)}",
         "blank frames": str(sum(count < first / 2 for count in counts)),
     }
-
-
-def _is_mesh(message: Received) -> bool:
-    return message.kind == "GlbMessage"
 
 
 def _settled(client: PlainClient, quiet_s: float = 1.0) -> None:

@@ -53,6 +53,11 @@ class Received:
         return self.name == name and what in self.message.get("updates", {})
 
 
+def is_mesh(message: Received) -> bool:
+    """Whether it is the surface, at rest."""
+    return message.kind == "GlbMessage"
+
+
 class PlainClient:
     """Connects to a viewer as its page does. A thread of it receives."""
 

@@ -13,6 +13,8 @@ from radarsdf import FitConfig, LiveMap
 from radarsdf.live.scan_log import SealedScan
 from radarsdf.returns.evidence import BLOCK_BITS
 
+from bench.live.removal import state
+
 from ..conftest import ground_and_wall, pose
 
 ORIGIN = (2.0, 0.0, 1.0)
@@ -26,12 +28,6 @@ def map_of(numbers, config=SETTINGS, poses=SCENE.poses, **arguments):
     for i in numbers:
         live.integrate(SCENE.points[i], poses[i], SCENE.intensities[i], scan_id=int(i))
     return live
-
-
-def state(live):
-    """The bits of all sums."""
-    keys = live._state.sums.block_keys()
-    return [array.tobytes() for array in (*live._state.sums.sums_of(keys), *live._state.sums.looks_of(keys))]
 
 
 def mesh_bits(mesh):

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from radarsdf import LiveMap
 
-from .test_live_map import ORIGIN, SCENE, SETTINGS, map_bits, mesh_bits, state
+from bench.live.removal import state
+
+from .test_live_map import ORIGIN, SCENE, SETTINGS, map_bits, mesh_bits
 
 FAR = SCENE.poses.copy()
 FAR[4:, 0, 3] += 200.0

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from radarsdf import LiveMap
 
+from bench.live.removal import state
+
 from ..warm_python import warm_python
-from .test_live_map import SCENE, map_of, mesh_bits, state
+from .test_live_map import SCENE, map_of, mesh_bits
 
 
 def test_a_map_goes_on_from_its_file(tmp_path):

@@ -24,7 +24,7 @@ from ..conftest import ground_and_wall
 
 pytest.importorskip("viser", reason="the extra view is not installed")
 
-from bench.viewing.client import Glb, PlainClient
+from bench.viewing.client import Glb, PlainClient, is_mesh
 
 CLOUD = "/surface/cloud"
 
@@ -51,10 +51,6 @@ def client(viewer):
 
 def mesh_of(message):
     return Glb.of(message.message["props"]["glb_data"])
-
-
-def is_mesh(message):
-    return message.kind == "GlbMessage"
 
 
 def slide(client, label, value):
