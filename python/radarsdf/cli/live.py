@@ -90,8 +90,7 @@ def run(options: argparse.Namespace) -> None:
             import numpy as np
 
             times_s = None if scans.times_s is None else scans.times_s[done.rows]
-            timed = options.trajectory.suffix.lower() == ".tum"
-            write_poses(options.trajectory, np.stack(done.poses), times_s if timed else None)
+            write_poses(options.trajectory, np.stack(done.poses), times_s)
             results.add(f"trajectory {options.trajectory}", trajectory=options.trajectory)
         results.end()
         if shown is not None:

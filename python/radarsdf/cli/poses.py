@@ -57,14 +57,13 @@ def run(options: argparse.Namespace) -> None:
         require("matplotlib", what="pictures need")
     results = Results(options)
     scans, posed = scans_and_poses(options, config, results, refine=True, find=options.find)
-    timed = options.out.suffix.lower() == ".tum"
     if as_scans:
         write_scans(options.out, scans)
-    elif posed.pieces > 1 and not timed:
+    elif posed.pieces > 1 and options.out.suffix.lower() != ".tum":
         msg = f"there are {posed.pieces} pieces, and {options.out} would not say which scans have poses: write .tum or .npz"
         raise ValueError(msg)
     else:
-        write_poses(options.out, scans.poses, scans.times_s if timed else None)
+        write_poses(options.out, scans.poses, scans.times_s)
     results.add(f"{len(scans.poses)} poses written to {options.out}", out=options.out)
     if options.picture is not None:
         from radarsdf.render.trajectory_picture import save_trajectory_picture
