@@ -127,7 +127,7 @@ def test_a_link_does_not_lead_out(copy, tmp_path, what):
         "tile": map_path(copy, tile).parent,
         "map": map_path(copy, tile),
         "failed": failure_path(copy, tile),
-        "rays": rays_path(copy, tile.name),
+        "rays": rays_path(copy, tile.tile),
         "scans": copy / "scans.npy",
         "plan": copy / "plan.json",
     }[what]
@@ -183,7 +183,7 @@ def test_a_folder_may_have_any_name(folder, tmp_path):
 def test_rays_that_are_damaged_are_refused(copy):
     plan = Plan.load(copy)
     tile = plan.tiles[0]
-    path = rays_path(copy, tile.name)
+    path = rays_path(copy, tile.tile)
     data = path.read_bytes()
     for wild in (np.nan, np.inf, 1e38):
         path.write_bytes(np.array(wild, "<f4").tobytes() + data[4:])

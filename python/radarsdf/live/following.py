@@ -22,8 +22,6 @@ from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 
 _STEPS = 100  # of the motion so far, that habits are learnt from
 _SIGN_FROM, _SIGN_UNTIL = 3, 30  # scans, after which the sign of the Doppler is looked for
-
-
 _TOLD_STEPS = 10  # over which it is asked whether returns alone tell the way
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # covariance of a step between given poses, about
 

@@ -202,9 +202,7 @@ class LiveMap:
                 msg = f"the map has a scan {scan_id!r} already: remove or move it"
                 raise ValueError(msg)
             with_intensities = scan.intensities is not None
-            if with_intensities != (
-                with_intensities if self._state.with_intensities is None else self._state.with_intensities
-            ):
+            if self._state.with_intensities not in (None, with_intensities):
                 msg = "either all scans have intensities, or none has"
                 raise ValueError(msg)
             step = None

@@ -26,15 +26,16 @@ from radarsdf.tiles.drive_poses import POSES, TRAJECTORY, DrivePoses, DriveToPos
 from radarsdf.tiles.grid import TileGrid
 from radarsdf.tiles.input_digest import InputDigest
 from radarsdf.tiles.locking import LOCK, only_planner
-from radarsdf.tiles.plan import PLAN, Plan, failure_path
+from radarsdf.tiles.plan import PLAN, TILES, Plan, failure_path
 from radarsdf.tiles.planning import make_plan
+from radarsdf.tiles.ray_files import SCANS
 from radarsdf.tiles.running import run_tasks
 from radarsdf.tiles.tile_fit import fit_tile, is_done
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
-_OURS = {PLAN, LOCK, POSES, TRAJECTORY, "tiles", "scans.npy"}
+_OURS = {PLAN, LOCK, POSES, TRAJECTORY, TILES, SCANS}
 
 
 def fit_tiles(
@@ -136,7 +137,7 @@ def plan_tiles(
         folder.mkdir(exist_ok=True)
         with only_planner(folder):
             if not (folder / PLAN).is_file():  # another process may just have made it
-                shutil.rmtree(folder / "tiles", ignore_errors=True)  # of a plan that was not finished
+                shutil.rmtree(folder / TILES, ignore_errors=True)  # of a plan that was not finished
                 config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
                 if drive is not None:
                     poses = DrivePoses.of(drive, config, folder, progress)

@@ -126,7 +126,7 @@ def piece_path(city: TileBlend, tile: Tile, settings: PieceSettings) -> Path:
     text = settings.to_json() + str([other for other in neighbours(tile) if city.has(other)])
     key = hashlib.blake2b((city.plan.digest + text).encode(), digest_size=8).hexdigest()
     name = _FILES.replace("*", key)
-    return within(city.folder, folder_of(city.folder, city.plan.by_tile[tile]) / name)
+    return within(city.folder, folder_of(city.folder, tile) / name)
 
 
 def pieces_in(folder: Path) -> list[Path]:

@@ -28,7 +28,7 @@ from radarsdf.tiles.grid import Tile, TileGrid
 
 FORMAT = "radarsdf.tiles"
 FORMAT_VERSION = 1
-PLAN = "plan.json"
+PLAN, TILES = "plan.json", "tiles"
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Number = Annotated[int, Field(ge=-(2**53), le=2**53)]  # of a tile or a cell
 _Length = Annotated[float, Field(gt=0, le=MAX_POSITION_M)]
@@ -58,7 +58,7 @@ class TilePlan:
     @property
     def name(self) -> str:
         """Of its files."""
-        return f"{self.tile[0]}_{self.tile[1]}"
+        return _name(self.tile)
 
 
 @settings
@@ -234,19 +234,23 @@ def within(folder: Path, path: Path) -> Path:
     return path
 
 
-def folder_of(folder: Path, tile: TilePlan) -> Path:
+def _name(tile: Tile) -> str:
+    return f"{tile[0]}_{tile[1]}"
+
+
+def folder_of(folder: Path, tile: Tile) -> Path:
     """Where the files of a tile are."""
-    return folder / "tiles" / tile.name
+    return folder / TILES / _name(tile)
 
 
 def map_path(folder: Path, tile: TilePlan) -> Path:
     """The map of a tile."""
-    return within(folder, folder_of(folder, tile) / "map.safetensors")
+    return within(folder, folder_of(folder, tile.tile) / "map.safetensors")
 
 
 def failure_path(folder: Path, tile: TilePlan) -> Path:
     """Why the fit of a tile failed."""
-    return within(folder, folder_of(folder, tile) / "failed.txt")
+    return within(folder, folder_of(folder, tile.tile) / "failed.txt")
 
 
 def failure_of(folder: Path, tile: TilePlan) -> str:

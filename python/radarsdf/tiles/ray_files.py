@@ -17,12 +17,12 @@ from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.plausible import Plausible
 from radarsdf.returns.rays import Rays, rays_from
 from radarsdf.tiles.grid import Tile
-from radarsdf.tiles.plan import Plan, TilePlan, within
+from radarsdf.tiles.plan import Plan, TilePlan, folder_of, within
 
 _RECORD = np.dtype([("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")])
 """A return in the frame of its tile, m; its scan; its intensity, sensor units, NaN if there are none."""
 _BUFFER_BYTES = 64 << 20  # of all tiles together, before they are appended to their files
-_SCANS = "scans.npy"
+SCANS = "scans.npy"
 
 
 class RayFiles:
@@ -53,7 +53,7 @@ class RayFiles:
     def flush(self) -> None:
         """Writes what is held."""
         for tile, parts in self._buffers.items():
-            path = _path(self._folder, tile)
+            path = rays_path(self._folder, tile)
             if tile not in self._begun:
                 path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("ab" if tile in self._begun else "wb") as file:
@@ -64,7 +64,7 @@ class RayFiles:
 
     def remove(self, tile: Tile) -> None:
         """Removes the file of a tile, and its folder if that is then empty."""
-        path = _path(self._folder, tile)
+        path = rays_path(self._folder, tile)
         path.unlink(missing_ok=True)
         if not any(path.parent.iterdir()):
             path.parent.rmdir()
@@ -72,7 +72,7 @@ class RayFiles:
 
 def write_scans(folder: Path, positions: NDArray[np.float64], up: NDArray[np.float64]) -> None:
     """Writes from where each scan was seen and its z axis, (F, 3) each, world, m."""
-    np.save(within(folder, folder / _SCANS), np.concatenate([positions, up], axis=1), allow_pickle=False)
+    np.save(within(folder, folder / SCANS), np.concatenate([positions, up], axis=1), allow_pickle=False)
 
 
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[np.bool_]]:
@@ -85,7 +85,7 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
     OSError
         If it cannot be read.
     """
-    path = rays_path(folder, tile.name)
+    path = rays_path(folder, tile.tile)
     if not path.exists():
         msg = f"{path} is gone, as after radarsdf tiles clean: fit the scans again in a new folder"
         raise ValueError(msg)
@@ -95,19 +95,19 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
         msg = f"{path} has {found:g} rays instead of {tile.rays}: make the plan again"
         raise ValueError(msg)
     rows = np.fromfile(path, _RECORD)
-    table = array_in(within(folder, folder / _SCANS))  # of which few rows are needed
+    table = array_in(within(folder, folder / SCANS))  # of which few rows are needed
     if (
         table.shape != (plan.scans, 6)
         or table.dtype != np.float64
         or not 0 <= rows["scan"].min() <= rows["scan"].max() < plan.scans
     ):
-        msg = f"{folder / _SCANS} does not belong to {path}: make the plan again"
+        msg = f"{folder / SCANS} does not belong to {path}: make the plan again"
         raise ValueError(msg)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
     of_scans = np.array(table[numbers])
     points = np.ascontiguousarray(rows["point"])
     if not ((np.abs(points) <= MAX_POSITION_M).all() and (np.abs(of_scans) <= MAX_POSITION_M).all()):
-        msg = f"{path} or {folder / _SCANS} holds something other than finite positions: make the plan again"
+        msg = f"{path} or {folder / SCANS} holds something other than finite positions: make the plan again"
         raise ValueError(msg)
     intensities = None
     if plan.intensity_range is not None:
@@ -136,14 +136,10 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
 
 def read_intensities(folder: Path, tile: Tile) -> NDArray[np.float32]:
     """(N,) of the rays that cross a tile, as they were given, sensor units."""
-    intensities: NDArray[np.float32] = np.fromfile(_path(folder, tile), _RECORD)["intensity"]
+    intensities: NDArray[np.float32] = np.fromfile(rays_path(folder, tile), _RECORD)["intensity"]
     return intensities
 
 
-def _path(folder: Path, tile: Tile) -> Path:
-    return rays_path(folder, f"{tile[0]}_{tile[1]}")
-
-
-def rays_path(folder: Path, name: str) -> Path:
-    """The rays of the tile of this name."""
-    return within(folder, folder / "tiles" / name / "rays.bin")
+def rays_path(folder: Path, tile: Tile) -> Path:
+    """The rays of a tile."""
+    return within(folder, folder_of(folder, tile) / "rays.bin")

@@ -243,7 +243,7 @@ class TiledMap(TileBlend, Map):
         freed = 0
         for tile in self.tiles:
             storage.load_contents(map_path(self.folder, tile))
-            rays = rays_path(self.folder, tile.name)
+            rays = rays_path(self.folder, tile.tile)
             for path in [*pieces_in(rays.parent), *([rays] if rays.exists() else [])]:
                 freed += path.stat().st_size
                 path.unlink()
