@@ -34,7 +34,7 @@ class MapParts(ABC):
 
     @property
     @abstractmethod
-    def any_contents(self) -> MapContents:
+    def _contents_of_any(self) -> MapContents:
         """The parts of the map, or of one of its tiles, for what all have in common."""
 
     @cached_property
@@ -42,7 +42,7 @@ class MapParts(ABC):
         """(8,) how much more often 0 to 7 or more scans pass a leaf cell behind a surface than one before it."""
         from radarsdf.map.gridding import passage_odds  # noqa: PLC0415 - it imports trimesh, which is slow
 
-        return passage_odds(self.any_contents)
+        return passage_odds(self._contents_of_any)
 
     @abstractmethod
     def echoes(self) -> EchoesAt:
@@ -62,11 +62,11 @@ class MapParts(ABC):
 
     def _uncertainty(self, world: Tensor) -> Tensor:
         """:meth:`Map.uncertainty` there, (N,)."""
-        return queries.uncertainty(self.any_contents, self.evidence_at(world))
+        return queries.uncertainty(self._contents_of_any, self.evidence_at(world))
 
     def _confidence(self, world: Tensor) -> Tensor:
         """:meth:`Map.confidence` there, (N,)."""
-        return queries.confidence(self.any_contents, self.evidence_at(world))
+        return queries.confidence(self._contents_of_any, self.evidence_at(world))
 
     @abstractmethod
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:

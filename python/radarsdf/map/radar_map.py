@@ -58,7 +58,7 @@ class RadarMap(Map):
         return self._answers_at(queries.intensity, world, sensors, extrapolate=extrapolate)
 
     @property
-    def any_contents(self) -> MapContents:
+    def _contents_of_any(self) -> MapContents:
         return self._contents
 
     def _answers_at(self, query: Callable[..., Tensor], *positions: Tensor, extrapolate: bool) -> Tensor:

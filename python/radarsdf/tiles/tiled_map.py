@@ -18,6 +18,7 @@ from torch import Tensor
 
 from radarsdf.checks import path_of
 from radarsdf.map import queries, storage
+from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
 from radarsdf.returns.echoes import EchoesAt
 from radarsdf.tiles.blend import Share, TileBlend, averages, distance
@@ -94,6 +95,10 @@ class TiledMap(TileBlend, Map):
 
     def _observed(self, world: Tensor) -> Tensor:
         return torch.from_numpy(self.seen(_contiguous(world)))
+
+    @property
+    def _contents_of_any(self) -> MapContents:
+        return self.any_contents
 
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         positions, places = _contiguous(world), _contiguous(sensors)
