@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -216,27 +217,23 @@ def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -
 
 def positive(value: Any, name: str) -> float:
     """`value` as a float, positive and finite."""
-    array = real_array(value, name)
-    if array.shape != () or not 0 < array < np.inf:
-        msg = f"{name} must be positive and finite, not {_said(value)}"
-        raise ValueError(msg)
-    return float(array)
+    return _scalar(value, name, "positive and finite", lambda x: 0 < x < np.inf)
 
 
 def not_negative(value: Any, name: str) -> float:
     """`value` as a float, at least 0 and finite."""
-    array = real_array(value, name)
-    if array.shape != () or not 0 <= array < np.inf:
-        msg = f"{name} must be at least 0 and finite, not {_said(value)}"
-        raise ValueError(msg)
-    return float(array)
+    return _scalar(value, name, "at least 0 and finite", lambda x: 0 <= x < np.inf)
 
 
 def number(value: Any, name: str) -> float:
     """`value` as a float. Infinity is allowed, NaN is not."""
+    return _scalar(value, name, "a number", lambda x: not math.isnan(x))
+
+
+def _scalar(value: Any, name: str, wanted: str, fits: Callable[[float], bool]) -> float:
     array = real_array(value, name)
-    if array.shape != () or np.isnan(array):
-        msg = f"{name} must be a number, not {_said(value)}"
+    if array.shape != () or not fits(float(array)):
+        msg = f"{name} must be {wanted}, not {_said(value)}"
         raise ValueError(msg)
     return float(array)
 
