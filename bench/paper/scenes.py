@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from radarsdf import FitConfig
+from radarsdf.checks import check_box
 from radarsdf.evaluation import holdout
 from radarsdf.io import read
 from radarsdf.io.datasets.snail_radar import is_snail_radar
@@ -195,7 +196,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
             "or a folder of scans with poses"
         )
         raise ValueError(msg)
-    return scene if box is None else dataclasses.replace(scene, box=_corners(box))
+    return scene if box is None else dataclasses.replace(scene, box=check_box(box))
 
 
 def _simulated(simulation: Simulation) -> Scene:
@@ -249,11 +250,3 @@ def _seen_by_both(scene: Scene) -> NDArray[np.float64] | None:
     distance, _ = cKDTree(rays.points + rays.origin).query(lidar, distance_upper_bound=SEEN_BY_RADAR_M)
     seen: NDArray[np.float64] = lidar[distance <= SEEN_BY_RADAR_M]
     return seen
-
-
-def _corners(box: ArrayLike) -> NDArray[np.float64]:
-    corners: NDArray[Any] = np.asarray(box, np.float64)
-    if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
-        msg = "box must be (2, 3): a lower corner and an upper one above it"
-        raise ValueError(msg)
-    return corners

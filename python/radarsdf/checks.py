@@ -74,6 +74,18 @@ def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
     return points
 
 
+def check_box(box: ArrayLike) -> NDArray[np.float64]:
+    """Lower and upper corner (2, 3), world, m. Raises a ValueError if they are none."""
+    corners = real_array(box, "box")
+    if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
+        msg = "box must be a lower and an upper corner, (2, 3), the lower corner first"
+        raise ValueError(msg)
+    if not (np.abs(corners) <= MAX_POSITION_M).all():
+        msg = f"box must be finite, and within {MAX_POSITION_M:g} m"
+        raise ValueError(msg)
+    return corners
+
+
 def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
     """Raises a ValueError unless there are scans, each an array (N, 3)."""
     if not scans:

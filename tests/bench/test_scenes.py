@@ -77,7 +77,7 @@ def test_box(wall):
     assert wall.box is None
     box = load_scene("wall", frames=2, box=[[0, 0, 0], [1, 2, 3]]).box
     assert_array_equal(box, [[0, 0, 0], [1, 2, 3]])
-    with pytest.raises(ValueError, match="a lower corner and an upper one"):
+    with pytest.raises(ValueError, match="a lower and an upper corner"):
         load_scene("wall", frames=2, box=[[0, 0, 0], [1, 0, 3]])
 
 

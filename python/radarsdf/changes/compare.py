@@ -33,12 +33,12 @@ from radarsdf.changes.probability import (
     share_of_changes,
 )
 from radarsdf.changes.reflectance import Differences
+from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.io.scans import Scans
 from radarsdf.map.gridding import check_passages
 from radarsdf.map.map import Map
-from radarsdf.map.meshing import check_box
 
 _PROBABLE = 0.5  # more likely than not
 _PARALLEL = np.cos(np.pi / 4)  # a surface that moved is still about parallel

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf._core import cell_keys
-from radarsdf.checks import MAX_POSITION_M, positions, positive, real_array, whole_number
+from radarsdf.checks import check_box, positions, positive, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def surface_metrics(
     positive(threshold_m, "threshold_m")
     positive(outlier_m, "outlier_m")
     positive(truncation_m, "truncation_m")
-    corners = None if box is None else _check_box(box)
+    corners = None if box is None else check_box(box)
     points = _in_box(positions(ground_truth, "ground_truth"), corners)
     if len(points) == 0:
         msg = "there are no ground-truth points" + ("" if corners is None else " in the box")
@@ -219,7 +219,7 @@ def adjacent_angles(mesh: trimesh.Trimesh, *, box: ArrayLike | None = None) -> N
     if len(faces) == 0:
         return np.zeros(0)
     origin = vertices.mean(axis=0)
-    return _angles(vertices - origin, faces, None if box is None else _check_box(box) - origin)
+    return _angles(vertices - origin, faces, None if box is None else check_box(box) - origin)
 
 
 def gamma_from_moments(angles_rad: ArrayLike) -> tuple[float | None, float | None, float | None]:
@@ -252,17 +252,6 @@ def gamma_from_moments(angles_rad: ArrayLike) -> tuple[float | None, float | Non
 
 def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0 else 0.0
-
-
-def _check_box(box: ArrayLike) -> _Points:
-    corners = real_array(box, "box")
-    if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
-        msg = "box must be (2, 3): a lower corner and an upper one above it"
-        raise ValueError(msg)
-    if not (np.abs(corners) <= MAX_POSITION_M).all():
-        msg = f"box must be finite, and within {MAX_POSITION_M:g} m"
-        raise ValueError(msg)
-    return corners
 
 
 def _vertices(mesh: trimesh.Trimesh) -> _Points:

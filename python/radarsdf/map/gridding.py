@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import MAX_POSITION_M, positive
+from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.grids.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
-from radarsdf.map.meshing import check_box
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.passages import MOST_SCANS
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import MAX_POSITION_M, number, positive, real_array, whole_number
+from radarsdf.checks import MAX_POSITION_M, check_box, number, positive, real_array, whole_number
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
@@ -218,18 +218,6 @@ def check_viewpoint(scale: IntensityScale | None, viewpoint: ArrayLike) -> NDArr
         msg = f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m"
         raise ValueError(msg)
     return sensor_position
-
-
-def check_box(box: ArrayLike) -> NDArray[np.float64]:
-    """Lower and upper corner (2, 3), world, m. Raises a ValueError if they are none."""
-    corners = real_array(box, "box")
-    if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
-        msg = "box must be a lower and an upper corner, (2, 3)"
-        raise ValueError(msg)
-    if not (np.abs(corners) <= MAX_POSITION_M).all():
-        msg = f"box must be finite, and within {MAX_POSITION_M:g} m"
-        raise ValueError(msg)
-    return corners
 
 
 def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:

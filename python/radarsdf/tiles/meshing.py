@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.budget.estimate import check_triangles
-from radarsdf.checks import path_of, positive
+from radarsdf.checks import check_box, path_of, positive
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import whole_file
 from radarsdf.io.records import face_records, ply_header, records
-from radarsdf.map.meshing import Limits, check_box
+from radarsdf.map.meshing import Limits
 from radarsdf.map.threshold import Threshold
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.pieces import PieceSettings, divides, mesh_tile, piece_path, write_piece
