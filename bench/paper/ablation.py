@@ -12,8 +12,8 @@ from radarsdf.evaluation import intensity_metrics
 
 from bench.settings import Changes, merged
 
-from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, world_returns
-from .report import figure, markdown
+from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, panels, world_returns
+from .report import markdown
 from .scenes import Scene
 
 # All inputs of the paper, also those that the default configuration does not use.
@@ -81,17 +81,13 @@ def table(rows: list[Row]) -> str:
 
 def plot(rows: list[Row], path: Path) -> None:
     """MAE of each variant."""
-    panels = groups([row for row in rows if "mae" in row], "scene", "base")
-    with figure(path, columns=max(1, len(panels))) as axes:
-        for ax, ((scene, base), own) in zip(axes[0], panels.items(), strict=False):
-            for i, ((variant,), same) in enumerate(groups(own, "variant").items()):
-                values = [row["mae"] for row in same]
-                ax.barh(
-                    i, np.mean(values), xerr=np.std(values), color="tab:gray" if variant == "full" else "C0"
-                )
-            ax.set_yticks(range(len(_VARIANTS)), list(_VARIANTS))
-            ax.invert_yaxis()
-            ax.set(title=f"{scene}, {base}", xlabel="held-out MAE, sensor units")
+    for ax, own in panels(path, [row for row in rows if "mae" in row], "scene", "base"):
+        for i, ((variant,), same) in enumerate(groups(own, "variant").items()):
+            values = [row["mae"] for row in same]
+            ax.barh(i, np.mean(values), xerr=np.std(values), color="tab:gray" if variant == "full" else "C0")
+        ax.set_yticks(range(len(_VARIANTS)), list(_VARIANTS))
+        ax.invert_yaxis()
+        ax.set(xlabel="held-out MAE, sensor units")
 
 
 EXPERIMENT = Experiment(

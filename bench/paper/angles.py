@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from radarsdf.evaluation import adjacent_angles, gamma_from_moments
 
-from .experiment import Experiment, Options, Row, for_each_peer, groups
-from .report import figure, markdown
+from .experiment import Experiment, Options, Row, for_each_peer, panels
+from .report import markdown
 from .scenes import Scene
 
 _BINS = np.linspace(0, np.pi, 181)
@@ -48,13 +48,11 @@ def _numbers(row: Row) -> list[str]:
 
 def plot(rows: list[Row], path: Path) -> None:
     """Outlines of the histograms."""
-    scenes = groups([row for row in rows if "histogram" in row], "scene")
-    with figure(path, columns=max(1, len(scenes))) as axes:
-        for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
-            for row in own:
-                ax.stairs(100 * np.asarray(row["histogram"]), np.rad2deg(_BINS), label=row["method"])
-            ax.set(title=scene, xlim=(0, 90), xlabel="angle between triangles, °", ylabel="share of edges, %")
-            ax.set_yscale("log")
+    for ax, own in panels(path, [row for row in rows if "histogram" in row], "scene"):
+        for row in own:
+            ax.stairs(100 * np.asarray(row["histogram"]), np.rad2deg(_BINS), label=row["method"])
+        ax.set(xlim=(0, 90), xlabel="angle between triangles, °", ylabel="share of edges, %")
+        ax.set_yscale("log")
 
 
 EXPERIMENT = Experiment(

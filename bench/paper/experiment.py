@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from radarsdf.returns.rays import Rays, prepare
 from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
 from bench.settings import Changes, merged
 
+from .report import figure
 from .scenes import Scene
 
 Row = dict[str, Any]
@@ -166,6 +167,17 @@ def groups(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
     for row in rows:
         found.setdefault(tuple(row.get(key) for key in keys), []).append(row)
     return found
+
+
+def panels(
+    path: Path, rows: list[Row], *keys: str, size: tuple[float, float] = (5, 3.6)
+) -> Iterator[tuple[Any, list[Row]]]:
+    """Axes with a title, and the rows, of each group by `keys`, side by side in a plot that is written to `path` in the end."""
+    found = groups(rows, *keys)
+    with figure(path, columns=max(1, len(found)), size=size) as axes:
+        for ax, (names, own) in zip(axes[0], found.items(), strict=False):
+            ax.set_title(", ".join(names))
+            yield ax, own
 
 
 def mean_and_deviation(rows: list[Row], key: str) -> str:

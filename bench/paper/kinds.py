@@ -15,8 +15,8 @@ from radarsdf.simulate import KINDS, SCENES
 from bench.peers.interface import PEERS
 
 from .calibration import repeated, sampled
-from .experiment import Experiment, Options, Row, Task, fit, groups
-from .report import best_in_bold, figure, markdown
+from .experiment import Experiment, Options, Row, Task, fit, groups, panels
+from .report import best_in_bold, markdown
 from .scenes import Scene
 from .truth import truth_of
 
@@ -116,18 +116,16 @@ def _calibration(rows: list[Row]) -> str:
 
 def plot(rows: list[Row], path: Path) -> None:
     """For each kind, the share of true surface over the confidence."""
-    judged = groups([row for row in rows if "worst_gap" in row], "scene")
-    with figure(path, columns=max(1, len(judged)), size=(3, 3)) as axes:
-        for ax, ((scene,), own) in zip(axes[0], judged.items(), strict=False):
-            ax.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color="lightgray")
-            for row in own:
-                known = [
-                    (p, share)
-                    for p, share in zip(row["bin_confidence"], row["bin_true_share"], strict=True)
-                    if p is not None
-                ]
-                ax.plot(*zip(*known, strict=True), "o-", ms=3, label=row["method"])
-            ax.set(title=scene, xlabel="confidence", ylabel="share of true surface", xlim=(0, 1), ylim=(0, 1))
+    for ax, own in panels(path, [row for row in rows if "worst_gap" in row], "scene", size=(3, 3)):
+        ax.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color="lightgray")
+        for row in own:
+            known = [
+                (p, share)
+                for p, share in zip(row["bin_confidence"], row["bin_true_share"], strict=True)
+                if p is not None
+            ]
+            ax.plot(*zip(*known, strict=True), "o-", ms=3, label=row["method"])
+        ax.set(xlabel="confidence", ylabel="share of true surface", xlim=(0, 1), ylim=(0, 1))
 
 
 EXPERIMENT = Experiment(

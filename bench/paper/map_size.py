@@ -10,8 +10,8 @@ from pathlib import Path
 
 from bench.settings import Changes, merged
 
-from .experiment import Experiment, Options, Row, Task, fit, groups
-from .report import figure, markdown
+from .experiment import Experiment, Options, Row, Task, fit, groups, panels
+from .report import markdown
 from .scenes import Scene
 
 _STEPS = (10, 5, 3, 2, 1)  # of 117 scans, these leave 12, 24, 39, 59 and 117 as in the paper
@@ -87,15 +87,11 @@ def table(rows: list[Row]) -> str:
 
 def plot(rows: list[Row], path: Path) -> None:
     """Size in MB over the number of scans."""
-    scenes = groups([row for row in rows if row.get("bytes") is not None], "scene")
-    with figure(path, columns=max(1, len(scenes))) as axes:
-        for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
-            for (method,), same in groups(own, "method").items():
-                ax.plot(
-                    [r["frames"] for r in same], [r["bytes"] / 1e6 for r in same], "o-", ms=3, label=method
-                )
-            ax.set(title=scene, xlabel="scans", ylabel="map, MB")
-            ax.grid(alpha=0.3)
+    for ax, own in panels(path, [row for row in rows if row.get("bytes") is not None], "scene"):
+        for (method,), same in groups(own, "method").items():
+            ax.plot([r["frames"] for r in same], [r["bytes"] / 1e6 for r in same], "o-", ms=3, label=method)
+        ax.set(xlabel="scans", ylabel="map, MB")
+        ax.grid(alpha=0.3)
 
 
 EXPERIMENT = Experiment("Map size over the number of scans", ("hugin", "oculii", "wall"), tasks, table, plot)

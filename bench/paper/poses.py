@@ -18,8 +18,8 @@ from radarsdf.poses.rigid import aligned
 from radarsdf.simulate import SCENES, measured_motion
 
 from .broken_poses import BREAKAGES, Poses
-from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, world_returns
-from .report import figure, markdown
+from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, panels, world_returns
+from .report import markdown
 from .scenes import Scene, load_scene
 
 _SOURCES = ("returns and Doppler", "returns, Doppler, gyroscope", "returns alone")
@@ -183,29 +183,27 @@ def table(rows: list[Row]) -> str:
 
 def plot(rows: list[Row], path: Path) -> None:
     """F-scores less those of the true poses, as given and as found."""
-    scenes = groups([row for row in rows if row.get("f_found") is not None], "scene")
-    with figure(path, columns=max(1, len(scenes))) as axes:
-        for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
-            kinds = groups(own, "poses")
-            places = np.arange(len(kinds))
-            for key, mark in (("f_given", "x"), ("f_found", "o")):
-                values: list[Any] = [
-                    [row[key] - row["f_true"] for row in same if row.get(key) is not None]
-                    for same in kinds.values()
-                ]
-                for place, of_kind in zip(places, values, strict=True):
-                    ax.plot(
-                        of_kind,
-                        [place] * len(of_kind),
-                        mark,
-                        ms=4,
-                        color="C1" if mark == "x" else "C0",
-                        alpha=0.7,
-                    )
-            ax.set_yticks(places, [str(name) for (name,) in kinds])
-            ax.invert_yaxis()
-            ax.set(title=scene, xlabel="F-score less that of true poses, points (x given, o found)")
-            ax.grid(alpha=0.3)
+    for ax, own in panels(path, [row for row in rows if row.get("f_found") is not None], "scene"):
+        kinds = groups(own, "poses")
+        places = np.arange(len(kinds))
+        for key, mark in (("f_given", "x"), ("f_found", "o")):
+            values: list[Any] = [
+                [row[key] - row["f_true"] for row in same if row.get(key) is not None]
+                for same in kinds.values()
+            ]
+            for place, of_kind in zip(places, values, strict=True):
+                ax.plot(
+                    of_kind,
+                    [place] * len(of_kind),
+                    mark,
+                    ms=4,
+                    color="C1" if mark == "x" else "C0",
+                    alpha=0.7,
+                )
+        ax.set_yticks(places, [str(name) for (name,) in kinds])
+        ax.invert_yaxis()
+        ax.set(xlabel="F-score less that of true poses, points (x given, o found)")
+        ax.grid(alpha=0.3)
 
 
 EXPERIMENT = Experiment(

@@ -10,8 +10,8 @@ from pathlib import Path
 from scipy.spatial import cKDTree
 
 from .calibration import sampled
-from .experiment import Experiment, Options, Row, for_each_peer, groups
-from .report import figure, markdown
+from .experiment import Experiment, Options, Row, for_each_peer, groups, panels
+from .report import markdown
 from .scenes import Scene
 
 NEAR_M = 0.2
@@ -76,14 +76,13 @@ def _text(row: Row | None) -> str:
 
 def plot(rows: list[Row], path: Path) -> None:
     """For each scene, completion over precision in each band."""
-    scenes = groups([row for row in rows if row.get("precision") and row.get("completion")], "scene")
-    with figure(path, columns=max(1, len(scenes))) as axes:
-        for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
-            for (method,), same in groups(own, "method").items():
-                x, y = ([100 * row[key] for row in same] for key in ("precision", "completion"))
-                ax.plot(x, y, "o-", ms=4, label=method)
-            ax.set(title=scene, xlabel="precision, %", ylabel="completion, %", xlim=(0, 100), ylim=(0, 100))
-            ax.legend(fontsize=7)
+    for ax, own in panels(
+        path, [row for row in rows if row.get("precision") and row.get("completion")], "scene"
+    ):
+        for (method,), same in groups(own, "method").items():
+            x, y = ([100 * row[key] for row in same] for key in ("precision", "completion"))
+            ax.plot(x, y, "o-", ms=4, label=method)
+        ax.set(xlabel="precision, %", ylabel="completion, %", xlim=(0, 100), ylim=(0, 100))
 
 
 EXPERIMENT = Experiment(

@@ -7,8 +7,8 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from .experiment import Experiment, Options, Row, Task, groups
-from .report import figure, markdown
+from .experiment import Experiment, Options, Row, Task, groups, panels
+from .report import markdown
 from .scenes import Scene
 
 
@@ -48,19 +48,17 @@ def table(rows: list[Row]) -> str:
 
 def plot(rows: list[Row], path: Path) -> None:
     """Completion ratio over n."""
-    scenes = groups([row for row in rows if "completion_ratio" in row], "scene")
-    with figure(path, columns=max(1, len(scenes))) as axes:
-        for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
-            for (method,), same in groups(own, "method").items():
-                ax.plot(
-                    [r["n"] for r in same],
-                    [100 * r["completion_ratio"] for r in same],
-                    "o-",
-                    ms=3,
-                    label=method,
-                )
-            ax.set(title=scene, xlabel="every n-th scan", ylabel="completion ratio, %")
-            ax.grid(alpha=0.3)
+    for ax, own in panels(path, [row for row in rows if "completion_ratio" in row], "scene"):
+        for (method,), same in groups(own, "method").items():
+            ax.plot(
+                [r["n"] for r in same],
+                [100 * r["completion_ratio"] for r in same],
+                "o-",
+                ms=3,
+                label=method,
+            )
+        ax.set(xlabel="every n-th scan", ylabel="completion ratio, %")
+        ax.grid(alpha=0.3)
 
 
 EXPERIMENT = Experiment("Completion with every n-th scan", ("hugin", "oculii"), tasks, table, plot)

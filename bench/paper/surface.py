@@ -7,8 +7,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from .experiment import Experiment, Options, Row, for_each_peer, groups
-from .report import Column, figure, metric_table
+from .experiment import Experiment, Options, Row, for_each_peer, groups, panels
+from .report import Column, metric_table
 from .scenes import Scene
 
 COLUMNS: tuple[Column, ...] = (
@@ -44,11 +44,9 @@ def table(rows: list[Row]) -> str:
 
 def plot(rows: list[Row], path: Path) -> None:
     """F-score with nothing discarded over time."""
-    scenes = groups([row for row in rows if "f_score_all" in row], "scene")
-    with figure(path, columns=max(1, len(scenes))) as axes:
-        for ax, ((scene,), own) in zip(axes[0], scenes.items(), strict=False):
-            _scatter(ax, own)
-            ax.set(title=scene, xscale="log", xlabel="time, s", ylabel="F-score, nothing discarded, %")
+    for ax, own in panels(path, [row for row in rows if "f_score_all" in row], "scene"):
+        _scatter(ax, own)
+        ax.set(xscale="log", xlabel="time, s", ylabel="F-score, nothing discarded, %")
 
 
 def _scatter(ax: Any, rows: list[Row]) -> None:

@@ -19,6 +19,7 @@ from radarsdf.checks import (
     real_array,
     refuse_masked,
 )
+from radarsdf.io.scans import chosen
 
 FloatArray = NDArray[np.float64]
 
@@ -74,15 +75,11 @@ class Recording:
 
     def select(self, scans: NDArray[np.int64]) -> Recording:
         """The scans with these numbers (K,), in this order."""
-
-        def chosen(arrays: list[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
-            return None if arrays is None else [arrays[i] for i in scans]
-
         return Recording(
             [self.points[i] for i in scans],
             self.poses[scans],
-            chosen(self.intensities),
-            chosen(self.doppler_mps),
+            chosen(self.intensities, scans),
+            chosen(self.doppler_mps, scans),
             None if self.times_s is None else self.times_s[scans],
         )
 

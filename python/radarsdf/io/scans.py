@@ -249,18 +249,14 @@ class Scans:
 
     def select(self, frames: NDArray[np.int64]) -> Scans:
         """The scans with the numbers `frames`, (K,), in this order. All scans are read."""
-
-        def chosen(arrays: list[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
-            return None if arrays is None else [arrays[i] for i in frames]
-
         return Scans(
             [self.points[i] for i in frames],
             self.poses[frames],
-            chosen(self.intensities),
+            chosen(self.intensities, frames),
             self.ground_truth,
-            doppler_mps=chosen(self.doppler_mps),
+            doppler_mps=chosen(self.doppler_mps, frames),
             times_s=None if self.times_s is None else self.times_s[frames],
-            sigmas=chosen(self.sigmas),
+            sigmas=chosen(self.sigmas, frames),
             truth_kind=self.truth_kind,
             imu=self.imu,
         )
@@ -346,6 +342,11 @@ def filled(points: Any, **given: Any) -> tuple[Any, ...]:
         return points, *given.values()
     arrays = points.points  # first: it reads all there is, in one pass
     return arrays, *(getattr(points, name) if values is None else values for name, values in given.items())
+
+
+def chosen(arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64]) -> list[NDArray[Any]] | None:
+    """Those of these `numbers`, (K,), in this order, if there are arrays."""
+    return None if arrays is None else [arrays[i] for i in numbers]
 
 
 def _listed(arrays: Sequence[NDArray[Any]] | None, name: str) -> list[NDArray[Any]] | None:
