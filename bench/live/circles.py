@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-from matplotlib.figure import Figure
 from radarsdf import FitConfig, LiveMap
 
+from bench.paper.report import figure
 from bench.rows import quantile
 from bench.timing import timed
 
@@ -55,16 +55,13 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """Milliseconds and megabytes over the scans."""
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    scans = [row["scans"] for row in rows]
-    for name in ("integrate p50, ms", "p99"):
-        left.plot(scans, [row[name] for row in rows], "o-", label=name)
-    for name in ("map, MB", "process at most, MB"):
-        right.plot(scans, [row[name] for row in rows], "o-", label=name)
-    for axes in (left, right):
-        axes.set_ylim(0)
-        axes.set_xlabel("scans")
-        axes.grid(alpha=0.3)
-        axes.legend()
-    figure.savefig(path, dpi=110)
+    with figure(path, columns=2, size=(4, 3.2)) as ((left, right),):
+        scans = [row["scans"] for row in rows]
+        for name in ("integrate p50, ms", "p99"):
+            left.plot(scans, [row[name] for row in rows], "o-", label=name)
+        for name in ("map, MB", "process at most, MB"):
+            right.plot(scans, [row[name] for row in rows], "o-", label=name)
+        for axes in (left, right):
+            axes.set_ylim(0)
+            axes.set_xlabel("scans")
+            axes.grid(alpha=0.3)

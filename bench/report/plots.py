@@ -10,6 +10,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from radarsdf.render.figures import new_figure
 
 from .results import Results, Row, digest
 from .tables import by_scene
@@ -63,11 +64,7 @@ def _save(figure: Any, path: Path, mark: str) -> None:
 
 def _figure(rows: int) -> tuple[Any, Any]:
     """With two panels in each row."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - tables need no matplotlib
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(9.2, 3.8 * rows), dpi=_DPI, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(figsize=(9.2, 3.8 * rows), dpi=_DPI, layout="constrained", facecolor="white")
     return figure, figure.subplots(rows, 2, squeeze=False)
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from radarsdf import RadarMap, TiledMap
+
+from bench.paper.report import figure
 
 _HALF_M = 3.0  # of what is drawn, along the section and in height
 _STEP_M = 0.02
@@ -39,27 +40,24 @@ def draw(city: TiledMap, one: RadarMap, mesh: Any, positions: _Floats, path: Pat
     grid = np.tile(centre, (along.size, 1))
     grid[:, across] += along.ravel()
     grid[:, 2] += height.ravel()
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for map_, color, width, label in ((one, "#c0392b", 2.5, "one fit"), (city, "#2c3e50", 1.2, "tiles")):
-        unknown = ~map_.observed(grid)
-        distance_m: Any = np.where(unknown, np.nan, map_.sdf(grid)).reshape(along.shape)
-        left.contour(s, s, distance_m.T, [0.0], colors=color, linewidths=width)
-        left.plot([], [], color=color, lw=width, label=label)
-        if city.has_intensity:
-            size_m = np.abs(np.nan_to_num(distance_m, nan=np.inf))
-            rows = np.arange(len(s)), size_m.argmin(axis=1)
-            values = map_.intensity(grid.reshape(*along.shape, 3)[rows], sensor)
-            values[size_m[rows] > 2 * _STEP_M] = np.nan  # no surface is there
-            right.plot(s, values, color=color, lw=width, label=label)
-    for axes in (left, right):
-        axes.axvline(0, color="#888888", lw=0.8, ls="--")
-        axes.set_xlabel("across the border, m")
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    left.set(title="where the signed distance is zero", ylabel="height, m", aspect="equal")
-    right.set(title="intensity of that surface", ylabel="dB")
-    figure.savefig(path, dpi=110)
+    with figure(path, columns=2, size=(5.5, 4)) as ((left, right),):
+        for map_, color, width, label in ((one, "#c0392b", 2.5, "one fit"), (city, "#2c3e50", 1.2, "tiles")):
+            unknown = ~map_.observed(grid)
+            distance_m: Any = np.where(unknown, np.nan, map_.sdf(grid)).reshape(along.shape)
+            left.contour(s, s, distance_m.T, [0.0], colors=color, linewidths=width)
+            left.plot([], [], color=color, lw=width, label=label)
+            if city.has_intensity:
+                size_m = np.abs(np.nan_to_num(distance_m, nan=np.inf))
+                rows = np.arange(len(s)), size_m.argmin(axis=1)
+                values = map_.intensity(grid.reshape(*along.shape, 3)[rows], sensor)
+                values[size_m[rows] > 2 * _STEP_M] = np.nan  # no surface is there
+                right.plot(s, values, color=color, lw=width, label=label)
+        for axes in (left, right):
+            axes.axvline(0, color="#888888", lw=0.8, ls="--")
+            axes.set_xlabel("across the border, m")
+            axes.grid(alpha=0.3)
+        left.set(title="where the signed distance is zero", ylabel="height, m", aspect="equal")
+        right.set(title="intensity of that surface", ylabel="dB")
 
 
 def _busiest(city: TiledMap, mesh: Any) -> tuple[_Floats, int]:

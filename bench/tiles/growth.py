@@ -18,7 +18,6 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
 from radarsdf import FitConfig
 from radarsdf.io import Scan
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
@@ -84,21 +83,20 @@ def _geometry(scans: Any) -> Any:
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """Seconds and memory over the returns. Processor time is of all steps and workers."""
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    counts = [row["returns"] for row in rows]
-    for name in ("plan, s", "fit, s", "mesh, s"):
-        left.loglog(counts, [row[name] for row in rows], "o-", label=name)
-    processor_s = [1e-6 * row["returns"] * row["processor, µs a return"] for row in rows]
-    left.loglog(counts, processor_s, "k.--", label="processor, s")
-    for name in ("plan, MB", "worker, MB"):
-        right.semilogx(counts, [row[name] for row in rows], "o-", label=name)
-    right.set_ylim(0)
-    for axes in (left, right):
-        axes.set_xlabel("returns")
-        axes.grid(alpha=0.3)
-        axes.legend()
-    figure.savefig(path, dpi=110)
+    from bench.paper.report import figure  # noqa: PLC0415 - the process that is measured imports no more than it needs
+
+    with figure(path, columns=2, size=(4, 3.2)) as ((left, right),):
+        counts = [row["returns"] for row in rows]
+        for name in ("plan, s", "fit, s", "mesh, s"):
+            left.loglog(counts, [row[name] for row in rows], "o-", label=name)
+        processor_s = [1e-6 * row["returns"] * row["processor, µs a return"] for row in rows]
+        left.loglog(counts, processor_s, "k.--", label="processor, s")
+        for name in ("plan, MB", "worker, MB"):
+            right.semilogx(counts, [row[name] for row in rows], "o-", label=name)
+        right.set_ylim(0)
+        for axes in (left, right):
+            axes.set_xlabel("returns")
+            axes.grid(alpha=0.3)
 
 
 if __name__ == "__main__":
