@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 # Without a graphics card the browser draws in software.
@@ -148,15 +149,8 @@ def camera_of(server: Any, timeout_s: float = 30.0) -> Any:
 
 def pixel_of(camera: Any, point: NDArray[np.float64]) -> tuple[float, float]:
     """The pixel in which the page draws a point (3,), frame of the page, m."""
-    w, x, y, z = camera.wxyz
-    R_page_camera = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    right, down, forward = R_page_camera.T @ (point - camera.position)
+    R_page_camera = Rotation.from_quat(np.roll(camera.wxyz, -1))
+    right, down, forward = R_page_camera.inv().apply(point - camera.position)
     focal = camera.image_height / 2 / np.tan(camera.fov / 2)
     return (
         float(camera.image_width / 2 + focal * right / forward),

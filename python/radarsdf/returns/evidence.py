@@ -72,9 +72,7 @@ class Evidence:
         counted = count_looks(
             leaf_keys,
             leaf_size_m,
-            np.ascontiguousarray(rays.points),
-            np.ascontiguousarray(rays.directions),
-            np.ascontiguousarray(rays.ranges_m),
+            *rays.in_c_order(),
             rays.scans,
             num_threads,
         )

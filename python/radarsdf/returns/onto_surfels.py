@@ -35,9 +35,7 @@ def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: 
         0: as many as OpenMP uses.
     """
     points, directions, ranges_m = move_onto_planes(
-        np.ascontiguousarray(rays.points),
-        np.ascontiguousarray(rays.directions),
-        np.ascontiguousarray(rays.ranges_m),
+        *rays.in_c_order(),
         np.ascontiguousarray(rays.scans),
         rays.up_of_scan,
         surfels.flat_planes_at(rays.points, num_threads),

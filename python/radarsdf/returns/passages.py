@@ -67,9 +67,7 @@ class Passages:
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
         lower, upper = (limit if box_cells is None else np.asarray(box_cells)).__iter__()
         keys, planes = find_passages(
-            np.ascontiguousarray(rays.points),
-            np.ascontiguousarray(rays.directions),
-            np.ascontiguousarray(rays.ranges_m),
+            *rays.in_c_order(),
             np.minimum(before_m, known_m),
             np.ascontiguousarray(rays.scans),
             leaf_size_m,

@@ -91,6 +91,13 @@ class Rays:
             scans=np.ascontiguousarray(chosen(self.scans)),
         )
 
+    def in_c_order(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """`points`, `directions` and `ranges_m` as the core takes them."""
+        points, directions, ranges_m = map(
+            np.ascontiguousarray, (self.points, self.directions, self.ranges_m)
+        )
+        return points, directions, ranges_m
+
     def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns, and for each the sensor position it was seen from: (N, 3) and (N, 3) float64, world, m."""
         points = self.points.astype(np.float64) + self.origin

@@ -46,9 +46,7 @@ class ScanSums:
         """Of the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
         cells = ReturnCells.of(rays, leaf_size_m, num_threads)
         sums = sum_returns(
-            np.ascontiguousarray(rays.points),
-            np.ascontiguousarray(rays.directions),
-            np.ascontiguousarray(rays.ranges_m),
+            *rays.in_c_order(),
             cells.cell_of_ray,
             _corners(cells.keys),
             leaf_size_m / QUANTA,
