@@ -9,7 +9,7 @@ change only where a sample changes its sign.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,6 @@ from torch.autograd.function import once_differentiable
 from radarsdf import _core
 
 _SMALL_INTEGERS = 2  # bytes: float32 holds all of them
-_Gradients = tuple[Tensor | None, ...]
 
 
 def as_samples(values: Tensor, name: str) -> Tensor:
@@ -43,13 +42,14 @@ def volume_mesh(
     num_threads: int,
 ) -> tuple[Tensor, Tensor]:
     """Vertices and faces of a volume, of arguments that `marching_cubes` has checked."""
-    if volume.requires_grad and torch.is_grad_enabled():
-        mesh: tuple[Tensor, Tensor] = _OfVolume.apply(  # type: ignore[no-untyped-call]
-            volume, mask, spacing, origin, level, num_threads
-        )
-        return mesh
-    return _tensors(
-        *_core.marching_cubes_dense(volume.detach().numpy(), mask, spacing, origin, level, num_threads)
+    rest = mask, spacing, origin, level, num_threads
+    return _mesh(
+        volume,
+        lambda samples: _core.marching_cubes_dense(samples, *rest),
+        lambda samples: _core.marching_cubes_dense_with_edges(samples, *rest),
+        lambda volume, edges, grad, into: _core.marching_cubes_dense_backward(
+            volume, edges, grad, spacing, level, into, num_threads
+        ),
     )
 
 
@@ -63,93 +63,55 @@ def cells_mesh(
     num_threads: int,
 ) -> tuple[Tensor, Tensor]:
     """Vertices and faces of some cells, of arguments that `extract_cells` has checked."""
-    if values.requires_grad and torch.is_grad_enabled():
-        mesh: tuple[Tensor, Tensor] = _OfCells.apply(  # type: ignore[no-untyped-call]
-            values, corners, cells, spacing, origin, level, num_threads
-        )
-        return mesh
-    return _tensors(
-        *_core.marching_cubes_sparse(
-            corners, values.detach().numpy(), cells, spacing, origin, level, num_threads
-        )
+    rest = cells, spacing, origin, level, num_threads
+    return _mesh(
+        values,
+        lambda samples: _core.marching_cubes_sparse(corners, samples, *rest),
+        lambda samples: _core.marching_cubes_sparse_with_edges(corners, samples, *rest),
+        lambda values, edges, uppers, grad, into: _core.marching_cubes_sparse_backward(
+            values, edges, uppers, grad, spacing, level, into, num_threads
+        ),
     )
 
 
-def _tensors(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[Tensor, Tensor]:
+def _mesh(
+    samples: Tensor,
+    plain: Callable[[NDArray[Any]], tuple[NDArray[Any], ...]],
+    with_edges: Callable[[NDArray[Any]], tuple[NDArray[Any], ...]],
+    pull_back: Callable[..., None],
+) -> tuple[Tensor, Tensor]:
+    """Vertices and faces by one of two calls of the core, and their gradient by the third, which keeps what it names alone."""
+    if samples.requires_grad and torch.is_grad_enabled():
+        mesh: tuple[Tensor, Tensor] = _OfSamples.apply(samples, with_edges, pull_back)  # type: ignore[no-untyped-call]
+        return mesh
+    vertices, faces = plain(samples.detach().numpy())
     return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 
-class _OfVolume(torch.autograd.Function):
+class _OfSamples(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        volume: Tensor,
-        mask: NDArray[np.bool_] | None,
-        spacing: Sequence[float],
-        origin: Sequence[float],
-        level: float,
-        num_threads: int,
+        samples: Tensor,
+        with_edges: Callable[[NDArray[Any]], tuple[NDArray[Any], ...]],
+        pull_back: Callable[..., None],
     ) -> tuple[Tensor, Tensor]:
-        vertices, faces, edges = _core.marching_cubes_dense_with_edges(
-            volume.detach().numpy(), mask, spacing, origin, level, num_threads
-        )
-        ctx.save_for_backward(volume, torch.from_numpy(edges))
-        ctx.rest = spacing, level, num_threads
-        return _mark(ctx, *_tensors(vertices, faces))
+        vertices, faces, *edges = map(torch.from_numpy, with_edges(samples.detach().numpy()))
+        ctx.save_for_backward(samples, *edges)
+        ctx.pull_back = pull_back
+        ctx.mark_non_differentiable(faces)
+        ctx.set_materialize_grads(False)  # or the faces' gradient would be zeros of their size
+        return vertices, faces
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, vertices_grad: Tensor | None, _: Tensor | None) -> _Gradients:
+    def backward(
+        ctx: Any, vertices_grad: Tensor | None, _: Tensor | None
+    ) -> tuple[Tensor | None, None, None]:
         if vertices_grad is None:
-            return (None,) * 6
-        volume, edges = (saved.detach().numpy() for saved in ctx.saved_tensors)
-        spacing, level, num_threads = ctx.rest
-        grad = _unset_like(volume)
-        _core.marching_cubes_dense_backward(
-            volume, edges, vertices_grad.contiguous().numpy(), spacing, level, grad, num_threads
-        )
-        return torch.from_numpy(grad), *(None,) * 5
-
-
-class _OfCells(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        values: Tensor,
-        corners: NDArray[np.int32],
-        cells: NDArray[np.int32],
-        spacing: Sequence[float],
-        origin: Sequence[float],
-        level: float,
-        num_threads: int,
-    ) -> tuple[Tensor, Tensor]:
-        vertices, faces, *edges = _core.marching_cubes_sparse_with_edges(
-            corners, values.detach().numpy(), cells, spacing, origin, level, num_threads
-        )
-        ctx.save_for_backward(values, *(torch.from_numpy(array) for array in edges))
-        ctx.rest = spacing, level, num_threads
-        return _mark(ctx, *_tensors(vertices, faces))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, vertices_grad: Tensor | None, _: Tensor | None) -> _Gradients:
-        if vertices_grad is None:
-            return (None,) * 7
-        values, edges, uppers = (saved.detach().numpy() for saved in ctx.saved_tensors)
-        spacing, level, num_threads = ctx.rest
-        grad = _unset_like(values)
-        _core.marching_cubes_sparse_backward(
-            values, edges, uppers, vertices_grad.contiguous().numpy(), spacing, level, grad, num_threads
-        )
-        return torch.from_numpy(grad), *(None,) * 6
-
-
-def _unset_like(samples: NDArray[Any]) -> NDArray[Any]:
-    # The core fills it. NumPy asks for huge pages, as PyTorch does not.
-    return np.empty(samples.shape, samples.dtype)
-
-
-def _mark(ctx: Any, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    ctx.mark_non_differentiable(faces)
-    ctx.set_materialize_grads(False)  # or the faces' gradient would be zeros of their size
-    return vertices, faces
+            return None, None, None
+        samples, *edges = (saved.detach().numpy() for saved in ctx.saved_tensors)
+        # The core fills it. NumPy asks for huge pages, as PyTorch does not.
+        grad = np.empty(samples.shape, samples.dtype)
+        ctx.pull_back(samples, *edges, vertices_grad.contiguous().numpy(), grad)
+        return torch.from_numpy(grad), None, None
