@@ -164,6 +164,11 @@ def test_scans_have_their_own_poses_and_times(street):
     )
 
 
+def test_two_scans_may_have_one_time(street):
+    found = radarsdf.refine_poses(street.points[:3], street.poses[:3], times=[0.0, 1, 1])
+    assert np.isfinite(found.poses).all()
+
+
 def test_known_deviations_stay(street):
     found = radarsdf.refine_poses(street.points[:6], street.poses[:6], sigma_m=0.02, sigma_rad=0.001)
     assert (found.report["sigma_m"], found.report["sigma_rad"]) == pytest.approx((0.02, 0.001))
