@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED
-from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.by_doppler import SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope, UnknownAxesError
 from radarsdf.poses.imu_alignment import ImuAlignment
 from radarsdf.poses.imu_motion import cumulated
@@ -39,7 +39,7 @@ def ride():
     seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds)
     seen += np.random.default_rng(1).normal(0, 1, seen.shape) * [0.02, 0.02, 0.04]
     count = len(t)
-    velocities = Velocities(
+    velocities = SensorVelocities(
         seen, np.tile(np.diag([0.02, 0.02, 0.04]) ** 2, (count, 1, 1)), np.ones(3), [], np.ones(count, bool)
     )
     return t, poses, velocities
@@ -102,7 +102,7 @@ def test_a_sensor_that_goes_straight_on_leaves_it_open():
     poses[:, 0, 3] = times_s
     rng = np.random.default_rng(2)
     covariance = np.tile(0.02**2 * np.eye(3), (200, 1, 1))
-    velocities = Velocities(
+    velocities = SensorVelocities(
         [1, 0, 0] + rng.normal(0, 0.02, (200, 3)), covariance, np.ones(3), [], np.ones(200, bool)
     )
     assert ImuAlignment.of(measured_imu(poses, times_s), velocities, times_s) is None

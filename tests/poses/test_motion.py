@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from radarsdf.poses.by_doppler import DopplerMotion, Velocities
+from radarsdf.poses.by_doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.rigid import aligned, moved, steps, transform, turned_by
 from radarsdf.simulate import drifted
@@ -120,7 +120,7 @@ def test_velocities_lead_from_pose_to_pose():
     poses = np.stack([pose(t) for t in times_s])
     mean = np.stack([pose(t)[:3, :3].T @ (pose(t + h) - pose(t - h))[:3, 3] / (2 * h) for t in times_s])
     count = len(times_s)
-    velocities = Velocities(
+    velocities = SensorVelocities(
         mean, np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.ones(3), [], np.ones(count, bool)
     )
     found = DopplerMotion.by(velocities, times_s, poses)

@@ -11,7 +11,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Scans
-from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.by_doppler import SensorVelocities
 from radarsdf.poses.drive import Drive
 from radarsdf.poses.rigid import aligned, rotation, turned_by
 from radarsdf.poses.tracking import Tracked
@@ -243,7 +243,7 @@ def test_scans_of_a_sensor_that_stands_do_not_count_again(drive):
     """They have the same returns with the same errors. Slow or on the spot, a sensor does not stand."""
     speeds = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.2])  # m/s
     turned = np.array([0.0, 0.0, 0.02, 0.5, 0.5, 0.5, 0.8, 0.8])  # rad
-    velocities = Velocities(
+    velocities = SensorVelocities(
         np.column_stack([speeds, 0 * speeds, 0 * speeds]),
         np.tile(0.02**2 * np.eye(3), (8, 1, 1)),
         np.ones(3),

@@ -24,7 +24,7 @@ _MANY_MOVE = 0.4
 
 
 @dataclass(frozen=True)
-class Velocities:
+class VelocitiesFound:
     """Velocities of K scans by their Doppler."""
 
     scans: NDArray[np.int64]
@@ -37,14 +37,14 @@ class Velocities:
     """Number of scans that were tried."""
 
 
-def velocities_of(recording: Recording, values: list[NDArray[Any]], count: int = 40) -> Velocities:
+def velocities_of(recording: Recording, values: list[NDArray[Any]], count: int = 40) -> VelocitiesFound:
     """Velocities of about `count` scans from `values`, which may be Doppler."""
     scans = recording.some_scans(count)
     scans = np.array([i for i in scans.tolist() if len(recording.points[i]) >= MIN_RETURNS], np.int64)
     found = sensor_velocities([recording.points[i] for i in scans], [values[i] for i in scans])
     good = np.array([velocity.found for velocity in found], bool)
     total = sum(len(velocity.static) for velocity in found if velocity.found)
-    return Velocities(
+    return VelocitiesFound(
         scans[good] if len(scans) else scans,
         np.array([velocity.velocity_mps for velocity in found if velocity.found]).reshape(-1, 3),
         sum(int(velocity.static.sum()) for velocity in found) / total if total else 0.0,
@@ -101,7 +101,7 @@ def _are_speeds(recording: Recording, values: list[NDArray[Any]]) -> bool:
     return bool(np.median(np.linalg.norm(found.of_doppler_mps, axis=1)) > _STILL_MPS)
 
 
-def _beside_poses(recording: Recording, velocities: Velocities) -> list[Finding]:
+def _beside_poses(recording: Recording, velocities: VelocitiesFound) -> list[Finding]:
     """Compares velocities by Doppler with those by poses: sign, yaw, and with times the clock."""
     times = recording.ascending_times_s
     knots = np.arange(len(recording), dtype=np.float64) if times is None else times

@@ -11,7 +11,7 @@ import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.scan_log import LoggedScan
-from radarsdf.poses.by_doppler import LEAST_MPS, Velocities, doppler_sign
+from radarsdf.poses.by_doppler import LEAST_MPS, SensorVelocities, doppler_sign
 from radarsdf.poses.drive import Drive, rates_of
 from radarsdf.poses.odometry import LEAST_TOLD
 from radarsdf.poses.rates import Rate
@@ -137,7 +137,7 @@ class Follower:
             usual.moves.learnt(moves, durations_s),
         )
 
-    def _velocities(self, steps: list[Step], sign: int) -> Velocities | None:
+    def _velocities(self, steps: list[Step], sign: int) -> SensorVelocities | None:
         """By their Doppler. None: one of the last two tells none."""
         if any(step.velocity is None or not step.velocity.found for step in steps[-2:]):
             return None
@@ -152,7 +152,7 @@ class Follower:
         changes = np.square(np.diff(speeds, axis=0)).sum(axis=0) if len(known) > 1 else np.ones(3)
         static = [np.ones(len(step.scan), bool) for step in steps]
         found = np.ones(len(steps), bool)
-        return Velocities(mean, covariance, changes / duration_s + LEAST_MPS**2, static, found)
+        return SensorVelocities(mean, covariance, changes / duration_s + LEAST_MPS**2, static, found)
 
     def _found_sign(self) -> int:
         """-1 if the radar's Doppler is positive as the sensor comes nearer, 1 if it is negative; 0 if that is not clear."""

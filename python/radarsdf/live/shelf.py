@@ -11,7 +11,7 @@ import numpy as np
 from radarsdf._core import GrowingSums
 from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.live.regions import REGION_BITS, Keys, regions_of
-from radarsdf.live.storage import SUMS, checked_sums
+from radarsdf.live.storage import CELL_COLUMNS, checked_sums
 from radarsdf.returns.evidence import BLOCK_BITS
 
 
@@ -41,7 +41,7 @@ class Shelf:
                 continue
             written[region] = self._folder / f"region-{region:016x}.npz"
             columns = (*sums.sums_of(own), *sums.looks_of(own))
-            write_arrays(written[region], dict(zip(SUMS, columns, strict=True)))
+            write_arrays(written[region], dict(zip(CELL_COLUMNS, columns, strict=True)))
             gone.append(own)
         self._paths |= written
         keys = np.concatenate([blocks[:0], *gone])
@@ -57,11 +57,11 @@ class Shelf:
         for region in found:
             path = self._paths[region]
             try:
-                read.append(checked_sums(arrays_of(path, tuple(SUMS))))
+                read.append(checked_sums(arrays_of(path, tuple(CELL_COLUMNS))))
             except ValueError as error:
                 msg = f"{path} is no region of this map, or it is damaged: {error}"
                 raise ValueError(msg) from error
-        joined = {name: np.concatenate([arrays[name] for arrays in read]) for name in SUMS}
+        joined = {name: np.concatenate([arrays[name] for arrays in read]) for name in CELL_COLUMNS}
         sums.insert(*joined.values())
         for region in found:
             self._paths.pop(region).unlink(missing_ok=True)

@@ -43,7 +43,7 @@ class Stored:
     looks: NDArray[np.uint32]
 
 
-SUMS: dict[str, tuple[Any, ...]] = {
+CELL_COLUMNS: dict[str, tuple[Any, ...]] = {
     "keys": (np.uint64, None),
     "sums": (np.int64, None, 14),
     "scans_of_cells": (np.uint32, None),
@@ -75,7 +75,7 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
         ],
     }
     scans = list(stored.scans.values())
-    arrays: dict[str, NDArray[Any]] = {name: getattr(stored, name) for name in SUMS}
+    arrays: dict[str, NDArray[Any]] = {name: getattr(stored, name) for name in CELL_COLUMNS}
     arrays["poses"] = np.stack([scan.pose for scan in scans]) if scans else np.zeros((0, 4, 4))
     arrays["counts"] = np.array([len(scan.points) for scan in scans], np.int64)
     for name in FIELDS:
@@ -90,7 +90,7 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
 
 def load_state(path: str | PathLike[str]) -> Stored:
     """The state that :func:`save_state` wrote. Raises a ValueError if the file is none, or damaged."""
-    names = ("described", "poses", "counts", *SUMS, *FIELDS, *(f"{name}_single" for name in FIELDS))
+    names = ("described", "poses", "counts", *CELL_COLUMNS, *FIELDS, *(f"{name}_single" for name in FIELDS))
     arrays = arrays_of(Path(path), names)
     try:
         return _state_of(arrays)
@@ -100,9 +100,9 @@ def load_state(path: str | PathLike[str]) -> Stored:
 
 
 def checked_sums(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The arrays of :data:`SUMS`. Raises a ValueError if they are none."""
-    check_arrays(arrays, SUMS)
-    sums = {name: np.ascontiguousarray(arrays[name]) for name in SUMS}
+    """The arrays of :data:`CELL_COLUMNS`. Raises a ValueError if they are none."""
+    check_arrays(arrays, CELL_COLUMNS)
+    sums = {name: np.ascontiguousarray(arrays[name]) for name in CELL_COLUMNS}
     if (np.diff(sums["keys"].astype(np.float64)) < 0).any() or (sums["sums"][:, 0] < 1).any():
         msg = "its sums are none"
         raise ValueError(msg)

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 _PARTS = 1000  # of the confidences from 0 to 1
 _SCALARS = 3
-SUMS = 3 * _PARTS + _SCALARS
+TALLY_NUMBERS = 3 * _PARTS + _SCALARS
 """Numbers of a :class:`Tally`."""
 
 
@@ -102,12 +102,12 @@ class Tally:
         )
 
     def sums(self) -> Floats:
-        """(SUMS,) all numbers, which may be added to those of other parts of a map. :meth:`of_sums` is the inverse."""
+        """(TALLY_NUMBERS,) all numbers, which may be added to those of other parts of a map. :meth:`of_sums` is the inverse."""
         return np.concatenate([np.atleast_1d(values) for values in astuple(self)])
 
     @classmethod
     def of_sums(cls, sums: Floats) -> Tally:
-        """The tally with these numbers (SUMS,)."""
+        """The tally with these numbers (TALLY_NUMBERS,)."""
         area_m2, true_m2, covering = sums[:-_SCALARS].reshape(-1, _PARTS)
         existing_m2, once_m2, twice_m2 = sums[-_SCALARS:].tolist()
         return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)

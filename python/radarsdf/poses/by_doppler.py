@@ -28,7 +28,7 @@ _LEAST_STEP_M = 1e-4  # deviation of a step, to divide by
 
 
 @dataclass(frozen=True)
-class Velocities:
+class SensorVelocities:
     """Of the sensor in its own frame, at each of F scans."""
 
     mean_mps: Floats
@@ -45,7 +45,7 @@ class Velocities:
     @classmethod
     def of(
         cls, scans: Sequence[Floats], doppler_mps: Sequence[NDArray[Any]], times_s: Floats
-    ) -> Velocities | None:
+    ) -> SensorVelocities | None:
         """Of scans (N_i, 3), sensor frame, m. None: fewer than half of them tell a velocity."""
         each = sensor_velocities(scans, doppler_mps)
         found = np.array([velocity.found for velocity in each], bool)
@@ -69,14 +69,14 @@ class Velocities:
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
         return cls(mean, covariance, change, static, found)
 
-    def select(self, rows: slice) -> Velocities:
+    def select(self, rows: slice) -> SensorVelocities:
         """Of these scans."""
-        return Velocities(
+        return SensorVelocities(
             self.mean_mps[rows], self.covariance[rows], self.change, self.static[rows], self.found[rows]
         )
 
     @property
-    def turned(self) -> Velocities:
+    def turned(self) -> SensorVelocities:
         """For a radar whose Doppler is positive if the sensor comes nearer."""
         return dataclasses.replace(self, mean_mps=-self.mean_mps)
 
@@ -100,7 +100,7 @@ def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> 
 class DopplerMotion(Motion):
     """Translations from scan to scan, by velocities. Which way a step leads depends on how the sensor turned meanwhile."""
 
-    velocities: Velocities
+    velocities: SensorVelocities
     durations_s: Floats
     """(F - 1,)."""
     turns: Floats
@@ -108,7 +108,7 @@ class DopplerMotion(Motion):
 
     @classmethod
     def by(
-        cls, velocities: Velocities, times_s: Floats, poses: Floats, turns: Floats | None = None
+        cls, velocities: SensorVelocities, times_s: Floats, poses: Floats, turns: Floats | None = None
     ) -> DopplerMotion:
         """Of scans with these times (F,) and about these poses (F, 4, 4). `turns` None: those that lead where the poses do."""
         durations_s = np.diff(times_s)
@@ -135,7 +135,7 @@ class DopplerMotion(Motion):
         return dataclasses.replace(self, steps=between)
 
 
-def _likely_turns(velocities: Velocities, durations_s: Floats, given: Floats) -> Floats:
+def _likely_turns(velocities: SensorVelocities, durations_s: Floats, given: Floats) -> Floats:
     """(F - 1, 3) rotation vectors of given steps: of those that differ by whole turns, the one whose way ends nearest."""
     found = []
     for i, step in enumerate(given):
@@ -151,7 +151,7 @@ def _likely_turns(velocities: Velocities, durations_s: Floats, given: Floats) ->
     return np.array(found).reshape(-1, 3)
 
 
-def doppler_sign(scans: Sequence[Floats], velocities: Velocities, times_s: Floats) -> int:
+def doppler_sign(scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats) -> int:
     """-1 if neighbouring scans, without what moves, agree better once all velocities are turned round, else 1."""
     moved_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * np.diff(times_s)
     usable = (

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import real_array
 from radarsdf.io.scans import Scans, filled
-from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.by_doppler import SensorVelocities
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.movers import checked_doppler
 from radarsdf.returns.rays import check_scans
@@ -30,7 +30,7 @@ class CheckedScans:
     """(F,) from the first scan on."""
     begin_s: float
     """Time of the first scan."""
-    velocities: Velocities | None
+    velocities: SensorVelocities | None
     """By the Doppler. None: there is none, or it tells no velocity."""
     movers: int
     """Number of returns that were left out, because they move."""
@@ -55,7 +55,7 @@ class CheckedScans:
         times_s = None if times_s is None else times_s - begin_s
         if doppler_mps is None or times_s is None:
             return cls(scans, times_s, begin_s, None, 0, [])
-        velocities = Velocities.of(scans, checked_doppler(scans, doppler_mps), times_s)
+        velocities = SensorVelocities.of(scans, checked_doppler(scans, doppler_mps), times_s)
         if velocities is None:
             return cls(scans, times_s, begin_s, None, 0, [NO_VELOCITY])
         movers = sum(int((~static).sum()) for static in velocities.static)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.by_doppler import DopplerMotion, Velocities
+from radarsdf.poses.by_doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.expected import ExpectedStep
 from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion
@@ -35,7 +35,7 @@ class Drive:
 
     scans: list[Floats]
     times_s: Floats
-    velocities: Velocities | None
+    velocities: SensorVelocities | None
     gyroscope: Gyroscope | None
     turns: Habits = _TURNS
     """Of the sensor, in its own frame."""

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radarsdf.io.imu import Imu
-from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.by_doppler import SensorVelocities
 from radarsdf.poses.gyroscope import FIRST_BIAS_RAD_S
 from radarsdf.poses.imu_motion import ImuMotion
 from radarsdf.poses.rigid import Floats, nearest_rotation, rotation, skew
@@ -75,7 +75,7 @@ class ImuAlignment:
         return f"The IMU's axes were {how}, scans are {self.late_s:.3f} s late in its clock, and its accelerometer says which way is up."
 
     @classmethod
-    def of(cls, imu: Imu, velocities: Velocities, times_s: Floats) -> ImuAlignment | None:
+    def of(cls, imu: Imu, velocities: SensorVelocities, times_s: Floats) -> ImuAlignment | None:
         """Of velocities at `times_s` (F,), ascending, by the clock of `imu`. None: they do not tell, or not for sure."""
         if imu.specific_force is None or len(times_s) < 2 * _WINDOW_SCANS or len(imu) < 2:
             return None
@@ -121,7 +121,7 @@ def _windows(times_s: Floats) -> list[slice]:
     return [rows for rows in found if rows.stop - rows.start > 2]
 
 
-def _first_state(imu: Imu, velocities: Velocities, times_s: Floats) -> _State | None:
+def _first_state(imu: Imu, velocities: SensorVelocities, times_s: Floats) -> _State | None:
     """By linear least squares at many times between the clocks; None if chance explains the motions as well."""
     motion = ImuMotion.of(imu, np.zeros((1, 3)), np.zeros(3))
     ways = motion.integral(np.einsum("gij,gj->gi", motion.turns, motion.forces))
@@ -153,7 +153,7 @@ def _first_state(imu: Imu, velocities: Velocities, times_s: Floats) -> _State | 
 def _linear_fit(
     motion: ImuMotion,
     ways: Floats,
-    velocities: Velocities,
+    velocities: SensorVelocities,
     at_s: Floats,
     windows: list[slice],
     R_known: Floats | None,
@@ -211,7 +211,7 @@ class _Rows:
 
 
 def _linearised(
-    imu: Imu, velocities: Velocities, times_s: Floats, state: _State, windows: list[slice]
+    imu: Imu, velocities: SensorVelocities, times_s: Floats, state: _State, windows: list[slice]
 ) -> Iterator[_Rows]:
     motion = ImuMotion.of(imu, state.rate_bias, state.force_bias)
     forces = np.einsum("gij,gj->gi", motion.turns, motion.forces)
@@ -270,7 +270,7 @@ def _prior(state: _State) -> tuple[Floats, Floats]:
     return matrix, gradient
 
 
-def _fitted(imu: Imu, velocities: Velocities, times_s: Floats, state: _State) -> ImuAlignment | None:
+def _fitted(imu: Imu, velocities: SensorVelocities, times_s: Floats, state: _State) -> ImuAlignment | None:
     """By Gauss and Newton's method, robust. None: it does not explain the velocities, or leaves the rotation open."""
     windows, R_known = _windows(times_s), imu.R_sensor_imu is not None
     windows = windows[:: 1 + len(times_s) // _MOST_SCANS]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from radarsdf.io.imu import Imu
-from radarsdf.poses.by_doppler import Velocities
+from radarsdf.poses.by_doppler import SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope
 from radarsdf.poses.imu_alignment import ImuAlignment
 from radarsdf.poses.rigid import Floats, covariance_in
@@ -29,7 +29,9 @@ class Inertial:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, imu: Imu | None, velocities: Velocities | None, times_s: Floats, begin_s: float) -> Inertial:
+    def of(
+        cls, imu: Imu | None, velocities: SensorVelocities | None, times_s: Floats, begin_s: float
+    ) -> Inertial:
         """Of scans at `times_s` (F,) after `begin_s`, in the clock of the IMU."""
         if imu is None:
             return cls(None)

@@ -78,8 +78,8 @@ class SensorReturns:
         return Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self))
 
 
-def windows(num_scans: int, size: int, shifted: bool) -> list[tuple[int, int]]:
-    """Ranges of at most `size` scans that follow each other. `shifted`: by half of one."""
+def plane_windows(num_scans: int, size: int, shifted: bool) -> list[tuple[int, int]]:
+    """Begin and end of windows of at most `size` scans whose returns share planes. `shifted`: by half of one."""
     begin = -(size // 2) if shifted and size < num_scans else 0
     ranges = [(max(0, k), min(num_scans, k + size)) for k in range(begin, num_scans, size)]
     return [(low, high) for low, high in ranges if high - low > 1]
@@ -115,7 +115,7 @@ def common_planes(
     rays = returns.every(grid.together).posed(poses)
     planes = np.full(len(rays), -1, np.int32)
     centres, normals, noises, total = [], [], [], 0
-    for low, high in windows(len(poses), grid.window, grid.shifted):
+    for low, high in plane_windows(len(poses), grid.window, grid.shifted):
         rows = slice(*np.searchsorted(rays.scans, [low, high]).tolist())
         part = rays.select(rows)
         surfels = Surfels.of(part, grid.cell_m / LEAVES_PER_SURFEL, num_threads)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import Surface, VertexLimits, renumbered
-from radarsdf.map.threshold import SUMS
+from radarsdf.map.threshold import TALLY_NUMBERS
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
@@ -116,7 +116,7 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
     "border_rows": (np.int64, None),
     "border_edges": (np.int64, None, 4),
     "cells": (np.int64, 2),
-    "tally": (np.float64, SUMS),
+    "tally": (np.float64, TALLY_NUMBERS),
 }
 """Type and shape of each array of a `Piece`. None: any length."""
 

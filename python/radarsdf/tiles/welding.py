@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from radarsdf.map.isosurface import mesh_components
 from radarsdf.map.meshing import renumbered
-from radarsdf.map.threshold import SUMS, Tally
+from radarsdf.map.threshold import TALLY_NUMBERS, Tally
 from radarsdf.tiles.pieces import Piece, tally_sums
 
 
@@ -34,7 +34,7 @@ class WeldedPart(NamedTuple):
 
 def tally_of(paths: Sequence[Path]) -> Tally:
     """Of all surface of pieces in these files."""
-    return Tally.of_sums(sum((tally_sums(path) for path in paths), np.zeros(SUMS)))
+    return Tally.of_sums(sum((tally_sums(path) for path in paths), np.zeros(TALLY_NUMBERS)))
 
 
 class WeldedMesh:
