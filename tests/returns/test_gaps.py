@@ -9,7 +9,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
-from radarsdf.config.fit_config import BLOCK_CELLS
+from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.gaps import _MAX_SUPPORT, bridged
 from radarsdf.returns.rays import prepare
@@ -82,7 +82,7 @@ def test_as_a_search_of_all_pairs_says(max_cells):
     keys = cell_keys(((cells + 0.5) * LEAF_M), LEAF_M)
     returns = ReturnCells.of(rays, LEAF_M)
     support = support_at(keys, returns.keys, returns.counts)
-    block = cells // BLOCK_CELLS  # the cells lie in eight of them, and every leaf cell holds returns
+    block = cells // LATTICE_BLOCK_CELLS  # the cells lie in eight of them, and every leaf cell holds returns
     same = (block[:, None] == block).all(axis=2)
     least = np.array([0.5 * np.median(support[of_block]) for of_block in same])
     expected = set()

@@ -55,7 +55,7 @@ def check_ground(recording: Recording) -> list[Finding]:
     ]
 
 
-def check_fit(recording: Recording, config: FitConfig) -> list[Finding]:
+def check_noise_and_cost(recording: Recording, config: FitConfig) -> list[Finding]:
     """Tells the noise of the sensor, and what a fit will cost, or why it would refuse."""
     try:
         rays = prepare(recording.points, recording.poses, recording.intensities, **config.preparation)

@@ -113,7 +113,7 @@ def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort)
         wrong += before_fit.check_ground(recording)
     found += wrong
     if config is not None and not any(finding.severity == "error" for finding in found):
-        found += before_fit.check_fit(recording, config)
+        found += before_fit.check_noise_and_cost(recording, config)
         if not any(finding.severity == "error" for finding in found):
             found += check_drift(recording, config)
     return found

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import FloatArray, Recording
-from radarsdf.returns.doppler import MIN_RETURNS, sensor_velocities
+from radarsdf.returns.doppler import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _STILL_MPS = 0.3  # slower, the direction of a velocity tells nothing
 _MIN_SCANS = 4
@@ -40,7 +40,7 @@ class VelocitiesFound:
 def velocities_of(recording: Recording, values: list[NDArray[Any]], count: int = 40) -> VelocitiesFound:
     """Velocities of about `count` scans from `values`, which may be Doppler."""
     scans = recording.some_scans(count)
-    scans = np.array([i for i in scans.tolist() if len(recording.points[i]) >= MIN_RETURNS], np.int64)
+    scans = np.array([i for i in scans.tolist() if len(recording.points[i]) >= MIN_DOPPLER_RETURNS], np.int64)
     found = sensor_velocities([recording.points[i] for i in scans], [values[i] for i in scans])
     good = np.array([velocity.found for velocity in found], bool)
     total = sum(len(velocity.static) for velocity in found if velocity.found)

@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.clouds.writing import write_cloud
     from radarsdf.io.files import check_outputs
     from radarsdf.io.npz import write_scans
-    from radarsdf.map.views import scans_of
+    from radarsdf.map.views import scans_of_views
     from radarsdf.render.view_picture import save_view_picture
 
     suffix = options.out.suffix.lower()
@@ -87,7 +87,7 @@ def run(options: argparse.Namespace) -> None:
     )
     if suffix == ".png":
         views = list(views)  # a picture shows all of a view; of others, the returns are kept alone
-    scans = scans_of(view for view in views if len(view))
+    scans = scans_of_views(view for view in views if len(view))
     if not len(scans):
         msg = f"{options.map} has no surface that the sensor sees from {'this pose' if len(poses) == 1 else 'these poses'}: nothing written"
         raise ValueError(msg)

@@ -21,7 +21,9 @@ from radarsdf.config.groups import (
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import by_name, settings
 
-BLOCK_CELLS = 32  # edge of a block, leaf cells: a multiple of that of the cubes in which looks are counted
+LATTICE_BLOCK_CELLS = (
+    32  # edge of a block, leaf cells: a multiple of that of the cubes in which looks are counted
+)
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
 
@@ -129,7 +131,7 @@ class FitConfig:
     @property
     def lattice(self) -> WorldLattice:
         """Where cells lie in the world, from leaf cells to the coarsest."""
-        return WorldLattice(self.leaf_size_m, max(BLOCK_CELLS, 2 ** (self.encoding.num_levels - 1)))
+        return WorldLattice(self.leaf_size_m, max(LATTICE_BLOCK_CELLS, 2 ** (self.encoding.num_levels - 1)))
 
     @property
     def preparation(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.start import average_at_vertices, cells_smoothed, told_by
 from radarsdf.live.ghosts import means_of
 from radarsdf.live.regions import REGION_BITS, RegionTable, regions_of, regions_round
-from radarsdf.live.rows import ROUND, Keys, Replacement, leaves_of, shifted, steps_round, within
+from radarsdf.live.rows import ROUND, Keys, Replacement, between, leaves_of, shifted, steps_round
 from radarsdf.returns.cells import merged_keys
 from radarsdf.returns.evidence import BLOCK_BITS, ReturnsOfCells, sums_round
 from radarsdf.returns.gaps import bridged
@@ -57,7 +57,7 @@ class TrueReturns:
 
     def within(self, blocks: Keys) -> TrueReturns:
         """Those in these blocks."""
-        here = within(self.means.keys, *leaves_of(blocks))
+        here = between(self.means.keys, *leaves_of(blocks))
         return TrueReturns(self.means.select(here), self.normals[here], self.told.select(here))
 
 
@@ -122,7 +122,7 @@ class GrowingDistances:
         anew = self._blocks_anew(reached, before["keys"], leaf_keys)
         # All that has a part in what their corners get.
         needed = self._blocks_smoothed_with(_blocks_round(anew))
-        leaf_keys = leaf_keys[within(leaf_keys, *leaves_of(needed))]
+        leaf_keys = leaf_keys[between(leaf_keys, *leaves_of(needed))]
         new_keys, new = self._made(anew, leaf_keys, returns.within(needed), num_threads)
         rows = Replacement.of(before["keys"], new_keys, *leaves_of(anew))
         self.table.put(around, rows.rows(before, new))
@@ -148,10 +148,10 @@ class GrowingDistances:
     def _find_crossed(self, reached: Keys, means: MeanRays, around: Keys, num_threads: int) -> Keys:
         """Keys of the leaf cells of the regions `around` that rays cross near their returns: found anew in blocks `reached`."""
         first, last = leaves_of(reached)
-        rays = means.select(within(means.keys, *leaves_of(_blocks_round(reached))))
+        rays = means.select(between(means.keys, *leaves_of(_blocks_round(reached))))
         found = rays.leaf_keys(self._config.leaf_size_m, self._config.near_band_m, num_threads)
         before = self._crossed.gather(around)["keys"]
-        crossed = Replacement.of(before, found[within(found, first, last)], first, last).keys
+        crossed = Replacement.of(before, found[between(found, first, last)], first, last).keys
         self._crossed.put(around, {"keys": crossed})
         return crossed
 
@@ -184,7 +184,7 @@ class GrowingDistances:
         `leaf_keys`, `returns`: of all leaf cells in these blocks, and of those round them that smoothing carries something from.
         """
         config = self._config
-        own = within(leaf_keys, *leaves_of(blocks))
+        own = between(leaf_keys, *leaves_of(blocks))
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
         distances_m = average_at_vertices(
             table, returns.means, returns.told, returns.normals, config, num_threads

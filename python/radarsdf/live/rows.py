@@ -42,7 +42,7 @@ class Replacement:
     @classmethod
     def of(cls, keys: Keys, new_keys: Keys, first: Keys, last: Keys) -> Replacement:
         """The rows of `keys` from each of `first` (B,) to each of `last` (B,) go, those of `new_keys` come."""
-        stays = ~within(keys, first, last)
+        stays = ~between(keys, first, last)
         kept = keys[stays]
         is_new = np.zeros(len(kept) + len(new_keys), bool)
         is_new[np.searchsorted(kept, new_keys) + np.arange(len(new_keys))] = True
@@ -63,7 +63,7 @@ class Replacement:
         }
 
 
-def within(keys: Keys, first: Keys, last: Keys) -> NDArray[np.bool_]:
+def between(keys: Keys, first: Keys, last: Keys) -> NDArray[np.bool_]:
     """(N,) which of the ascending `keys` (N,) lie between one of `first` (B,) and the same of `last` (B,), ends included."""
     edges = np.zeros(len(keys) + 1, np.int64)
     np.add.at(edges, np.searchsorted(keys, first), 1)

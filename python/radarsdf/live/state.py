@@ -18,7 +18,7 @@ from radarsdf.live.scan_log import LoggedScan, ScanLog
 from radarsdf.live.scans import rays_of
 from radarsdf.live.shelf import Shelf
 from radarsdf.live.storage import Stored
-from radarsdf.live.surface import Changes, GrowingSurface
+from radarsdf.live.surface import ChangedSums, GrowingSurface
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
 from radarsdf.returns.noise import SensorNoise
@@ -166,7 +166,7 @@ class GrowingState:
         """Of all cells."""
         return ScanSums(self.config.leaf_size_m, *self.sums.sums_of(self.sums.block_keys()))
 
-    def changes(self) -> tuple[GrowingSurface, Changes, SensorNoise]:
+    def changes(self) -> tuple[GrowingSurface, ChangedSums, SensorNoise]:
         """The surface as it was derived last, and what it has to take in."""
         if self._surface is None:
             origin = np.zeros(3) if self.origin is None else self.origin
@@ -178,7 +178,7 @@ class GrowingState:
         returns, looked = (
             np.unique(np.concatenate([_NONE, *keys])) for keys in (self._returns_changed, self._looks_changed)
         )
-        changes = Changes(
+        changes = ChangedSums(
             returns,
             ScanSums(self.config.leaf_size_m, *self.sums.sums_of(returns)),
             looked,

@@ -15,7 +15,7 @@ from radarsdf.fitting.start import normals_at
 from radarsdf.live.distances import GrowingDistances
 from radarsdf.live.ghosts import NOWHERE, GrowingGhosts, means_of, surfels_of
 from radarsdf.live.regions import RegionTable, Rows, regions_of, regions_round
-from radarsdf.live.rows import ROUND, Keys, Replacement, changed_rows, leaves_of, shifted, within
+from radarsdf.live.rows import ROUND, Keys, Replacement, between, changed_rows, leaves_of, shifted
 from radarsdf.live.triangles import GrowingTriangles, Triangles
 from radarsdf.returns.cells import merged_keys
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
@@ -29,7 +29,7 @@ _PLANE = 9  # numbers of a surfel: centre, normal, variances
 
 
 @dataclass(frozen=True)
-class Changes:
+class ChangedSums:
     """What became of the sums since the surface was derived last. Of a block, all is told anew."""
 
     returns: Keys
@@ -106,7 +106,7 @@ class GrowingSurface:
         """Number of leaf cells near the surface."""
         return self._distances.table.num_rows
 
-    def update(self, changes: Changes, noise: SensorNoise, num_threads: int) -> Keys:
+    def update(self, changes: ChangedSums, noise: SensorNoise, num_threads: int) -> Keys:
         """Takes changes in. Gives the keys (D,) of the blocks of the surface that were made anew, ascending."""
         looked = self._take_looks(changes)
         changed = self._take_sums(changes)
@@ -131,12 +131,12 @@ class GrowingSurface:
         rough_share = 1 - on_flat / on_planes if on_planes else 0.0
         return self._triangles.joined(rough_share, returns / max(cells, 1), self.num_leaves)
 
-    def _take_sums(self, changes: Changes) -> Keys:
+    def _take_sums(self, changes: ChangedSums) -> Keys:
         """The keys of the leaf cells whose sums changed, and of the others in their blocks."""
         regions = regions_of(changes.returns << BLOCK_BITS)
         first, last = leaves_of(changes.returns)
         before, after = self._leaves.gather(regions), changes.sums
-        there = within(before["keys"], first, last)
+        there = between(before["keys"], first, last)
         changed = changed_rows(
             before["keys"][there],
             (before["sums"][there], before["scans"][there]),
@@ -172,7 +172,7 @@ class GrowingSurface:
         # All of a block is new in these columns, so all of it is to be made.
         return np.union1d(changed, after.keys)
 
-    def _take_looks(self, changes: Changes) -> Keys:
+    def _take_looks(self, changes: ChangedSums) -> Keys:
         """The regions whose looks changed."""
         blocks, new = changes.look_blocks, changes.looks
         regions = regions_of(blocks << BLOCK_BITS)

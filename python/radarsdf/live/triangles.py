@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.regions import REGION_CELLS, Keys, RegionTable, regions_round
 from radarsdf.map import queries
-from radarsdf.map.contents import Scene
+from radarsdf.map.contents import WholeMap
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import Surface, local
 from radarsdf.map.threshold import areas_round
@@ -27,7 +27,7 @@ _ON_BORDER = 1e-4  # leaf cells: vertices are at least 1e-3 from the corners of 
 class Triangles:
     """All triangles of the surface with what decides which of them are kept."""
 
-    scene: Scene
+    scene: WholeMap
     surface: Surface
     leaf_cells: int
     """Number of leaf cells near the surface."""
@@ -81,7 +81,7 @@ class GrowingTriangles:
         cells, blocks = surface.gather(around), looks.gather(around)
         of_cells = Looks(blocks["keys"] >> BLOCK_BITS, blocks["scans"]).at(cells["keys"])
         evidence = Evidence(cells["information"], cells["detections"], of_cells)
-        scene = Scene(self._origin, self._config, 0.0, 0.0)
+        scene = WholeMap(self._origin, self._config, 0.0, 0.0)
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
         world = np.concatenate([vertices for vertices, _ in found.values()]) + self._origin
         at = queries.interpolated(evidence, cells["keys"], self._config.leaf_size_m, local(scene, world))
@@ -92,7 +92,7 @@ class GrowingTriangles:
             self.num_bytes += piece.num_bytes
 
     def joined(self, rough_share: float, returns_per_cell: float, leaf_cells: int) -> Triangles:
-        """All triangles, those of neighbours with common vertices. The first two numbers: see :class:`Scene`."""
+        """All triangles, those of neighbours with common vertices. The first two numbers: see :class:`WholeMap`."""
         told = rough_share, returns_per_cell
         if self._joined is not None and self._joined.told == told:
             return self._joined
@@ -109,7 +109,7 @@ class GrowingTriangles:
         one[rows] = rows[first][which]
         areas_m2 = np.concatenate([np.zeros(0), *(piece.areas_m2 for piece in pieces)])
         evidence = torch.cat([torch.zeros((0, 3)), *(piece.evidence for piece in pieces)])
-        scene = Scene(self._origin, self._config, *told)
+        scene = WholeMap(self._origin, self._config, *told)
         surface = Surface.told_by(
             scene,
             vertices,

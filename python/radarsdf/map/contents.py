@@ -22,8 +22,8 @@ from radarsdf.returns.sensor import Sensor
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What evidence depends on besides the returns at a place."""
+class WholeMap:
+    """What is known of the whole map, on which evidence depends besides the returns at a place."""
 
     origin: NDArray[np.float64]
     """(3,) origin of the local frame in world coordinates, m."""
@@ -36,7 +36,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class MapContents(Scene):
+class MapContents(WholeMap):
     """The parts of a map."""
 
     field: Field

@@ -43,7 +43,7 @@ class CellsInBox:
     """Whether it is a leaf cell of the map."""
 
 
-def cells_of(
+def dense_cells(
     contents: MapContents, lower: NDArray[np.int64], shape: tuple[int, int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
     """Passed, returns and observed of leaf cells from `lower` on, counted from the origin of a map."""

@@ -17,7 +17,7 @@ from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
-from radarsdf.map.contents import MapContents, Scene
+from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.isosurface import extract_cells, mesh_components
 from radarsdf.map.threshold import Tally, Threshold, areas_round
 from radarsdf.map.voxels import sample_lattice
@@ -108,7 +108,7 @@ class Surface:
     @classmethod
     def told_by(
         cls,
-        scene: Scene,
+        scene: WholeMap,
         vertices: NDArray[np.float64],
         faces: NDArray[np.int32],
         evidence: queries.EvidenceAt,
@@ -196,7 +196,7 @@ def extract_mesh(
     return mesh
 
 
-def local(contents: Scene, world: NDArray[np.float64]) -> torch.Tensor:
+def local(contents: WholeMap, world: NDArray[np.float64]) -> torch.Tensor:
     """Positions (N, 3) in the world, m, in the local frame, float32."""
     return queries.to_local(contents, torch.from_numpy(world))
 

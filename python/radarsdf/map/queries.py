@@ -17,7 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf._core import CellBlocks
-from radarsdf.map.contents import MapContents, Scene
+from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.progress import hides_bar
 from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence
@@ -55,7 +55,7 @@ def piece_triangles(voxel_m: float) -> int:
 
 
 @torch.inference_mode(mode=False)  # gradients, of which normals are made, need ordinary tensors
-def to_local(contents: Scene, world: Tensor) -> Tensor:
+def to_local(contents: WholeMap, world: Tensor) -> Tensor:
     """World positions (N, 3), m, in the local frame, float32. The origin is subtracted in float64."""
     return (world.double() - torch.from_numpy(contents.origin)).float()
 
@@ -175,24 +175,24 @@ def interpolated(
     return EvidenceAt(*torch.from_numpy(at_points).unbind(1))
 
 
-def uncertainty(contents: Scene, evidence: EvidenceAt) -> Tensor:
+def uncertainty(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
     """(N,) standard error of the surface's position, m. NaN where there are no returns."""
     variance_m2 = 1 / evidence.information + _floor_m(contents) ** 2
     return variance_m2.sqrt().masked_fill(evidence.information <= 0, torch.nan)
 
 
-def roughness(contents: Scene) -> float:
+def roughness(contents: WholeMap) -> float:
     """From 0, where all returns lie on thin surfaces, to 1, of a scene as rough as real drives."""
     share: float = contents.rough_share / _ROUGH_SHARE
     return min(share, 1.0)
 
 
-def _floor_m(contents: Scene) -> float:
+def _floor_m(contents: WholeMap) -> float:
     cells: float = _FLOOR_CELLS + _ROUGH_FLOOR_CELLS * roughness(contents) ** 1.5
     return cells * contents.config.leaf_size_m
 
 
-def confidence(contents: Scene, evidence: EvidenceAt) -> Tensor:
+def confidence(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
     """(N,) probability that a surface is within a leaf cell's edge. 0 where there are no returns."""
     return probabilities(contents, evidence).confidence.float()
 
@@ -208,7 +208,7 @@ class Probabilities(NamedTuple):
     """(N,) share of a normal distribution of the position's error within a leaf cell's edge."""
 
 
-def probabilities(contents: Scene, evidence: EvidenceAt) -> Probabilities:
+def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
     """All three of each point."""
     start_vector_library()
     columns = terms(contents, evidence)
@@ -224,7 +224,7 @@ def probabilities(contents: Scene, evidence: EvidenceAt) -> Probabilities:
     return Probabilities(true.minimum(reach), covering, reach)
 
 
-def terms(contents: Scene, evidence: EvidenceAt) -> Tensor:
+def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
     """(N, 5) float64, of which logits are made: 1, the logarithm of the error in leaf cells, how many returns of a surface are
     missing there, in deviations of chance, how rough the map is, and how crowded its returns are. Infinite without returns.
 

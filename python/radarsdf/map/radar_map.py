@@ -90,13 +90,13 @@ class RadarMap(Map):
         )
 
     def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellsInBox:
-        from radarsdf.map.gridding import CellsInBox, cells_of  # noqa: PLC0415 - it imports trimesh, which is slow
+        from radarsdf.map.gridding import CellsInBox, dense_cells  # noqa: PLC0415 - it imports trimesh, which is slow
 
         leaf_m = self.config.leaf_size_m
         first = np.floor((lower - self.origin) / leaf_m).astype(np.int64)
         count = np.floor((upper - self.origin) / leaf_m).astype(np.int64) - first + 1
         x, y, z = count.tolist()
-        return CellsInBox(self.origin + first * leaf_m, *cells_of(self._contents, first, (x, y, z)))
+        return CellsInBox(self.origin + first * leaf_m, *dense_cells(self._contents, first, (x, y, z)))
 
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
         return queries.evidence(self._contents, queries.to_local(self._contents, world))

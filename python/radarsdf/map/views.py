@@ -77,10 +77,10 @@ class View:
     @property
     def scans(self) -> Scans:
         """The returns as scans of one scan, which the writers of :mod:`radarsdf.io` take."""
-        return scans_of([self])
+        return scans_of_views([self])
 
 
-def scans_of(views: Iterable[View]) -> Scans:
+def scans_of_views(views: Iterable[View]) -> Scans:
     """The returns of views, one scan each. Of each view nothing else is kept."""
     kept = [(view.points, view.T_world_sensor, view.intensities) for view in views]
     values = [intensities for _, _, intensities in kept if intensities is not None]

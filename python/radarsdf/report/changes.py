@@ -14,7 +14,7 @@ from radarsdf.changes.changes import CHANGED, NAMES, Changes, Region, colors_of
 from radarsdf.report.extras import require_extras
 from radarsdf.report.page import (
     Section,
-    Verdict,
+    Sentence,
     color_key,
     frame,
     grid,
@@ -90,7 +90,7 @@ def write_changes_report(
 
 def _conclusion(changes: Changes, regions: Sequence[Region]) -> Section:
     """What changed, in words."""
-    found = [Verdict("note", "Frames", changes.report["alignment"])]
+    found = [Sentence("note", "Frames", changes.report["alignment"])]
     areas_m2 = changes.report["areas_m2"]
     for kind in (NAMES[kind] for kind in CHANGED):
         own = [region for region in regions if region.kind == kind]
@@ -98,21 +98,21 @@ def _conclusion(changes: Changes, regions: Sequence[Region]) -> Section:
             continue
         places = "one place" if len(own) == 1 else f"{len(own)} places"
         text = f"{areas_m2[kind]:.1f} m² in {places}, the largest round {place_of(own[0])}. It {_IN_WORDS[kind]}."
-        found.append(Verdict("warning", kind.capitalize(), text))
+        found.append(Sentence("warning", kind.capitalize(), text))
     if len(found) == 1:
-        found.append(Verdict("good", "Changes", "No place changed that is large enough to be listed."))
+        found.append(Sentence("good", "Changes", "No place changed that is large enough to be listed."))
     offset = changes.report["intensity_offset"]
     if offset is None:
         found.append(
-            Verdict(
+            Sentence(
                 "note", "Reflectance", "It was not compared: a map has no intensities, or they share no view."
             )
         )
     else:
         text = f"All returns of the later drive are {offset:+.1f} stronger, sensor units: that is no change of a place."
-        found.append(Verdict("note", "Reflectance", text))
+        found.append(Sentence("note", "Reflectance", text))
     seen = "What the other drive did not look at is unseen, not gone."
-    return Section("conclusion", "Conclusion", [items([*found, Verdict("note", "Unseen", seen)])])
+    return Section("conclusion", "Conclusion", [items([*found, Sentence("note", "Unseen", seen)])])
 
 
 def _surface(mesh: Any) -> Section:

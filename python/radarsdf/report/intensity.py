@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from radarsdf.evaluation import KNNIntensity, intensity_metrics
 from radarsdf.report import plots
-from radarsdf.report.page import Section, Verdict, grid, image, note, paragraph, table
+from radarsdf.report.page import Section, Sentence, grid, image, note, paragraph, table
 from radarsdf.report.subject import Subject
 from radarsdf.returns.movers import rays_as_measured
 from radarsdf.returns.rays import Rays
@@ -24,7 +24,7 @@ _RANGE_BINS = 16
 _WORDS = {"Nearest neighbours": "the nearest neighbours", "Always the median": "the median of all"}
 
 
-def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]], list[Verdict]]:
+def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]], list[Sentence]]:
     """Errors of the intensities on scans that the fit left out, else on those that it was given; and what they say."""
     anchor, title = "intensity", "Intensity"
     scans = subject.scans if subject.held_out is None else subject.held_out
@@ -71,12 +71,12 @@ def intensity_section(subject: Subject) -> tuple[Section, list[tuple[str, str]],
         ),
     ]
     compared = " and ".join(f"{mean:.2f} of {_WORDS[name]}" for name, (mean, _) in others.items())
-    verdict = Verdict(
+    sentence = Sentence(
         "good" if metrics["mae"] < min(mean for mean, _ in others.values()) else "warning",
         "Intensity",
         f"The mean error is {metrics['mae']:.2f} {_UNIT}, beside {compared}, on {on}.",
     )
-    return Section(anchor, title, body), [(f"Intensity error, {_UNIT}", f"{metrics['mae']:.2f}")], [verdict]
+    return Section(anchor, title, body), [(f"Intensity error, {_UNIT}", f"{metrics['mae']:.2f}")], [sentence]
 
 
 def _others(subject: Subject, rays: Rays, measured: _Floats) -> dict[str, tuple[float, float]]:

@@ -27,7 +27,7 @@ class Section:
     """HTML, from the functions below."""
 
 
-class Verdict(NamedTuple):
+class Sentence(NamedTuple):
     """A sentence of the conclusion."""
 
     mark: Literal["good", "warning", "error", "note"]

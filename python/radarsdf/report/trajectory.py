@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.report import plots
-from radarsdf.report.page import Section, Verdict, grid, image, paragraph, table
+from radarsdf.report.page import Section, Sentence, grid, image, paragraph, table
 from radarsdf.report.subject import Subject
 
 _M, _DEG = "\N{NO-BREAK SPACE}m", "°"
 
 
-def trajectory_section(subject: Subject) -> tuple[list[Section], list[Verdict]]:
+def trajectory_section(subject: Subject) -> tuple[list[Section], list[Sentence]]:
     """The way before and after, and how well it is known; and what the conclusion says of it. Nothing of poses as given."""
     way = subject.radar_map.report.get("poses")
     if way is None:
@@ -42,7 +42,7 @@ def trajectory_section(subject: Subject) -> tuple[list[Section], list[Verdict]]:
         )
     body = [paragraph(way["verdict"]), grid(*pictures), table("", (), _facts(way, before, after))]
     mark: Literal["warning", "good"] = "warning" if way["improved"] is False else "good"
-    return [Section("poses", "Poses", body)], [Verdict(mark, "Poses", way["verdict"])]
+    return [Section("poses", "Poses", body)], [Sentence(mark, "Poses", way["verdict"])]
 
 
 def _facts(way: dict[str, Any], before: NDArray[Any] | None, after: NDArray[Any]) -> list[tuple[str, str]]:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf.evaluation import surface_metrics, uncertainty_metrics
 from radarsdf.report import plots
-from radarsdf.report.page import Section, Verdict, grid, image, note, paragraph, table
+from radarsdf.report.page import Section, Sentence, grid, image, note, paragraph, table
 from radarsdf.report.subject import Subject
 from radarsdf.report.surface import colored, picture
 from radarsdf.threads import resolve_num_threads
@@ -34,7 +34,7 @@ _POINTS = {
 _Floats = NDArray[np.float64]
 
 
-def truth_section(subject: Subject) -> tuple[Section, list[tuple[str, str]], list[Verdict]]:
+def truth_section(subject: Subject) -> tuple[Section, list[tuple[str, str]], list[Sentence]]:
     """Errors of the surface, the most important one for the top of the page, and a sentence for the conclusion."""
     anchor, title = "errors", "Errors against ground truth"
     truth, mesh = subject.ground_truth, subject.mesh
@@ -42,8 +42,8 @@ def truth_section(subject: Subject) -> tuple[Section, list[tuple[str, str]], lis
         why = "The scans come without a truth." if truth is None else "There is no surface."
         if subject.scans is None:
             why = "This report was made without scans, which may come with a truth."
-        verdict = Verdict("note", "Surface", f"How right it is was not measured. {why}")
-        return Section(anchor, title, [paragraph(f"Not measured. {why}")]), [], [verdict]
+        sentence = Sentence("note", "Surface", f"How right it is was not measured. {why}")
+        return Section(anchor, title, [paragraph(f"Not measured. {why}")]), [], [sentence]
     one, many = _POINTS[subject.truth_kind]
     m = surface_metrics(mesh, truth, box=subject.box, samples=_SAMPLES)
     accuracy = (
@@ -110,15 +110,15 @@ def truth_section(subject: Subject) -> tuple[Section, list[tuple[str, str]], lis
             + "radarsdf eval measures with other samples or in a box."
         ),
     ]
-    verdict = Verdict(
+    sentence = Sentence(
         "note",
         "Surface",
         f"Its F-score is {_percent(m['f_score_all'])} with nothing discarded, its mean error {accuracy}, against {many}.",
     )
-    return Section(anchor, title, body), [("F-score, all", _percent(m["f_score_all"]))], [verdict]
+    return Section(anchor, title, body), [("F-score, all", _percent(m["f_score_all"]))], [sentence]
 
 
-def uncertainty_section(subject: Subject) -> tuple[Section, list[Verdict]]:
+def uncertainty_section(subject: Subject) -> tuple[Section, list[Sentence]]:
     """The uncertainty of the surface, whether it is right where there is ground truth, and sentences about that."""
     anchor, title = "uncertainty", "Uncertainty"
     mesh = subject.mesh
@@ -157,7 +157,7 @@ def uncertainty_section(subject: Subject) -> tuple[Section, list[Verdict]]:
         table("", ("", *(f"{rank} % are below" for rank in ranks)), rows),
     ]
     half = f"Half of the surface is known within {np.nanmedian(sigma_m):.3f}\N{NO-BREAK SPACE}m"
-    verdict = Verdict(
+    sentence = Sentence(
         "note", "Uncertainty", f"{half}, as the map says; no truth tells whether that is right."
     )
     if subject.ground_truth is not None:
@@ -165,14 +165,14 @@ def uncertainty_section(subject: Subject) -> tuple[Section, list[Verdict]]:
         figures += figure
         body.append(note(words))
         if share is not None:
-            verdict = Verdict(
+            sentence = Sentence(
                 "good" if share >= _LEAST_SHARE else "warning",
                 "Uncertainty",
                 f"{half}, and {_percent(share)} of its errors are within one standard error, where 68 % are expected: "
                 f"{_in_words(share)}.",
             )
     body.insert(2, grid(*figures))
-    return Section(anchor, title, body), [verdict]
+    return Section(anchor, title, body), [sentence]
 
 
 def _in_words(share: float) -> str:

@@ -20,7 +20,7 @@ from radarsdf.products import normal_matrix, product
 
 FloatArray = NDArray[np.float64]
 
-MIN_RETURNS = 10
+MIN_DOPPLER_RETURNS = 10
 """Fewer returns of a scan tell no velocity."""
 
 _DRAWS = (
@@ -75,7 +75,7 @@ def sensor_velocity(
     usable = (ranges > 0) & np.isfinite(speeds) & np.isfinite(ranges)
     unknown = SensorVelocity(np.full(3, np.nan), np.full((3, 3), np.nan), np.zeros(len(x), bool))
     rows = np.flatnonzero(usable)
-    if len(rows) < MIN_RETURNS:
+    if len(rows) < MIN_DOPPLER_RETURNS:
         return unknown
     away = -x[rows] / ranges[rows, None]
     away_columns = np.ascontiguousarray(away.T)
@@ -93,7 +93,7 @@ def sensor_velocity(
     for _ in range(_ROUNDS):
         off = residuals(velocity[None])[0]
         agrees = np.abs(off) < max(_SIGMA_MPS, 3 * sigma)
-        if agrees.sum() < max(MIN_RETURNS / 2, _MIN_AGREEING * len(rows)):
+        if agrees.sum() < max(MIN_DOPPLER_RETURNS / 2, _MIN_AGREEING * len(rows)):
             return unknown
         normal = normal_matrix(away[agrees], away[agrees])
         if np.linalg.cond(normal) > _MAX_CONDITION:

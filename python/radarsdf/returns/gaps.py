@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, bridge_cells
-from radarsdf.config.fit_config import BLOCK_CELLS
+from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.returns.support import support_at
 
 # Measured on simulated and real scans; see bench/history/surface.md.
@@ -67,7 +67,7 @@ def _medians(leaf_keys: NDArray[np.uint64], support: NDArray[np.float64]) -> NDA
 
     Of a block, not of the map: what is added here must not depend on how many returns there are elsewhere.
     """
-    block = leaf_keys >> np.uint64(3 * (BLOCK_CELLS.bit_length() - 1))
+    block = leaf_keys >> np.uint64(3 * (LATTICE_BLOCK_CELLS.bit_length() - 1))
     starts = np.flatnonzero(np.diff(block, prepend=~block[:1]))  # cells of a block follow each other
     # Sorted within blocks: the number of the block counts more than the support.
     number = np.repeat(np.arange(len(starts), dtype=np.uint64), np.diff(starts, append=len(block)))

@@ -28,14 +28,14 @@ from radarsdf.tiles.input_digest import InputDigest
 from radarsdf.tiles.locking import LOCK, only_planner
 from radarsdf.tiles.plan import PLAN, TILES, Plan, failure_path
 from radarsdf.tiles.planning import make_plan
-from radarsdf.tiles.ray_files import SCANS
+from radarsdf.tiles.ray_files import SCANS_FILE
 from radarsdf.tiles.running import run_tasks
 from radarsdf.tiles.tile_fit import fit_tile, is_done
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
-_OURS = {PLAN, LOCK, POSES, TRAJECTORY, TILES, SCANS}
+_OURS = {PLAN, LOCK, POSES, TRAJECTORY, TILES, SCANS_FILE}
 
 
 def fit_tiles(

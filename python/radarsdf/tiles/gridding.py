@@ -9,7 +9,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.map.gridding import CellsInBox, cells_of
+from radarsdf.map.gridding import CellsInBox, dense_cells
 from radarsdf.returns.echoes import EchoesAt
 from radarsdf.tiles.blend import TileBlend
 
@@ -30,7 +30,7 @@ def cells_of_tiles(tiles: TileBlend, lower: NDArray[np.float64], upper: NDArray[
         stop = np.array([*np.minimum(own + edge, last[:2]), last[2]])
         place = tuple(slice(a, b) for a, b in zip(start - first, stop - first, strict=True))
         count_x, count_y, count_z = (stop - start).tolist()
-        found = cells_of(
+        found = dense_cells(
             tiles.contents_of((x, y)), start - tiles.plan.origin_cells((x, y)), (count_x, count_y, count_z)
         )
         passed[place], returns[place], observed[place] = found

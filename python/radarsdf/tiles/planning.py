@@ -27,7 +27,7 @@ from radarsdf.threads import Workers
 from radarsdf.tiles.grid import Tile, TileGrid
 from radarsdf.tiles.input_digest import InputDigest
 from radarsdf.tiles.plan import Plan, TilePlan
-from radarsdf.tiles.ray_files import RayFiles, read_intensities, read_rays, write_scans
+from radarsdf.tiles.ray_files import RayFiles, read_intensities, read_rays, write_scan_axes
 
 _CHUNK_SCANS = 256  # in memory at a time
 _CHUNK_RETURNS = 500_000  # likewise: fewer scans of a dense sensor
@@ -166,7 +166,7 @@ class Planner:
             msg = "no return of any scan lies within the ranges"
             raise ValueError(msg)
         positions = np.concatenate(self._positions)
-        write_scans(self._folder, positions, np.concatenate(self._up))
+        write_scan_axes(self._folder, positions, np.concatenate(self._up))
         tiles = [
             TilePlan(
                 tile=tile,

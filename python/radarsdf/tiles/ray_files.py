@@ -22,7 +22,7 @@ from radarsdf.tiles.plan import Plan, TilePlan, folder_of, within
 _RECORD = np.dtype([("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")])
 """A return in the frame of its tile, m; its scan; its intensity, sensor units, NaN if there are none."""
 _BUFFER_BYTES = 64 << 20  # of all tiles together, before they are appended to their files
-SCANS = "scans.npy"
+SCANS_FILE = "scans.npy"
 
 
 class RayFiles:
@@ -70,9 +70,9 @@ class RayFiles:
             path.parent.rmdir()
 
 
-def write_scans(folder: Path, positions: NDArray[np.float64], up: NDArray[np.float64]) -> None:
+def write_scan_axes(folder: Path, positions: NDArray[np.float64], up: NDArray[np.float64]) -> None:
     """Writes from where each scan was seen and its z axis, (F, 3) each, world, m."""
-    np.save(within(folder, folder / SCANS), np.concatenate([positions, up], axis=1), allow_pickle=False)
+    np.save(within(folder, folder / SCANS_FILE), np.concatenate([positions, up], axis=1), allow_pickle=False)
 
 
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[np.bool_]]:
@@ -95,19 +95,19 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
         msg = f"{path} has {found:g} rays instead of {tile.rays}: make the plan again"
         raise ValueError(msg)
     rows = np.fromfile(path, _RECORD)
-    table = array_in(within(folder, folder / SCANS))  # of which few rows are needed
+    table = array_in(within(folder, folder / SCANS_FILE))  # of which few rows are needed
     if (
         table.shape != (plan.scans, 6)
         or table.dtype != np.float64
         or not 0 <= rows["scan"].min() <= rows["scan"].max() < plan.scans
     ):
-        msg = f"{folder / SCANS} does not belong to {path}: make the plan again"
+        msg = f"{folder / SCANS_FILE} does not belong to {path}: make the plan again"
         raise ValueError(msg)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
     of_scans = np.array(table[numbers])
     points = np.ascontiguousarray(rows["point"])
     if not ((np.abs(points) <= MAX_POSITION_M).all() and (np.abs(of_scans) <= MAX_POSITION_M).all()):
-        msg = f"{path} or {folder / SCANS} holds something other than finite positions: make the plan again"
+        msg = f"{path} or {folder / SCANS_FILE} holds something other than finite positions: make the plan again"
         raise ValueError(msg)
     intensities = None
     if plan.intensity_range is not None:
