@@ -23,17 +23,17 @@ def keys_of(cells):
     return np.unique(cell_keys(np.ascontiguousarray(cells, np.float64) + 0.5, 1.0))
 
 
-@pytest.mark.parametrize("cells_per_leaf", [1, 2])
-def test_rows_are_those_of_the_regions_that_their_cells_are_in(cells_per_leaf):
+@pytest.mark.parametrize("leaves_per_cell", [1, 2])
+def test_rows_are_those_of_the_regions_that_their_cells_are_in(leaves_per_cell):
     keys = keys_of(CELLS)
-    table = RegionTable(cells_per_leaf, number=np.zeros(0))
+    table = RegionTable(leaves_per_cell, number=np.zeros(0))
     regions = np.unique(table.regions_of(keys))
     table.put(regions, {"keys": keys, "number": np.arange(len(keys)) * 1.0})
     np.testing.assert_array_equal(table.regions, regions)
     whole = table.gather(regions)
     np.testing.assert_array_equal(whole["keys"], keys)
     np.testing.assert_array_equal(whole["number"], np.arange(len(keys)))
-    edge = REGION_CELLS // cells_per_leaf
+    edge = REGION_CELLS // leaves_per_cell
     for region, cube in zip(regions, cubes_of(regions), strict=True):
         expected = (lattice_of(keys) // edge == cube).all(axis=1)
         np.testing.assert_array_equal(table.gather(region[None])["number"], np.flatnonzero(expected))

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks
-from radarsdf.live.regions import REGION_CELLS, Keys, RegionTable, Rows, cubes_of, regions_round
+from radarsdf.live.regions import REGION_CELLS, RegionTable, Rows, cubes_of, regions_round
+from radarsdf.live.rows import Keys
 from radarsdf.returns.cells import merged_keys
 from radarsdf.returns.ghosts import are_behind, are_opaque, first_crossed, mostly_behind
 from radarsdf.returns.mean_rays import MeanRays
@@ -143,7 +144,9 @@ class GrowingGhosts:
         found = first_crossed(surfels, flat, means_of(rows), noise, num_threads)
         keys = np.append(surfels.keys[surfels.cell_of_plane[flat]], NOWHERE)  # the last is that of -1
         first = rows["first"] = keys[found]
-        passed = np.append(cells["passed"], 0.0)  # the last is that of cells that are there no more
+        # Of rays that end in other regions, the counts stay. They are whole numbers, so that what is taken away and added
+        # leaves the bits of a new count. The last is that of cells that are there no more.
+        passed = np.append(cells["passed"], 0.0)
         ends = np.searchsorted(self._leaves.regions_of(rows["keys"]), rays, side="right").tolist()
         starts = [0, *ends[:-1]]
         for region, start, end in zip(rays.tolist(), starts, ends, strict=True):

@@ -25,6 +25,7 @@ from radarsdf.checks import (
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.following import Follower
 from radarsdf.live.learning import finished, known_now
+from radarsdf.live.rows import Keys
 from radarsdf.live.scan_log import ScanId, ScanLog
 from radarsdf.live.scans import Integrated, checked_scan, finite_time
 from radarsdf.live.shelf import Shelf
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
     import trimesh
 
     from radarsdf.map.radar_map import RadarMap
-
-Keys = NDArray[np.uint64]
 
 
 class LiveMap:

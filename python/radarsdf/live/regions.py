@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
-from radarsdf.live.rows import steps_round
+from radarsdf.live.rows import Keys, steps_round
 from radarsdf.returns.cells import lattice_of
 
-Keys = NDArray[np.uint64]
 Rows = dict[str, NDArray[Any]]
 
 REGION_CELLS = 64
@@ -52,14 +51,14 @@ class RegionTable:
 
     Parameters
     ----------
-    cells_per_leaf : int
+    leaves_per_cell : int
         Edge of a cell, leaf cells: 1, or 2.
     columns : ndarray
         Without rows: what types and shapes they have.
     """
 
-    def __init__(self, cells_per_leaf: int = 1, **columns: NDArray[Any]) -> None:
-        self._merged = cells_per_leaf.bit_length() - 1
+    def __init__(self, leaves_per_cell: int = 1, **columns: NDArray[Any]) -> None:
+        self._merged = leaves_per_cell.bit_length() - 1
         self._empty: Rows = {"keys": np.zeros(0, np.uint64), **columns}
         self._parts: dict[int, Rows] = {}
         self.num_bytes = 0

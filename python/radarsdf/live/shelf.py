@@ -10,7 +10,8 @@ import numpy as np
 
 from radarsdf._core import GrowingSums
 from radarsdf.io.npz import arrays_of, write_arrays
-from radarsdf.live.regions import REGION_BITS, Keys, regions_of
+from radarsdf.live.regions import REGION_BITS, regions_of
+from radarsdf.live.rows import Keys
 from radarsdf.live.storage import CELL_COLUMNS, checked_sums
 from radarsdf.returns.evidence import BLOCK_BITS
 

@@ -14,6 +14,7 @@ from radarsdf._core import GrowingSums, SumsChange
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.learning import noise_of, quick_of
 from radarsdf.live.regions import REGION_CELLS, cubes_of, regions_of
+from radarsdf.live.rows import Keys
 from radarsdf.live.scan_log import LoggedScan, ScanLog
 from radarsdf.live.scans import rays_of
 from radarsdf.live.shelf import Shelf
@@ -25,7 +26,6 @@ from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.scan_sums import QUANTA, ScanSums
 from radarsdf.threads import resolve_num_threads
 
-Keys = NDArray[np.uint64]
 _NONE = np.zeros(0, np.uint64)
 _MARKS = 64  # lists of changed blocks, before they are joined
 _BYTES_OF_SUMS = 350  # of a cell with returns, in a table with room for twice as many

@@ -132,7 +132,7 @@ class GrowingSurface:
         return self._triangles.joined(rough_share, returns / max(cells, 1), self.num_leaves)
 
     def _take_sums(self, changes: ChangedSums) -> Keys:
-        """The keys of the leaf cells whose sums changed, and of the others in their blocks."""
+        """The keys of the leaf cells whose sums changed, and of all that now hold returns in their blocks."""
         regions = regions_of(changes.returns << BLOCK_BITS)
         first, last = leaves_of(changes.returns)
         before, after = self._leaves.gather(regions), changes.sums
@@ -152,8 +152,18 @@ class GrowingSurface:
             "first": np.full(len(after.keys), NOWHERE),
         }
         self._leaves.put(regions, Replacement.of(before["keys"], after.keys, first, last).rows(before, new))
-        keys, moments = after.merged_moments()
+        self._take_moments(regions, merged_keys(first), merged_keys(last), after)
+        # Normals and planes of whole blocks are gone now, so all of their cells are to be made.
+        return np.union1d(changed, after.keys)
+
+    def _take_moments(self, regions: Keys, first: Keys, last: Keys, sums: ScanSums) -> None:
+        """The cells of surfels from each of `first` (B,) to each of `last` (B,), in these regions, become those of the sums.
+
+        What follows from moments is not made yet. How many rays pass a plane first is kept: :class:`GrowingGhosts` changes
+        it by the rays that it asks again, and does not count the others anew.
+        """
         before = self._cells.gather(regions)
+        keys, moments = sums.merged_moments()
         passed = np.zeros(len(keys))
         _, kept, old = np.intersect1d(keys, before["keys"], assume_unique=True, return_indices=True)
         passed[kept] = before["passed"][old]
@@ -167,10 +177,7 @@ class GrowingSurface:
             "behind": np.zeros(len(keys)),
             "ghosts": np.zeros(len(keys), bool),
         }
-        rows = Replacement.of(before["keys"], keys, merged_keys(first), merged_keys(last))
-        self._cells.put(regions, rows.rows(before, new))
-        # All of a block is new in these columns, so all of it is to be made.
-        return np.union1d(changed, after.keys)
+        self._cells.put(regions, Replacement.of(before["keys"], keys, first, last).rows(before, new))
 
     def _take_looks(self, changes: ChangedSums) -> Keys:
         """The regions whose looks changed."""

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.live.regions import REGION_CELLS, Keys, RegionTable, regions_round
+from radarsdf.live.regions import REGION_CELLS, RegionTable, regions_round
+from radarsdf.live.rows import Keys
 from radarsdf.map import queries
 from radarsdf.map.contents import WholeMap
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
