@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 import trimesh
@@ -87,6 +89,11 @@ def test_points_are_spread_evenly():
     assert edge_m == 0.05
 
 
+def test_a_glb_says_how_long_it_is():
+    data = glb(SQUARE, TWO, np.zeros((4, 3), np.uint8))
+    assert struct.unpack("<4s2I", data[:12]) == (b"glTF", 2, len(data))
+
+
 def test_a_glb_has_the_colors_that_were_given():
     pytest.importorskip("viser", reason="the extra view is not installed")
     from bench.viewing.client import Glb  # noqa: PLC0415 - which needs it
@@ -138,6 +145,7 @@ def test_a_ray_meets_the_nearest_triangle():
     assert first_hit(vertices, faces, [0.25, 0.25, -0.5], [0, 0, -1]) == pytest.approx([0.25, 0.25, -1])
     for origin, direction in [([0, 0, 2], [0, 0, 1]), ([1.1, 0.5, 2], [0, 0, -1]), ([-1, 0.5, 0], [1, 0, 0])]:
         assert first_hit(vertices, faces, origin, direction) is None
+    assert first_hit(vertices, faces[:1], [0.25, 0.25, 2], [0, 0, -1]) == pytest.approx([0.25, 0.25, -1])
     assert first_hit(vertices, faces[:0], [0, 0, 2], [0, 0, -1]) is None
 
 

@@ -32,8 +32,6 @@ def first_hit(
     origin, direction = np.asarray(ray_origin, np.float64), np.asarray(ray_direction, np.float64)
     direction = direction / np.linalg.norm(direction)
     faces = faces[_near(vertices, faces, origin, direction)]
-    if len(faces) == 0:
-        return None
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     p = np.cross(direction, c - a)
     with np.errstate(divide="ignore", invalid="ignore"):  # triangles along the ray
