@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from radarsdf.poses.by_doppler import DopplerMotion, SensorVelocities
+from radarsdf.poses.by_doppler import LEAST_MPS, DopplerMotion, SensorVelocities
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.rigid import aligned, moved, steps, transform, turned_by
 from radarsdf.simulate import drifted
@@ -126,6 +126,14 @@ def test_velocities_lead_from_pose_to_pose():
     found = DopplerMotion.by(velocities, times_s, poses)
     # Between scans its velocity is taken to change evenly, in its own frame. That of a neighbour would be off by 0.05 m.
     np.testing.assert_allclose(found.steps, steps(poses), atol=2e-3)
+
+
+def test_velocities_change_by_time():
+    scan = np.random.default_rng(6).normal(size=(200, 3))
+    directions = scan / np.linalg.norm(scan, axis=1, keepdims=True)
+    doppler_mps = [-directions @ np.array([forward, 0, 0]) for forward in (5, 6, 5)]
+    change = SensorVelocities.of([scan] * 3, doppler_mps, np.array([0, 0.1, 0.2])).change
+    np.testing.assert_allclose(change, [2 / 0.2 + LEAST_MPS**2, LEAST_MPS**2, LEAST_MPS**2], rtol=1e-6)
 
 
 def test_steps_of_a_slow_source_are_unsteady():
