@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking.check import check_cheaply
+from radarsdf.checking.hypotheses import hypotheses
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import recorded_scans
@@ -151,6 +152,16 @@ def test_millimetres_on_both_sides_are_found_by_the_ranges(good):
     points, poses = good
     for found in found_in([1000 * p for p in points], with_positions(poses, 1000 * poses[:, :3, 3])):
         assert (found[0].name, found[0].severity) == ("units", "error")
+
+
+def test_the_units_that_are_tried():
+    poses = with_positions(np.tile(np.eye(4), (2, 1, 1)), [[0, 0, 0], [1, 0, 0]])
+    tried = [tried for tried in hypotheses(poses, np.array([[0, 1]])) if tried.finding == "units"]
+    factors = [np.linalg.norm(one.T_j_i[0, :3, 3]) for one in tried]
+    assert factors == pytest.approx([1e-3, 1e-2, 0.3048, 1 / 0.3048, 1e2, 1e3])
+    for one, factor in zip(tried, factors, strict=True):
+        above, *below = one.what.rsplit(" ", 1)[1].split("/")
+        assert float(above) / float(*below or [1]) == pytest.approx(factor)
 
 
 def test_a_clock_that_is_off_is_found_where_the_motion_changes():
