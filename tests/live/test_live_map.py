@@ -71,7 +71,7 @@ def test_random_operations_leave_a_map_of_what_is_in_it():
 def test_a_mesh_that_grows_is_that_of_a_quick_fit():
     live = map_of([])
     for i in range(6):
-        live.integrate(SCENE.points[i], SCENE.poses[i], SCENE.intensities[i])
+        assert live.integrate(SCENE.points[i], SCENE.poses[i], SCENE.intensities[i]).scan_id == i
         grown = live.mesh()
         assert mesh_bits(grown) == mesh_bits(map_of(range(i + 1)).mesh())
     quick = FitConfig.quick(
