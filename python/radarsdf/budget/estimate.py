@@ -358,7 +358,7 @@ def _distinct(
         # Count by the column of each cell or corner itself. Those of a return in the sample may be in another
         # column.
         found = np.ascontiguousarray(found << level)
-        counts.append(len(found) if share == 1 else int(sample_cells(found, _COLUMN, share).sum()) / share)
+        counts.append(int(sample_cells(found, _COLUMN, share).sum()) / share)
     # Steps that are too long miss cells: as if there were so many times more.
     return [count * wanted / steps for count in counts]
 
