@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import pytest
 import radarsdf
 from radarsdf import FitConfig, evaluation, io, simulate
 from radarsdf.cli import tiles, whole_parser
@@ -61,6 +62,24 @@ def lines():
 
 def test_no_feature_goes_and_none_comes_unnamed():
     assert lines() == FILE.read_text(encoding="utf-8").splitlines()
+
+
+@pytest.mark.parametrize(
+    ("command", "suffixes"),
+    [
+        ("eval", (*CLOUD_SUFFIXES, *MESH_SUFFIXES)),
+        ("convert", (*CLOUD_OUT_SUFFIXES, *MESH_SUFFIXES)),
+    ],
+)
+def test_helps_name_all_formats(command, suffixes):
+    (commands,) = (a for a in whole_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    text = commands.choices[command].format_help()
+    assert [suffix for suffix in suffixes if suffix not in text] == []
+
+
+def test_the_page_of_files_names_all_that_are_read():
+    text = (FILE.parents[1] / "docs" / "your_own_scans.md").read_text(encoding="utf-8")
+    assert [suffix for suffix in (*CLOUD_SUFFIXES, *BAG_SUFFIXES) if f"`{suffix}`" not in text] == []
 
 
 if __name__ == "__main__":

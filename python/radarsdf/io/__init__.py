@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Reads and writes files of scans, poses, point clouds and meshes. Imports only `checks`, `interrupts` and `_core` of this package."""
+"""Reads and writes files of scans, poses, point clouds and meshes. Knows no other room of this package."""
 
 from radarsdf.io.clouds.reading import read_points
 from radarsdf.io.clouds.writing import write_cloud

@@ -1,22 +1,43 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Clouds of radar returns as LAS and LAZ, by laspy."""
+"""LAS and LAZ, read and written by laspy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.extras import require
+from radarsdf.io.clouds.las_checks import check_las_points, check_las_records
 
-INTENSITY = "radar_intensity"
-"""The extra dimension of intensities: LAS's own are whole numbers from 0 to 65535."""
-
+# The extra dimension of intensities: LAS's own are whole numbers from 0 to 65535.
+_INTENSITY = "radar_intensity"
 _SCALE_M = 1e-4
 _POINT_FORMAT = 6  # the first of LAS 1.4, with a time
+
+
+def read_las(path: Path) -> dict[str, NDArray[Any]]:
+    """The columns (N,) of a file by their names. Those of radars that :func:`las_writer` wrote have the names as there."""
+    laspy = require("laspy", what=f"{path}: LAS and LAZ files are read by")
+    check_las_records(path)
+    # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
+        header = file.header
+        check_las_points(path, header)
+        cloud = file.read_points(header.point_count)
+    # Scaled and shifted, in double precision: the integers in the file are no metres.
+    columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
+    if "intensity" in header.point_format.dimension_names:
+        columns["intensity"] = np.asarray(cloud.intensity)
+    if "gps_time" in header.point_format.dimension_names:
+        columns["time"] = np.asarray(cloud.gps_time)
+    for name in header.point_format.extra_dimension_names:
+        columns["intensity" if name == _INTENSITY else str(name)] = np.asarray(cloud[name])
+    return columns
 
 
 def las_writer(compressed: bool) -> Callable[[Any, Iterator[NDArray[Any]]], int]:
@@ -43,7 +64,7 @@ def las_writer(compressed: bool) -> Callable[[Any, Iterator[NDArray[Any]]], int]
 def _extra(part: NDArray[Any]) -> dict[str, str]:
     """Columns that are extra dimensions, by their names in the file."""
     names = [name for name in part.dtype.names or () if name not in ("x", "y", "z", "time")]
-    return {INTENSITY if name == "intensity" else name: name for name in names}
+    return {_INTENSITY if name == "intensity" else name: name for name in names}
 
 
 def _header(laspy: Any, first: NDArray[Any]) -> Any:

@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
-from radarsdf.extras import require
 from radarsdf.interrupts import whole_import
 from radarsdf.io.clouds.fields import COLUMNS, Fields
-from radarsdf.io.clouds.las import INTENSITY as RADAR_INTENSITY
-from radarsdf.io.clouds.laz import check_las_points, check_las_records
+from radarsdf.io.clouds.las import read_las
 from radarsdf.io.clouds.pcd import read_pcd
 from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.origin import origin_of
@@ -202,26 +200,12 @@ def _ply(path: Path) -> Columns:
     return columns
 
 
-def _las(path: Path) -> Columns:
-    laspy = require("laspy", what=f"{path}: LAS and LAZ files are read by")
-    check_las_records(path)
-    # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
-    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
-        header = file.header
-        check_las_points(path, header)
-        cloud = file.read_points(header.point_count)
-    # Scaled and shifted, in double precision: the integers in the file are no metres.
-    columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
-    if "intensity" in header.point_format.dimension_names:
-        columns["intensity"] = np.asarray(cloud.intensity)
-    if "gps_time" in header.point_format.dimension_names:
-        columns["time"] = np.asarray(cloud.gps_time)
-    for name in header.point_format.extra_dimension_names:
-        columns["intensity" if name == RADAR_INTENSITY else str(name)] = np.asarray(cloud[name])
-    return columns
-
-
-_NAMED: dict[str, Callable[[Path], Columns]] = {".pcd": read_pcd, ".ply": _ply, ".las": _las, ".laz": _las}
+_NAMED: dict[str, Callable[[Path], Columns]] = {
+    ".pcd": read_pcd,
+    ".ply": _ply,
+    ".las": read_las,
+    ".laz": read_las,
+}
 """Readers of formats that name their columns."""
 
 _NAMELESS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
