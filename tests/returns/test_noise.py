@@ -78,3 +78,11 @@ def test_variances_of_returns():
     ranges_m = np.array([0.0, 10.0, 50.0], np.float32)
     expected = 0.1**2 + (0.003**2 + 0.004**2) / 2 * ranges_m.astype(np.float64) ** 2
     np.testing.assert_allclose(noise.variances_m2(ranges_m), expected, rtol=1e-5)
+
+
+def test_a_median_of_noises_is_of_each_number():
+    noises = [SensorNoise(0.1, 0.02, 0.001), SensorNoise(0.3, 0.01, 0.002), SensorNoise(0.2, 0.03, 0.003)]
+    found = SensorNoise.median(noises)
+    assert found == SensorNoise(0.2, 0.02, 0.002)
+    assert ReturnsConfig(**found.settings).azimuth_noise_rad == 0.02
+    assert found.variances == pytest.approx([0.04, 4e-4, 4e-6])

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -125,8 +124,8 @@ def common_planes(
         normals.append(told_normals(surfels, num_threads))
         total += len(surfels.centres)
         if noise is None:
-            noises.append(dataclasses.astuple(sensor_noise(surfels, part, config, num_threads)))
-    known = SensorNoise(*np.median(noises, axis=0).tolist()) if noise is None else noise
+            noises.append(sensor_noise(surfels, part, config, num_threads))
+    known = SensorNoise.median(noises) if noise is None else noise
     common = CommonPlanes(
         rays.points,
         rays.directions,
@@ -138,7 +137,7 @@ def common_planes(
         np.concatenate(centres),
         np.ascontiguousarray(np.concatenate(normals)),
         grid.cell_m,
-        np.square(dataclasses.astuple(known)).tolist(),
+        known.variances,
         min(grid.window // grid.together, _TOGETHER),
         num_threads,
     )

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections import deque
 from collections.abc import Sequence
@@ -162,11 +161,12 @@ class Tracker:
         self, scan: Floats, pose: Floats, middle: Floats, prior: Floats
     ) -> tuple[Floats, Floats, float]:
         """The pose that the returns and a prior round `middle` lead to, its covariance, and the share of returns that agree."""
+        assert self._noise is not None
         information, weight, covariance = np.linalg.inv(prior), 0.0, prior
         for planes in self._planes:
             for _ in range(_ITERATIONS):
                 hessian, gradient, doubt, weight = planes.beside(
-                    scan, np.ascontiguousarray(pose), self._variances()
+                    scan, np.ascontiguousarray(pose), self._noise.variances
                 )
                 hessian, gradient = _told(hessian, gradient, doubt)
                 off = np.concatenate(
@@ -185,7 +185,8 @@ class Tracker:
     ) -> Tracked | None:
         """The best of many poses, if the returns agree there clearly better than at places where the sensor cannot be."""
         assert self.last is not None
-        coarse, variances = self._planes[0], self._variances()
+        assert self._noise is not None
+        coarse, variances = self._planes[0], self._noise.variances
         asked = thinned(scan, _SEARCHED)
         turns, steps = expected.candidates(capture_m, radius_m)
         poses = np.ascontiguousarray(np.einsum("ij,kjl->kil", self.last.pose, steps))
@@ -216,11 +217,6 @@ class Tracker:
         up = self.last.pose[:3, 2]
         poses[:, :3, 3] += shifts - np.einsum("ki,i->k", shifts, up)[:, None] * up
         return np.ascontiguousarray(poses)
-
-    def _variances(self) -> list[float]:
-        assert self._noise is not None
-        found: list[float] = np.square(dataclasses.astuple(self._noise)).tolist()
-        return found
 
 
 def begun(pose: Floats, piece: int = 0) -> Tracked:

@@ -107,7 +107,7 @@ def _gains(
     something: so the median of the densities is added to each, and such returns say little.
     """
     given = _Neighbours.of(asked, used, before)
-    of_asked, of_used = (_variances_m2(returns, noise) for returns in (asked, used))
+    of_asked, of_used = (noise.mean_variances_m2(returns.ranges_m) for returns in (asked, used))
     of_asked += float(np.median(given.nearest_m)) ** 2
     density = given.density(of_asked, of_used)
     floor = float(np.median(density))
@@ -150,10 +150,3 @@ class _Neighbours:
             parts = np.exp(-0.5 * self.distances_m**2 / variance) / variance**1.5
         density: Floats = np.where(self.others, parts, 0.0).sum(axis=1)
         return density
-
-
-def _variances_m2(returns: SensorReturns, noise: SensorNoise) -> Floats:
-    """(N,) of their noise, mean of the three axes."""
-    across = noise.azimuth_rad**2 + noise.elevation_rad**2
-    variances: Floats = (noise.range_m**2 + across * np.square(returns.ranges_m, dtype=np.float64)) / 3
-    return variances

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,22 @@ class SensorNoise:
     elevation_rad: float
     """In elevation, rad."""
 
+    @classmethod
+    def median(cls, noises: Sequence[SensorNoise]) -> SensorNoise:
+        """Of several, number by number."""
+        return cls(*np.median([dataclasses.astuple(noise) for noise in noises], axis=0).tolist())
+
+    @property
+    def variances(self) -> list[float]:
+        """Along the beam, m², in azimuth and in elevation, rad²: what the core takes."""
+        squares: list[float] = np.square(dataclasses.astuple(self)).tolist()
+        return squares
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """As settings of returns, of a fit that need not estimate it."""
+        return dict(zip(NOISE_SETTINGS, dataclasses.astuple(self), strict=True))
+
     @property
     def angle_rad(self) -> float:
         """Across the beam, root mean square of azimuth and elevation, rad."""
@@ -53,6 +70,14 @@ class SensorNoise:
         variances: NDArray[np.float32] = np.float32(self.range_m**2) + np.square(
             np.float32(self.angle_rad) * ranges_m
         )
+        return variances
+
+    def mean_variances_m2(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(N,) mean of the variances along the three axes, of returns at these ranges (N,), m²."""
+        across_rad2 = self.azimuth_rad**2 + self.elevation_rad**2
+        variances: NDArray[np.float64] = (
+            self.range_m**2 + across_rad2 * np.square(ranges_m, dtype=np.float64)
+        ) / 3
         return variances
 
 
@@ -110,7 +135,7 @@ def variances_across(
 ) -> NDArray[np.float64]:
     """(M,) variances of the returns in these `rows` (M,) across planes with `normals` (M, 3), m²."""
     variances: NDArray[np.float64] = np.einsum(
-        "k,kn->n", np.square(dataclasses.astuple(noise)), _shares(rays, rows, normals)
+        "k,kn->n", np.array(noise.variances), _shares(rays, rows, normals)
     )
     return variances
 

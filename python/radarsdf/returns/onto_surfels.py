@@ -42,7 +42,7 @@ def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: 
         surfels.centres,
         surfels.normals,
         np.ascontiguousarray(surfels.variances[:, 0]),
-        np.square(dataclasses.astuple(noise)).tolist(),
+        noise.variances,
         num_threads,
     )
     return dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)

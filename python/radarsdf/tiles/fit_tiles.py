@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor
@@ -22,6 +21,7 @@ from radarsdf.io.files import write_whole
 from radarsdf.io.poses.reading import UNPOSED, NoPoses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
+from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.tiles.drive_poses import POSES, TRAJECTORY, DrivePoses, DriveToPose
 from radarsdf.tiles.grid import TileGrid
 from radarsdf.tiles.input_digest import InputDigest
@@ -246,9 +246,9 @@ class _Checked:
 
 def _check_same(folder: Path, plan: Plan, config: FitConfig, grid: TileGrid, digest: str) -> None:
     known = {
-        field.name: getattr(plan.config.returns, field.name)
-        for field in dataclasses.fields(config.returns)
-        if field.name.endswith(("noise_m", "noise_rad")) and getattr(config.returns, field.name) is None
+        name: getattr(plan.config.returns, name)
+        for name in NOISE_SETTINGS
+        if getattr(config.returns, name) is None
     }
     ours, theirs = (settings_of_results(own) for own in (config.override(returns=known), plan.config))
     if config.num_threads not in (0, plan.config.num_threads):

@@ -19,7 +19,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.io.scans import Scan, scans_in_memory
 from radarsdf.returns.movers import Standing
-from radarsdf.returns.noise import NOISE_SETTINGS, SensorNoise
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.plausible import Intensities
 from radarsdf.returns.rays import Rays, check_range, middle_scan, prepare
 from radarsdf.returns.sensor import Sensor
@@ -213,15 +213,14 @@ class Planner:
             rays, _ = read_rays(self._folder, plan, tile)
             with Workers(plan.config.num_threads) as workers:
                 surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
-            noises.append(dataclasses.astuple(surface.noise))
+            noises.append(surface.noise)
             rough += surface.surfels.rough_share() * len(rays)
             returns += len(rays)
             cells += len(surface.surfels.keys)
-        noise = SensorNoise(*np.median(noises, axis=0).tolist())
-        known = dict(zip(NOISE_SETTINGS, dataclasses.astuple(noise), strict=True))
+        noise = SensorNoise.median(noises)
         return dataclasses.replace(
             plan,
-            config=plan.config.override(returns=known),
+            config=plan.config.override(returns=noise.settings),
             rough_share=rough / returns,
             returns_per_cell=returns / max(cells, 1),
             sensor=self._sensor(noise),
