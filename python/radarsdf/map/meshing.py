@@ -26,11 +26,11 @@ with whole_import():
     import trimesh
 
 
-class VertexLimits(NamedTuple):
-    """What a mesh leaves out by what is known of a vertex, whatever the rest of the surface is: a tile asks this alone."""
+class TriangleLimits(NamedTuple):
+    """What a mesh leaves out triangle by triangle, whatever the rest of the surface is: a tile asks this alone."""
 
-    max_uncertainty: float
-    """m"""
+    max_uncertainty: float = math.inf
+    """Of each vertex, m."""
 
 
 class Limits(NamedTuple):
@@ -38,7 +38,7 @@ class Limits(NamedTuple):
 
     min_confidence: float | None
     """None: that of the highest expected F-score."""
-    of_vertices: VertexLimits
+    of_triangles: TriangleLimits
     min_component_triangles: int
 
     @classmethod
@@ -62,7 +62,7 @@ class Limits(NamedTuple):
         if min_component_triangles is None:
             min_component_triangles = queries.piece_triangles(voxel_m)
         whole_number(min_component_triangles, "min_component_triangles", 0)
-        return cls(min_confidence, VertexLimits(max_uncertainty), min_component_triangles)
+        return cls(min_confidence, TriangleLimits(max_uncertainty), min_component_triangles)
 
 
 @dataclass(frozen=True)
@@ -134,15 +134,15 @@ class Surface:
             cells_searched,
         )
 
-    def known(self, limits: VertexLimits) -> NDArray[np.bool_]:
-        """Which of the vertices are known well enough, (V,)."""
-        return np.asarray(np.nan_to_num(self.uncertainty_m, nan=np.inf) <= limits.max_uncertainty, bool)
+    def allowed(self, limits: TriangleLimits) -> NDArray[np.bool_]:
+        """Which of the faces nothing speaks against but the rest of the surface, (F,)."""
+        known = np.nan_to_num(self.uncertainty_m, nan=np.inf) <= limits.max_uncertainty
+        return with_all(known, self.faces)
 
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
         """Which of the faces a mesh keeps, (F,)."""
-        good = self.known(limits.of_vertices)
-        good &= self.confidence >= self.threshold(limits).min_confidence
-        kept = np.asarray(good[self.faces].all(axis=1), bool)
+        kept = self.allowed(limits.of_triangles)
+        kept &= with_all(self.confidence >= self.threshold(limits).min_confidence, self.faces)
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
@@ -218,6 +218,13 @@ def check_viewpoint(scale: IntensityScale | None, viewpoint: ArrayLike) -> NDArr
         msg = f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m"
         raise ValueError(msg)
     return sensor_position
+
+
+def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(F,) which of the faces (F, 3) have three vertices that are `good` (V,)."""
+    first, second, third = faces.T
+    found: NDArray[np.bool_] = good[first] & good[second] & good[third]
+    return found
 
 
 def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:

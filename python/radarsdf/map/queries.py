@@ -203,7 +203,7 @@ class Probabilities(NamedTuple):
     confidence: Tensor
     """(N,) see :func:`confidence`."""
     covering: Tensor
-    """(N,) truth that the surface covers and none of more confidence does, for its area; in proportion to each other."""
+    """(N,) the truth that the surface covers first, if surface is taken as its confidence falls, over its area. Only ratios count."""
     reach: Tensor
     """(N,) share of a normal distribution of the position's error within a leaf cell's edge."""
 

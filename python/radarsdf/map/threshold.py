@@ -61,7 +61,8 @@ class Tally:
     true_m2: Floats
     """(B,) how much of it is expected to be true."""
     covering: Floats
-    """(B,) how much of the truth it is expected to cover that no surface of more confidence does; in proportion to each other."""
+    """(B,) the truth that it is expected to cover first, if surface is taken as its confidence falls. Only ratios count: what one
+    place covers is learnt up to a factor."""
     existing_m2: float
     """True surface that was seen, whether or not it is known well enough where it is."""
     once_m2: float

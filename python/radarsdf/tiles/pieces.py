@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
-from radarsdf.map.meshing import Surface, VertexLimits, renumbered
+from radarsdf.map.meshing import Surface, TriangleLimits, renumbered
 from radarsdf.map.threshold import TALLY_NUMBERS
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
@@ -40,7 +40,7 @@ class PieceSettings:
     """Along the edge of a leaf cell."""
     box: tuple[tuple[float, ...], ...] | None
     """Lower and upper corner, world, m."""
-    limits: VertexLimits
+    limits: TriangleLimits
     """What is left out of the mesh of a tile. All else depends on the other tiles."""
 
     def to_json(self) -> str:
@@ -51,7 +51,7 @@ class PieceSettings:
     def from_json(cls, text: str) -> PieceSettings:
         """The settings that :meth:`to_json` wrote."""
         values: dict[str, Any] = json.loads(text)
-        box, limits = values.pop("box"), VertexLimits(**values.pop("limits"))
+        box, limits = values.pop("box"), TriangleLimits(**values.pop("limits"))
         return cls(box=None if box is None else tuple(map(tuple, box)), limits=limits, **values)
 
 
@@ -187,7 +187,7 @@ def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
         num_threads=threads,
     )
     surface = Surface.told_by(city.any_contents, vertices, faces, city.evidence(vertices), len(cells))
-    kept, faces = renumbered(len(vertices), faces[surface.known(settings.limits)[faces].all(axis=1)])
+    kept, faces = renumbered(len(vertices), faces[surface.allowed(settings.limits)])
     vertices = vertices[kept]
     rows, edges = _border(config.lattice.cells(vertices) * steps, city.plan.tile_cells * steps)
     return Piece(

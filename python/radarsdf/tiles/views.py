@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from radarsdf.budget.estimate import check_views
 from radarsdf.map import queries
-from radarsdf.map.meshing import Limits, Surface, VertexLimits
+from radarsdf.map.meshing import Limits, Surface, TriangleLimits
 from radarsdf.map.traced_surface import TracedSurface
 from radarsdf.map.views import ViewedMap
 from radarsdf.tiles.blend import TileBlend
@@ -45,7 +44,7 @@ def viewed_tiles(
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(config.max_memory_bytes, cells=cells)
     origin = config.lattice.position(city.plan.origin_cells(tiles[0]))
-    everything = PieceSettings(1, None, VertexLimits(math.inf))
+    everything = PieceSettings(1, None, TriangleLimits())
     pieces = [piece_of(city, tile, everything) for tile in tiles]
     before = np.cumsum([0, *[len(piece.vertices) for piece in pieces]])
     together = np.concatenate([piece.vertices for piece in pieces])

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from radarsdf.map.isosurface import mesh_components
-from radarsdf.map.meshing import renumbered
+from radarsdf.map.meshing import renumbered, with_all
 from radarsdf.map.threshold import TALLY_NUMBERS, Tally
 from radarsdf.tiles.pieces import Piece, tally_sums
 
@@ -109,7 +109,7 @@ class WeldedMesh:
         """A piece, its triangles that are probable enough, to which component each belongs, and the sizes of those."""
         piece = Piece.load(self._paths[i])
         good = piece.confidence >= self.threshold.min_confidence
-        faces = piece.faces[good[piece.faces].all(axis=1)]
+        faces = piece.faces[with_all(good, piece.faces)]
         return piece, faces, *mesh_components(faces, len(piece.vertices))
 
     def _large(self, min_triangles: int) -> list[NDArray[np.bool_]]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import whole_number
-from radarsdf.map.meshing import renumbered
+from radarsdf.map.meshing import renumbered, with_all
 from radarsdf.map.threshold import Threshold
 from radarsdf.view.thinning import thinned
 
@@ -87,7 +87,7 @@ class ShownSurface:
 
     def part(self, kept: NDArray[np.bool_]) -> tuple[_Rows, NDArray[np.int32]]:
         """The triangles of which all vertices are kept: rows of their vertices (N,), and faces (M, 3) as rows of those."""
-        used, faces = renumbered(len(kept), self.faces[kept[self.faces].all(axis=1)])
+        used, faces = renumbered(len(kept), self.faces[with_all(kept, self.faces)])
         return np.flatnonzero(used), faces
 
 
