@@ -89,7 +89,7 @@ class Sensor:
 
     @property
     def resolution_m(self) -> float:
-        """Full width at half maximum of the noise along the beam, m."""
+        """Resolution along the beam, m: the full width at half maximum of the noise. It is told; nothing in the package uses it."""
         return _FWHM * self.noise.range_m
 
     def threshold(self, ranges_m: NDArray[Any]) -> NDArray[np.float64]:
