@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 from pathlib import Path
 
 import pytest
@@ -30,8 +31,11 @@ def features():
     """A line for each name, sorted."""
     for package in (radarsdf, evaluation, io, simulate):
         yield from (f"name {package.__name__}.{name}" for name in package.__all__)
-    for kind in (radarsdf.RadarMap, radarsdf.TiledMap, radarsdf.FitConfig, io.Scans, io.Scan):
-        yield from (f"name {kind.__name__}.{name}" for name in dir(kind) if not name.startswith("_"))
+    for kind in documented_classes():
+        fields = getattr(kind, "__dataclass_fields__", ())  # those without a default are no attributes
+        yield from (
+            f"name {kind.__name__}.{name}" for name in {*dir(kind), *fields} if not name.startswith("_")
+        )
     for group, settings in FitConfig().to_dict().items():
         own = settings if isinstance(settings, dict) else {"": None}
         yield from (f"setting {group}.{name}".removesuffix(".") for name in own)
@@ -45,6 +49,18 @@ def features():
     yield from (f"reads {type(dataset).__name__}" for dataset in DATASETS)
     yield from (f"reads {dialect.name}" for dialect in DIALECTS)
     yield from (f"writes {suffix}" for suffix in (*CLOUD_OUT_SUFFIXES, *MESH_SUFFIXES))
+
+
+def documented_classes():
+    """The classes that the reference of docs/api shows."""
+    for page in sorted((FILE.parents[1] / "docs" / "api").glob("*.md")):
+        module = "radarsdf"
+        for line in page.read_text(encoding="utf-8").splitlines():
+            directive, _, name = line.partition(":: ")
+            if directive in (".. module", ".. currentmodule", ".. automodule"):
+                module = name
+            elif directive == ".. autoclass":
+                yield getattr(importlib.import_module(module), name.partition("(")[0])
 
 
 def options(command, parser):
