@@ -439,12 +439,16 @@ def test_echoes_are_kept_bit_for_bit(scene, tmp_path):
     for name in ("points", "directions", "ranges_m", "intensities", "counts"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(expected, name))
     assert loaded.sigma == expected.sigma > 0
-    for name, wrong in (
-        ("counts", torch.zeros_like(tensors["echoes.counts"])),
-        ("points", tensors["echoes.points"][:-1]),
-        ("intensities", tensors["echoes.intensities"] * math.nan),
-        ("directions", tensors["echoes.directions"].to(torch.int16)),
+    for name, wrong, what in (
+        ("counts", torch.zeros_like(tensors["echoes.counts"]), "the echoes hold numbers out of range"),
+        ("points", tensors["echoes.points"][:-1], "the echoes have arrays of wrong shapes"),
+        (
+            "intensities",
+            tensors["echoes.intensities"] * math.nan,
+            "intensities of the echoes is not .* finite",
+        ),
+        ("directions", tensors["echoes.directions"].to(torch.int16), r"directions of .* torch\.int8"),
     ):
         write(path, tensors | {f"echoes.{name}": wrong}, metadata)
-        with pytest.raises(ValueError, match="is not a whole radarsdf map: the echoes"):
+        with pytest.raises(ValueError, match=f"is not a whole radarsdf map: {what}"):
             radarsdf.load(path)

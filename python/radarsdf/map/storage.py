@@ -37,19 +37,25 @@ _FEATURES = "field.cells.features"
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
-_PASSAGES = ("keys", "planes")  # bits, stored as int64, which all readers of safetensors have
-_ECHOES = {
-    "points": torch.float32, "directions": torch.int8, "ranges_m": torch.float16, "intensities": torch.float32,
-    "counts": torch.int16,
-}  # fmt: skip
-# Types and numbers of dimensions of the arrays of `Reflectance`. Keys have at most 63 bits, as those of leaf cells.
-_REFLECTANCE = {
-    "coefficients": (torch.float64, 2),
-    "table": (torch.float32, 2),
-    "plane_keys": (torch.int64, 1),
-    "normals": (torch.float32, 2),
-    "mean_keys": (torch.int64, 1),
-    "means": (torch.float16, 1),
+# Types and numbers of dimensions of the arrays of other parts. Bits and keys are stored as int64, which all readers of
+# safetensors have; keys have at most 63 bits, as those of leaf cells.
+_PARTS = {
+    "passages": {"keys": (torch.int64, 1), "planes": (torch.int64, 3)},
+    "echoes": {
+        "points": (torch.float32, 2),
+        "directions": (torch.int8, 2),
+        "ranges_m": (torch.float16, 1),
+        "intensities": (torch.float32, 1),
+        "counts": (torch.int16, 1),
+    },
+    "reflectance": {
+        "coefficients": (torch.float64, 2),
+        "table": (torch.float32, 2),
+        "plane_keys": (torch.int64, 1),
+        "normals": (torch.float32, 2),
+        "mean_keys": (torch.int64, 1),
+        "means": (torch.float16, 1),
+    },
 }
 
 
@@ -107,13 +113,10 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     # Morton keys have 63 bits, so they fit into int64, which all readers of safetensors have.
     tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
-    tensors |= {
-        f"passages.{name}": torch.from_numpy(getattr(contents.passages, name).view(np.int64))
-        for name in _PASSAGES
-    }
-    tensors |= {f"echoes.{name}": torch.from_numpy(getattr(contents.echoes, name)) for name in _ECHOES}
+    tensors |= _tensors_of("passages", contents.passages)
+    tensors |= _tensors_of("echoes", contents.echoes)
     if contents.reflectance is not None:
-        tensors |= _tensors_of(contents.reflectance)
+        tensors |= _tensors_of("reflectance", contents.reflectance)
     scale = contents.intensity_scale
     description = {
         "config": contents.config.to_dict(),
@@ -144,52 +147,35 @@ def _with_empty_columns(features: Tensor) -> Tensor:
     return torch.cat([features, features.new_zeros(len(features), FEATURE_DIM - features.shape[1])], 1)
 
 
-def _tensors_of(reflectance: Reflectance) -> dict[str, Tensor]:
-    arrays = {name: getattr(reflectance, name) for name in _REFLECTANCE}
+def _tensors_of(part: str, owner: Passages | Echoes | Reflectance) -> dict[str, Tensor]:
+    arrays = {f"{part}.{name}": getattr(owner, name) for name in _PARTS[part]}
     return {
-        f"reflectance.{name}": torch.from_numpy(a.view(np.int64) if a.dtype == np.uint64 else a)
-        for name, a in arrays.items()
+        name: torch.from_numpy(array.view(np.int64) if array.dtype == np.uint64 else array)
+        for name, array in arrays.items()
     }
 
 
+def _arrays_of(part: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
+    """Takes the arrays of a part from the tensors. Raises a ValueError if one is of another type, or is not finite."""
+    arrays = {}
+    for name, (dtype, dimensions) in _PARTS[part].items():
+        tensor = tensors.pop(f"{part}.{name}")
+        if tensor.dtype != dtype or tensor.ndim != dimensions or not tensor.isfinite().all():
+            msg = f"{name} of the {part} is not {dimensions}-dimensional, finite and {dtype}"
+            raise ValueError(msg)
+        array = tensor.numpy().copy()
+        arrays[name] = array.view(np.uint64) if dtype == torch.int64 else array
+    return arrays
+
+
 def _reflectance_of(tensors: dict[str, Tensor], leaf_size_m: float, network_share: float) -> Reflectance:
-    """Takes its part of the tensors."""
     if not 0 <= network_share <= 1:
         msg = f"network_share must be in [0, 1], not {network_share}"
         raise ValueError(msg)
-    arrays: dict[str, Any] = {}
-    for name, (dtype, dimensions) in _REFLECTANCE.items():
-        tensor = tensors.pop(f"reflectance.{name}")
-        if tensor.dtype != dtype or tensor.ndim != dimensions or not tensor.isfinite().all():
-            msg = f"{name} of the reflectance is not {dimensions}-dimensional, finite and {dtype}"
-            raise ValueError(msg)
-        array = tensor.numpy()
-        arrays[name] = array.view(np.uint64) if dtype == torch.int64 else array
+    arrays = _arrays_of("reflectance", tensors)
     reflectance = Reflectance(leaf_size_m, **arrays, network_share=network_share)
     reflectance.check()
     return reflectance
-
-
-def _passages_of(tensors: dict[str, Tensor]) -> Passages:
-    """Takes its part of the tensors."""
-    arrays = [tensors.pop(f"passages.{name}") for name in _PASSAGES]
-    if any(array.dtype != torch.int64 for array in arrays):
-        msg = "the passages are not of 64 bits"
-        raise ValueError(msg)
-    passages = Passages(*(array.numpy().copy().view(np.uint64) for array in arrays))
-    passages.check()
-    return passages
-
-
-def _echoes_of(tensors: dict[str, Tensor], sigma: float, leaf_size_m: float) -> Echoes:
-    """Takes its part of the tensors."""
-    arrays = {name: tensors.pop(f"echoes.{name}") for name in _ECHOES}
-    if any(array.dtype != _ECHOES[name] or not array.isfinite().all() for name, array in arrays.items()):
-        msg = "the echoes are not finite, or of other types"
-        raise ValueError(msg)
-    echoes = Echoes(**{name: array.numpy().copy() for name, array in arrays.items()}, sigma=sigma)
-    echoes.check(leaf_size_m)
-    return echoes
 
 
 @torch.inference_mode(mode=False)  # or the map could not give gradients
@@ -278,8 +264,10 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     if not (evidence["information"].isfinite() & (evidence["information"] >= 0)).all():
         msg = "information holds something other than finite numbers of at least 0"
         raise ValueError(msg)
-    passages = _passages_of(tensors)
-    echoes = _echoes_of(tensors, float(description["echo_sigma"]), config.leaf_size_m)
+    passages = Passages(**_arrays_of("passages", tensors))
+    passages.check()
+    echoes = Echoes(**_arrays_of("echoes", tensors), sigma=float(description["echo_sigma"]))
+    echoes.check(config.leaf_size_m)
     scale = None
     if description["intensity_scale"] is not None:
         scale = IntensityScale.between(description["intensity_scale"])
