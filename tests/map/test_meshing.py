@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents
 from radarsdf.map.isosurface import mesh_components
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.map.voxels import _corner_distances, _crossed, _smooth_in_cells, _voxels_of
+from radarsdf.map.voxels import _corner_distances, _smooth_in_cells, _voxels_of, crossed
 from scipy.spatial import KDTree
 
 from ..conftest import ground_and_wall
@@ -323,10 +324,12 @@ def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
 @pytest.mark.parametrize("voxel_size", [0.05, 0.07, 0.1, 0.13])
 def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, voxel_size, monkeypatch):
     cells = sharp_map.field.cells.table.leaf_cells()
-    assert len(_crossed(sharp_map._contents, cells)) < 0.8 * len(cells)
+    searched = crossed(cells, LEAF_M, partial(_corner_distances, sharp_map._contents, LEAF_M))
+    assert len(searched) < 0.8 * len(cells)
     mesh = sharp_map.mesh(voxel_size)
-    assert mesh.metadata["leaf_cells_searched"] < 0.8 * mesh.metadata["leaf_cells"] == 0.8 * len(cells)
-    monkeypatch.setattr("radarsdf.map.voxels._crossed", lambda _, cells: cells)
+    assert mesh.metadata["leaf_cells_searched"] == len(searched)
+    assert mesh.metadata["leaf_cells"] == len(cells)
+    monkeypatch.setattr("radarsdf.map.voxels.crossed", lambda cells, *_: cells)
     whole = sharp_map.mesh(voxel_size)
     assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4 if voxel_size in (0.05, 0.1) else 1e-3)
     distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)

@@ -152,7 +152,7 @@ def _fine_grid(
         distance_m[rows] = surface.distance_m
         # Where the map has it: how far it may be off is said by `position_error_m`, or rough surfaces would be nowhere.
         of_surface = np.where(
-            _crossed(distance_m)[rows] & (np.abs(surface.distance_m) <= _HALF_WIDTH * size),
+            _beside_other_side(distance_m)[rows] & (np.abs(surface.distance_m) <= _HALF_WIDTH * size),
             surface.confidence,
             0,
         )
@@ -229,7 +229,7 @@ def _below(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return share
 
 
-def _crossed(distance_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _beside_other_side(distance_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Voxels beside one on the other side of a surface: what is only near zero may be the end of what the field knows."""
     before, behind = distance_m > 0, distance_m <= 0  # NaN is neither
     found = np.zeros(distance_m.shape, bool)

@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,11 +66,11 @@ def sample_lattice(
     if box is not None:
         lower, upper = box
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
-    if voxel_size == leaf_size_m and box is None and _is_grid(config):
-        corners, voxel_corners, distances_m = _grid(contents, progress)
+    if voxel_size == leaf_size_m and box is None and _is_of_vertices(config):
+        corners, voxel_corners, distances_m = _distances_of_vertices(contents, progress)
         return SampledLattice(corners, voxel_corners, distances_m, len(cells))
     if voxel_size < leaf_size_m and _smooth_in_cells(config):
-        cells = _crossed(contents, cells)
+        cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
     voxels = _voxels_of(cells, voxel_size, config)
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
@@ -92,7 +94,7 @@ def _smooth_in_cells(config: FitConfig) -> bool:
     )
 
 
-def _is_grid(config: FitConfig) -> bool:
+def _is_of_vertices(config: FitConfig) -> bool:
     """Whether the field at a vertex of the leaf cells depends only on the feature of that vertex."""
     return (
         config.encoding.kind == "octree"
@@ -101,10 +103,10 @@ def _is_grid(config: FitConfig) -> bool:
     )
 
 
-def _grid(
+def _distances_of_vertices(
     contents: MapContents, progress: bool | None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-    """If :func:`_is_grid`: vertices (V, 3), rows of them for each leaf cell (C, 8), and distances (V,), m.
+    """If :func:`_is_of_vertices`: vertices (V, 3), rows of them for each leaf cell (C, 8), and distances (V,), m.
 
     This needs no interpolation, which makes it fast.
     """
@@ -119,14 +121,21 @@ def _grid(
     return corners, cell_corners, values
 
 
-def _crossed(contents: MapContents, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Those of the leaf cells (M, 3) whose corners are not all clearly on one side of the surface."""
-    size_m = contents.config.leaf_size_m
-    cells, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
-    values = _corner_distances(contents, size_m, cells, corners, cell_corners, progress=False)[cell_corners]
-    margin_m = _CLEARLY * size_m
-    crossed: NDArray[np.int32] = cells[(values.min(axis=1) <= margin_m) & (values.max(axis=1) >= -margin_m)]
-    return crossed
+def crossed(
+    cells: NDArray[np.integer[Any]],
+    leaf_size_m: float,
+    distances_at: Callable[[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]], NDArray[Any]],
+) -> NDArray[np.int32]:
+    """Those of the leaf cells (M, 3) whose corners are not all clearly on one side of the surface.
+
+    `distances_at`: signed distances (K,), m, of the cells, their corners (K, 3) and the rows of these (M', 8), as
+    :func:`sparse_lattice` gives them.
+    """
+    unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
+    values = distances_at(unique, corners, cell_corners)[cell_corners]
+    margin_m = _CLEARLY * leaf_size_m
+    found: NDArray[np.int32] = unique[(values.min(axis=1) <= margin_m) & (values.max(axis=1) >= -margin_m)]
+    return found
 
 
 def _per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
@@ -175,7 +184,7 @@ def _corner_distances(
     voxels: NDArray[np.int32],
     corners: NDArray[np.int32],
     voxel_corners: NDArray[np.int32],
-    progress: bool | None,
+    progress: bool | None = False,
 ) -> NDArray[np.float32]:
     """Signed distance (K,) at lattice corners (K, 3), m.
 

@@ -21,13 +21,12 @@ from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.isosurface import extract_cells, sparse_lattice
 from radarsdf.map.meshing import Surface, TriangleLimits, renumbered
 from radarsdf.map.threshold import TALLY_NUMBERS
+from radarsdf.map.voxels import crossed
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
 from radarsdf.tiles.plan import folder_of, within
 
-# As in one map: cells with all corners farther from the surface than this, in leaf cells, are left out.
-_CLEARLY = 0.25
 _FILES = "mesh-*.npz"
 _ON_LATTICE = 1e-4  # voxels: vertices are at least 1e-3 from the corners of their edges
 
@@ -171,7 +170,11 @@ def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
         cells = cells[((position(cells + 1) >= lower) & (position(cells) <= upper)).all(axis=1)]
     found = len(cells)
     if steps > 1:
-        cells = _crossed(city, cells)
+        cells = crossed(
+            cells,
+            config.leaf_size_m,
+            lambda _, corners, __: city.distances_at(corners.astype(np.int64), config.leaf_size_m),
+        ).astype(np.int64)
     inside = np.stack(np.meshgrid(*[np.arange(steps)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     voxels = (cells[:, None, :] * steps + inside).reshape(-1, 3)
     if settings.box is not None:
@@ -212,17 +215,6 @@ def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
             centres = plan.config.lattice.position(cells + 0.5)
             parts.append(cells[plan.grid.within_half_a_halo(other, centres)])
     found: NDArray[np.int64] = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
-    return found
-
-
-def _crossed(city: TileBlend, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Those of the leaf cells (C, 3) whose corners are not all clearly on one side of the surface."""
-    size_m = city.config.leaf_size_m
-    unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
-    values = city.distances_at(corners.astype(np.int64), size_m)[cell_corners]
-    margin_m = _CLEARLY * size_m
-    crossed = (values.min(axis=1) <= margin_m) & (values.max(axis=1) >= -margin_m)
-    found: NDArray[np.int64] = unique[crossed].astype(np.int64)
     return found
 
 
