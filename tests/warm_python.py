@@ -2,9 +2,18 @@
 # SPDX-License-Identifier: MIT
 """A Python that has imported PyTorch and radarsdf already, as a command: imports take seconds, a fork of them takes none.
 
-``warm_python()`` gives the first words of the command; ``-c CODE``, ``-m MODULE`` or a script and their arguments follow. A process
-without threads has imported everything, and forks itself for each command. The command is a small process in front of the
-fork: it hands on its streams, folder, variables and signals, and ends with its status, or is killed with it.
+``warm_python()`` gives the first words of the command; ``-c CODE``, ``-m MODULE`` or a script and their arguments follow. There are
+three kinds of processes:
+
+- the server, one for all tests, which :func:`warm_python` starts. It has imported everything, has no threads, and forks itself for
+  each command (:func:`_serve`);
+- the fork, which does what the command asks for (:func:`_run`);
+- the front, which the test sees as the command: a small process that hands on its streams, folder, variables and signals to the
+  fork, and ends with the status of the fork (:func:`_ask`).
+
+Front and server have a connection for each command. The front sends the length of what it asks for, with its three streams; the
+words, folder and variables as JSON; then a byte for each signal. The server sends the status, four bytes. A connection that ends
+before means that the front was killed: so is the fork.
 
 Not for tests of what is imported, of variables that are read while it is, or of streams that are closed.
 """
@@ -58,11 +67,17 @@ def warm_python() -> list[str]:
 
     atexit.register(end)
     assert server.stdout.readline() == b"ready\n"
-    return [sys.executable, "-I", "-S", __file__, path]
+    return [
+        sys.executable,
+        "-I",
+        "-S",
+        __file__,
+        path,
+    ]  # without site-packages, which take time to look through
 
 
 def _ask(path: str, words: list[str]) -> int:
-    """In front of the fork: its status, that of :func:`os.waitpid`."""
+    """What the front does. Gives the status of the fork, that of :func:`os.waitpid`."""
     with socket.socket(socket.AF_UNIX) as server:
         server.connect(path)
         asked = json.dumps([words, str(Path.cwd()), dict(os.environ)]).encode()
@@ -77,6 +92,7 @@ def _ask(path: str, words: list[str]) -> int:
 
 
 def _serve(path: str) -> None:
+    """What the server does, until the tests have ended."""
     for name in _IMPORTED:
         __import__(name)
     with socket.socket(socket.AF_UNIX) as listener, selectors.DefaultSelector() as waiting:
@@ -86,7 +102,9 @@ def _serve(path: str) -> None:
         sys.stdout.flush()
         waiting.register(listener, selectors.EVENT_READ)
         waiting.register(0, selectors.EVENT_READ)  # closed where the tests have ended
-        children: dict[int, tuple[int, socket.socket]] = {}  # by pidfd and by connection
+        children: dict[
+            int, tuple[int, socket.socket]
+        ] = {}  # forks by their pidfds, with the connections of their fronts
         while True:
             for key, _ in waiting.select():
                 if key.fileobj == 0:
@@ -99,8 +117,8 @@ def _serve(path: str) -> None:
                         continue
                     ended = os.pidfd_open(child)
                     children[ended] = child, front
-                    waiting.register(front, selectors.EVENT_READ, ended)
-                    waiting.register(ended, selectors.EVENT_READ, ended)
+                    for either in (front, ended):  # the front has a signal or is gone; the fork has ended
+                        waiting.register(either, selectors.EVENT_READ, ended)
                 elif key.data not in children:
                     continue  # it ended while its front was killed
                 elif isinstance(key.fileobj, socket.socket):
@@ -122,7 +140,7 @@ def _serve(path: str) -> None:
 
 
 def _forked(front: socket.socket) -> int | None:
-    """The child that does what a command asks for; None if the command was gone before it asked."""
+    """The number of the fork that does what a front asks for; None if the front was gone before it asked."""
     length, streams, _, _ = socket.recv_fds(front, 8, 3)
     asked = b""
     while len(asked) < int.from_bytes(length, "big"):
@@ -140,7 +158,7 @@ def _forked(front: socket.socket) -> int | None:
 
 
 def _run(words: list[str], folder: str, environment: dict[str, str]) -> None:
-    """What a Python does between its start and its end."""
+    """What the fork does: all that a Python does between its start and its end."""
     os.closerange(3, 1024)
     os.chdir(folder)
     os.environ.clear()
