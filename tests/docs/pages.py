@@ -23,6 +23,13 @@ _FENCE = re.compile(r"^```(\S*)\s*$")
 _NOT_RUN = re.compile(r"^<!-- not run: (.+) -->$")
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")
 _LEFT_OUT = "…"
+_SHORT_MAIN = """
+import sys
+from radarsdf.cli import main
+from tests.short import shorten
+shorten(setattr)
+sys.exit(main())
+"""
 
 
 @dataclass(frozen=True)
@@ -114,7 +121,7 @@ def shell_environment(folder: Path) -> dict[str, str]:
     tools = folder / "tools"
     tools.mkdir()
     python = shlex.join(warm_python())
-    for name, words in (("radarsdf", f"{python} -m radarsdf"), ("python", python)):
+    for name, words in (("radarsdf", f"{python} -c {shlex.quote(_SHORT_MAIN)}"), ("python", python)):
         script = tools / name
         script.write_text(f'#!/bin/sh\nexec {words} "$@"\n', encoding="utf-8")
         script.chmod(0o755)

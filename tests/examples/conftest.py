@@ -1,0 +1,14 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Short fits of short drives."""
+
+from __future__ import annotations
+
+import pytest
+
+from ..short import shorten
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    shorten(monkeypatch.setattr)

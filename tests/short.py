@@ -1,0 +1,42 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Pages and examples are about words and files: what they fit need not be good, and their drives need not be long."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import radarsdf
+from radarsdf.budget.schedule import Schedule
+
+from .poses.drift import first
+
+_SCANS = {"hugin": 12, "oculii": 90}  # so many tell an IMU's axes
+
+
+def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
+    """A tenth of the training, and the first scans of simulated drives."""
+    usual = Schedule.of
+
+    def short(*given, **named):
+        found = usual(*given, **named)
+        return dataclasses.replace(
+            found,
+            sdf_iterations=min(found.sdf_iterations, 30),
+            intensity_iterations=min(found.intensity_iterations, 60),
+        )
+
+    set_attribute(Schedule, "of", short)
+    for name, scans in _SCANS.items():
+        set_attribute(radarsdf.simulate, name, _begun(getattr(radarsdf.simulate, name), scans))
+
+
+def _begun(drive, scans):
+    @functools.wraps(drive)
+    def begun(*given, **named):
+        return first(drive(*given, **named), scans)
+
+    return begun
