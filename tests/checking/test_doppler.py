@@ -106,6 +106,7 @@ def test_returns_in_one_direction_have_no_velocity():
     assert not sensor_velocity(points, np.full(100, -7.0)).found
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_good_doppler_says_only_what_moves(drive):
     points, poses, doppler, times = drive
     found = radarsdf.check(points, poses, doppler_mps=doppler, times_s=times)
@@ -115,6 +116,7 @@ def test_good_doppler_says_only_what_moves(drive):
     assert 9 < share < 12
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_the_other_sign_is_noted(drive):
     points, poses, doppler, times = drive
     found = named(radarsdf.check(points, poses, doppler_mps=[-d for d in doppler], times_s=times))
@@ -130,17 +132,20 @@ def test_a_turned_sensor_is_named(drive):
     assert "sensor_turned" in named(found)
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_a_clock_that_is_off_is_named(drive):
     points, poses, doppler, times = drive
     found = named(radarsdf.check(points[2:], poses[:-2], doppler_mps=doppler[2:], times_s=times[2:]))
     assert found.get("clock_offset") == "error"
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_doppler_as_intensity_is_named(drive):
     points, poses, doppler, _ = drive
     assert named(radarsdf.check(points, poses, doppler))["intensity_is_doppler"] == "error"
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_intensity_as_doppler_is_named(drive):
     points, poses, _, times = drive
     intensities = [100 - 20 * np.log10(np.linalg.norm(scan, axis=1)) for scan in points]

@@ -82,6 +82,7 @@ def test_a_breakage_is_named(good, finding):
 @pytest.mark.parametrize(
     ("axis", "degrees", "words"), [("z", -45, "-45 degrees of yaw"), ("y", 15, "15 degrees of pitch")]
 )
+@pytest.mark.parametrize("good", ["wall", "astyx"], indirect=True)
 def test_how_far_a_sensor_is_turned_is_said(good, axis, degrees, words):
     points, poses = good
     found = radarsdf.check(points, of_vehicle(poses, axis, degrees))
@@ -137,7 +138,7 @@ def test_few_sparse_scans_have_no_finding(frames, seed):
 def test_far_from_the_origin_nothing_changes(good):
     points, poses = good
     far = with_positions(poses, poses[:, :3, 3] + [4.5e5, 5.4e6, 100.0])
-    assert worse_than_notes(radarsdf.check(points, far)) == []
+    assert [worse_than_notes(found) for found in found_in(points, far) if worse_than_notes(found)] == []
     for name in ("poses_inverted", "points_in_world_frame"):
         for found in found_in(*BREAKAGES[name](points, far)):
             assert found[0].name == name
@@ -176,4 +177,4 @@ def test_recorded_drives_have_no_finding_until_their_poses_are_inverted(name):
         points = [drive["points"][drive["frame"] == i] for i in range(len(drive["poses"]))]
         poses = drive["poses"]
     assert worse_than_notes(radarsdf.check(points, poses)) == []
-    assert radarsdf.check(points, np.linalg.inv(poses))[0].name == "poses_inverted"
+    assert check_cheaply(points, np.linalg.inv(poses))[0].name == "poses_inverted"

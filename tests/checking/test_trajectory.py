@@ -42,17 +42,20 @@ def test_one_pose_beside_the_others_is_a_jump(good):
     assert names(radarsdf.check(points, poses)) == ["pose_jumps"]
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_a_pause_of_the_recording_is_no_jump(good):
     points, poses = good
     kept = [i for i in range(30) if not 12 <= i < 18]
     assert names(radarsdf.check([points[i] for i in kept], poses[kept])) == []
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_poses_that_are_held_are_named(good):
     points, poses = good
     assert names(radarsdf.check(points, np.repeat(poses[::2], 2, axis=0)))[:1] == ["duplicate_poses"]
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_a_sensor_that_stands_still_is_a_note(good):
     points, poses = good
     still = [0] * 3 + list(range(27))
@@ -63,6 +66,7 @@ def test_a_sensor_that_stands_still_is_a_note(good):
     assert "duplicate_poses" in [finding.name for finding in found]
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_copies_of_scans_are_named(good):
     points, poses = good
     points = [*points[:5], points[4], *points[6:]]
@@ -97,6 +101,7 @@ def test_returns_and_scans_that_are_none_are_named(good):
     assert names(radarsdf.check([*points[:3], hole[:0], *points[4:]], poses)) == ["empty_scans"]
 
 
+@pytest.mark.usefixtures("right_frames")
 def test_times_of_nothing_are_named(good):
     assert names(radarsdf.check(*good, times_s=np.zeros(30))) == ["times"]
 
