@@ -17,7 +17,7 @@ from radarsdf.evaluation import (
     intensity_metrics,
     surface_metrics,
 )
-from scipy.spatial.distance import cdist
+from scipy.spatial import cKDTree
 
 
 def plane(height=0.0, size=4.0, cells=8, offset=(0.0, 0.0, 0.0)):
@@ -36,9 +36,9 @@ def grid(size=4.0, step=0.02, offset=(0.0, 0.0, 0.0)):
 
 
 def by_definition(samples, ground_truth):
-    """The metrics from all pairwise distances, written without regard to speed."""
-    distance = np.concatenate([cdist(part, ground_truth) for part in np.array_split(samples, 20)])
-    accuracy, completion = distance.min(axis=1), np.minimum(distance.min(axis=0), 2.0)
+    """The metrics from all nearest neighbours at once, written without regard to speed."""
+    accuracy = cKDTree(ground_truth).query(samples)[0]
+    completion = np.minimum(cKDTree(samples).query(ground_truth)[0], 2.0)
     kept = accuracy[accuracy <= 0.4]
     a, p, c = np.mean(kept < 0.2), np.mean(accuracy < 0.2), np.mean(completion < 0.2)
     return {
