@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import json
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf import FitConfig, RadarMap
+from radarsdf.render.picture import save_picture
 
 from bench.paper import __main__ as command
 from bench.paper.curve import _LEVERS, budget, medians
@@ -48,7 +50,9 @@ def run(tmp_path, *words):
 
 
 @pytest.mark.usefixtures("peers")
-def test_surface(tmp_path):
+def test_surface(tmp_path, monkeypatch):
+    small = functools.partial(save_picture, width=160, height=100)
+    monkeypatch.setattr("bench.paper.experiment.save_picture", small)
     table, values = run(tmp_path, "surface", "wall", "--peers", "BPA", "Poisson", "--meshes")
     assert sorted(path.name for path in (tmp_path / "meshes").iterdir()) == [
         "wall, 4 frames, BPA.ply",
@@ -77,7 +81,7 @@ def test_angles_are_those_of_the_sphere(tmp_path):
 
 @pytest.mark.usefixtures("peers")
 def test_sparse_gives_every_nth_frame(tmp_path):
-    table, values = run(tmp_path, "sparse", "wall", "--peers", "BPA", "Poisson")
+    table, values = run(tmp_path, "sparse", "wall", "--peers", "BPA", "Poisson", "--samples", "1000")
     assert [row["n"] for row in values["rows"]] == [1, 1, 2, 2]
     assert [row["seconds"] for row in values["rows"] if row["method"] == "BPA"] == [5.0, 3.0]
     assert "Poisson: Open3D is not here" in table
@@ -100,7 +104,9 @@ def test_map_size_of_the_octree_is_the_reference(tmp_path):
 @pytest.mark.usefixtures("peers")
 def test_curve_has_budgets_levers_and_peers(tmp_path):
     words = ("curve", "wall", "--peers", "BPA", "Poisson", "radarsdf", "--repetitions", "3")
-    table, values = run(tmp_path, *words, "--set", "encoding.kind=octree", "encoding.num_levels=2")
+    table, values = run(
+        tmp_path, *words, "--samples", "1000", "--set", "encoding.kind=octree", "encoding.num_levels=2"
+    )
     rows = values["rows"]
     assert [row["repetition"] for row in rows] == sorted([0, 1, 2] * (len(rows) // 3))  # the methods by turns
     methods = {row["method"]: row for row in rows}
@@ -142,7 +148,9 @@ def test_intensity_repeats_with_other_seeds(tmp_path):
     assert " ± " in table
 
 
-def test_ablation_has_all_variants(tmp_path):
+def test_ablation_has_all_variants(tmp_path, monkeypatch):
+    few = {"sdf_iterations": 5, "intensity_iterations": 5}  # enough to differ
+    monkeypatch.setattr("bench.paper.experiment._SHORT", {"training": few})
     table, values = run(tmp_path, "ablation", "wall", "--repetitions", "1")
     variants = [row["variant"] for row in values["rows"]]
     assert variants == ["full", "w/o SDF", "w/o SDF normals", "w/o geometry feature", "w/o viewing direction"]

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import copy
 import json
+import shutil
 
 import pytest
 import trimesh
@@ -39,6 +40,10 @@ def curve_row(kind, method, seconds, share, mae=None):
 
 @pytest.fixture
 def made_up():
+    return made_up_results()
+
+
+def made_up_results():
     parts = {
         "surface": [
             surface_row("radarsdf", 0.75, 3.0),
@@ -84,13 +89,26 @@ def made_up():
     }  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def written_once(tmp_path_factory):
+    """The folder of a document, which no test changes."""
+    folder = tmp_path_factory.mktemp("written")
+    (folder / "results.json").write_text(json.dumps(made_up_results()), encoding="utf-8")
+    command.main(["write", str(folder / "results.json"), "--root", str(folder)])
+    return folder
+
+
 @pytest.fixture
-def written(made_up, tmp_path):
+def written(written_once, tmp_path):
     """The folder of a document, and the file of its results."""
-    path = tmp_path / "results.json"
-    path.write_text(json.dumps(made_up), encoding="utf-8")
-    command.main(["write", str(path), "--root", str(tmp_path)])
-    return tmp_path, path
+    shutil.copytree(written_once, tmp_path, dirs_exist_ok=True)
+    return tmp_path, tmp_path / "results.json"
+
+
+@pytest.fixture
+def without_plots(monkeypatch):
+    """Most of the time of a document is that of its plots, which other tests look at."""
+    monkeypatch.setattr(command, "draw", lambda *_: None)
 
 
 def check(root, path):
@@ -164,6 +182,7 @@ def test_the_same_results_give_the_same_files(written):
 BLOCK = "<!-- measured: {} -->\n{}<!-- end -->\n"
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_pages_get_the_figures_of_the_run(made_up, written):
     root, path = written
     page = root / "README.md"
