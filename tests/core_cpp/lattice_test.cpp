@@ -69,19 +69,21 @@ TEST_CASE("a Morton key gives its coordinates back, and shifted its parent's") {
 
 TEST_CASE("the flat map is a map") {
   std::mt19937_64 generator(2);
+  std::vector<std::uint64_t> keys(16000);  // random: the hash gives each of consecutive numbers a place of its own
+  for (std::uint64_t& key : keys) key = generator() >> 1;
   std::map<std::uint64_t, std::int32_t> expected;
   radarsdf::FlatMap map;
   for (std::int32_t i = 0; i < 20000; ++i) {
-    const std::uint64_t key = generator() % 15000;
+    const std::uint64_t key = keys[generator() % 15000];
     CHECK(map.insert(key, i) == expected.insert({key, i}).second);
   }
   CHECK(map.size() == expected.size());
-  for (std::uint64_t key = 0; key < 16000; ++key) {
+  for (const std::uint64_t key : keys) {
     const auto found = expected.find(key);
     REQUIRE(map.find(key) == (found == expected.end() ? -1 : found->second));
   }
   for (std::int32_t i = 0; i < 40000; ++i) {  // comes and goes: what is left is found, wherever it was moved to
-    const std::uint64_t key = generator() % 15000;
+    const std::uint64_t key = keys[generator() % 15000];
     if (generator() % 3 == 0) {
       CHECK(map.insert(key, i) == expected.insert({key, i}).second);
     } else {
@@ -89,7 +91,7 @@ TEST_CASE("the flat map is a map") {
     }
   }
   CHECK(map.size() == expected.size());
-  for (std::uint64_t key = 0; key < 16000; ++key) {
+  for (const std::uint64_t key : keys) {
     const auto found = expected.find(key);
     REQUIRE(map.find(key) == (found == expected.end() ? -1 : found->second));
   }
