@@ -295,5 +295,15 @@ TEST_CASE("a table refuses what it cannot hold") {
   CHECK_THROWS_AS(VertexTable({1}, 0, 1, Encoding::kOctree, 1), std::invalid_argument);
   CHECK_THROWS_AS(VertexTable({1}, 1, 0, Encoding::kOctree, 1), std::invalid_argument);
   CHECK_THROWS_AS(VertexTable({1}, 1, radarsdf::kMaxLevels + 1, Encoding::kOctree, 1), std::invalid_argument);
-  CHECK_THROWS_AS(VertexTable({~std::uint64_t{0} >> 1}, 1, 1, Encoding::kOctree, 1), std::invalid_argument);
+  CHECK_THROWS_AS(VertexTable({std::uint64_t{1} << 63}, 1, 1, Encoding::kOctree, 1), std::invalid_argument);
+  for (std::size_t axis = 0; axis < 3; ++axis) {  // the far vertex of a cell of the coarser level must fit, too
+    std::uint32_t cell[3] = {};
+    const auto key_at = [&](std::uint32_t coordinate) {
+      cell[axis] = coordinate;
+      return radarsdf::morton_key(cell[0], cell[1], cell[2]);
+    };
+    constexpr std::uint32_t kEnd = (1u << radarsdf::kAxisBits) - 4;
+    CHECK(VertexTable({key_at(kEnd - 1)}, 1, 2, Encoding::kOctree, 1).num_rows() == 16);
+    CHECK_THROWS_AS(VertexTable({key_at(kEnd)}, 1, 2, Encoding::kOctree, 1), std::invalid_argument);
+  }
 }
