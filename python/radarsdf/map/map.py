@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any, overload
 
@@ -37,8 +38,8 @@ class Map(MapParts):
 
     Queries take world coordinates, m, as NumPy arrays or CPU tensors. Results are of the same kind: float64
     for float64 coordinates and lists, otherwise float32. Coordinates are converted to the local frame in
-    float64, so large ones such as UTM lose no precision. Several threads may query a map at once. A map can
-    be pickled for other processes.
+    float64, so large ones such as UTM lose no precision. Positions of another shape than (N, 3) are a ValueError. Several
+    threads may query a map at once. A map can be pickled for other processes.
 
     A map knows the cells near returns, see :meth:`observed`. Elsewhere, in free space too, and at positions that are
     not finite, the signed distance, gradient and intensity are NaN. Where there are no returns round a position, the
@@ -63,15 +64,9 @@ class Map(MapParts):
         Returns
         -------
         (N,) array or tensor
-            Signed distance, m, positive in free space and zero on the surface. NaN where `x` is not
-            :meth:`observed`, or not finite: free space far from surfaces is not told from the unknown. It is learnt
-            along the sensor's rays. So it is longer than the shortest distance where rays meet the surface at a flat
-            angle.
-
-        Raises
-        ------
-        ValueError
-            If `x` does not have shape (N, 3).
+            Signed distance, m, positive in free space and zero on the surface. NaN where `x` is not :meth:`observed`, or not
+            finite: free space far from surfaces is not told from the unknown. It is learnt along the sensor's rays. So it is
+            longer than the shortest distance where rays meet the surface at a flat angle.
         """
         world, answer = as_positions(x)
         return answer(self._sdf(world, extrapolate))
@@ -117,18 +112,12 @@ class Map(MapParts):
         Returns
         -------
         (N,) array or tensor
-            (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells round the point, interpolated between cells, and
-            a floor that no number of returns makes smaller, added in quadrature; m. The noise σ of a return is
-            that along the beam and across it together; see ``report["noise"]``. It grows with the range, so that
-            far returns tell less than near ones. The floor is 0.05 leaf cells, and up to 1.1 more where much
-            of the returns lies on no thin surface (:attr:`rough_share`). NaN where there are no returns in the
-            cells round `x`, and where it is not finite. Errors of the poses count if ``returns.pose_sigma_m`` and
-            ``pose_sigma_rad`` in the :class:`FitConfig` state them.
-
-        Raises
-        ------
-        ValueError
-            If `x` does not have shape (N, 3).
+            (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells round the point, interpolated between cells, and a floor that
+            no number of returns makes smaller, added in quadrature; m. The noise σ of a return is that along the beam and
+            across it together; see ``report["noise"]``. It grows with the range, so that far returns tell less than near
+            ones. The floor is 0.05 leaf cells, and up to 1.1 more where much of the returns lies on no thin surface
+            (:attr:`rough_share`). NaN where there are no returns in the cells round `x`, and where it is not finite. Errors
+            of the poses count if ``returns.pose_sigma_m`` and ``pose_sigma_rad`` in the :class:`FitConfig` state them.
         """
         world, answer = as_positions(x)
         return answer(self._uncertainty(world))
@@ -199,7 +188,6 @@ class Map(MapParts):
         sensors, _ = as_positions(sensor_positions, rows=len(world))
         return answer(self._intensity(world, sensors, extrapolate))
 
-    @abstractmethod
     def mesh(
         self,
         voxel_size: float = queries.VOXEL_M,
@@ -239,11 +227,10 @@ class Map(MapParts):
         Returns
         -------
         trimesh.Trimesh
-            World frame, m. Triangles and vertex normals face free space. The mesh is empty if there is no
-            surface. The vertices have their :meth:`confidence` as ``mesh.vertex_attributes["confidence"]``,
-            and their :meth:`uncertainty` as ``"uncertainty_m"``.
-            In ``mesh.metadata``, `leaf_cells` is the number of leaf cells, and `leaf_cells_searched` of those
-            in which the surface can be; `min_confidence` is what was kept from, `expected_precision` and
+            World frame, m. Triangles and vertex normals face free space. The mesh is empty if there is no surface. The
+            vertices have their :meth:`confidence` as ``mesh.vertex_attributes["confidence"]``, and their :meth:`uncertainty`
+            as ``"uncertainty_m"``. In ``mesh.metadata``, `leaf_cells` is the number of leaf cells, and `leaf_cells_searched`
+            of those in which the surface can be; `min_confidence` is what was kept from, `expected_precision` and
             `expected_completion` are the shares of it that are expected to be true and of the truth that it is expected to
             cover, and `whole_precision` and `whole_completion` are those if all were kept.
 
@@ -254,6 +241,18 @@ class Map(MapParts):
         MemoryError
             If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
+        from radarsdf.map.meshing import mesh_seen_from  # noqa: PLC0415 - trimesh is slow to import
+
+        make = partial(
+            self._surface_mesh,
+            voxel_size,
+            box=box,
+            min_confidence=min_confidence,
+            max_uncertainty=max_uncertainty,
+            min_component_triangles=min_component_triangles,
+            progress=progress,
+        )
+        return mesh_seen_from(self, viewpoint, make)
 
     def grid(
         self,
@@ -301,7 +300,7 @@ class Map(MapParts):
         MemoryError
             If the box has more than 2²⁸ voxels.
         """
-        from radarsdf.map.gridding import make_grid  # noqa: PLC0415 - it imports trimesh, which is slow
+        from radarsdf.map.gridding import make_grid  # noqa: PLC0415 - as above
 
         return make_grid(self, box, voxel_size, occupied_from, free_to)
 

@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +25,9 @@ from radarsdf.map.voxels import sample_lattice
 
 with whole_import():
     import trimesh
+
+if TYPE_CHECKING:
+    from radarsdf.map.map import Map
 
 
 class TriangleLimits(NamedTuple):
@@ -169,43 +173,46 @@ class Surface:
         return mesh
 
 
+def mesh_seen_from(
+    radar_map: Map, viewpoint: ArrayLike | None, make: Callable[[], trimesh.Trimesh]
+) -> trimesh.Trimesh:
+    """The mesh of a map that `make` makes, with the intensities that are predicted for a viewpoint, if there is one."""
+    scale = radar_map.intensity_scale
+    sensor_position = None if viewpoint is None else check_viewpoint(scale, viewpoint)
+    mesh = make()
+    if sensor_position is not None and scale is not None:
+        vertices: Any = mesh.vertices
+        intensity = radar_map.intensity(
+            np.array(vertices, np.float64), sensor_position, extrapolate=True
+        ).astype(np.float32)
+        mesh.vertex_attributes["intensity"] = intensity
+        colors = intensity_colors(intensity, scale.low, scale.high)
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
+    return mesh
+
+
 def extract_mesh(
     contents: MapContents,
     voxel_size: float,
     *,
     box: ArrayLike | None,
-    viewpoint: ArrayLike | None,
     progress: bool | None,
     **wanted: Any,
 ) -> trimesh.Trimesh:
-    """See :meth:`Map.mesh`, of which `wanted` are the limits."""
+    """The mesh of one map. See :meth:`Map.mesh`, of which `wanted` are the limits."""
     voxel_size = positive(voxel_size, "voxel_size")
     if voxel_size > MAX_POSITION_M:
         msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
         raise ValueError(msg)
     limits = Limits.of(voxel_size, **wanted)
-    sensor_position = None if viewpoint is None else check_viewpoint(contents.intensity_scale, viewpoint)
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)
-    mesh = surface.mesh(contents.origin, limits, len(contents.evidence.looks))
-    if sensor_position is not None:
-        points, _ = queries.into_cells(contents, local(contents, np.array(mesh.vertices, np.float64)))
-        sensors = local(contents, np.array(sensor_position[None])).expand(len(points), 3)
-        assert contents.intensity_scale is not None
-        add_intensity(mesh, queries.intensity(contents, points, sensors).numpy(), contents.intensity_scale)
-    return mesh
+    return surface.mesh(contents.origin, limits, len(contents.evidence.looks))
 
 
 def local(contents: WholeMap, world: NDArray[np.float64]) -> torch.Tensor:
     """Positions (N, 3) in the world, m, in the local frame, float32."""
     return queries.to_local(contents, torch.from_numpy(world))
-
-
-def add_intensity(mesh: trimesh.Trimesh, intensity: NDArray[np.float32], scale: IntensityScale) -> None:
-    """Gives the vertices of a mesh intensities (V,), sensor units, and colours."""
-    mesh.vertex_attributes["intensity"] = intensity
-    colors = intensity_colors(intensity, scale.low, scale.high)
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
 
 
 def check_viewpoint(scale: IntensityScale | None, viewpoint: ArrayLike) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from radarsdf.map.contents import MapContents
 from radarsdf.returns.echoes import EchoesAt
 
 if TYPE_CHECKING:
+    import trimesh
+
     from radarsdf.map.gridding import CellsInBox
     from radarsdf.map.views import ViewedMap
 
@@ -71,6 +73,10 @@ class MapParts(ABC):
     @abstractmethod
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         """:meth:`Map.intensity` there, (N,), for sensors at (N, 3)."""
+
+    @abstractmethod
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
+        """:meth:`Map.mesh` without intensities. `wanted`: its arguments but for the viewpoint."""
 
     @abstractmethod
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:

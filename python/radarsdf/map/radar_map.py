@@ -10,7 +10,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from radarsdf.config.fit_config import FitConfig
@@ -65,29 +65,10 @@ class RadarMap(Map):
         local = (queries.to_local(self._contents, given) for given in positions)
         return queries.answers_at(self._contents, query, *local, extrapolate=extrapolate)
 
-    def mesh(
-        self,
-        voxel_size: float = queries.VOXEL_M,
-        *,
-        box: ArrayLike | None = None,
-        viewpoint: ArrayLike | None = None,
-        min_confidence: float | None = None,
-        max_uncertainty: float | None = None,
-        min_component_triangles: int | None = None,
-        progress: bool | None = None,
-    ) -> trimesh.Trimesh:
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
         from radarsdf.map.meshing import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
 
-        return extract_mesh(
-            self._contents,
-            voxel_size,
-            box=box,
-            viewpoint=viewpoint,
-            min_confidence=min_confidence,
-            max_uncertainty=max_uncertainty,
-            min_component_triangles=min_component_triangles,
-            progress=progress,
-        )
+        return extract_mesh(self._contents, voxel_size, **wanted)
 
     def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellsInBox:
         from radarsdf.map.gridding import CellsInBox, dense_cells  # noqa: PLC0415 - it imports trimesh, which is slow

@@ -131,21 +131,24 @@ class TiledMap(TileBlend, Map):
         Each tile is a task for the `executor`. `voxel_size` must divide the leaf cell's edge. :meth:`export` writes a mesh
         that does not fit into memory.
         """
-        from radarsdf.map.meshing import add_intensity, check_viewpoint  # noqa: PLC0415 - trimesh is slow to import
-        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - likewise
+        from radarsdf.map.meshing import mesh_seen_from  # noqa: PLC0415 - trimesh is slow to import
 
-        sensor_position = None if viewpoint is None else check_viewpoint(self.intensity_scale, viewpoint)
-        mesh = mesh_of(
-            self, voxel_size, executor, progress,
+        make = partial(
+            self._surface_mesh,
+            voxel_size,
             box=box,
             min_confidence=min_confidence,
             max_uncertainty=max_uncertainty,
             min_component_triangles=min_component_triangles,
-        )  # fmt: skip
-        if sensor_position is not None and self.intensity_scale is not None:
-            values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position, extrapolate=True)
-            add_intensity(mesh, values.astype(np.float32), self.intensity_scale)
-        return mesh
+            executor=executor,
+            progress=progress,
+        )
+        return mesh_seen_from(self, viewpoint, make)
+
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
+        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - as above
+
+        return mesh_of(self, voxel_size, **wanted)
 
     def cells_round(self, lower: _Floats, upper: _Floats) -> CellsInBox:
         from radarsdf.tiles.gridding import cells_of_tiles  # noqa: PLC0415 - it imports trimesh, which is slow
