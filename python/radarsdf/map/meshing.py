@@ -159,18 +159,34 @@ class Surface:
 
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """What the limits leave, in the world; `leaf_cells` of the whole map."""
-        mesh = self.part(origin, self.kept(limits))
-        mesh.metadata |= {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
-        mesh.metadata |= self.threshold(limits).metadata
-        return mesh
+        used, faces = renumbered(len(self.vertices), self.faces[self.kept(limits)])
+        return described_mesh(
+            self.vertices[used] + origin,
+            faces,
+            self.confidence[used],
+            self.uncertainty_m[used],
+            self.threshold(limits),
+            leaf_cells,
+            self.cells_searched,
+        )
 
-    def part(self, origin: NDArray[np.float64], kept: NDArray[np.bool_]) -> trimesh.Trimesh:
-        """The faces that are `kept` (F,), in the world."""
-        used, faces = renumbered(len(self.vertices), self.faces[kept])
-        mesh = trimesh.Trimesh(self.vertices[used] + origin, faces, process=False)
-        mesh.vertex_attributes["confidence"] = self.confidence[used]
-        mesh.vertex_attributes["uncertainty_m"] = self.uncertainty_m[used]
-        return mesh
+
+def described_mesh(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.integer[Any]],
+    confidence: NDArray[np.float32],
+    uncertainty_m: NDArray[np.float32],
+    threshold: Threshold,
+    leaf_cells: int,
+    cells_searched: int,
+) -> trimesh.Trimesh:
+    """The mesh of vertices (V, 3), world, m, with all that :meth:`Map.mesh` says of a mesh without intensities."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.vertex_attributes["confidence"] = confidence
+    mesh.vertex_attributes["uncertainty_m"] = uncertainty_m
+    mesh.metadata |= {"leaf_cells": leaf_cells, "leaf_cells_searched": cells_searched}
+    mesh.metadata |= threshold.metadata
+    return mesh
 
 
 def mesh_seen_from(

@@ -7,17 +7,16 @@ from __future__ import annotations
 from concurrent.futures import Executor
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.budget.estimate import check_triangles
 from radarsdf.checks import check_box, path_of, positive
-from radarsdf.interrupts import whole_import
 from radarsdf.io.files import whole_file
 from radarsdf.io.records import face_records, ply_header, records
-from radarsdf.map.meshing import Limits
+from radarsdf.map.meshing import Limits, described_mesh
 from radarsdf.map.threshold import Threshold
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.pieces import PieceSettings, divides, mesh_tile, piece_path, write_piece
@@ -25,7 +24,7 @@ from radarsdf.tiles.running import Task, run_tasks
 from radarsdf.tiles.tileset import content_folder, write_tileset
 from radarsdf.tiles.welding import WeldedMesh, tally_of
 
-with whole_import():
+if TYPE_CHECKING:
     import trimesh
 
 
@@ -40,16 +39,16 @@ def mesh_of(
     welded = _welded(city, voxel_size, executor, progress, **limits)
     check_triangles(welded.num_faces, city.config.max_memory_bytes)
     parts = list(welded.parts())
-    mesh = trimesh.Trimesh(
+    leaf_cells, cells_searched = welded.cells.tolist()
+    return described_mesh(
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.faces for part in parts]),
-        process=False,
+        np.concatenate([part.confidence for part in parts]),
+        np.concatenate([part.uncertainty_m for part in parts]),
+        welded.threshold,
+        leaf_cells,
+        cells_searched,
     )
-    mesh.metadata |= {"leaf_cells": int(welded.cells[0]), "leaf_cells_searched": int(welded.cells[1])}
-    mesh.metadata |= welded.threshold.metadata
-    mesh.vertex_attributes["confidence"] = np.concatenate([part.confidence for part in parts])
-    mesh.vertex_attributes["uncertainty_m"] = np.concatenate([part.uncertainty_m for part in parts])
-    return mesh
 
 
 def export_mesh(
