@@ -159,15 +159,21 @@ class Surface:
 
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """What the limits leave, in the world; `leaf_cells` of the whole map."""
-        used, faces = renumbered(len(self.vertices), self.faces[self.kept(limits)])
+        return self.part(
+            origin,
+            self.kept(limits),
+            leaf_cells=leaf_cells,
+            leaf_cells_searched=self.cells_searched,
+            **self.threshold(limits).metadata,
+        )
+
+    def part(
+        self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
+    ) -> trimesh.Trimesh:
+        """The faces that are `kept` (F,), in the world."""
+        used, faces = renumbered(len(self.vertices), self.faces[kept])
         return described_mesh(
-            self.vertices[used] + origin,
-            faces,
-            self.confidence[used],
-            self.uncertainty_m[used],
-            self.threshold(limits),
-            leaf_cells,
-            self.cells_searched,
+            self.vertices[used] + origin, faces, self.confidence[used], self.uncertainty_m[used], **metadata
         )
 
 
@@ -176,16 +182,13 @@ def described_mesh(
     faces: NDArray[np.integer[Any]],
     confidence: NDArray[np.float32],
     uncertainty_m: NDArray[np.float32],
-    threshold: Threshold,
-    leaf_cells: int,
-    cells_searched: int,
+    **metadata: float,
 ) -> trimesh.Trimesh:
-    """The mesh of vertices (V, 3), world, m, with all that :meth:`Map.mesh` says of a mesh without intensities."""
+    """The mesh of vertices (V, 3), world, m, with what is known of them and of all."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.vertex_attributes["confidence"] = confidence
     mesh.vertex_attributes["uncertainty_m"] = uncertainty_m
-    mesh.metadata |= {"leaf_cells": leaf_cells, "leaf_cells_searched": cells_searched}
-    mesh.metadata |= threshold.metadata
+    mesh.metadata |= metadata
     return mesh
 
 

@@ -45,9 +45,9 @@ def mesh_of(
         np.concatenate([part.faces for part in parts]),
         np.concatenate([part.confidence for part in parts]),
         np.concatenate([part.uncertainty_m for part in parts]),
-        welded.threshold,
-        leaf_cells,
-        cells_searched,
+        leaf_cells=leaf_cells,
+        leaf_cells_searched=cells_searched,
+        **welded.threshold.metadata,
     )
 
 
