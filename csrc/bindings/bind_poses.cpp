@@ -2,13 +2,13 @@
 // SPDX-License-Identifier: MIT
 #include <pybind11/stl.h>
 
-#include <array>
 #include <memory>
 
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "poses/common_planes.hpp"
 #include "poses/local_planes.hpp"
+#include "returns/return_noise.hpp"
 
 namespace radarsdf {
 namespace {
@@ -17,10 +17,6 @@ void check_blocks(const Array<double>& blocks, std::int64_t count, const char* n
   if (blocks.ndim() != 3 || blocks.shape(0) != count || blocks.shape(1) != kPose || blocks.shape(2) != kPose) {
     throw std::invalid_argument(std::string(name) + " must have shape (" + std::to_string(count) + ", 6, 6)");
   }
-}
-
-ReturnVariances variances_of(const std::array<double, 3>& variances) {
-  return {variances[0], variances[1], variances[2]};
 }
 
 void bind_local_planes(py::module_& m) {
@@ -39,7 +35,7 @@ void bind_local_planes(py::module_& m) {
       .def(
           "beside",
           [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& pose,
-             const std::array<double, 3>& variances) {
+             const VarianceNumbers& variances) {
             const std::int64_t count = check_points(points);
             check_shape(pose, 4, 4, "pose");
             const Agreement found = planes.beside(points.data(), count, pose.data(), variances_of(variances));
@@ -57,7 +53,7 @@ void bind_local_planes(py::module_& m) {
       .def(
           "scores",
           [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& poses,
-             const std::array<double, 3>& variances) {
+             const VarianceNumbers& variances) {
             const std::int64_t count = check_points(points);
             if (poses.ndim() != 3 || poses.shape(1) != 4 || poses.shape(2) != 4) {
               throw std::invalid_argument("poses must have shape (K, 4, 4)");
@@ -81,7 +77,7 @@ void bind_poses(py::module_& m) {
       .def(py::init([](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
                        const Array<std::int32_t>& scans, const Array<std::int32_t>& planes,
                        const Array<double>& positions, const Array<double>& up_of_scan, const Array<double>& centres,
-                       const Array<double>& normals, double extent_m, const std::array<double, 3>& variances,
+                       const Array<double>& normals, double extent_m, const VarianceNumbers& variances,
                        std::int64_t scans_together, int num_threads) {
              const std::int64_t count = check_points(points);
              check_shape(directions, count, 3, "directions");

@@ -2,12 +2,12 @@
 // SPDX-License-Identifier: MIT
 #include <pybind11/stl.h>
 
-#include <array>
 #include <memory>
 
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "returns/onto_planes.hpp"
+#include "returns/return_noise.hpp"
 #include "returns/surface_crossings.hpp"
 
 namespace radarsdf {
@@ -58,7 +58,7 @@ void bind_surface_crossings(py::module_& m) {
       [](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
          const Array<std::int32_t>& scans, const Array<double>& up_of_scan, const Array<std::int32_t>& planes,
          const Array<double>& centres, const Array<double>& normals, const Array<double>& variances_m2,
-         const std::array<double, 3>& noise, int num_threads) {
+         const VarianceNumbers& noise, int num_threads) {
         const std::int64_t count = check_points(points), num_planes = check_column(variances_m2, "variances_m2");
         check_shape(directions, count, 3, "directions");
         check_shape(up_of_scan, up_of_scan.ndim() == 2 ? up_of_scan.shape(0) : 0, 3, "up_of_scan");
@@ -80,7 +80,7 @@ void bind_surface_crossings(py::module_& m) {
         const MovedRays moved{new_points.mutable_data(), new_directions.mutable_data(), new_ranges.mutable_data()};
         {
           const py::gil_scoped_release release;
-          move_onto_planes(rays, all, {noise[0], noise[1], noise[2]}, moved, num_threads);
+          move_onto_planes(rays, all, variances_of(noise), moved, num_threads);
         }
         return py::make_tuple(new_points, new_directions, new_ranges);
       },

@@ -5,6 +5,7 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 
 namespace radarsdf {
@@ -13,6 +14,11 @@ namespace radarsdf {
 struct ReturnVariances {
   double range_m2, azimuth_rad2, elevation_rad2;
 };
+
+// The same as Python gives them: `SensorNoise.variances`.
+using VarianceNumbers = std::array<double, 3>;
+
+inline ReturnVariances variances_of(const VarianceNumbers& numbers) { return {numbers[0], numbers[1], numbers[2]}; }
 
 template <typename A, typename B>
 double dot3(const A* a, const B* b) {
