@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from radarsdf.map.radar_map import load
+from radarsdf.map.radar_map import load_file
 
 from bench.paper.report import markdown
 
@@ -80,7 +80,7 @@ def kill_savers(folder: Path, kills: int, python: Sequence[str] = (sys.executabl
 
 def _content(path: Path) -> bytes:
     """All numbers of a map. The bytes of its file are not compared: safetensors writes metadata in random order."""
-    field = load(path).field
+    field = load_file(path).field
     numbers = [field.cells.table.leaf_keys(), *(tensor.numpy() for tensor in field.state_dict().values())]
     return b"".join(array.tobytes() for array in numbers)
 
@@ -102,7 +102,7 @@ def fill_disk(folder: Path) -> list[int]:
     """
     old, new = samples.maps()
     (folder / "new").write_bytes(new)
-    radar_map = load(folder / "new")
+    radar_map = load_file(folder / "new")
     disk, refused = folder / "disk", []
     disk.mkdir()
     target, page = disk / "map.safetensors", os.sysconf("SC_PAGESIZE")

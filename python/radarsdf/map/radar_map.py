@@ -157,7 +157,7 @@ class RadarMap(Map):
         return self._contents.field
 
 
-def load(path: str | PathLike[str]) -> RadarMap:
+def load_file(path: str | PathLike[str]) -> RadarMap:
     """Reads a map that :meth:`Map.save` wrote. Nothing in the file is executed.
 
     Parameters

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
 from radarsdf.map.map import Map
-from radarsdf.map.radar_map import load as load_file
+from radarsdf.map.radar_map import load_file
 from radarsdf.returns.rays import Rays
 from radarsdf.tiles.tiled_map import TiledMap
 
