@@ -29,8 +29,11 @@ def test_sparse_lattice_at_the_limits():
     assert len(sparse_lattice([[-(2**31), 0, 0], [2**31 - 2, 0, 0]])[1]) == 16
     with pytest.raises(ValueError, match="beyond int32"):
         sparse_lattice([[2**31 - 1, 0, 0]])
-    with pytest.raises(ValueError, match="too far apart"):
-        sparse_lattice([[-(2**31)] * 3, [2**31 - 2] * 3])
+    last = 2**21 - 2  # the lower corner of a cell: corners to 2^21 - 1 along three axes take 63 bits
+    assert sparse_lattice([[0, 0, 0], [last] * 3])[1][[0, -1]].tolist() == [[0, 0, 0], [last + 1] * 3]
+    for far in ([last + 1, last, last], [2**31 - 2] * 3):
+        with pytest.raises(ValueError, match="too far apart"):
+            sparse_lattice([[0, 0, 0], far])
     with pytest.raises(ValueError, match="range of int32"):
         sparse_lattice([[2**31, 0, 0]])
     with pytest.raises(TypeError, match="integers"):
