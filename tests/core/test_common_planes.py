@@ -140,3 +140,6 @@ def test_shapes_are_checked():
     for place, wrong, match in ((3, given[3][::-1].copy(), "ascend"), (4, given[4] + 12, "planes must lie")):
         with pytest.raises(ValueError, match=match):
             CommonPlanes(*given[:place], wrong, *given[place + 1 :], EXTENT_M, VARIANCES, 3)
+    for extent_m, scans_together in ((0.0, 3), (np.nan, 3), (EXTENT_M, 0)):
+        with pytest.raises(ValueError, match="must be positive"):
+            CommonPlanes(*given, extent_m, VARIANCES, scans_together)
