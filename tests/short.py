@@ -11,6 +11,8 @@ from typing import Any
 
 import radarsdf
 from radarsdf.budget.schedule import Schedule
+from radarsdf.checking import frames
+from radarsdf.render import picture
 
 from .poses.drift import first
 
@@ -18,7 +20,7 @@ _SCANS = {"hugin": 12, "oculii": 90}  # so many tell an IMU's axes
 
 
 def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
-    """A tenth of the training, and the first scans of simulated drives."""
+    """A tenth of the training, the first scans of simulated drives, a quarter of the pairs in checks, small pictures."""
     usual = Schedule.of
 
     def short(*given, **named):
@@ -30,6 +32,13 @@ def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
         )
 
     set_attribute(Schedule, "of", short)
+    usual_picture = picture.save_picture
+
+    def small(*given, **named):
+        usual_picture(*given, **named | {"width": 160, "height": 100})
+
+    set_attribute(picture, "save_picture", small)
+    set_attribute(frames, "FULL", dataclasses.replace(frames.FULL, pairs=12))
     for name, scans in _SCANS.items():
         set_attribute(radarsdf.simulate, name, _begun(getattr(radarsdf.simulate, name), scans))
 
@@ -37,6 +46,6 @@ def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
 def _begun(drive, scans):
     @functools.wraps(drive)
     def begun(*given, **named):
-        return first(drive(*given, **named), scans)
+        return first(drive, scans, *given, **named)
 
     return begun

@@ -9,9 +9,9 @@ import pytest
 import radarsdf
 from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.io.scans import Scans
-from radarsdf.simulate import MeasuredMotion, drifted, measured_motion
+from radarsdf.simulate import drifted, measured_motion
 
-from ..poses.drift import position_error_m
+from ..poses.drift import first, position_error_m
 from ..poses.test_odometry import errors
 from .calls import call, refusal, values
 
@@ -19,23 +19,20 @@ FRAMES = 24
 
 
 @pytest.fixture(scope="module")
-def whole():
-    return radarsdf.simulate.oculii(seed=62, frames=120)
+def simulation():
+    """The first scans of a drive."""
+    return first(radarsdf.simulate.oculii, FRAMES, seed=62, frames=120)
 
 
 @pytest.fixture(scope="module")
-def drive(whole):
-    """Its first scans."""
-    return Scans(whole.points[:FRAMES], whole.poses[:FRAMES], whole.intensities[:FRAMES])
+def drive(simulation):
+    return Scans(simulation.points, simulation.poses, simulation.intensities)
 
 
 @pytest.fixture(scope="module")
-def motion(whole):
+def motion(simulation):
     """What they measure of their motion."""
-    motion = measured_motion(whole)
-    return MeasuredMotion(
-        motion.times_s[:FRAMES], motion.doppler_mps[:FRAMES], motion.angular_velocity[:FRAMES]
-    )
+    return measured_motion(simulation)
 
 
 @pytest.fixture

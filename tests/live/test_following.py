@@ -10,12 +10,14 @@ import radarsdf
 from radarsdf import FitConfig, LiveMap
 from radarsdf.live.following import Lost
 
+from ..poses.drift import first
+
 SETTINGS = FitConfig(num_threads=1)
 
 
 @pytest.fixture(scope="module")
 def drive():
-    scans = radarsdf.simulate.oculii(seed=91, frames=60)
+    scans = first(radarsdf.simulate.oculii, 25, seed=91, frames=60)
     return scans, radarsdf.simulate.measured_motion(scans)
 
 

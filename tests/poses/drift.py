@@ -8,9 +8,10 @@ import dataclasses
 import functools
 
 import numpy as np
+import pytest
 import radarsdf
 from radarsdf.io import Scans
-from radarsdf.simulate import drifted, measured_motion
+from radarsdf.simulate import RadarSensor, Scan, drifted, measured_motion
 from scipy.spatial.transform import Rotation
 
 
@@ -30,8 +31,19 @@ def position_error_m(poses, true):
     return float(np.sqrt(((poses - true)[:, :3, 3] ** 2).sum(axis=1).mean()))
 
 
-def first(simulation, count):
-    """Its first scans. A shorter drive of the same kind would go the same way in longer steps."""
+def first(drive, count, *given, **named):
+    """Its first scans. A shorter drive of the same kind would go the same way in longer steps.
+
+    `drive` is one of `radarsdf.simulate`. What it does not scan takes no time.
+    """
+    scan, nothing = RadarSensor.scan, Scan(np.zeros((0, 3), np.float32), *np.zeros((3, 0), np.float32))
+
+    def begun(sensor, scene, T_world_sensor, seed=0, frame=0):
+        return scan(sensor, scene, T_world_sensor, seed, frame) if frame < count else nothing
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RadarSensor, "scan", begun)
+        simulation = drive(*given, **named)
     of_scans = {
         name: getattr(simulation, name)[:count]
         for name in ("points", "poses", "intensities", "noiseless_intensities", "origin_kind")
