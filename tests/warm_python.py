@@ -15,7 +15,7 @@ Front and server have a connection for each command. The front sends the length 
 words, folder and variables as JSON; then a byte for each signal. The server sends the status, four bytes. A connection that ends
 before means that the front was killed: so is the fork.
 
-Not for tests of what is imported, of variables that are read while it is, or of streams that are closed.
+Not for tests of what is imported, of variables that are read while it is, or of streams that are closed from the start.
 """
 
 from __future__ import annotations
@@ -178,7 +178,8 @@ def _run(words: list[str], folder: str, environment: dict[str, str]) -> None:
         traceback.print_exc()
         status = -signal.SIGINT if type(error) is KeyboardInterrupt else 1
     with contextlib.suppress(OSError):
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
     if status < 0:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGINT)
