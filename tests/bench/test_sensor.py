@@ -19,7 +19,7 @@ from bench.sensor.figures import deviation, figures, plane_errors
 
 from ..conftest import recorded_scans
 
-SEEDS = (0, 1, 2)
+SEEDS = (1, 2)
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +47,13 @@ def test_the_simulation_is_as_noisy_as_the_drives(simulations):
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_each_part_of_the_noise_is_needed(simulations, changes, seed, what_fails, is_too_large):
-    """In one scene, which by itself agrees with the drives in what fails."""
+    """In every second scan of one scene, which by itself agrees with the drives in what fails."""
     usual, drive, found = simulations[SEEDS.index(seed)]
     assert what_fails not in misfits([found])
     sensor = replace(usual.sensor, **changes)
-    changed = simulate(usual.scene, sensor, usual.poses, name=usual.name, seed=seed)
-    wrong = misfits([figures(with_lidar(changed, same_lidar=drive))])
+    changed = simulate(usual.scene, sensor, usual.poses[::2], name=usual.name, seed=seed)
+    lidar = replace(drive, lidar_frame=drive.lidar_frame // 2)
+    wrong = misfits([figures(with_lidar(changed, same_lidar=lidar))])
     assert what_fails in wrong
     assert (wrong[what_fails] > 1) == is_too_large
 
