@@ -22,6 +22,9 @@ from .results import Row
 
 Values = dict[str, Any]
 
+PYTHON = [sys.executable]
+"""Begins the commands."""
+
 # 3QFPI trains for more than a minute on each scene: `curve` has it on one, and `--long` on all.
 _PEERS = tuple(name for name in PEERS if name != "3QFPI")
 _SCENES = ("hugin", "oculii", "wall")
@@ -195,7 +198,7 @@ def run(name: str, *, size: str, real: Sequence[Path] = ()) -> Values:
 
 def _run(words: Sequence[str], file: str, rows: Callable[[Values], list[Row]]) -> Values:
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", *(word.replace("{folder}", folder) for word in words)]
+        command = [*PYTHON, "-m", *(word.replace("{folder}", folder) for word in words)]
         with timed() as taken:
             done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         found: Values = {"command": _shown(words), "seconds": round(taken.wall_s, 1)}

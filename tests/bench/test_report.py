@@ -20,6 +20,8 @@ from bench.report import experiments, pages, results
 from bench.report.document import WORD_LIMIT, document
 from bench.report.plots import PLOTS
 
+from ..warm_python import warm_python
+
 MACHINE = {
     "processor": "Imaginary 3000", "threads": 2, "instruction_set": "made-up", "python": "3.99", "torch": "9.9",
     "compiler": "none", "cores": 2, "memory_gb": 11, "system": "Nowhere",
@@ -346,7 +348,8 @@ def test_the_commit_is_that_of_the_files():
     assert results.begin(quick=True)["machine"]["cores"] >= 1
 
 
-def test_a_command_that_fails_becomes_a_reason_without_folders():
+def test_a_command_that_fails_becomes_a_reason_without_folders(monkeypatch):
+    monkeypatch.setattr(experiments, "PYTHON", warm_python())
     found = experiments._run(
         ("bench.paper", "surface", "nowhere.npz", "--out", "{folder}"),
         "surface.json",
@@ -400,7 +403,7 @@ def test_what_the_paper_s_experiments_write_can_be_shown(experiment, made_up, tm
 
     monkeypatch.setattr("bench.paper.experiment.reconstruct", reconstruct)
     words = [word.replace("{folder}", str(tmp_path)) for word in experiments.EXPERIMENTS[experiment].quick]
-    paper_command.main(words[1:])
+    paper_command.main([*words[1:], "--samples", "1000"])
     values = json.loads((tmp_path / f"{experiment}.json").read_text())
     made_up["experiments"] = {experiment: {"rows": experiments.EXPERIMENTS[experiment].rows(values)}}
     text = document(made_up)
