@@ -17,6 +17,7 @@ def added_m(points, poses):
     return float(re.search(r"about ([0-9.]+) m", notes[0])[1]) if notes else None
 
 
+@pytest.mark.usefixtures("right_frames")
 @pytest.mark.parametrize(("kind", "frames"), [("hugin", 30), ("wall", 20), ("oculii", 50)])
 def test_exact_poses_add_nothing(kind, frames):
     scans = getattr(radarsdf.simulate, kind)(frames=frames, seed=1)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import radarsdf
 
+pytestmark = pytest.mark.usefixtures("right_frames")
+
 
 @pytest.fixture(scope="module")
 def good():

@@ -19,6 +19,7 @@ from radarsdf.fitting.training import Training
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from ..conftest import ground_and_wall
 from ..settings import grouped
 from ..warm_python import warm_python
 
@@ -32,6 +33,12 @@ QUICK = FitConfig(
         "intensity_batch_size": 700,
     },
 )
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Few returns: only bits are compared."""
+    return ground_and_wall(returns_per_scan=300)
 
 
 def fitted(scene, path=None, config=QUICK, intensities=True):
@@ -135,7 +142,7 @@ def counted(self, state):
     if count == 37:
         os.kill(os.getpid(), signal.SIGKILL)
 radarsdf.fitting.checkpoint.Checkpoint.write = counted
-fitted(ground_and_wall(), {str(path)!r})
+fitted(ground_and_wall(returns_per_scan=300), {str(path)!r})
 """
     assert subprocess.run([*warm_python(), "-c", code], check=False).returncode == -signal.SIGKILL
     with safe_open(path, "pt") as file:

@@ -38,7 +38,7 @@ def losses(scene, threads, **training):
 @pytest.mark.parametrize("stage", STAGES)
 def test_the_loss_does_not_depend_on_the_threads(scene, gradients, batch_size, stage):
     training = {"gradients": gradients, "batch_size": batch_size, "intensity_batch_size": batch_size}
-    found = [losses(scene, threads, **training, **STAGES[stage]) for threads in (1, 2, 3, 7, 16)]
+    found = [losses(scene, threads, **training, **STAGES[stage]) for threads in (1, 3, 16)]
     assert all(math.isfinite(value) for one in found for value in one.values())
     for one in found[1:]:
         assert one == pytest.approx(found[0], rel=1e-5)
