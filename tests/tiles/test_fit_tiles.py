@@ -101,8 +101,19 @@ def test_done_tiles_are_kept_and_others_are_made_with_the_same_bits(drive, folde
     assert_same_bits(maps_of(folder), maps_of(again))
 
 
+def two_processes():
+    """Where it can be, forks of one that has imported PyTorch and has no threads."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return ProcessPoolExecutor(2, multiprocessing.get_context("spawn"))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(
+        ["radarsdf.fitting.fit", "radarsdf.map.meshing", "radarsdf.tiles.fit_tiles"]
+    )
+    return ProcessPoolExecutor(2, context)
+
+
 def test_processes_give_the_same_bits(drive, folder, tmp_path):
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as executor:
+    with two_processes() as executor:
         city = tiles_of(drive, tmp_path / "city", executor=executor)
         mesh = city.mesh(0.2, executor=executor, progress=False)
     assert_same_bits(maps_of(folder), maps_of(tmp_path / "city"))
