@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from radarsdf.map.colors import intensity_colors
 from radarsdf.render.picture import render, save_picture
+from radarsdf.render.raster import project
 
 WHITE = np.array([255, 255, 255])
 
@@ -106,6 +107,14 @@ def test_surfaces_toward_the_light_are_brighter():
     image = render(trimesh.creation.icosphere(subdivisions=4), width=200, height=200).astype(int)
     assert image[65, 70].sum() > image[135, 130].sum() + 60  # upper left against lower right
     assert (image[2, 2] == WHITE).all()
+
+
+def test_a_scene_beside_the_axis_is_in_the_middle():
+    seen = np.array([[2.0, 1, 10], [5, 1, 10], [2, 3, 10]])  # x right, y up, z ahead
+    x, y, _ = project(seen, np.array([[0, 1, 2]]), (60, 90))
+    assert (x.min() + x.max(), y.min() + y.max()) == pytest.approx((90, 60))
+    assert np.ptp(x) == pytest.approx(1.5 * np.ptp(y))
+    assert 80 < np.ptp(x) < 90
 
 
 def test_what_lies_behind_the_viewer_is_left_out():
