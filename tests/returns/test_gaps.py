@@ -11,7 +11,7 @@ from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.returns.cells import ReturnCells
-from radarsdf.returns.gaps import _MAX_SUPPORT, bridged
+from radarsdf.returns.gaps import _MAX_SUPPORT, _medians, bridged
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.support import support_at
 
@@ -116,3 +116,14 @@ def test_the_published_configuration_bridges_nothing():
     rays = rays_to([(0, 0, 0), (2, 0, 0)])
     leaf_keys = leaf_keys_of(rays)
     assert bridged(leaf_keys, leaf_keys, np.ones(len(leaf_keys)), 0) is leaf_keys
+
+
+def test_medians_are_those_of_the_cells_with_returns_in_each_block():
+    rng = np.random.default_rng(4)
+    keys = np.sort(rng.choice(4 * LATTICE_BLOCK_CELLS**3, 3000, replace=False)).astype(np.uint64)
+    support = rng.integers(0, 9, len(keys)).astype(float)
+    block = keys // LATTICE_BLOCK_CELLS**3
+    found = _medians(keys, support)
+    for one in np.unique(block):
+        rows = block == one
+        assert found[rows] == pytest.approx(np.median(support[rows & (support > 0)]))
