@@ -90,6 +90,7 @@ def test_each_part_that_was_skipped_has_a_time():
     _, saved_s = skipped_of(FitConfig(), with_intensity=False)
     assert next(iter(saved_s)).startswith("the intensity network")
     assert all(seconds > 0 for seconds in saved_s.values())
+    assert skipped_of(FitConfig.paper(), with_intensity=True)[1] == {}
 
 
 @pytest.mark.parametrize("setting", ["normals", "geometry_feature_dim"])

@@ -9,12 +9,12 @@ import dataclasses
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.io import UNPOSED
+from radarsdf.io import UNPOSED, Imu
 from radarsdf.poses.by_doppler import SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope, UnknownAxesError
 from radarsdf.poses.imu_alignment import ImuAlignment
 from radarsdf.poses.imu_motion import cumulated
-from radarsdf.poses.inertial import levelled
+from radarsdf.poses.inertial import Inertial, levelled
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation
@@ -162,3 +162,13 @@ def test_a_walk_ends_where_it_began():
     imu = found.report["imu"]
     # The trigger of the radar says the same, which is not read: scans are recorded 0.115 s after they were taken.
     assert imu["late_s"] == pytest.approx(0.115, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("measured_s", "is_used"),
+    [([-9, -5], False), ([-9, 0], True), ([4, 9], True), ([5, 9], False), ([2], False)],
+)
+def test_an_imu_is_used_if_it_measured_during_the_scans(measured_s, is_used):
+    imu = Imu(np.array(measured_s) + 100.0, np.zeros((len(measured_s), 3)), R_sensor_imu=np.eye(3))
+    found = Inertial.of(imu, None, np.arange(5.0), 100.0)
+    assert (found.gyroscope is not None, len(found.notes)) == (is_used, 0 if is_used else 1)
