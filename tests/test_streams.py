@@ -146,6 +146,7 @@ def test_every_command_without_streams(files, usual, redirections, before_all):
     statuses, output, errors = all_commands(files, redirections, before_all)
     assert statuses == dict.fromkeys(COMMANDS, 0) | {"wrong": 1}
     assert errors == ("" if "2>" in redirections or before_all == NO_ERRORS else said)
+    assert said.strip() not in output  # of an error without a standard error
     # All but seconds, and threads: a fork of the warm Python has one.
     found, expected = (
         [line for line in text.splitlines() if " s" not in line and not line.endswith(" threads")]

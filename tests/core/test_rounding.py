@@ -67,7 +67,7 @@ def arguments(dtype, encoding, count=300):
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("encoding", stress.ENCODINGS.values(), ids=stress.ENCODINGS)
-@pytest.mark.parametrize("power", [-100, -40, 40, 100])  # of two: 1e-30 to 1e30
+@pytest.mark.parametrize("power", [-100, 100])  # of two: 1e-30 to 1e30
 @pytest.mark.parametrize("with_directions", [False, True])
 def test_a_power_of_two_goes_through_exactly(dtype, encoding, power, with_directions):
     features, points, g, v = arguments(dtype, encoding)

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from functools import partial
 
 import numpy as np
 import pytest
@@ -52,6 +52,12 @@ def mesh(sharp_map):
     return sharp_map.mesh()
 
 
+@pytest.fixture(scope="module")
+def mesh_of(sharp_map):
+    """A function: the mesh of a size of voxels, made once for all tests."""
+    return functools.cache(sharp_map.mesh)
+
+
 def surface_distance(vertices):
     return np.minimum(np.abs(vertices[:, 2]), np.abs(vertices[:, 0] - 20))
 
@@ -95,8 +101,8 @@ def test_triangles_face_free_space(mesh):
 
 
 @pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
-def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, voxel_size):
-    mesh = sharp_map.mesh(voxel_size)
+def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, mesh_of, voxel_size):
+    mesh = mesh_of(voxel_size)
     assert len(mesh.faces) > 0
     # Vertices may lie on the very border, the middle of a triangle does not.
     assert sharp_map.observed(mesh.triangles_center).mean() > 0.9999
@@ -105,18 +111,16 @@ def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, voxel_siz
 
 
 @pytest.mark.parametrize("voxel_size", [0.07, 0.13, 0.19])
-def test_small_voxels_have_their_centres_in_the_map(sharp_map, voxel_size):
-    local = (
-        sharp_map.mesh(voxel_size).triangles_center - sharp_map.origin
-    )  # each in the middle of one voxel's
+def test_small_voxels_have_their_centres_in_the_map(sharp_map, mesh_of, voxel_size):
+    local = mesh_of(voxel_size).triangles_center - sharp_map.origin  # each in the middle of one voxel's
     centres = (np.floor(local / voxel_size) + 0.5) * voxel_size
     occupied = sharp_map.field.cells.occupied(torch.from_numpy(centres.astype(np.float32)))
     assert occupied.float().mean() > 0.9999
 
 
 @pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.15, 0.2, 0.3])
-def test_any_voxel_size_gives_the_same_surface(sharp_map, voxel_size):
-    mesh = sharp_map.mesh(voxel_size)
+def test_any_voxel_size_gives_the_same_surface(sharp_map, mesh_of, voxel_size):
+    mesh = mesh_of(voxel_size)
     centres = mesh.triangles_center[inside(mesh)]
     assert np.median(surface_distance(centres)) < 0.03
     ground = (np.abs(mesh.triangles_center[:, 1]) < 5) & inside(mesh) & (mesh.triangles_center[:, 0] < 19)
@@ -172,8 +176,8 @@ def test_two_meshes_of_one_map_are_the_same_bits(sharp_map):
 
 
 @pytest.mark.parametrize("voxel_size", [0.1, 0.15])
-def test_small_parts_give_the_same_bits(sharp_map, voxel_size, monkeypatch):
-    whole = sharp_map.mesh(voxel_size)
+def test_small_parts_give_the_same_bits(sharp_map, mesh_of, voxel_size, monkeypatch):
+    whole = mesh_of(voxel_size)
     monkeypatch.setattr("radarsdf.map.voxels._PART", 1 << 12)  # of a large map, as many parts
     parts = sharp_map.mesh(voxel_size)
     np.testing.assert_array_equal(parts.vertices, whole.vertices)
@@ -322,11 +326,13 @@ def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
 
 # Voxels that do not divide the cells are moved otherwise at the border: there, a few vertices differ.
 @pytest.mark.parametrize("voxel_size", [0.05, 0.07, 0.1, 0.13])
-def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(sharp_map, voxel_size, monkeypatch):
+def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
+    sharp_map, mesh_of, voxel_size, monkeypatch
+):
     cells = sharp_map.field.cells.table.leaf_cells()
-    searched = crossed(cells, LEAF_M, partial(_corner_distances, sharp_map._contents, LEAF_M))
+    searched = crossed(cells, LEAF_M, functools.partial(_corner_distances, sharp_map._contents, LEAF_M))
     assert len(searched) < 0.8 * len(cells)
-    mesh = sharp_map.mesh(voxel_size)
+    mesh = mesh_of(voxel_size)
     assert mesh.metadata["leaf_cells_searched"] == len(searched)
     assert mesh.metadata["leaf_cells"] == len(cells)
     monkeypatch.setattr("radarsdf.map.voxels.crossed", lambda cells, *_: cells)
