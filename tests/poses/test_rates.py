@@ -5,10 +5,12 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from radarsdf.poses.drive import Drive
+from radarsdf import FitConfig
+from radarsdf.poses.drive import Drive, followed
 from radarsdf.poses.rates import Habits, Rate
 
 TURNS = Habits(np.array([0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.15]), True)
@@ -66,3 +68,16 @@ def test_a_step_is_expected_from_the_middle_of_the_one_before():
         np.testing.assert_array_equal(nothing.turn.mean, 0)
         np.testing.assert_allclose(nothing.turn.covariance, nothing.duration_s**2 * np.diag(TURNS.usual))
         np.testing.assert_allclose(nothing.way_covariance, nothing.duration_s**2 * np.diag(MOVES.usual))
+
+
+def test_a_gyroscope_helps_from_the_second_pass_on(monkeypatch):
+    """The first finds the turns that tell its bias."""
+    seen = []
+    passed = SimpleNamespace(tracked=[], rotations=lambda times_s: (times_s, times_s))
+    monkeypatch.setattr(
+        "radarsdf.poses.drive._Pass.of", lambda drive, _: seen.append(drive.gyroscope) or passed
+    )
+    monkeypatch.setattr(Drive, "learnt", lambda drive, _: drive)
+    gyroscope = SimpleNamespace(learnt=lambda *_: "learnt")
+    followed(Drive([], np.arange(3.0), None, gyroscope), FitConfig(), 1)
+    assert seen == [None, "learnt", "learnt"]
