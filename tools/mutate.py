@@ -8,7 +8,7 @@
 A fault is one operator, comparison or number that is another one. The tests of the module that it is in run first, then
 those of its room, and all tests if none of those fails (``--room-only``: they do not). What no test catches is printed
 with its line: a test is missing, or the line says the same as before. The work is done in a clone below a temporary
-folder. With ``--core``, each fault is compiled there, and ``tests/core`` runs, too.
+folder. With ``--core``, each fault is compiled there, and the C++ tests, which need doctest, and ``tests/core`` run, too.
 """
 
 from __future__ import annotations
@@ -118,7 +118,11 @@ def compiled(clone: Path) -> bool:
         pybind11 = subprocess.check_output(
             [sys.executable, "-m", "pybind11", "--cmakedir"], text=True
         ).strip()
-        options = [f"-Dpybind11_DIR={pybind11}", f"-DPython_EXECUTABLE={sys.executable}"]
+        options = [
+            f"-Dpybind11_DIR={pybind11}",
+            f"-DPython_EXECUTABLE={sys.executable}",
+            "-DRADARSDF_TESTS=ON",
+        ]
         subprocess.run(
             ["cmake", "-S", clone, "-B", build, "-G", "Ninja", *options], check=True, capture_output=True
         )
@@ -127,6 +131,16 @@ def compiled(clone: Path) -> bool:
     for module in (build / "csrc/bindings").glob("_core*.so"):
         shutil.copy(module, clone / "python/radarsdf")
     return True
+
+
+def caught_in_core(clone: Path) -> str | None:
+    """The first C++ test that fails, or None. They take a second, and catch every second fault."""
+    command = ["ctest", "--test-dir", clone / "build/dev", "--timeout", "60"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return None
+    failed = re.search(r"(\w+_test) \.*\*\*\*", done.stdout)
+    return f"FAILED {failed[1]}" if failed else f"exit {done.returncode} of ctest"
 
 
 def tests_of(fault: Fault, clone: Path) -> Iterator[list[str]]:
@@ -201,7 +215,7 @@ def main() -> None:
                 if not options.room_only:
                     tests.append([str(clone / "tests")])
                 found = (caught_by(clone, some, options.processes) for some in tests)
-                test = next(filter(None, found), None)
+                test = (caught_in_core(clone) if options.core else None) or next(filter(None, found), None)
                 tried += 1
                 missed += test is None
             fault.file.write_text(source, encoding="utf-8")
