@@ -14,7 +14,7 @@ namespace radarsdf {
 namespace {
 
 constexpr int kSurfelFloats = sizeof(Surfel) / sizeof(float);
-static_assert(kSurfelFloats == 7, "a surfel is a row of seven floats");
+static_assert(kSurfelFloats == 8, "a surfel is a row of eight floats");
 
 }  // namespace
 
@@ -28,8 +28,9 @@ void bind_surface_crossings(py::module_& m) {
                                                 keys.shape(0), cell_size_m);
            }),
            "keys"_a.noconvert(), "surfels"_a.noconvert(), "cell_size_m"_a,
-           "`keys` (M,) uint64 of `cell_keys`, each once; `surfels` (M, 7) float32: centre, normal towards the "
-           "sensors, standard deviation of the returns across the plane; local frame, m.")
+           "`keys` (M,) uint64 of `cell_keys`, each once; `surfels` (M, 8) float32: centre, normal towards the "
+           "sensors, standard deviation of the returns across the plane, how far from the centre a ray crosses it, "
+           "in its cell, inf: anywhere; local frame, m.")
       .def(
           "first_crossings",
           [](const SurfelMap& map, const Array<float>& points, const Array<float>& directions,

@@ -39,6 +39,12 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
     if (!(cosine > 0) || depth_m <= margin_m) return false;
     const double at_m = -depth_m / cosine;
     if (at_m < begin_m - slack_m || at_m > end_m + slack_m) return false;
+    float off_m2 = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const float off_m = p[axis] + static_cast<float>(at_m) * d[axis] - c[axis];
+      off_m2 += off_m * off_m;
+    }
+    if (off_m2 > surfel.reach * surfel.reach) return false;
     const float along = noise.range_m * cosine, across = noise.angle_rad * ranges_m[i];
     const float variance =
         along * along + across * across * (1 - cosine * cosine) + surfel.thickness * surfel.thickness;

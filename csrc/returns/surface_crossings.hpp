@@ -17,6 +17,7 @@ struct Surfel {
   float centre[3];  ///< local frame, m
   float normal[3];  ///< unit, towards the sensors
   float thickness;  ///< standard deviation of the returns across the plane, m
+  float reach;      ///< how far from the centre a ray crosses it in its cell, m
 };
 
 // Standard deviations of a return's position.

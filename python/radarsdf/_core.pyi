@@ -858,7 +858,7 @@ class SurfelMap:
         cell_size_m: typing.SupportsFloat | typing.SupportsIndex,
     ) -> None:
         """
-        `keys` (M,) uint64 of `cell_keys`, each once; `surfels` (M, 7) float32: centre, normal towards the sensors, standard deviation of the returns across the plane; local frame, m.
+        `keys` (M,) uint64 of `cell_keys`, each once; `surfels` (M, 8) float32: centre, normal towards the sensors, standard deviation of the returns across the plane, how far from the centre a ray crosses it, in its cell, inf: anywhere; local frame, m.
         """
     def first_crossings(
         self,

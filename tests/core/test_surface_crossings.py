@@ -14,7 +14,7 @@ SLACK_M = 0.25 * CELL_M
 
 
 def a_scene(seed):
-    """Surfels in cells that are crowded in places, with nothing in between: keys and rows (M, 7)."""
+    """Surfels in cells that are crowded in places, with nothing in between: keys and rows (M, 8)."""
     rng = np.random.default_rng(seed)
     clusters = [
         centre + rng.integers(-4, 5, (300, 3)) for centre in rng.integers(-60, 60, (60, 3)) * [1, 1, 0.2]
@@ -24,7 +24,7 @@ def a_scene(seed):
     cells = cells[np.argsort(keys)]
     normals = rng.normal(size=cells.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    rows = np.concatenate([(cells + rng.random(cells.shape)) * CELL_M, normals, np.zeros((len(cells), 1))], 1)
+    rows = np.concatenate([(cells + rng.random(cells.shape)) * CELL_M, normals, np.tile([[0, np.inf]], (len(cells), 1))], 1)
     return np.sort(keys), rows.astype(np.float32)
 
 

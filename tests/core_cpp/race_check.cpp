@@ -192,7 +192,7 @@ void sums_and_rays(int threads, Results& results) {
   for (std::int64_t cell = 0; cell < num_cells; ++cell) {
     const double* m = values.data() + radarsdf::kSums * cell;
     const auto mean = [&](int k) { return static_cast<float>(1e-4 * m[k] / m[0]); };
-    surfels.push_back({{mean(1), mean(2), mean(3)}, {0, 0, 1}, 0.05F});
+    surfels.push_back({{mean(1), mean(2), mean(3)}, {0, 0, 1}, 0.05F, 0.3F});
   }
   const radarsdf::SurfelMap map(sorted.data(), surfels.data(), num_cells, 0.4);
   std::vector<std::int32_t> crossed(kPoints);

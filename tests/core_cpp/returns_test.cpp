@@ -118,7 +118,7 @@ TEST_CASE("rays cross a plane where they end behind it") {
   for (int x = -20; x < 20; ++x) {
     for (int y = -20; y < 20; ++y) {
       const float centre[2] = {(static_cast<float>(x) + 0.5F) * kCell, (static_cast<float>(y) + 0.5F) * kCell};
-      by_key[key_of(x, y, 0)] = {{centre[0], centre[1], 0.1F}, {0, 0, 1}, 0.01F};
+      by_key[key_of(x, y, 0)] = {{centre[0], centre[1], 0.1F}, {0, 0, 1}, 0.01F, 1.0F};
     }
   }
   std::vector<std::uint64_t> keys;

@@ -129,8 +129,8 @@ def test_ctrl_c_ends_a_long_call_of_the_core():
         np.float32
     )
     keys = np.sort(_core.cell_keys(cells, 0.4, 1))
-    planes = np.full((len(keys), 7), 100, np.float32)
-    planes[:, 3:] = [1, 0, 0, 0.01]
+    planes = np.full((len(keys), 8), 100, np.float32)
+    planes[:, 3:] = [1, 0, 0, 0.01, np.inf]
     directions = np.random.default_rng(0).normal(size=(100_000, 3))
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
     surfels = _core.SurfelMap(keys, planes, 0.4)

@@ -103,6 +103,26 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     assert ghosts_of(rays, surfels, noise)[behind].mean() < 0.05
 
 
+def test_what_is_seen_beside_a_trunk_is_no_ghost():
+    """A trunk fills a part of its cells only. Rays through the rest of these end at what is there."""
+    rng = np.random.default_rng(2)
+
+    def strip(x_m, left_m, right_m, count):
+        return np.column_stack(
+            [rng.normal(x_m, 0.02, count), rng.uniform(left_m, right_m, count), rng.uniform(-0.15, 0.15, count)]
+        )
+
+    def dropped(left_m, right_m):
+        things = strip(10, left_m, right_m, 400), strip(18, 0.47, 0.62, 60)
+        rays = prepare([np.concatenate(things).astype(np.float32)], np.eye(4)[None])
+        return ghosts_of(rays, Surfels.of(rays, LEAF_M), SensorNoise(0.02, 0.001, 0.001))
+
+    assert not dropped(0.02, 0.14).any()
+    behind_a_wall = dropped(0.02, 0.38)
+    assert not behind_a_wall[:400].any()
+    assert behind_a_wall[400:].mean() > 0.9
+
+
 def test_few_returns_make_no_plane():
     few = ground_and_wall(scans=2, returns_per_scan=20)
     rays = prepare(few.points, few.poses)
@@ -110,10 +130,10 @@ def test_few_returns_make_no_plane():
     assert not find_ghosts(surfels, rays, NOISE).any()
 
 
-def one_surfel(normal=(-1.0, 0, 0), thickness_m=0.0):
+def one_surfel(normal=(-1.0, 0, 0), thickness_m=0.0, reach_m=np.inf):
     """A plane through (10, 0.2, 0.2)."""
     centre = np.array([[10.0, 0.2, 0.2]], np.float32)
-    row = np.concatenate([centre, [normal], [[thickness_m]]], 1).astype(np.float32)
+    row = np.concatenate([centre, [normal], [[thickness_m, reach_m]]], 1).astype(np.float32)
     return SurfelMap(cell_keys(centre, CELL_M), row, CELL_M)
 
 
@@ -130,6 +150,8 @@ def test_crossings_of_one_surfel():
     assert crossed(one_surfel(), sensor, [9.5, 0.2, 0.2]) == [-1]  # ends in front
     assert crossed(one_surfel(), sensor, [10.1, 0.2, 0.2]) == [-1]  # within the margin
     assert crossed(one_surfel(), sensor, [11.0, 3.0, 0.2]) == [-1]  # passes beside
+    assert crossed(one_surfel(reach_m=0.1), sensor, [11.0, 0.3, 0.2]) == [0]  # 0.09 m off its centre
+    assert crossed(one_surfel(reach_m=0.1), sensor, [11.0, 0.2, 0.33]) == [-1]  # 0.12 m off
     assert crossed(one_surfel([1, 0, 0]), sensor, [11.0, 0.2, 0.2]) == [-1]  # comes from behind
     assert crossed(one_surfel(thickness_m=0.5), sensor, [11.0, 0.2, 0.2]) == [
         -1
@@ -147,7 +169,7 @@ def test_the_walk_finds_what_a_search_of_all_surfels_finds(sensor):
     """A row of facing planes: a ray through any of them crosses the first on its way."""
     x = np.arange(11, 14, CELL_M) + 0.05
     centres = np.column_stack([x, np.full(len(x), 0.2), np.full(len(x), 0.2)]).astype(np.float32)
-    rows = np.concatenate([centres, np.tile([[-1.0, 0, 0, 0]], (len(x), 1))], 1).astype(np.float32)
+    rows = np.concatenate([centres, np.tile([[-1.0, 0, 0, 0, np.inf]], (len(x), 1))], 1).astype(np.float32)
     surfels = SurfelMap(cell_keys(centres, CELL_M), rows, CELL_M)
     rng = np.random.default_rng(1)
     targets = np.column_stack([rng.uniform(11, 14, 500), rng.uniform(0.05, 0.35, (500, 2))])
@@ -186,9 +208,9 @@ def test_rays_beyond_the_lattice_cross_nothing():
 
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match="surfels"):
-        SurfelMap(np.zeros(2, np.uint64), np.zeros((2, 6), np.float32), CELL_M)
+        SurfelMap(np.zeros(2, np.uint64), np.zeros((2, 7), np.float32), CELL_M)
     with pytest.raises(ValueError, match="cell_size_m"):
-        SurfelMap(np.zeros(0, np.uint64), np.zeros((0, 7), np.float32), 0.0)
+        SurfelMap(np.zeros(0, np.uint64), np.zeros((0, 8), np.float32), 0.0)
     with pytest.raises(ValueError, match="points"):
         one_surfel().first_crossings(
             np.zeros((2, 3), np.float32), np.zeros((1, 3), np.float32), np.zeros(1, np.float32), 0, 0, 0, 0

@@ -176,13 +176,8 @@ class GrowingGhosts:
         """Question 3, of the rays that end in these regions."""
         rows, cells = self._leaves.gather(rays), self._cells.gather(self._planes_in(self._boxes_of(rays)))
         surfels, flat = self._surfels(cells)
-        number = np.full(len(surfels.keys) + 1, -1, np.int32)  # of the flat plane of each cell
-        number[surfels.cell_of_plane[flat]] = np.arange(len(flat), dtype=np.int32)
-        first = np.full(len(rows["keys"]), -1, np.int32)
-        crosses = rows["first"] != NOWHERE
-        first[crosses] = number[surfels.blocks.rows(rows["first"][crosses], num_threads)]
         opaque = cells["opaque"][surfels.cell_of_plane[flat]]
-        behind = are_behind(surfels, flat, opaque, first, means_of(rows), noise, num_threads)
+        behind = are_behind(surfels, flat[opaque], rows["first"] != NOWHERE, means_of(rows), noise, num_threads)
         own = self._cells.gather(rays)
         cell_of_ray = CellBlocks(own["keys"]).rows(merged_keys(rows["keys"]), num_threads)
         own["behind"] = np.bincount(cell_of_ray[behind], rows["counts"][behind], len(own["keys"]))

@@ -24,6 +24,10 @@ from radarsdf.returns.surfels import NEIGHBOUR_WEIGHT, Surfels
 _MARGIN = 0.25  # cells of surfels
 _SIGMAS = 2.0  # standard deviations of the noise
 _MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there. A hedge lets most rays through.
+# A trunk, a rail or the end of a wall fills a part of a surfel's cell. What lies evenly on a strip reaches √3 standard
+# deviations across it from its middle. A ray farther from the centre passes beside; along a strip some do not, but what
+# is narrow mirrors little. Surfaces that fill the cell reach beyond it.
+_REACH_SIGMAS = 3**0.5
 # Share of the returns round a ghost that are behind a surface too. Round a noisy return it is lower.
 _MIN_SHARE = 0.5
 
@@ -64,7 +68,7 @@ def find_ghosts(
     passed = np.zeros(len(surfels.keys))
     passed[surfels.cell_of_plane[flat]] = count(first, first >= 0, len(flat))
     opaque = are_opaque(surfels, flat, passed, num_threads)
-    behind = are_behind(surfels, flat, opaque, first, rays, noise, num_threads)
+    behind = are_behind(surfels, flat[opaque], first >= 0, rays, noise, num_threads)
     return mostly_behind(surfels, count(cell_of_ray, behind, len(surfels.keys)), num_threads)
 
 
@@ -74,9 +78,16 @@ def first_crossed(
     rays: Rays | MeanRays,
     noise: SensorNoise,
     num_threads: int = 0,
+    *,
+    beside: bool = True,
 ) -> NDArray[np.int32]:
-    """(N,) row in `planes`, rows of surfels, of the first that each ray crosses from its front, or -1."""
-    chosen = (surfels.centres[planes], surfels.normals[planes], np.sqrt(surfels.variances[planes, :1]))
+    """(N,) row in `planes`, rows of surfels, of the first that each ray crosses from its front, or -1.
+
+    `beside`: it also crosses one where the plane goes on, in the surfel's cell, beside the returns.
+    """
+    variances = surfels.variances[planes]
+    reach_m = np.full(len(planes), np.inf) if beside else _REACH_SIGMAS * np.sqrt(variances[:, 1])
+    chosen = (surfels.centres[planes], surfels.normals[planes], np.sqrt(variances[:, :1]), reach_m[:, None])
     surfel_map = SurfelMap(
         surfels.keys[surfels.cell_of_plane[planes]],
         np.concatenate(chosen, 1).astype(np.float32),
@@ -110,17 +121,16 @@ def are_opaque(
 def are_behind(
     surfels: Surfels,
     planes: NDArray[np.int64],
-    opaque: NDArray[np.bool_],
-    first: NDArray[np.int32],
+    crosses: NDArray[np.bool_],
     rays: Rays | MeanRays,
     noise: SensorNoise,
     num_threads: int = 0,
 ) -> NDArray[np.bool_]:
-    """(N,) which rays end behind an opaque one of `planes`; `first` (N,) as of :func:`first_crossed`."""
-    behind = first >= 0
-    # A ray through a surface that is not opaque may cross an opaque one behind it. There are few such rays.
-    through = np.flatnonzero(behind)[~opaque[first[behind]]]
-    behind[through] = first_crossed(surfels, planes[opaque], rays.select(through), noise, num_threads) >= 0
+    """(N,) which rays end behind one of `planes`, rows of opaque surfels. `crosses` (N,): which cross any flat one."""
+    behind = crosses.copy()
+    behind[crosses] = (
+        first_crossed(surfels, planes, rays.select(np.flatnonzero(crosses)), noise, num_threads, beside=False) >= 0
+    )
     return behind
 
 
