@@ -24,7 +24,9 @@ def a_scene(seed):
     cells = cells[np.argsort(keys)]
     normals = rng.normal(size=cells.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    rows = np.concatenate([(cells + rng.random(cells.shape)) * CELL_M, normals, np.tile([[0, np.inf]], (len(cells), 1))], 1)
+    rows = np.concatenate(
+        [(cells + rng.random(cells.shape)) * CELL_M, normals, np.tile([[0, np.inf]], (len(cells), 1))], 1
+    )
     return np.sort(keys), rows.astype(np.float32)
 
 

@@ -109,7 +109,11 @@ def test_what_is_seen_beside_a_trunk_is_no_ghost():
 
     def strip(x_m, left_m, right_m, count):
         return np.column_stack(
-            [rng.normal(x_m, 0.02, count), rng.uniform(left_m, right_m, count), rng.uniform(-0.15, 0.15, count)]
+            [
+                rng.normal(x_m, 0.02, count),
+                rng.uniform(left_m, right_m, count),
+                rng.uniform(-0.15, 0.15, count),
+            ]
         )
 
     def dropped(left_m, right_m):

@@ -55,8 +55,8 @@ class ReturnsConfig:
     without."""
     drop_ghosts: bool = True
     """Whether the sdf stage leaves out ghosts: returns behind a surface that their rays crossed, as mirrors
-    cause them (3QFPI: no). Measured: 84 to 94 % of the surface that ghosts cause is gone, and 0.7 % of the
-    true returns. The intensity stage still uses ghosts."""
+    cause them (3QFPI: no). Measured on twelve kinds of simulated scenes: half to three quarters of the
+    ghosts go, and 0 to 2 % of the true returns, 6 % along fences. The intensity stage still uses ghosts."""
     range_noise_m: _NoiseM | None = None
     """Standard deviation of a return along the beam, m. None: estimated from the returns; see
     :func:`radarsdf.returns.noise.sensor_noise`."""

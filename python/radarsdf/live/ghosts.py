@@ -177,7 +177,9 @@ class GrowingGhosts:
         rows, cells = self._leaves.gather(rays), self._cells.gather(self._planes_in(self._boxes_of(rays)))
         surfels, flat = self._surfels(cells)
         opaque = cells["opaque"][surfels.cell_of_plane[flat]]
-        behind = are_behind(surfels, flat[opaque], rows["first"] != NOWHERE, means_of(rows), noise, num_threads)
+        behind = are_behind(
+            surfels, flat[opaque], rows["first"] != NOWHERE, means_of(rows), noise, num_threads
+        )
         own = self._cells.gather(rays)
         cell_of_ray = CellBlocks(own["keys"]).rows(merged_keys(rows["keys"]), num_threads)
         own["behind"] = np.bincount(cell_of_ray[behind], rows["counts"][behind], len(own["keys"]))

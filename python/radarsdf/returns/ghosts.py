@@ -129,7 +129,8 @@ def are_behind(
     """(N,) which rays end behind one of `planes`, rows of opaque surfels. `crosses` (N,): which cross any flat one."""
     behind = crosses.copy()
     behind[crosses] = (
-        first_crossed(surfels, planes, rays.select(np.flatnonzero(crosses)), noise, num_threads, beside=False) >= 0
+        first_crossed(surfels, planes, rays.select(np.flatnonzero(crosses)), noise, num_threads, beside=False)
+        >= 0
     )
     return behind
 
