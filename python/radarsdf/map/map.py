@@ -241,10 +241,8 @@ class Map(MapParts):
         MemoryError
             If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
-        from radarsdf.map.meshing import mesh_seen_from  # noqa: PLC0415 - trimesh is slow to import
-
-        make = partial(
-            self._surface_mesh,
+        return self._mesh_seen_from(
+            viewpoint,
             voxel_size,
             box=box,
             min_confidence=min_confidence,
@@ -252,7 +250,14 @@ class Map(MapParts):
             min_component_triangles=min_component_triangles,
             progress=progress,
         )
-        return mesh_seen_from(self, viewpoint, make)
+
+    def _mesh_seen_from(
+        self, viewpoint: ArrayLike | None, voxel_size: float, **wanted: Any
+    ) -> trimesh.Trimesh:
+        """What :meth:`mesh` answers; `wanted`: arguments of `_surface_mesh`."""
+        from radarsdf.map.meshing import mesh_seen_from  # noqa: PLC0415 - trimesh is slow to import
+
+        return mesh_seen_from(self, viewpoint, partial(self._surface_mesh, voxel_size, **wanted))
 
     def grid(
         self,

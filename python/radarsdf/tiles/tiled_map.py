@@ -131,10 +131,8 @@ class TiledMap(TileBlend, Map):
         Each tile is a task for the `executor`. `voxel_size` must divide the leaf cell's edge. :meth:`export` writes a mesh
         that does not fit into memory.
         """
-        from radarsdf.map.meshing import mesh_seen_from  # noqa: PLC0415 - trimesh is slow to import
-
-        make = partial(
-            self._surface_mesh,
+        return self._mesh_seen_from(
+            viewpoint,
             voxel_size,
             box=box,
             min_confidence=min_confidence,
@@ -143,10 +141,9 @@ class TiledMap(TileBlend, Map):
             executor=executor,
             progress=progress,
         )
-        return mesh_seen_from(self, viewpoint, make)
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
-        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - as above
+        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - trimesh is slow to import
 
         return mesh_of(self, voxel_size, **wanted)
 
