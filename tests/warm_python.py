@@ -67,13 +67,8 @@ def warm_python() -> list[str]:
 
     atexit.register(end)
     assert server.stdout.readline() == b"ready\n"
-    return [
-        sys.executable,
-        "-I",
-        "-S",
-        __file__,
-        path,
-    ]  # without site-packages, which take time to look through
+    # Without site-packages, which take time to look through.
+    return [sys.executable, "-I", "-S", __file__, path]
 
 
 def _ask(path: str, words: list[str]) -> int:
@@ -102,9 +97,8 @@ def _serve(path: str) -> None:
         sys.stdout.flush()
         waiting.register(listener, selectors.EVENT_READ)
         waiting.register(0, selectors.EVENT_READ)  # closed where the tests have ended
-        children: dict[
-            int, tuple[int, socket.socket]
-        ] = {}  # forks by their pidfds, with the connections of their fronts
+        # Forks by their pidfds, with the connections of their fronts.
+        children: dict[int, tuple[int, socket.socket]] = {}
         while True:
             for key, _ in waiting.select():
                 if key.fileobj == 0:

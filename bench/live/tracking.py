@@ -24,10 +24,8 @@ from bench.rows import quantile
 from bench.timing import timed
 
 _RETURNS = 2000  # of a scan
-_SCANS, _QUICK_SCANS = (
-    120,
-    12,
-)  # of a drive, and of its beginning: of fewer along all of it, no two would see the same
+_SCANS = 120  # of a drive
+_QUICK_SCANS = 12  # of its beginning: of so few along all of it, no two would see the same
 _SENSORS = {"hugin": HUGIN_A3, "oculii": OCULII_EAGLE}
 
 
