@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -130,6 +131,18 @@ def test_a_batch_of_few_rays_draws_one_order_at_most(rays, kind, monkeypatch):
         np.add.at(seen, rows[: samples.num_near].numpy(), 1)
         assert len(draws) <= batch + 1
         assert seen.max() - seen.min() <= 1
+
+
+@pytest.mark.parametrize("kind", DRAWS)
+def test_memory_of_a_batch_does_not_grow_with_the_rays(rays, kind):
+    many = rays.select(np.arange(300 * NUM_RAYS) % NUM_RAYS)
+    draw = sampler(many)
+    DRAWS[kind](draw)  # draws the order of all rays
+    tracemalloc.start()  # NumPy's arrays are traced, PyTorch's tensors are not
+    DRAWS[kind](draw)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < len(many)  # bytes
 
 
 def test_spread_sees_each_ray_equally_often(rays):

@@ -177,7 +177,7 @@ class RaySampler:
         """
         # A whole pass takes every ray once, in any order: of few rays, a batch would draw hundreds of orders.
         passes, count = divmod(count, len(self._rays))
-        parts = [np.repeat(np.arange(len(self._rays)), passes)]
+        parts = [np.repeat(np.arange(len(self._rays)), passes)] if passes else []
         while count > 0:
             if self._next >= len(self._order):
                 self._draw_order()
