@@ -284,7 +284,8 @@ class Map(MapParts):
         Parameters
         ----------
         box : (2, 3) array_like
-            Lower and upper corner, world, m. The grid begins at the lower one, and ends at or behind the upper one.
+            Lower and upper corner, world, m. The grid covers the box, extended to multiples of `voxel_size` in the world: grids
+            of adjacent boxes fit together.
         voxel_size : float
             Edge of a voxel, m. Below that of a leaf cell, voxels are not better known. Above it, a voxel is occupied if a
             part of it is, and free only if it is throughout.
