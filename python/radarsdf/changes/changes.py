@@ -51,6 +51,17 @@ class ChangedSurface:
     """(V,) later less earlier intensity from views that both drives had, sensor units, without what all places have in
     common. NaN where there were none."""
 
+    def inside(self, box: Floats | None) -> ChangedSurface:
+        """The triangles in a box (2, 3), world of the earlier map, m. None: all."""
+        if box is None:
+            return self
+        from radarsdf.map.meshing import renumbered  # noqa: PLC0415 - it imports trimesh, slow to import
+
+        within = ((self.vertices >= box[0]) & (self.vertices <= box[1])).all(axis=1)
+        used, faces = renumbered(len(within), self.faces[within[self.faces].all(axis=1)])
+        of_vertices = {name: values[used] for name, values in vars(self).items() if name != "faces"}
+        return ChangedSurface(faces=faces, **of_vertices)
+
     def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
         """(F,) kind of each face, that of most of its vertices, or the first; and areas, m²."""
         kinds = self.kind[self.faces]
@@ -97,10 +108,11 @@ class Changes:
     T_before_after: Floats
     """(4, 4) from the later map's world to that of the earlier one, m."""
     report: dict[str, Any]
-    """`alignment` in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map tells of; `changed_share`, the
+    """`alignment`: in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map tells of; `changed_share`, the
     probable share of it that changed; `scale` and `freedom`: over their standard errors, distances between the maps follow
     Student's t with so many degrees of freedom, so much widened;
-    `intensity_offset`, by which all intensities changed, sensor units."""
+    `reflectance`: what intensities have in common, in words, or why they were not compared; `intensity_offset`, by which all of them
+    changed, sensor units, None if they were not compared."""
 
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:
         """Changes that hang together, the largest first; without those of a smaller area, m²."""
