@@ -51,17 +51,6 @@ class ChangedSurface:
     """(V,) later less earlier intensity from views that both drives had, sensor units, without what all places have in
     common. NaN where there were none."""
 
-    def inside(self, box: Floats | None) -> ChangedSurface:
-        """The triangles in a box (2, 3), world of the earlier map, m. None: all."""
-        if box is None:
-            return self
-        from radarsdf.map.meshing import renumbered  # noqa: PLC0415 - it imports trimesh, slow to import
-
-        within = ((self.vertices >= box[0]) & (self.vertices <= box[1])).all(axis=1)
-        used, faces = renumbered(len(within), self.faces[within[self.faces].all(axis=1)])
-        of_vertices = {name: values[used] for name, values in vars(self).items() if name != "faces"}
-        return ChangedSurface(faces=faces, **of_vertices)
-
     def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
         """(F,) kind of each face, that of most of its vertices, or the first; and areas, m²."""
         kinds = self.kind[self.faces]

@@ -39,6 +39,7 @@ from radarsdf.fitting.fit import fit
 from radarsdf.io.scans import Scans
 from radarsdf.map.gridding import check_passages
 from radarsdf.map.map import Map
+from radarsdf.map.meshing import renumbered
 
 _PROBABLE = 0.5  # more likely than not
 _LEVEL = np.cos(np.pi / 4)  # least part of a level surface's normal that is upright
@@ -140,10 +141,13 @@ def compare(
             moved_m,
         )
     before_surface, after_surface = (
-        ChangedSurface(
-            side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m.astype(np.float32),
-            change.astype(np.float32),
-        ).inside(corners)
+        _inside(
+            corners,
+            ChangedSurface(
+                side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m.astype(np.float32),
+                change.astype(np.float32),
+            ),
+        )
         for side, (kinds, probability, moved_m), change in zip(sides, told, changes, strict=True)
     )  # fmt: skip
     return _summed(before_surface, after_surface, alignment, share, errors, differences)
@@ -203,6 +207,16 @@ class _Side:
         # Along the normal: the earlier surface moved to where the later one is.
         towards = -other.distance_m if lost == GONE else other.distance_m
         return kinds, probability, np.where(kinds == MOVED, towards, np.nan)
+
+
+def _inside(box: Floats | None, surface: ChangedSurface) -> ChangedSurface:
+    """The triangles in a box (2, 3), world of the earlier map, m. None: all."""
+    if box is None:
+        return surface
+    within = ((surface.vertices >= box[0]) & (surface.vertices <= box[1])).all(axis=1)
+    used, faces = renumbered(len(within), surface.faces[within[surface.faces].all(axis=1)])
+    of_vertices = {name: values[used] for name, values in vars(surface).items() if name != "faces"}
+    return ChangedSurface(faces=faces, **of_vertices)
 
 
 def _check_common(
