@@ -19,7 +19,7 @@ def record(folder: Path) -> tuple[Path, Path]:
     """Write what a driver would: a PCD file a scan, named by its time, and poses as TUM has them."""
     drive = radarsdf.simulate.hugin(frames=12)
     clouds = folder / "drive"
-    clouds.mkdir()
+    clouds.mkdir(exist_ok=True)
     lines = []
     for i, (points, values) in enumerate(zip(drive.points, drive.intensities, strict=True)):
         time_s, T_world_sensor = 1_700_000_000.0 + 0.1 * i, drive.poses[i]

@@ -65,8 +65,10 @@ def record(bag: Path) -> None:
 
 def main(folder: Path) -> None:
     """Write a bag, read it, fit it."""
-    record(folder / "drive_bag")
-    scans = radarsdf.io.read(folder / "drive_bag")  # topic="/radar", pose_topic="/tf", were there several
+    bag = folder / "drive_bag"
+    if not bag.exists():  # rosbags replaces none
+        record(bag)
+    scans = radarsdf.io.read(bag)  # topic="/radar", pose_topic="/tf", were there several
     print(f"{len(scans)} scans; {scans.notes[0]}")
     radar_map = radarsdf.fit(scans, config=radarsdf.FitConfig(effort=0.5))
     print(radar_map)

@@ -91,6 +91,27 @@ def test_maps_of_different_frames_are_aligned_first(drives, maps):
     assert np.abs(found.T_before_after @ apart @ x - x)[[0, 2]].max() < 0.1
 
 
+@pytest.mark.parametrize(
+    ("turn_rad", "shift_m", "said"),
+    [(np.pi / 9, 0, "of the steep surfaces"), (0, 200, "no surface in common")],
+    ids=["turned", "elsewhere"],
+)
+def test_maps_that_do_not_fit_together_are_refused(drives, maps, turn_rad, shift_m, said):
+    apart = transform(np.array([0.0, 0.0, turn_rad]), np.array([shift_m, 0.0, 0.0]))
+    with pytest.raises(ValueError, match=said):
+        radarsdf.compare(maps[0], drives[1].points, apart @ drives[1].poses, align_frames=False)
+
+
+def test_a_box_round_a_change_has_nothing_but_the_change(changes, maps):
+    """Although most of what is in it changed: maps are judged as a whole."""
+    around = np.stack([TAKEN - [0.7, 0.7, 0.1], TAKEN + 0.7])
+    found = radarsdf.compare(maps[0], maps[2], box=around)
+    assert {region.kind for region in found.regions(0.1)} == {"gone"}
+    assert ((found.before.vertices >= around[0]) & (found.before.vertices <= around[1])).all()
+    np.testing.assert_array_equal(found.T_before_after, changes.T_before_after)
+    assert 0 < found.report["compared_m2"] < 0.1 * changes.report["compared_m2"]
+
+
 def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
     for number, name in ((0, "a"), (2, "b")):
         maps[number].save(tmp_path / f"{name}.safetensors")

@@ -156,3 +156,13 @@ def test_pieces_are_not_joined(drive, motion, tmp_path, capsys, monkeypatch):
 def test_outputs_are_checked_before_the_work(drifted_file, tmp_path, capsys):
     assert "no file of poses" in refusal(capsys, tmp_path, "poses", drifted_file, "-o", tmp_path / "a.txt")
     assert "same file" in refusal(capsys, tmp_path, "poses", drifted_file, "-o", drifted_file)
+
+
+def test_times_that_the_output_needs_are_asked_for_before_the_work(drive, tmp_path, capsys, monkeypatch):
+    path = tmp_path / "untimed.npz"
+    write_scans(path, Scans(drive.points, drive.poses))
+    for work in ("radarsdf.refine_poses", "radarsdf.odometry", "radarsdf.live.replay.replay"):
+        monkeypatch.setattr(work, None)
+    out = tmp_path / "poses.tum"
+    for words in (("poses", path, "-o"), ("poses", path, "--find", "-o"), ("live", path, "--trajectory")):
+        assert f"{out} needs times" in refusal(capsys, tmp_path, *words, out)

@@ -10,8 +10,9 @@ import radarsdf
 import trimesh
 from radarsdf.cli import main
 from radarsdf.grids.costmap import Wheels
+from radarsdf.grids.grid import Grid
 
-BOX = [[5.0, -5.03, -1.57], [22.0, 4.97, 4.43]]  # centres of voxels are on no face of a cell
+BOX = [[5.0, -5.03, -1.57], [22.0, 4.97, 4.43]]
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,8 @@ def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(9, 18, 2000), rng.uniform(-4, 4, 2000), np.zeros(2000)])
     assert (grid.at(ground) == 0).mean() < 0.001
-    assert (grid.at(ground) == 1).mean() > 0.9
+    # The ground is the border of two voxels.
+    assert np.any([grid.at(ground + [0, 0, z]) == 1 for z in (-0.01, 0.01)], axis=0).mean() > 0.9
     air = np.column_stack(
         [rng.uniform(8, 16, 2000), rng.uniform(-1.5, 1.5, 2000), rng.uniform(0.8, 1.3, 2000)]
     )
@@ -71,13 +73,13 @@ def test_a_saved_map_has_the_same_grid(grid, sharp_map, tmp_path):
     np.testing.assert_array_equal(again.probability, grid.probability)
 
 
-def test_larger_voxels_are_free_only_throughout(grid, sharp_map):
-    coarse = sharp_map.grid(BOX, 0.4)
-    x, y, z = (n // 2 for n in grid.shape)
-    parts = grid.state[: 2 * x, : 2 * y, : 2 * z].reshape(x, 2, y, 2, z, 2).transpose(0, 2, 4, 1, 3, 5)
-    parts = parts.reshape(x, y, z, 8)
-    np.testing.assert_array_equal(coarse.free[:x, :y, :z], (parts == 0).all(axis=-1))
-    np.testing.assert_array_equal(coarse.occupied[:x, :y, :z], (parts == 1).any(axis=-1))
+def test_larger_voxels_are_free_only_throughout(sharp_map):
+    box = [[4.8, -4.8, -1.6], [21.6, 4.8, 4.4]]
+    coarse, fine = sharp_map.grid(box, 0.4), sharp_map.grid(box, 0.2)
+    x, y, z = coarse.shape
+    parts = fine.state.reshape(x, 2, y, 2, z, 2).transpose(0, 2, 4, 1, 3, 5).reshape(x, y, z, 8)
+    np.testing.assert_array_equal(coarse.free, (parts == 0).all(axis=-1))
+    np.testing.assert_array_equal(coarse.occupied, (parts == 1).any(axis=-1))
 
 
 def test_distances_are_within_their_error_and_the_unknown_is_no_way_out(grid):
@@ -102,66 +104,78 @@ def test_the_ground_is_cheap_and_the_wall_is_not(grid):
     assert (wall == 100).mean() > 0.9
 
 
+def in_map_server(path):
+    """States (X, Y), resolution and origin of a map as ROS's map_server reads it in its mode `trinary`."""
+    yaml, image = pytest.importorskip("yaml"), pytest.importorskip("PIL.Image")
+    read = yaml.safe_load(path.read_text("utf-8"))
+    with image.open(path.parent / read["image"]) as opened:
+        pixels = np.asarray(opened, np.float64)
+    assert read["mode"] == "trinary"
+    occupancy = pixels / 255 if read["negate"] else (255 - pixels) / 255
+    state = np.full(pixels.shape, -1)
+    state[occupancy > read["occupied_thresh"]] = 1
+    state[occupancy < read["free_thresh"]] = 0
+    return state[::-1].T, read["resolution"], read["origin"]  # its first row has the largest y
+
+
 def test_map_server_reads_what_it_should(grid, tmp_path):
     flat = grid.flat(0.3, 1.2)
-    flat.save(tmp_path / "nav.yaml")
-    head, size, depth, pixels = (tmp_path / "nav.pgm").read_bytes().split(b"\n", 3)
-    assert (head, size, depth) == (b"P5", b"85 50", b"255")
-    image = np.frombuffer(pixels, np.uint8).reshape(50, 85)[::-1].T
-    np.testing.assert_array_equal(image, np.choose(flat.state + 1, [205, 254, 0]))
-    text = (tmp_path / "nav.yaml").read_text()
-    assert "resolution: 0.2\n" in text
-    assert "origin: [5.000000000, -5.030000000, 0.0]\n" in text
+    flat.save(tmp_path / "it's a map.yaml")
+    state, resolution, origin = in_map_server(tmp_path / "it's a map.yaml")
+    np.testing.assert_array_equal(state, flat.state)
+    assert set(np.unique(state)) == {-1, 0, 1}
+    assert resolution == 0.2
+    np.testing.assert_allclose(origin, [5, -5.2, 0], atol=1e-9)
     assert (flat.state[74:76, 10:-10] == 1).any(axis=0).mean() > 0.9
     assert (flat.state[20:60, 20:-20] == 1).mean() < 0.02
 
 
-def read_octree(data):
-    """States of voxels (x, y, z) of a .bt, from the middle of the tree, as its documentation says."""
-    header, _, body = data.partition(b"data\n")
-    assert header.startswith(b"# Octomap OcTree binary file\n")
-    words = iter(np.frombuffer(body, "<u2").tolist())
-    found, nodes = {}, 1
-
-    def inner(corner, edge):
-        nonlocal nodes
-        word = next(words)
-        for child in range(8):
-            code = word >> (2 * child) & 3
-            half = edge // 2
-            first = tuple(c + half * (child >> axis & 1) for axis, c in enumerate(corner))
-            nodes += code != 0
-            if code == 3:
-                inner(first, half)
-            elif code:
-                for voxel in np.ndindex(half, half, half):
-                    found[tuple(a + b for a, b in zip(first, voxel, strict=True))] = code
-
-    inner((-32768,) * 3, 65536)
-    assert next(words, None) is None
-    assert int(header.split(b"size ")[1].split()[0]) == nodes
-    return found
+def made(state, origin, voxel_size):
+    """A grid of these states."""
+    numbers = np.full(state.shape, 0.5, np.float32)
+    return Grid(np.array(origin), voxel_size, state.astype(np.int8), numbers, numbers, 0.0)
 
 
-def test_an_octree_holds_the_same_voxels(grid, tmp_path):
-    grid.save(tmp_path / "grid.bt")
-    found = read_octree((tmp_path / "grid.bt").read_bytes())
-    first = np.round(grid.origin / grid.voxel_size).astype(int)
-    expected = {
-        tuple((first + voxel).tolist()): 1 if grid.state[tuple(voxel)] == 1 else 2
-        for voxel in np.argwhere(~grid.unknown)
-    }
-    assert found == expected
+def in_octomap(grid, path):
+    """States (X, Y, Z) at the centres of a grid's voxels, of the file as OctoMap reads it; and its edges of leaves, m."""
+    octomap = pytest.importorskip("octomap", reason="octomap-python has no wheel for this platform")
+    grid.save(path)
+    tree = octomap.OcTree(str(path).encode())
+    assert tree.getResolution() == pytest.approx(grid.voxel_size)
+    corners = np.array([grid.origin, grid.origin + np.array(grid.shape) * grid.voxel_size])
+    edges_m = [leaf.getSize() for leaf in tree.begin_leafs()]
+    if edges_m:
+        assert (tree.getMetricMin() >= corners[0] - 1e-6).all()
+        assert (tree.getMetricMax() <= corners[1] + 1e-6).all()
+    return tree.getLabels(grid.centres()).reshape(grid.shape), np.array(edges_m)
 
 
-def test_octomap_reads_the_octree(grid, tmp_path):
-    octomap = pytest.importorskip("octomap", reason="octomap-python is not installed")
-    grid.save(tmp_path / "grid.bt")
-    tree = octomap.OcTree(str(tmp_path / "grid.bt").encode())
-    for state, occupied in ((1, True), (0, False)):
-        for x in grid.centres(grid.state == state)[::97]:
-            node = tree.search(x + 1e-6)
-            assert tree.isNodeOccupied(node) == occupied
+def test_octomap_reads_each_voxel_as_it_is(grid, tmp_path):
+    found, _ = in_octomap(grid, tmp_path / "map.bt")
+    np.testing.assert_array_equal(found, grid.state)
+    state = np.random.default_rng(0).integers(-1, 2, (24, 9, 13))
+    state[:8, :8, :8], state[8:16, :8, :8] = 1, 0  # become leaves eight voxels wide
+    found, edges_m = in_octomap(made(state, [-1.6, 0.0, -3.2], 0.2), tmp_path / "random.bt")
+    np.testing.assert_array_equal(found, state)
+    assert (edges_m > 1.5).sum() == 2
+    for number in (1, 0, -1):
+        state = np.full((2, 2, 2), number)
+        np.testing.assert_array_equal(in_octomap(made(state, np.zeros(3), 0.1), tmp_path / "a.bt")[0], state)
+
+
+def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refused(sharp_map, tmp_path):
+    for size in (0.13, 0.2, 0.5):
+        box = np.array([[9.07, -2.93, -0.71], [14.0, 2.0, 1.2]])
+        grid = sharp_map.grid(box, size)
+        np.testing.assert_allclose(grid.origin / size, np.round(grid.origin / size), atol=1e-9)
+        upper = grid.origin + np.array(grid.shape) * size
+        assert ((grid.origin <= box[0]) & (box[0] < grid.origin + size)).all()
+        assert ((upper >= box[1] - 1e-9) & (box[1] > upper - size)).all()
+        np.testing.assert_array_equal(in_octomap(grid, tmp_path / "grid.bt")[0], grid.state)
+    with pytest.raises(ValueError, match=r"0\.07.*multiple.*0\.2 m.*0\. "):
+        made(np.ones((2, 2, 2)), [0.07, 0.2, 0.4], 0.2).save(tmp_path / "off.bt")
+    with pytest.raises(ValueError, match="32768"):
+        made(np.ones((2, 2, 2)), [7000.0, 0, 0], 0.2).save(tmp_path / "far.bt")
 
 
 def test_a_ply_holds_what_is_known(grid, tmp_path):
@@ -216,3 +230,15 @@ def test_the_command_writes_all_files(sharp_map, tmp_path, capsys):
     with np.load(tmp_path / "d.npz") as distances, np.load(tmp_path / "g.npz") as grid:
         assert distances["occupied_m"].shape == grid["state"].shape == (65, 30, 20)
     assert {path.name for path in tmp_path.iterdir()} >= {*names, "g.pgm", "c.npz"}
+
+
+def test_a_box_one_voxel_high_has_costs_and_shows_no_ground(sharp_map):
+    thin = sharp_map.grid([[15.0, -3.0, 0.8], [21.0, 3.0, 1.0]], 0.2)
+    assert thin.shape[2] == 1
+    costs = thin.costmap()
+    assert np.isnan(costs.height_m).all()
+    np.testing.assert_array_equal(costs.cost, np.where(thin.occupied[..., 0], 100, -1))
+    assert (costs.cost == 100).any()
+    with pytest.raises(ValueError, match=r"ground between z = 0\.80 and 1\.00 m"):
+        thin.flat()
+    assert thin.distances().not_free_m.shape == thin.shape

@@ -102,8 +102,12 @@ def test_the_mesh_says_what_it_was_kept_from_and_what_that_costs(of_many):
     # All that is uncertain beyond the limit is left out of this mesh, and counts there.
     assert threshold.whole_precision == pytest.approx((p * area).sum() / everything.area, abs=0.02)
     assert threshold.expected_precision > threshold.whole_precision
-    assert threshold.expected_completion < threshold.whole_completion
-    assert f"kept from a confidence of {threshold.min_confidence:.2f} on" in str(threshold)
+    assert threshold.coverage_of_observed < threshold.whole_coverage_of_observed
+    said = str(threshold)
+    assert f"kept from a confidence of {threshold.min_confidence:.2f} on" in said
+    assert f"cover {threshold.coverage_of_observed:.0%} of the surface that returns lie on" in said
+    assert "what is there" not in said
+    assert not [name for name in default.metadata if "completion" in name]
 
 
 def tally(area_m2, confidence, covering, existing=1.0, once=0.0, twice=0.0):
@@ -115,13 +119,13 @@ def tally(area_m2, confidence, covering, existing=1.0, once=0.0, twice=0.0):
 
 
 def test_the_threshold_is_that_of_the_highest_expected_f_score():
-    # Precisions from the highest on are 0.9, 0.85, 0.7 and completions 0.5, 0.8, 1: F-scores 0.643, 0.824, 0.824 and less.
+    # Precisions from the highest on are 0.9, 0.85, 0.7 and coverages 0.5, 0.8, 1: F-scores 0.643, 0.824, 0.824 and less.
     found = tally([1, 1, 1, 10], [0.9, 0.8, 0.4, 0.1], [5, 3, 2, 0]).threshold()
     assert found.min_confidence == 0.8
     assert found.expected_precision == pytest.approx(0.85)
-    assert found.expected_completion == pytest.approx(0.8)
+    assert found.coverage_of_observed == pytest.approx(0.8)
     assert found.whole_precision == pytest.approx(3.1 / 13)
-    assert found.whole_completion == 1
+    assert found.whole_coverage_of_observed == 1
 
 
 def test_the_less_can_be_reached_the_more_is_kept():
@@ -132,7 +136,7 @@ def test_the_less_can_be_reached_the_more_is_kept():
     assert tally(*surface).reachable == 1
     seen, unseen = (tally(*surface, existing=existing).threshold() for existing in (1, 3))
     assert unseen.min_confidence == 0.4 < seen.min_confidence
-    assert unseen.expected_completion == pytest.approx(0.9 / 3)
+    assert unseen.coverage_of_observed == pytest.approx(0.9 / 3)
 
 
 def test_where_nothing_can_be_reached_all_that_adds_something_is_kept():
@@ -140,7 +144,7 @@ def test_where_nothing_can_be_reached_all_that_adds_something_is_kept():
     found = tally([1, 1, 1], [0.9, 0.5, 0.2], [5, 3, 1], once=1.6)
     assert found.reachable == 0
     assert found.threshold().min_confidence == 0.2
-    assert found.threshold().expected_completion == 0
+    assert found.threshold().coverage_of_observed == 0
 
 
 def test_nothing_has_a_threshold_too():

@@ -31,7 +31,7 @@ def changes():
         "alignment": "As <given>.",
         "areas_m2": {"appeared": 0.5, "gone": 0.5, "moved": 0.0, "repainted": 0.5},
         "compared_m2": 2.0,
-        "intensity_offset": 0.3,
+        "reflectance": "As <given>.",
     }
     after = surface([SAME, APPEARED, REPAINTED], far)
     return Changes(surface([GONE], far + [0, 3.0, 0]), after, np.eye(4), report)

@@ -61,8 +61,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     Half of its vertices say where, the others judge. It begins where the frames are, and where a search by planes finds most
     agreement within some metres.
     """
-    target, _ = before.surface(None)
-    vertices, _ = after.surface(None)
+    target, vertices = (placed.to_common(placed.vertices) for placed in (before, after))
     if min(len(target), len(vertices)) < CELLS_OF_SURFACE:
         return unaligned()
     vertices = vertices[:: max(1, len(vertices) // _MOST_VERTICES)]

@@ -97,10 +97,11 @@ class Changes:
     T_before_after: Floats
     """(4, 4) from the later map's world to that of the earlier one, m."""
     report: dict[str, Any]
-    """`alignment` in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map tells of; `changed_share`, the
+    """`alignment`: in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map tells of; `changed_share`, the
     probable share of it that changed; `scale` and `freedom`: over their standard errors, distances between the maps follow
     Student's t with so many degrees of freedom, so much widened;
-    `intensity_offset`, by which all intensities changed, sensor units."""
+    `reflectance`: what intensities have in common, in words, or why they were not compared; `intensity_offset`, by which all of them
+    changed, sensor units, None if they were not compared."""
 
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:
         """Changes that hang together, the largest first; without those of a smaller area, m²."""

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,9 +39,14 @@ from radarsdf.fitting.fit import fit
 from radarsdf.io.scans import Scans
 from radarsdf.map.gridding import check_passages
 from radarsdf.map.map import Map
+from radarsdf.map.meshing import renumbered
 
 _PROBABLE = 0.5  # more likely than not
-_PARALLEL = np.cos(np.pi / 4)  # a surface that moved is still about parallel
+_LEVEL = np.cos(np.pi / 4)  # least part of a level surface's normal that is upright
+# Of what both saw, more would have changed only between maps that do not fit together: 16 % and more where one was turned by
+# 20° or more, or shifted by 20 m, on yard, hall, forest, car_park and facade. A car that moved on open ground is less.
+_MOST_CHANGED = 0.1
+_AGREEING_SIGMAS = 3.0
 
 
 def compare(
@@ -74,7 +79,7 @@ def compare(
         Whether the later map may be moved as a whole. It is if its surface is then nearer to the earlier one, by more than
         chance gives one of a thousand; frames may be some metres and some degrees apart.
     box : (2, 3) array_like, optional
-        Lower and upper corner, world of the earlier map, m: nothing outside is looked at.
+        Lower and upper corner, world of the earlier map, m: nothing outside is returned.
 
     Returns
     -------
@@ -84,7 +89,8 @@ def compare(
     Raises
     ------
     ValueError
-        If a map does not keep what rays passed, or for wrong arguments.
+        If a map does not keep what rays passed, for wrong arguments, or if the maps do not fit together: they saw no surface
+        in common, or of the level or of the steep surfaces that they have in common, more would have changed than agrees.
     TypeError
         If `before` is no map.
 
@@ -109,8 +115,8 @@ def compare(
     alignment = align(earlier, later) if align_frames else unaligned()
     later = later.at(alignment.T_before_after)
     sides = (
-        _Side.of(earlier, later, alignment, corners),
-        _Side.of(later, earlier, alignment, corners),
+        _Side.of(earlier, later, alignment),
+        _Side.of(later, earlier, alignment),
     )
     errors = errors_of([side.beside for side in sides])
     found = [side.beside.absence(errors) for side in sides]
@@ -119,9 +125,10 @@ def compare(
         side.kinds(absence, share, kind)
         for side, absence, kind in zip(sides, found, (GONE, APPEARED), strict=True)
     ]
+    _check_common(sides, [kinds for kinds, _, _ in told], errors, alignment)
     differences = Differences.of(earlier, later)
     changes = [np.full(len(side.vertices), np.nan) for side in sides]
-    if differences is not None:
+    if differences is not None and differences.other_units is None:
         changed = np.concatenate(
             [side.vertices[kinds > SAME] for side, (kinds, _, _) in zip(sides, told, strict=True)]
         )
@@ -134,9 +141,12 @@ def compare(
             moved_m,
         )
     before_surface, after_surface = (
-        ChangedSurface(
-            side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m.astype(np.float32),
-            change.astype(np.float32),
+        _inside(
+            corners,
+            ChangedSurface(
+                side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m.astype(np.float32),
+                change.astype(np.float32),
+            ),
         )
         for side, (kinds, probability, moved_m), change in zip(sides, told, changes, strict=True)
     )  # fmt: skip
@@ -169,19 +179,21 @@ class _Side:
     beside: Beside
 
     @classmethod
-    def of(cls, own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment, box: Floats | None) -> _Side:
-        vertices, faces = own_map.surface(box)
+    def of(cls, own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> _Side:
+        vertices = own_map.to_common(own_map.vertices)
         own = own_map.told(vertices)
         other = other_map.told(vertices, own.normals)
         sigma_m = np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals))
-        return cls(vertices, faces, own_map, other_map, Beside.of(own, other, other_map.leaf_m, sigma_m))
+        return cls(
+            vertices, own_map.faces, own_map, other_map, Beside.of(own, other, other_map.leaf_m, sigma_m)
+        )
 
     def kinds(self, absence: Absence, share: float, lost: int) -> tuple[NDArray[np.int8], Floats, Floats]:
         """(V,) kinds, probabilities and movements. `lost`: what a surface is that the other map has not."""
         own, other = self.beside.own, self.beside.other
         absent = own.confidence * posterior(absence.absent, share)
         elsewhere = own.confidence * posterior(absence.shifted, share)
-        parallel = np.einsum("ni,ni->n", own.normals, other.normals) >= _PARALLEL
+        parallel = self.beside.parallel
         shifted = np.where(parallel, other.confidence * elsewhere, 0.0)
         seen = np.isfinite(other.distance_m)
         behind = seen & (other.distance_m < 0)
@@ -197,6 +209,45 @@ class _Side:
         return kinds, probability, np.where(kinds == MOVED, towards, np.nan)
 
 
+def _inside(box: Floats | None, surface: ChangedSurface) -> ChangedSurface:
+    """The triangles in a box (2, 3), world of the earlier map, m. None: all."""
+    if box is None:
+        return surface
+    within = ((surface.vertices >= box[0]) & (surface.vertices <= box[1])).all(axis=1)
+    used, faces = renumbered(len(within), surface.faces[within[surface.faces].all(axis=1)])
+    of_vertices = {name: values[used] for name, values in vars(surface).items() if name != "faces"}
+    return ChangedSurface(faces=faces, **of_vertices)
+
+
+def _check_common(
+    sides: Sequence[_Side], kinds: Sequence[NDArray[np.int8]], errors: Errors, alignment: Alignment
+) -> None:
+    """Raises a ValueError if the maps do not fit together.
+
+    Maps in wrong frames agree about the ground and a level floor, so level and steep surfaces are judged each for themselves;
+    and on both sides, since a place may be cleared.
+    """
+    if all((of_side == UNSEEN).all() for of_side in kinds):
+        msg = f"the maps have no surface in common: they are of other places, or in other frames. {alignment.words}"
+        raise ValueError(msg)
+    seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
+    levels = [np.abs(side.beside.own.normals[:, 2]) >= _LEVEL for side in sides]
+    for name, chosen in (("level", levels), ("steep", [~level for level in levels])):
+        changed = [int((mask & (of_side > SAME)).sum()) for mask, of_side in zip(chosen, kinds, strict=True)]
+        agree = [
+            int((mask & side.beside.agree(errors, _AGREEING_SIGMAS) & (of_side == SAME)).sum())
+            for side, mask, of_side in zip(sides, chosen, kinds, strict=True)
+        ]
+        if sum(changed) > _MOST_CHANGED * seen and all(a > b for a, b in zip(changed, agree, strict=True)):
+            shares = [f"{a / (a + b):.0%}" for a, b in zip(changed, agree, strict=True)]
+            msg = (
+                f"the maps do not fit together: of the {name} surfaces that both saw, {shares[0]} of the earlier and {shares[1]} of "
+                f"the later map would have changed. {alignment.words} Give maps of one place, whose frames are at most some metres "
+                "and degrees apart, with poses that do not drift"
+            )
+            raise ValueError(msg)
+
+
 def _summed(
     before: ChangedSurface, after: ChangedSurface, alignment: Alignment, share: float, errors: Errors,
     differences: Differences | None,
@@ -208,6 +259,9 @@ def _summed(
         compared += float(face_m2[of_faces != UNSEEN].sum())
         for kind in CHANGED:
             areas[NAMES[kind]] += float(face_m2[of_faces == kind].sum())
+    words, offset = "Reflectance was not compared: a map has no intensities, or they share no view.", None
+    if differences is not None:
+        words, offset = differences.words, None if differences.other_units else differences.offset
     report = {
         "alignment": alignment.words,
         "areas_m2": areas,
@@ -215,6 +269,7 @@ def _summed(
         "changed_share": share,
         "scale": errors.scale,
         "freedom": errors.freedom,
-        "intensity_offset": None if differences is None else differences.offset,
+        "reflectance": words,
+        "intensity_offset": offset,
     }
     return Changes(before, after, alignment.T_before_after, report)

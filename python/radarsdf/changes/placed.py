@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from radarsdf.map.gridding import plane_at
 from radarsdf.map.map import Map
-from radarsdf.map.meshing import renumbered
 from radarsdf.products import turned
 
 Floats = NDArray[np.float64]
@@ -78,16 +77,6 @@ class PlacedMap:
     def to_common(self, x: Floats) -> Floats:
         """Places (N, 3) of the map's world in the common frame."""
         return turned(x, self.T_common_map[:3, :3]) + self.T_common_map[:3, 3]
-
-    def surface(self, box: ArrayLike | None) -> tuple[Floats, NDArray[np.int32]]:
-        """Vertices (V, 3), common frame, and faces (F, 3) of the mesh. `box` (2, 3): in the common frame."""
-        vertices, faces = self.to_common(self.vertices), self.faces
-        if box is None:
-            return vertices, faces
-        lower, upper = np.asarray(box, np.float64)
-        inside = ((vertices >= lower) & (vertices <= upper)).all(axis=1)
-        used, faces = renumbered(len(vertices), faces[inside[faces].all(axis=1)])
-        return vertices[used], faces
 
     def distance(self, x: Floats) -> tuple[Floats, Floats]:
         """`distance_m` and `normals` of :class:`Told` at places (N, 3)."""

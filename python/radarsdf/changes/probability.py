@@ -25,6 +25,7 @@ _ROUNDS, _SETTLED = 50, 1e-4  # of the share
 # Returns of a scan in cells side by side have causes in common: so many of them count once. Chosen on facade, hall and
 # forest of seed 31.
 _CELLS_PER_SCAN = 2.0
+_PARALLEL = np.cos(np.pi / 4)  # a surface that moved is still about parallel
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 _MOST_DISTANCES = 5_000  # that tell both, evenly spread
@@ -104,6 +105,16 @@ class Beside:
     def observed(self) -> NDArray[np.bool_]:
         """(N,) whether the distance is known."""
         return np.isfinite(self.other.distance_m) & np.isfinite(self.sigma_m)
+
+    @property
+    def parallel(self) -> NDArray[np.bool_]:
+        """(N,) whether the other map's surface is about parallel."""
+        mask: NDArray[np.bool_] = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= _PARALLEL
+        return mask
+
+    def agree(self, errors: Errors, sigmas: float) -> NDArray[np.bool_]:
+        """(N,) whether the other map has the surface, to within so many of its standard errors."""
+        return self.parallel & (np.abs(self.other.distance_m) <= sigmas * errors.scale * self.sigma_m)
 
     def distances(self) -> tuple[Floats, Floats]:
         """(K,) distances that are known, and their standard errors, m."""

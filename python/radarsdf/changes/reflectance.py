@@ -16,6 +16,9 @@ from radarsdf.changes.probability import odds_of_differences, posterior, share_o
 from radarsdf.products import turned
 from radarsdf.returns.echoes import PLACE_CELLS, EchoesAt, rows_of_views
 
+_SAME_UNITS = np.sqrt(2)  # units differ by factors of 2 at least, as half decibels and decibels do
+_FEWEST_VIEWS = 10
+
 
 @dataclass(frozen=True)
 class _Means:
@@ -81,6 +84,18 @@ class Differences:
     """Means that are so close to a place tell of it, m."""
     width: float
     """Of the range of intensities, sensor units."""
+    other_units: float | None
+    """How many times as widely the later intensities spread, if the two days are in different units. None: they are not."""
+
+    @property
+    def words(self) -> str:
+        """What all places have in common, in one sentence."""
+        if self.other_units is not None:
+            return (
+                "Reflectance was not compared: at the same places and from the same views, the intensities of the later map spread "
+                f"{self.other_units:.3g} times as widely, so they are in other units."
+            )
+        return f"All returns of the later drive are {self.offset:+.1f} stronger, sensor units: that is no change of a place."
 
     @classmethod
     def of(cls, before: PlacedMap, after: PlacedMap) -> Differences | None:
@@ -105,7 +120,7 @@ class Differences:
         sums = []
         for of_day in (~later, later):
             known = of_day & np.isfinite(left)
-            columns = np.column_stack([np.ones(len(left)), left, points])
+            columns = np.column_stack([np.ones(len(left)), left, intensities, points])
             sums.append(
                 np.stack(
                     [np.bincount(rows[known], counts[known] * column[known], count) for column in columns.T]
@@ -118,13 +133,14 @@ class Differences:
         values = second[1] / second[0] - first[1] / first[0]
         offset = float(np.median(values))
         between = _Means(
-            ((first[2:] + second[2:]) / (first[0] + second[0])).T,
+            ((first[3:] + second[3:]) / (first[0] + second[0])).T,
             values - offset,
             days[0].sigma ** 2 / first[0] + days[1].sigma ** 2 / second[0],
         )
         within = [_left_of(day, expected[number][later == bool(number)]) for number, day in enumerate(days)]
         width = max(scale.high - scale.low for scale in scales)
-        return cls(between, within, offset, PLACE_CELLS * leaf_m, width)
+        other_units = _ratio_of_units(first[2] / first[0], second[2] / second[0])
+        return cls(between, within, offset, PLACE_CELLS * leaf_m, width, other_units)
 
     def apart_from(self, changed: Floats) -> Differences:
         """Without those near places (C, 3) that changed otherwise: the returns of one day are of what is not there on the other."""
@@ -152,6 +168,20 @@ class Differences:
         odds = odds_of_differences(between.mean[known], sigma, self.width)
         changed[known] = posterior(odds, share_of_changes(odds))
         return between.mean, changed
+
+
+def _ratio_of_units(earlier: Floats, later: Floats) -> float | None:
+    """How many times as widely the later of two intensities (G,) of the same views spread, if that is no noise. None: they agree.
+
+    Noise lowers the slope of either on the other, so one that is still above the limit is of the units. Linear powers have long
+    tails, which are clipped.
+    """
+    x, y = (np.clip(values, *np.percentile(values, [5, 95])) for values in (earlier, later))
+    (var_x, cov), (_, var_y) = np.cov(x, y, bias=True)
+    if len(x) <= _FEWEST_VIEWS:
+        return None
+    error = np.sqrt(max(var_x * var_y - cov**2, 0) / len(x))
+    return float(np.sqrt(var_y / var_x)) if cov - 3 * error > _SAME_UNITS * min(var_x, var_y) > 0 else None
 
 
 def _placed(placed: PlacedMap) -> EchoesAt:

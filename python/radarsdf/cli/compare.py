@@ -72,6 +72,7 @@ def run(options: argparse.Namespace) -> None:
     results = Results(options)
     report = changes.report
     results.add(report["alignment"], alignment=report["alignment"], T_before_after=changes.T_before_after)
+    results.add(report["reflectance"], reflectance=report["reflectance"])
     areas = ", ".join(f"{name} {area:.1f}" for name, area in report["areas_m2"].items())
     results.add(
         f"of {report['compared_m2']:.0f} m2 that both saw, m2: {areas}",

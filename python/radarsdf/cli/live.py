@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
     """Replay the scans, say how the map kept up, and write it."""
     from radarsdf.checks import not_negative
     from radarsdf.io.files import check_outputs
-    from radarsdf.io.poses.writing import check_pose_suffix, write_poses
+    from radarsdf.io.poses.writing import check_pose_suffix, check_pose_times, write_poses
 
     config = config_of(options)
     rate = not_negative(options.rate, "--rate")
@@ -65,6 +65,8 @@ def run(options: argparse.Namespace) -> None:
     if options.view:
         check_address(options)
     scans, with_poses = _read(options)
+    if options.trajectory is not None:
+        check_pose_times(options.trajectory, scans.times_s)
     results = Results(options)
 
     from radarsdf.live.live_map import LiveMap

@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
 
         require("matplotlib", what="pictures need")
     results = Results(options)
-    scans, posed = scans_and_poses(options, config, results, refine=True, find=options.find)
+    scans, posed = scans_and_poses(options, config, results, refine=True, find=options.find, out=options.out)
     if as_scans:
         write_scans(options.out, scans)
     elif posed.pieces > 1 and options.out.suffix.lower() != ".tum":

@@ -8,6 +8,7 @@ import argparse
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from radarsdf.cli.results import Results
@@ -22,12 +23,21 @@ if TYPE_CHECKING:
 
 
 def scans_and_poses(
-    options: argparse.Namespace, config: FitConfig, results: Results, *, refine: bool, find: bool = False
+    options: argparse.Namespace,
+    config: FitConfig,
+    results: Results,
+    *,
+    refine: bool,
+    find: bool = False,
+    out: Path | None = None,
 ) -> tuple[Scans, Posed]:
-    """The scans of a command, those of the longest piece if there are several. Their poses are refined, if that is wanted, or found, if there are none or `find` says so."""
+    """The scans of a command, those of the longest piece if there are several. Their poses are refined, if that is wanted, or found, if there are none or `find` says so. `out`: the file of poses that the command writes."""
+    from radarsdf.io.poses.writing import check_pose_times
     from radarsdf.poses.posed import Posed
 
     scans, missing = scans_or_unposed(options, find=find)
+    if out is not None:
+        check_pose_times(out, scans.times_s)
     if find or missing is not None:
         with finding(options, missing):
             return _found(scans, config, results, options.command)

@@ -76,9 +76,11 @@ def ground(grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """
     size = grid.voxel_size
     z = grid.origin[2] + (np.arange(grid.shape[2]) + 0.5) * size
-    lower, upper = grid.distance_m[..., :-1], grid.distance_m[..., 1:]
+    # Above the uppermost voxels nothing is known.
+    lower, occupied = grid.distance_m, np.pad(grid.occupied, ((0, 0), (0, 0), (0, 1)))
+    upper = np.concatenate([lower[..., 1:], np.full_like(lower[..., :1], np.nan)], axis=2)
     with np.errstate(invalid="ignore"):
-        up = (lower <= 0) & (upper > 0) & (grid.occupied[..., :-1] | grid.occupied[..., 1:])
+        up = (lower <= 0) & (upper > 0) & (occupied[..., :-1] | occupied[..., 1:])
         share = np.where(up, lower / (lower - upper), 0)
     found: NDArray[np.bool_] = np.asarray(up.any(axis=2))
     first = up.argmax(axis=2)

@@ -81,7 +81,11 @@ def flat_grid(grid: Grid, lower_m: float, upper_m: float) -> FlatGrid:
         raise ValueError(msg)
     height, _ = ground(grid)
     if not np.isfinite(height).any():
-        msg = "the grid has no ground: choose a lower box"
+        top = grid.origin[2] + grid.shape[2] * grid.voxel_size
+        msg = (
+            f"no column of the grid shows ground between z = {grid.origin[2]:.2f} and {top:.2f} m: choose a box that reaches "
+            "from below the ground to two voxels or more above it"
+        )
         raise ValueError(msg)
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 

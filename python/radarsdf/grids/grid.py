@@ -26,7 +26,7 @@ class Grid:
     """
 
     origin: NDArray[np.float64]
-    """(3,) lower corner of voxel (0, 0, 0), world, m."""
+    """(3,) lower corner of voxel (0, 0, 0), world, m: a multiple of the voxel along each axis."""
     voxel_size: float
     """Edge of a voxel, m."""
     state: NDArray[np.int8]
@@ -100,7 +100,7 @@ class Grid:
         Raises
         ------
         ValueError
-            If the heights are not ascending, or the grid has no ground.
+            If the heights are not ascending, or no column of the grid shows ground.
         """
         return flat_grid(self, lower_m, upper_m)
 
@@ -116,7 +116,8 @@ class Grid:
         Raises
         ------
         ValueError
-            For another suffix, or if the grid is too far from the world's origin for a ``.bt``: 32,768 voxels.
+            For another suffix, or if the grid is too far from the world's origin for a ``.bt``, 32,768 voxels, or its origin
+            is not a multiple of its voxels.
         OSError
             If the file cannot be written.
         """

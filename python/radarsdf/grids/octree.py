@@ -3,8 +3,8 @@
 """A grid as an octree in OctoMap's binary format, which its tools and planners read.
 
 The file is a header of text and, from the root on, two bytes for each inner node: two bits for each of its eight
-children, in the order of x, y, z with x first. 01: occupied, 10: free, 11: an inner node, which follows after those
-before it; 00: unknown. The tree has 16 levels, of which the middle is at the origin of the world.
+children, in the order of x, y, z with x first. 1: free, 2: occupied, 3: an inner node, which follows after those
+before it; 0: unknown. The tree has 16 levels, of which the middle is at the origin of the world.
 """
 
 from __future__ import annotations
@@ -19,21 +19,29 @@ if TYPE_CHECKING:
 
 _LEVELS = 16
 _HALF = 1 << (_LEVELS - 1)  # voxels from the middle of the tree to its border
-_UNKNOWN, _OCCUPIED, _FREE, _INNER = 0, 1, 2, 3  # bit 0 and bit 1 of a child, as OctoMap reads them
+_MOST_OFF = 0.01  # voxels: rounding of the origin
+_FREE, _OCCUPIED, _INNER = 1, 2, 3
 
 
 def octree_bytes(grid: Grid) -> bytes:
-    """The file. Voxels are moved to the octree's lattice, by at most half a voxel along each axis.
+    """The file.
 
     Raises
     ------
     ValueError
-        If the grid reaches farther from the world's origin than the octree: 32,768 voxels.
+        If the grid's origin is not a multiple of its voxels, as that of :meth:`Map.grid` is, or if the grid reaches farther
+        from the world's origin than the octree: 32,768 voxels.
     """
+    start = np.round(grid.origin / grid.voxel_size)
+    if np.abs(grid.origin / grid.voxel_size - start).max() > _MOST_OFF:
+        msg = (
+            f"the grid's origin, {grid.origin}, must be a multiple of its voxels of {grid.voxel_size:g} m, as OctoMap's are: "
+            f"the nearest is {start * grid.voxel_size}"
+        )
+        raise ValueError(msg)
     known = np.argwhere(~grid.unknown)
     states = np.where(grid.state[~grid.unknown] == 1, _OCCUPIED, _FREE)
-    first = np.round(grid.origin / grid.voxel_size).astype(np.int64) + _HALF
-    keys = known + first
+    keys = known + start.astype(np.int64) + _HALF
     if len(keys) and not ((keys >= 0).all() and (keys < 2 * _HALF).all()):
         msg = f"the grid is more than {_HALF} voxels from the world's origin, where OctoMap's octree ends"
         raise ValueError(msg)

@@ -115,12 +115,14 @@ def make_grid(
         raise ValueError(msg)
     # A voxel is at most as large as a leaf cell, or is made of parts that are.
     parts = max(1, math.ceil(size / radar_map.config.leaf_size_m - 1e-6)) if size <= MAX_POSITION_M else 1
-    counts = np.maximum(1, np.ceil((corners[1] - corners[0]) / size - 1e-6))
+    # Whole multiples of the voxel, as octrees have them; 1e-6 voxels are rounding.
+    first = np.floor(corners[0] / size + 1e-6)
+    counts = np.maximum(1, np.ceil(corners[1] / size - 1e-6) - first)
     if np.prod(counts) * parts**3 > _MAX_VOXELS:
         msg = f"the box has {np.prod(counts) * parts**3:.3g} voxels: at most {_MAX_VOXELS} fit; take a smaller one, or larger voxels"
         raise MemoryError(msg)
     shape = tuple((counts.astype(np.int64) * parts).tolist())
-    fine = _fine_grid(radar_map, corners[0], size / parts, shape, occupied_from, free_to)
+    fine = _fine_grid(radar_map, first * size, size / parts, shape, occupied_from, free_to)
     return fine if parts == 1 else _coarser(fine, parts)
 
 
@@ -151,11 +153,7 @@ def _fine_grid(
         surface = _Planes.of(radar_map, x)
         distance_m[rows] = surface.distance_m
         # Where the map has it: how far it may be off is said by `position_error_m`, or rough surfaces would be nowhere.
-        of_surface = np.where(
-            _beside_other_side(distance_m)[rows] & (np.abs(surface.distance_m) <= _HALF_WIDTH * size),
-            surface.confidence,
-            0,
-        )
+        of_surface = np.where(_crossed(distance_m, _HALF_WIDTH * size)[rows], surface.confidence, 0)
         is_there = of_surface >= occupied_from
         occupied[rows] = is_there
         # Behind a surface, rays passed by mistake: nothing is free there.
@@ -168,7 +166,7 @@ def _fine_grid(
             position_error_m = _SIGMAS_95 * float(np.quantile(errors_m, 0.95))
     state = np.full(shape, UNKNOWN, np.int8)
     state[free], state[occupied] = FREE, OCCUPIED
-    return Grid(np.array(lower), size, state, probability, distance_m, position_error_m)
+    return Grid(lower, size, state, probability, distance_m, position_error_m)
 
 
 @dataclass(frozen=True)
@@ -229,16 +227,19 @@ def _below(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return share
 
 
-def _beside_other_side(distance_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Voxels beside one on the other side of a surface: what is only near zero may be the end of what the field knows."""
+def _crossed(distance_m: NDArray[np.float32], reach_m: float) -> NDArray[np.bool_]:
+    """Voxels next to one on the other side of a surface, if the surface is in reach or nearer to them than to that one.
+
+    What is only near zero may be the end of what the field knows.
+    """
+    away_m = np.abs(distance_m)
     before, behind = distance_m > 0, distance_m <= 0  # NaN is neither
     found = np.zeros(distance_m.shape, bool)
     for axis in range(3):
-        for side, other in ((before, behind), (behind, before)):
-            for here, beside in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
-                np.moveaxis(found, axis, 0)[here] |= (
-                    np.moveaxis(side, axis, 0)[here] & np.moveaxis(other, axis, 0)[beside]
-                )
+        for here, other in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+            a, b = ((*(slice(None),) * axis, part) for part in (here, other))
+            crossed = (before[a] & behind[b]) | (behind[a] & before[b])
+            found[a] |= crossed & ((away_m[a] <= reach_m) | (away_m[a] <= away_m[b]))
     return found
 
 

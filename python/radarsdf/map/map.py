@@ -212,9 +212,9 @@ class Map(MapParts):
             units, as ``mesh.vertex_attributes["intensity"]``, and colours from dark (low) to bright (high).
         min_confidence : float, optional
             In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out. Default: that at which the F-score
-            of the surface in the voxels is expected to be highest. Precision is the mean confidence of what is kept.
-            What can be completed is less than all: some of it no scan saw, and of some the position is too uncertain.
-            The less that is, the more is kept. 0: all is kept (3QFP).
+            of the observed surface is expected to be highest. Precision is the mean confidence of what is kept. What can
+            be covered is less than all: some of it was hit by chance by no scan, and of some the position is too
+            uncertain. The less that is, the more is kept. 0: all is kept (3QFP).
         max_uncertainty : float, optional
             Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. Default: there is no limit;
             what is uncertain is improbable, too.
@@ -230,9 +230,10 @@ class Map(MapParts):
             World frame, m. Triangles and vertex normals face free space. The mesh is empty if there is no surface. The
             vertices have their :meth:`confidence` as ``mesh.vertex_attributes["confidence"]``, and their :meth:`uncertainty`
             as ``"uncertainty_m"``. In ``mesh.metadata``, `leaf_cells` is the number of leaf cells, and `leaf_cells_searched`
-            of those in which the surface can be; `min_confidence` is what was kept from, `expected_precision` and
-            `expected_completion` are the shares of it that are expected to be true and of the truth that it is expected to
-            cover, and `whole_precision` and `whole_completion` are those if all were kept.
+            of those in which the surface can be; `min_confidence` is what was kept from, `expected_precision` the share of
+            it that is expected to be true, `coverage_of_observed` the share of the surface that returns lie on that it is
+            expected to cover, and `whole_precision` and `whole_coverage_of_observed` are those if all were kept. What no ray
+            reached is not in them: of all that is there, the mesh may cover far less.
 
         Raises
         ------
@@ -284,7 +285,8 @@ class Map(MapParts):
         Parameters
         ----------
         box : (2, 3) array_like
-            Lower and upper corner, world, m. The grid begins at the lower one, and ends at or behind the upper one.
+            Lower and upper corner, world, m. The grid covers the box, extended to multiples of `voxel_size` in the world: grids
+            of adjacent boxes fit together.
         voxel_size : float
             Edge of a voxel, m. Below that of a leaf cell, voxels are not better known. Above it, a voxel is occupied if a
             part of it is, and free only if it is throughout.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From which confidence on a mesh keeps a surface: where the F-score that is expected is highest."""
+"""From which confidence on a mesh keeps a surface: where the F-score that is expected of the observed surface is highest."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ class Threshold:
     """In [0, 1]. Surface of less is left out."""
     expected_precision: float
     """Share of the area kept that is expected to be true; 0 if nothing is kept."""
-    expected_completion: float
-    """Share of the true surface that it is expected to cover; 0 if none is expected."""
+    coverage_of_observed: float
+    """Share of the observed surface, that which returns lie on, that it is expected to cover; 0 if none is expected. Surface that
+    no ray reached does not count: the share of all that is there may be far smaller."""
     whole_precision: float
-    """The same if all surface were kept, whatever its confidence."""
-    whole_completion: float
-    """Likewise."""
+    """`expected_precision` if all surface were kept, whatever its confidence."""
+    whole_coverage_of_observed: float
+    """`coverage_of_observed` if all surface were kept."""
 
     @classmethod
     def of_mesh(cls, metadata: Mapping[str, Any]) -> Threshold:
@@ -47,8 +48,8 @@ class Threshold:
     def __str__(self) -> str:
         return (
             f"kept from a confidence of {self.min_confidence:.2f} on: {self.expected_precision:.0%} of it is expected to be "
-            f"true, and to cover {self.expected_completion:.0%} of what is there; of all surface that was found, "
-            f"{self.whole_precision:.0%} and {self.whole_completion:.0%}"
+            f"true, and to cover {self.coverage_of_observed:.0%} of the surface that returns lie on; of all surface that was "
+            f"found, {self.whole_precision:.0%} and {self.whole_coverage_of_observed:.0%}"
         )
 
 
@@ -114,29 +115,30 @@ class Tally:
         return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)
 
     def threshold(self, min_confidence: float | None = None) -> Threshold:
-        """That of the highest expected F-score, or what is expected of a given one."""
+        """That of the highest F-score expected of the observed surface, or what is expected of a given one."""
         kept_m2, true_m2, covering = (
             np.cumsum(values[::-1])[::-1] for values in (self.area_m2, self.true_m2, self.covering)
         )
         precision = np.divide(true_m2, kept_m2, out=np.zeros_like(true_m2), where=kept_m2 > 0)
-        completion = covering / covering[0] if covering[0] > 0 else covering
+        coverage = covering / covering[0] if covering[0] > 0 else covering
         if min_confidence is None:
-            total = precision + self.reachable * completion
+            total = precision + self.reachable * coverage
             # Over twice the reachable share, which is the same for all: if nothing can be reached, all is kept.
-            f_score = np.divide(precision * completion, total, out=np.zeros_like(total), where=total > 0)
+            f_score = np.divide(precision * coverage, total, out=np.zeros_like(total), where=total > 0)
             part = int(np.flatnonzero(f_score == f_score.max())[-1]) if f_score.any() else 0
             min_confidence = part / _PARTS
         else:
             part = min(round(min_confidence * _PARTS), _PARTS - 1)
-        completion = self.reachable * completion
-        expected = (precision[part], completion[part], precision[0], completion[0])
+        coverage = self.reachable * coverage
+        expected = (precision[part], coverage[part], precision[0], coverage[0])
         return Threshold(min_confidence, *map(float, expected))
 
     @property
     def reachable(self) -> float:
-        """Share of the true surface that can be covered: that scans saw, and that lies near enough to where it was found.
+        """Share of the observed surface that can be covered: that has returns, and lies near enough to where it was found.
 
-        At least once² / (2 · twice) was seen by no scan: the estimate of Chao for species that no sample has.
+        Of the surface that these scans could have hit, at least once² / (2 · twice) has no return: the estimate of Chao for
+        species that no sample has. Surface that no ray reaches leaves no trace in these counts.
         """
         true_m2 = float(self.true_m2.sum())
         if true_m2 == 0 or (self.once_m2 > 0 and self.twice_m2 == 0):

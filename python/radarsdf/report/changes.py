@@ -101,16 +101,7 @@ def _conclusion(changes: Changes, regions: Sequence[Region]) -> Section:
         found.append(Sentence("warning", kind.capitalize(), text))
     if len(found) == 1:
         found.append(Sentence("good", "Changes", "No place changed that is large enough to be listed."))
-    offset = changes.report["intensity_offset"]
-    if offset is None:
-        found.append(
-            Sentence(
-                "note", "Reflectance", "It was not compared: a map has no intensities, or they share no view."
-            )
-        )
-    else:
-        text = f"All returns of the later drive are {offset:+.1f} stronger, sensor units: that is no change of a place."
-        found.append(Sentence("note", "Reflectance", text))
+    found.append(Sentence("note", "Reflectance", changes.report["reflectance"]))
     seen = "What the other drive did not look at is unseen, not gone."
     return Section("conclusion", "Conclusion", [items([*found, Sentence("note", "Unseen", seen)])])
 

@@ -25,6 +25,15 @@ def check_pose_suffix(path: str | PathLike[str]) -> None:
         raise ValueError(msg)
 
 
+def check_pose_times(path: str | PathLike[str], times: ArrayLike | None) -> None:
+    """Raises a ValueError if :func:`write_poses` would refuse to write without times."""
+    if times is None and path_of(path, "path").suffix.lower() == ".tum":
+        msg = (
+            f"{path} needs times, when each pose was taken, s, and there are none: .kitti and .npy do without"
+        )
+        raise ValueError(msg)
+
+
 def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | None = None) -> None:
     """Writes a trajectory, whole or not at all.
 
@@ -55,6 +64,7 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | 
     12.500000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 1.000000000
     """
     check_pose_suffix(path)
+    check_pose_times(path, times)
     suffix = path_of(path, "path").suffix.lower()
     matrices = check_poses(poses)
     text = io.BytesIO()
@@ -63,9 +73,6 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | 
     elif suffix == ".kitti":
         np.savetxt(text, matrices[:, :3].reshape(-1, 12), "%.12g")
     else:
-        if times is None:
-            msg = f"{path} needs times: when each pose was taken, s"
-            raise ValueError(msg)
         times_s = real_array(times, "times")
         if times_s.shape != (len(matrices),) or not np.isfinite(times_s).all():
             msg = f"times must be one finite number for each of {len(matrices)} poses, not {times_s.shape}"
