@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from radarsdf.io.bags.files import Topic, messages_of, topics_with
+from radarsdf.io.bags.files import Topic, read_messages, topics_with
 from radarsdf.io.bags.messages import IMU, TRANSFORM_TYPES, Header, ImuMessage
 from radarsdf.io.bags.poses import static_between
 from radarsdf.io.imu import Imu
@@ -55,8 +55,8 @@ def imu_in_bags(
     """
     stamps_s, recorded_s, rates, forces = (array("d") for _ in range(4))
     first: Header | None = None
-    for message in messages_of(paths, {topic.name}):
-        measured: ImuMessage = message.read()
+    for message in read_messages(paths, {topic.name}, request.notes):
+        measured: ImuMessage = message.content
         if measured.angular_velocity is None:
             request.notes.add(f"{topic.name} has no angular velocity: it is not used")
             return None
@@ -84,6 +84,6 @@ def imu_in_bags(
     R_sensor_imu = request.R_sensor_imu
     if R_sensor_imu is None and first is not None:
         transforms = topics_with(TRANSFORM_TYPES, topics)
-        T_imu_sensor = static_between(paths, set(transforms), first.frame, sensor_frame)
+        T_imu_sensor = static_between(paths, set(transforms), first.frame, sensor_frame, request)
         R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
     return Imu(times_s[finite], table[:, :3], table[:, 3:] if has_force else None, R_sensor_imu)
