@@ -142,6 +142,7 @@ def test_poses_that_are_rare_or_not_of_the_sensor_are_passed_over(tmp_path):
             bag.write("/short", bag.pose_stamped(time_s, pose([80.0, 0, 0])), time_s)
         for time_s in TIMES_S:
             bag.write("/tag", bag.pose_stamped(time_s, pose([2.0, 0, 0]), "base"), time_s)  # of a thing seen
+            bag.write("/person", bag.pose_stamped(time_s, pose([10 * (time_s - START_S), 0, 0])), time_s)
             bag.write("/leader", bag.odometry(time_s, pose([90.0, 0, 0]), "odom", "leader"), time_s)
             plan = {time_s: pose([1.0, 0, 0])}  # without stamps
             message = bag.path({**plan, time_s + 1: pose([2.0, 0, 0])})
@@ -153,7 +154,7 @@ def test_poses_that_are_rare_or_not_of_the_sensor_are_passed_over(tmp_path):
     scans = read(path)
     assert_allclose(scans.poses[0], MOUNTING, atol=1e-9)
     passed = [note.split()[2] for note in scans.notes if note.startswith("poses of")]
-    assert passed == ["/amcl_pose", "/leader", "/route", "/short", "/tag"]
+    assert passed == ["/amcl_pose", "/leader", "/person", "/route", "/short", "/tag"]
 
 
 @pytest.mark.parametrize("which", ["mocap", "filter", "path", "odom"])
@@ -242,8 +243,11 @@ def test_a_damaged_message_is_left_out_and_named(tmp_path, kind, number):
                 message.width, message.data = 0, message.data[:0]
             bag.write("/radar", message, time_s + 0.01 * (i % 2))
 
-    scans = read(bag_of(tmp_path, write, kind=kind))
+    scans_path = bag_of(tmp_path, write, kind=kind)
+    scans = read(scans_path)
     assert len(scans) == 8
     (note,) = (note for note in scans.notes if note.startswith("messages left out: 1 of 10"))
     assert f"message {number} of /radar, at" in note
     assert "1 scans left out: they hold no returns" in scans.notes
+    in_order = read(scans_path, [pose([i, 0, 0]) for i in range(10)])  # still one for each message
+    assert in_order.poses[:, 0, 3].tolist() == [i for i in range(10) if i not in (8, number)]

@@ -85,6 +85,8 @@ class RawScan:
     """Its frame, of a bag."""
     topic: str = ""
     """Its topic, of a bag: scans of one topic have the same fields."""
+    number: int | None = None
+    """Of its pose, where poses are in the order of the scans. None: the number of those before it."""
 
 
 def posed(
@@ -103,13 +105,13 @@ def posed(
         first_s: float | None = None
         taken = 0
         matched: ScanPoses | None = None
-        for number, raw in enumerate(raw_scans()):
+        for before, raw in enumerate(raw_scans()):
             own = poses(raw.frame) if callable(poses) else poses
             if own is None:
                 notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}", 1)
                 continue
             matched = own
-            T_world_sensor = own.of(number, raw.time_s)
+            T_world_sensor = own.of(before if raw.number is None else raw.number, raw.time_s)
             if T_world_sensor is None:
                 first_s = raw.time_s if first_s is None else first_s
                 notes.count(WITHOUT_POSES.format(gap_s=own.max_gap_s), 1)

@@ -48,6 +48,8 @@ class Message:
     bag: Path
     content: Any = None
     """What it says; see :func:`radarsdf.io.bags.messages.read_message`."""
+    number: int = 0
+    """Of its topic, from 0."""
 
 
 def is_bag(path: Path) -> bool:
@@ -135,7 +137,7 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
                 f"is not a whole {message.message_type}: {error}",
             )
             continue
-        yield replace(message, content=content)
+        yield replace(message, content=content, number=numbers[message.topic] - 1)
     for topic, count in damaged.items():
         notes.add(f"messages left out: {count} of {numbers[topic]}; the first: {first[topic]}")
 

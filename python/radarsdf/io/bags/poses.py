@@ -42,6 +42,10 @@ _NOT_MEASURED = re.compile(
 """In the names of topics with poses that somebody wants or assumes: no sensor was there."""
 _TF = "TF"
 _SAMPLES = 200  # scans whose times are compared with poses
+_SAME_LENGTH, _SAME_LENGTH_M = (
+    0.3,
+    1.0,
+)  # of the paths of one vehicle, though its parts swing and poses are noisy
 _NEARLY_ALL = 0.9  # of what the best covers
 _SLOW_S, _SLOWER = 0.2, 3.0  # interval of poses that correct others, and its ratio to that of the others
 
@@ -110,6 +114,8 @@ class _Candidate:
 
     agrees: bool
     """Whether its frames are connected with that of the scans."""
+    names_child: bool
+    """Whether it says whose poses it has."""
     poses: StampedPoses
     interval_s: float
 
@@ -236,17 +242,18 @@ def _chosen(
         except ValueError as error:
             passed_over[name] = str(error)
             continue
-        agrees = (
-            not track.parent or _fixed(tree, track.parent, sensor) is None
-        )  # else it has poses of other things
+        # In a frame that moves with the sensor are poses of other things.
+        agrees = not track.parent or _fixed(tree, track.parent, sensor) is None
         if track.child and sensor in tree:
             agrees = agrees and _fixed(tree, track.child, sensor) is not None
-        candidates[name] = _Candidate(agrees, trajectory, _interval_s(trajectory))
+        candidates[name] = _Candidate(agrees, bool(track.child), trajectory, _interval_s(trajectory))
     about = request.notes.about
     try:
         of_tree = _of_tree(tree, sensor, request, quiet=True)(sensor) if tree else None
         if of_tree is not None and isinstance(of_tree.poses, TransformChain):
-            candidates[_TF] = _Candidate(True, of_tree.poses, max(map(_interval_s, of_tree.poses.moving())))
+            candidates[_TF] = _Candidate(
+                True, True, of_tree.poses, max(map(_interval_s, of_tree.poses.moving()))
+            )
     except ValueError:
         if not candidates:
             raise
@@ -275,17 +282,22 @@ def _unfit(
     candidates: dict[str, _Candidate], times_s: NDArray[np.float64], max_gap_s: float
 ) -> dict[str, str]:
     """Why some of the candidates do not count, by topic: by the frames, the times and the rate of the others."""
-    some = times_s[:: max(1, len(times_s) // _SAMPLES)]
-    covered = {
-        name: float(np.mean([c.poses.pose_at(time_s, max_gap_s) is not None for time_s in some.tolist()]))
-        for name, c in candidates.items()
-    }
+    some = times_s[:: max(1, len(times_s) // _SAMPLES)].tolist()
+    positions_m = {name: _positions_m(c.poses, some, max_gap_s) for name, c in candidates.items()}
+    covered = {name: float(np.isfinite(xyz[:, 0]).mean()) for name, xyz in positions_m.items()}
     best = max(covered.values())
     unfit: dict[str, str] = {}
     if any(c.agrees and covered[name] > best / 2 for name, c in candidates.items()):
         unfit = {
             n: "its frames do not lead to that of the scans" for n, c in candidates.items() if not c.agrees
         }
+    for name, c in candidates.items():
+        if c.names_child or _TF not in candidates:
+            continue
+        both = np.isfinite(positions_m[name] + positions_m[_TF]).all(axis=1)
+        own_m, of_tree_m = (_length_m(positions_m[n][both]) for n in (name, _TF))
+        if abs(own_m - of_tree_m) > _SAME_LENGTH_M + _SAME_LENGTH * max(own_m, of_tree_m):
+            unfit.setdefault(name, f"it moved {own_m:.1f} m, the sensor {of_tree_m:.1f} m by TF")
     best = max(share for name, share in covered.items() if name not in unfit)
     unfit |= {
         n: f"it covers {share:.0%} of the scans" for n, share in covered.items() if share < _NEARLY_ALL * best
@@ -295,6 +307,16 @@ def _unfit(
         if c.interval_s > max(_SLOW_S, _SLOWER * fastest_s):
             unfit.setdefault(name, f"a pose every {c.interval_s:.2g} s, of others every {fastest_s:.2g} s")
     return unfit
+
+
+def _positions_m(poses: StampedPoses, times_s: list[float], max_gap_s: float) -> NDArray[np.float64]:
+    """(N, 3) world frame; NaN where there are none."""
+    found = (poses.pose_at(time_s, max_gap_s) for time_s in times_s)
+    return np.array([np.full(3, np.nan) if pose is None else pose[:3, 3] for pose in found])
+
+
+def _length_m(positions_m: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(np.diff(positions_m, axis=0), axis=1).sum())
 
 
 def _base(track: _Track, name: str, tree: dict[str, _Track], sensor: str, notes: Notes) -> str:
@@ -323,8 +345,10 @@ def _tree(paths: list[Path], transforms: set[str], request: Request) -> dict[str
     edges: dict[str, dict[str, _Track]] = {}
     for message in read_messages(paths, transforms, request.notes):
         for pose in message.content:
-            new = _Track(pose.header.frame, static=_STATIC in message.topic)
-            edges.setdefault(pose.child, {}).setdefault(pose.header.frame, new).add(pose, message.recorded_s)
+            parents = edges.setdefault(pose.child, {})
+            if pose.header.frame not in parents:
+                parents[pose.header.frame] = _Track(pose.header.frame, static=_STATIC in message.topic)
+            parents[pose.header.frame].add(pose, message.recorded_s)
     choices = {}
     for child, parents in edges.items():
         usable = [track for track in parents.values() if track.usable().any()]

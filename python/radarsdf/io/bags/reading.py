@@ -7,8 +7,10 @@ from __future__ import annotations
 import heapq
 import itertools
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
+from dataclasses import replace
 from functools import cache
 from os import PathLike
 from pathlib import Path
@@ -67,12 +69,14 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     topics = topics_of(paths)
     scan_topics = _scan_topics(topics, paths, request)
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
-    frames = list(dict.fromkeys(cloud.header.frame for clouds in peeked.values() for cloud in clouds))
+    counted = Counter(cloud.header.frame for clouds in peeked.values() for cloud in clouds)
+    frames = [frame for frame, _ in counted.most_common()]
     by_record = {topic.name: _by_record(peeked[topic.name], topic, request) for topic in scan_topics}
 
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, by_record[topic.name], request) for topic in scan_topics]
-        return heapq.merge(*streams, key=lambda raw: raw.time_s)
+        merged = heapq.merge(*streams, key=lambda raw: raw.time_s)
+        return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
 
     def scan_times_s() -> NDArray[np.float64]:
         return np.array([raw.time_s for raw in raw_scans()], np.float64)
@@ -105,12 +109,13 @@ def _given(
 ) -> ScanPoses | FindPoses:
     """Poses that the user gives: in the order of the scans, or of the frame of the first scan by time."""
     if isinstance(poses, np.ndarray):
-        grouped = any(topic.message_type == POINT_A_MESSAGE for topic in topics)
-        count = sum(1 for _ in raw_scans()) if grouped else sum(topic.count for topic in topics)
+        numbered = len(topics) == 1 and topics[0].message_type != POINT_A_MESSAGE
+        count = topics[0].count if numbered else sum(1 for _ in raw_scans())
         return scan_poses(poses, count, None, request.extrinsic, request)[0]
     if poses is UNPOSED:
         if len(frames) > 1:
-            request.notes.add(f"the scans have several frames, of which nothing is made: {', '.join(frames)}")
+            listed = ", ".join(frames)
+            request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
         return ScanPoses(poses, np.eye(4), request.max_gap_s)
     return attached(poses, frames[0], cache(lambda: transforms_of(paths, request)), request)
 
@@ -216,11 +221,11 @@ def _raw_scans(paths: list[Path], topic: Topic, by_record: bool, request: Reques
     if topic.message_type == POINT_A_MESSAGE:
         yield from _grouped(paths, topic, by_record, request)
         return
-    for number, message in enumerate(read_messages(paths, {topic.name}, request.notes)):
+    for message in read_messages(paths, {topic.name}, request.notes):
         cloud: CloudMessage = message.content
         time_s = message.recorded_s if by_record else cloud.header.stamp_s
-        name = f"{message.bag}: message {number} of {topic.name}"
-        yield RawScan(cloud.columns, time_s, name, cloud.header.frame, topic.name)
+        name = f"{message.bag}: message {message.number} of {topic.name}"
+        yield RawScan(cloud.columns, time_s, name, cloud.header.frame, topic.name, message.number)
 
 
 def _grouped(paths: list[Path], topic: Topic, by_record: bool, request: Request) -> Iterator[RawScan]:
