@@ -70,8 +70,9 @@ class _Track:
         """Mask (P,) of poses that are finite, with a unit quaternion."""
         table = np.frombuffer(self.values, np.float64).reshape(-1, 7)
         largest = np.abs(table[:, 3:]).max(axis=1)  # not the length, whose square overflows
-        mask: NDArray[np.bool_] = np.isfinite(table).all(axis=1)
-        return mask & (largest >= _MIN_QUATERNION) & (largest <= _MAX_QUATERNION)
+        unit = (largest >= _MIN_QUATERNION) & (largest <= _MAX_QUATERNION)
+        mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
+        return mask
 
     def table(self) -> NDArray[np.float64]:
         """(P, 7) x, y, z, qx, qy, qz, qw of those that are usable."""

@@ -75,7 +75,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
 
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, by_record[topic.name], request) for topic in scan_topics]
-        merged = heapq.merge(*streams, key=lambda raw: raw.time_s)
+        merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
         return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
 
     def scan_times_s() -> NDArray[np.float64]:
