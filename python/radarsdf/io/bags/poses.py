@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.io.bags.files import Topic, read_messages, topics_of, topics_with
+from radarsdf.io.bags.files import read_messages, topics_of, topics_with
 from radarsdf.io.bags.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage
 from radarsdf.io.poses.reading import (
     FIND_POSES,
@@ -165,15 +165,14 @@ def poses_in_bags(
         listed = ", ".join(sorted([*fitting, *transforms]))
         msg = f"{paths[0]} has no poses in {wanted}: topics with poses are {listed or 'none'}"
         raise ValueError(msg)
-    tree = _tree(paths, transforms, request)
-    sensor = next((frame for frame in frames if frame in tree), frames[0])
-    if of_tree:
-        return _of_tree(tree, sensor, request)
     passed_over = {
         name: "a goal, a plan or the like, by its name" for name in fitting if _NOT_MEASURED.search(name)
     }
-    names = set(fitting) - set(passed_over) if wanted is None else {wanted}
-    tracks = _tracks(paths, {name: fitting[name] for name in names}, request)
+    names = {wanted} & set(fitting) if wanted is not None else set(fitting) - set(passed_over)
+    tracks, tree = _tracks_and_tree(paths, names, transforms, request)
+    sensor = next((frame for frame in frames if frame in tree), frames[0])
+    if of_tree:
+        return _of_tree(tree, sensor, request)
     if wanted is None:
         name = _chosen(tracks, tree, sensor, passed_over, preferred, scan_times_s, request)
         for other, why in sorted(passed_over.items()):
@@ -211,19 +210,6 @@ def attached(
 def transforms_of(paths: list[Path], request: Request) -> dict[str, _Track]:
     """The transforms in bags; see :func:`attached`."""
     return _tree(paths, set(topics_with(TRANSFORM_TYPES, topics_of(paths))), request)
-
-
-def _tracks(paths: list[Path], topics: dict[str, Topic], request: Request) -> dict[str, _Track]:
-    """The poses of each topic that has some."""
-    tracks: dict[str, _Track] = {}
-    for message in read_messages(paths, set(topics), request.notes):
-        if message.message_type == PATH:  # each message holds the whole path so far: the last one counts
-            tracks.pop(message.topic, None)
-        for pose in message.content:
-            track = tracks.setdefault(message.topic, _Track(pose.header.frame))
-            track.child = pose.child
-            track.add(pose, message.recorded_s)
-    return tracks
 
 
 def _chosen(
@@ -342,14 +328,26 @@ def _base(track: _Track, name: str, tree: dict[str, _Track], sensor: str, notes:
 
 
 def _tree(paths: list[Path], transforms: set[str], request: Request) -> dict[str, _Track]:
-    """The transform to each frame from its parent."""
+    return _tracks_and_tree(paths, set(), transforms, request)[1]
+
+
+def _tracks_and_tree(
+    paths: list[Path], topics: set[str], transforms: set[str], request: Request
+) -> tuple[dict[str, _Track], dict[str, _Track]]:
+    """The poses of each of `topics` that has some, and the transform to each frame from its parent."""
+    by_topic: dict[str, _Track] = {}
     edges: dict[str, dict[str, _Track]] = {}
-    for message in read_messages(paths, transforms, request.notes):
+    for message in read_messages(paths, topics | transforms, request.notes):
+        if message.message_type == PATH:  # each message holds the whole path so far: the last one counts
+            by_topic.pop(message.topic, None)
         for pose in message.content:
-            parents = edges.setdefault(pose.child, {})
-            if pose.header.frame not in parents:
-                parents[pose.header.frame] = _Track(pose.header.frame, static=_STATIC in message.topic)
-            parents[pose.header.frame].add(pose, message.recorded_s)
+            tracks, name = by_topic, message.topic
+            if message.topic in transforms:
+                tracks, name = edges.setdefault(pose.child, {}), pose.header.frame
+            if name not in tracks:
+                tracks[name] = _Track(pose.header.frame, static=_STATIC in message.topic)
+            tracks[name].child = pose.child
+            tracks[name].add(pose, message.recorded_s)
     choices = {}
     for child, parents in edges.items():
         usable = [track for track in parents.values() if track.usable().any()]
@@ -365,7 +363,7 @@ def _tree(paths: list[Path], transforms: set[str], request: Request) -> dict[str
                 break
         listed = ", ".join(f"{track.parent} ({len(track.stamps_s)} transforms)" for track in tracks)
         request.notes.add(f"{child} has several parents in TF, {listed}: {tree[child].parent} is used")
-    return tree
+    return by_topic, tree
 
 
 def _moves(tree: dict[str, _Track], frame: str, world: str | None) -> bool:
