@@ -241,12 +241,12 @@ def _chosen(
             candidates[_TF] = _Candidate(
                 True, True, of_tree.poses, max(map(_interval_s, of_tree.poses.moving()))
             )
-    except ValueError:
+    except ValueError as error:
         if not candidates:
-            raise
+            msg = f"{error}{_listed(passed_over)}"
+            raise type(error)(msg) from error
     if not candidates:
-        seen = "".join(f"; {name} is passed over ({why})" for name, why in sorted(passed_over.items()))
-        msg = f"{about} has no poses (Odometry, PoseStamped, Path or TF): give a file of poses, such as TUM; {FIND_POSES}{seen}"
+        msg = f"{about} has no poses (Odometry, PoseStamped, Path or TF): give a file of poses, such as TUM; {FIND_POSES}{_listed(passed_over)}"
         raise NoPoses(msg)
     if len(candidates) > 1:
         passed_over |= _unfit(candidates, scan_times_s(), request.max_gap_s)
@@ -259,6 +259,10 @@ def _chosen(
         )
         raise ValueError(msg)
     return left[0] if left else None
+
+
+def _listed(passed_over: dict[str, str]) -> str:
+    return "".join(f"; {name} is passed over ({why})" for name, why in sorted(passed_over.items()))
 
 
 def _interval_s(trajectory: Trajectory) -> float:
@@ -348,20 +352,20 @@ def _tracks_and_tree(
                 tracks[name] = _Track(pose.header.frame, static=_STATIC in message.topic)
             tracks[name].child = pose.child
             tracks[name].add(pose, message.recorded_s)
-    choices = {}
+    choices: dict[str, list[_Track]] = {}
     for child, parents in edges.items():
         usable = [track for track in parents.values() if track.usable().any()]
         if usable:
             choices[child] = sorted(usable, key=lambda track: -len(track.stamps_s))
-    tree = {child: tracks[0] for child, tracks in choices.items()}
-    for child, tracks in choices.items():
-        if len(tracks) == 1:
+    tree = {child: options[0] for child, options in choices.items()}
+    for child, options in choices.items():
+        if len(options) == 1:
             continue
-        for track in (*tracks, tracks[0]):
+        for track in (*options, options[0]):
             tree[child] = track
             if _moves(tree, child, request.world_frame):
                 break
-        listed = ", ".join(f"{track.parent} ({len(track.stamps_s)} transforms)" for track in tracks)
+        listed = ", ".join(f"{track.parent} ({len(track.stamps_s)} transforms)" for track in options)
         request.notes.add(f"{child} has several parents in TF, {listed}: {tree[child].parent} is used")
     return by_topic, tree
 
@@ -405,7 +409,14 @@ def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: b
             raise (ValueError if moving else NoPoses)(msg)
         base = lowest[0]
     chain = _ancestors(tree, base)
-    world = chain[-1] if request.world_frame is None else request.world_frame.lstrip("/")
+    if request.world_frame is None:
+        world = _world(tree, chain, request)
+        if notes is not None and world in tree:
+            notes.add(
+                f"TF above {world} is passed over: it changes rarely; world_frame chooses another world"
+            )
+    else:
+        world = request.world_frame.lstrip("/")
     if world not in chain:
         msg = f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}"
         raise ValueError(msg)
@@ -442,6 +453,15 @@ def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: b
             return None
 
     return find
+
+
+def _world(tree: dict[str, _Track], chain: list[str], request: Request) -> str:
+    """The root; but the frame below it where that is corrected rarely, and its own poses are dense."""
+    moving = [frame for frame in chain[:-1] if not tree[frame].is_constant()]
+    intervals_s = [_interval_s(tree[frame].trajectory(frame, request)) for frame in moving]
+    if len(moving) > 1 and intervals_s[-1] > max(_SLOW_S, _SLOWER * min(intervals_s)):
+        return moving[-1]
+    return chain[-1]
 
 
 def static_between(
