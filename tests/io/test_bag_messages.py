@@ -116,7 +116,9 @@ def test_ars548(tmp_path, kind, driver):
 def test_an_ars548_as_it_was_recorded():
     """Packets of the radar, and the same scan as its driver decoded it."""
     yaml = pytest.importorskip("yaml", reason="pyyaml is not installed")
-    scans = read(recorded_file("ars548/ars548_1708578204_1708578204.db3"), UNPOSED)
+    scans = read(
+        recorded_file("ars548"), UNPOSED
+    )  # a folder whose file has another name than its metadata say
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     decoded = yaml.load(recorded_file("ars548/ars548_detection.yaml").read_text(), loader)["detections"]
     names = ("range", "azimuth_angle", "elevation_angle", "range_rate", "rcs", "range_std", "azimuth_angle_std", "elevation_angle_std")  # fmt: skip

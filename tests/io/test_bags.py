@@ -302,7 +302,9 @@ def test_choices_that_are_not_clear(tmp_path):
         odometry(bag)
         for topic in ("/left/points", "/right/points"):
             bag.write(topic, bag.cloud2(START_S, columns(1)), START_S)
-    with pytest.raises(ValueError, match=r"say by topic which is the radar's, one or several of /left/points"):
+    with pytest.raises(
+        ValueError, match=r"say by topic which is the radar's, one or several of /left/points"
+    ):
         read(tmp_path / "a.bag")
     assert len(read(tmp_path / "a.bag", topic="/right/points")) == 1
     with pytest.raises(ValueError, match="has no topic /up: topics with points are /left/points"):

@@ -157,10 +157,10 @@ def _note_differences(fields: Fields, topic: str, other: Fields, notes: Notes) -
             notes.add(
                 f"some topics have {role}, others have none: it is not used where all scans must have it"
             )
-    if fields.names.get("intensity") != other.names.get("intensity"):
+    own, others = fields.names.get("intensity"), other.names.get("intensity")
+    if own and others and own != others:
         notes.add(
-            f"intensities of {topic} are {fields.names.get('intensity')}, of other topics {other.names.get('intensity')}: they are taken "
-            "as of one unit"
+            f"intensities of {topic} are {own}, of other topics {others}: they are taken as of one unit"
         )
 
 
