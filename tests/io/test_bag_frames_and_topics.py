@@ -113,6 +113,7 @@ def test_several_topics_are_merged_by_time(tmp_path, poses):
         "/robot1/goal_pose",
         "/move_base_simple/goal",
         "/initialpose",
+        "/robotGoalPose",
         "/mavros/setpoint_position/local",
     ],
 )

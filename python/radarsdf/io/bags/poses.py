@@ -36,16 +36,13 @@ _STATIC = "static"  # in the name of a topic whose transforms hold for all times
 _SAME = 1e-9  # a transform that changes by no more is constant, though it is published again and again
 _MIN_QUATERNION, _MAX_QUATERNION = 0.49, 1.01  # largest of the four numbers of a unit quaternion
 _NOT_MEASURED = re.compile(
-    r"(^|[/_.-])((goals?|plans?|planned|planner|initial|target|setpoint|waypoints?|desired|reference|ref|cmd)(?![a-z])|initialpose)",
+    r"goal|set_?point|way_?point|initial_?pose|desired|(^|[/_.-])(plans?|planned|planner|target|cmd)(?![a-z])",
     re.IGNORECASE,
 )
 """In the names of topics with poses that somebody wants or assumes: no sensor was there."""
 _TF = "TF"
 _SAMPLES = 200  # scans whose times are compared with poses
-_SAME_LENGTH, _SAME_LENGTH_M = (
-    0.3,
-    1.0,
-)  # of the paths of one vehicle, though its parts swing and poses are noisy
+_SAME_LENGTH, _SAME_LENGTH_M = 0.3, 1.0  # of the paths of one vehicle: its parts swing, and poses are noisy
 _NEARLY_ALL = 0.9  # of what the best covers
 _SLOW_S, _SLOWER = 0.2, 3.0  # interval of poses that correct others, and its ratio to that of the others
 
@@ -209,7 +206,7 @@ def attached(
 
 def transforms_of(paths: list[Path], request: Request) -> dict[str, _Track]:
     """The transforms in bags; see :func:`attached`."""
-    return _tree(paths, set(topics_with(TRANSFORM_TYPES, topics_of(paths))), request)
+    return _tracks_and_tree(paths, set(), set(topics_with(TRANSFORM_TYPES, topics_of(paths))), request)[1]
 
 
 def _chosen(
@@ -329,10 +326,6 @@ def _base(track: _Track, name: str, tree: dict[str, _Track], sensor: str, notes:
         f"{sensor or '(unnamed)'}: the poses are taken as those of the radar; give extrinsic if they are not"
     )
     return sensor
-
-
-def _tree(paths: list[Path], transforms: set[str], request: Request) -> dict[str, _Track]:
-    return _tracks_and_tree(paths, set(), transforms, request)[1]
 
 
 def _tracks_and_tree(
@@ -464,13 +457,9 @@ def _world(tree: dict[str, _Track], chain: list[str], request: Request) -> str:
     return chain[-1]
 
 
-def static_between(
-    paths: list[Path], transforms: set[str], base: str, sensor: str, request: Request
-) -> NDArray[np.float64] | None:
-    """T_base_sensor (4, 4) by the static transforms in topics of bags; None where they do not lead from one to the other."""
-    if base and base == sensor:
-        return np.eye(4)
-    return _fixed(_tree(paths, transforms, request), base, sensor) if base and transforms else None
+def static_between(paths: list[Path], base: str, sensor: str, request: Request) -> NDArray[np.float64] | None:
+    """T_base_sensor (4, 4) by the static transforms in bags; None where they do not lead from one to the other."""
+    return _fixed(transforms_of(paths, request), base, sensor) if base else None
 
 
 def _fixed(tree: dict[str, _Track], base: str, sensor: str) -> NDArray[np.float64] | None:

@@ -46,13 +46,10 @@ _STATUS = re.compile(
     "status|info|config|diagnos|imu|odom|twist|velocity|speed|rate|accel|steer|direction", re.IGNORECASE
 )
 """In the names of types without points."""
-_WITHOUT_POINTS = tuple(
-    f"{name}/" for name in (
-        "std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "tf", "tf2_msgs", "diagnostic_msgs", "visualization_msgs",
-        "rosgraph_msgs", "rcl_interfaces", "action_msgs", "actionlib_msgs", "builtin_interfaces", "stereo_msgs", "trajectory_msgs",
-    )
-)  # fmt: skip
-"""Packages whose other messages are no scans."""
+_STANDARD = re.compile(
+    r"((std|sensor|nav|geometry|visualization|diagnostic|lifecycle|tf2)_msgs|tf|rcl_interfaces|dynamic_reconfigure|bond)/[^ ]+$"
+)
+"""Types of packages whose other messages are no scans."""
 _PAUSE_S = 0.02  # the points of a scan are sent at once; scans are 30 ms apart or more
 _PEEKED_SCANS, _PEEKED_POINTS = 10, 400  # messages that are looked at for the clock: several scans
 
@@ -93,7 +90,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     def imu() -> Imu | None:
         if of_imu is None:
             return None
-        return imu_in_bags(paths, topics, of_imu, frames[0], by_record[scan_topics[0].name], request)
+        return imu_in_bags(paths, of_imu, frames[0], by_record[scan_topics[0].name], request)
 
     truth = request.truth or (lambda: None)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
@@ -161,8 +158,8 @@ def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) 
     radars = [t for t in unread if _is_radar(t)]
     if radars and not _is_radar(chosen[0]) and not _has_doppler(paths, chosen[0]):
         msg = (
-            f"{where}: messages of the radar cannot be read, {_listed(radars)}; the only points are those of {_listed(chosen)}, by "
-            f"name and fields no radar: give topic {chosen[0].name} to map them"
+            f"{where}: messages of the radar cannot be read, {_listed(radars)}. The only points are those of {_listed(chosen)}, whose "
+            f"name and fields are not a radar's: give topic {chosen[0].name} to map them"
         )
         raise ValueError(msg)
     if others := [t for t in (*fitting.values(), *unread) if t is not chosen[0]]:
@@ -181,8 +178,8 @@ def _is_radar(topic: Topic) -> bool:
 def _may_have_points(topic: Topic) -> bool:
     """Whether messages of a type that cannot be read are probably scans."""
     kind = topic.message_type
-    known = kind.startswith(_WITHOUT_POINTS) and " in " not in kind
-    return not known and bool(_POINTS.search(f"{topic.name} {kind}")) and not _STATUS.search(kind)
+    named = _POINTS.search(f"{topic.name} {kind}") and not _STATUS.search(kind)
+    return bool(named) and not _STANDARD.match(kind)
 
 
 def _has_doppler(paths: list[Path], topic: Topic) -> bool:
