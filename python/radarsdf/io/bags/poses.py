@@ -75,6 +75,11 @@ class _Track:
         """(P, 7) x, y, z, qx, qy, qz, qw of those that are usable."""
         return np.frombuffer(self.values, np.float64).reshape(-1, 7)[self.usable()]
 
+    def extent(self, max_gap_s: float) -> tuple[float, int]:
+        """The time in which there are poses, to 0.1 s, and their number."""
+        gaps_s = np.diff(np.frombuffer(self.recorded_s, np.float64))
+        return round(float(gaps_s[gaps_s <= max_gap_s].sum()), 1), len(self.recorded_s)
+
     def is_constant(self) -> bool:
         table = self.table()
         return self.static or bool((np.abs(table - table[0]) <= _SAME).all())
@@ -349,7 +354,7 @@ def _tracks_and_tree(
     for child, parents in edges.items():
         usable = [track for track in parents.values() if track.usable().any()]
         if usable:
-            choices[child] = sorted(usable, key=lambda track: -len(track.stamps_s))
+            choices[child] = sorted(usable, key=lambda track: track.extent(request.max_gap_s), reverse=True)
     tree = {child: options[0] for child, options in choices.items()}
     for child, options in choices.items():
         if len(options) == 1:
