@@ -104,7 +104,7 @@ def _given(
     raw_scans: Callable[[], Iterator[RawScan]],
     request: Request,
 ) -> ScanPoses | FindPoses:
-    """Poses that the user gives: in the order of the scans, or of the frame of the first scan by time."""
+    """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
     if isinstance(poses, np.ndarray):
         numbered = len(topics) == 1 and topics[0].message_type != POINT_A_MESSAGE
         count = topics[0].count if numbered else sum(1 for _ in raw_scans())
