@@ -44,7 +44,9 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="4 x 4 matrix from the sensor's frame to that of the poses, T_base_sensor, if they differ",
     )
-    parser.add_argument("--topic", metavar="NAME", help="in a bag: the topic of the scans")
+    parser.add_argument(
+        "--topic", action="append", metavar="NAME", help="in a bag: the topic of the scans; may be repeated"
+    )
     parser.add_argument("--pose-topic", metavar="NAME", help="in a bag: the topic of the poses")
     parser.add_argument(
         "--imu-topic",
@@ -122,9 +124,9 @@ def _field(text: str) -> tuple[str, str]:
 def words_of(options: argparse.Namespace) -> list[str]:
     """The same arguments, as one would type them again."""
     words = [options.scans, options.poses]
-    for name in ("extrinsic", "topic", "pose_topic", "imu_topic", "imu_rotation"):
+    for name in ("extrinsic", "pose_topic", "imu_topic", "imu_rotation"):
         value = getattr(options, name)
         words += [f"--{name.replace('_', '-')}", value] if value is not None else []
-    for text in options.field:
-        words += ["--field", text]
+    for option, texts in (("--topic", options.topic or []), ("--field", options.field)):
+        words += [word for text in texts for word in (option, text)]
     return [str(word) for word in words if word is not None]

@@ -52,7 +52,7 @@ def read(
     poses: str | PathLike[str] | ArrayLike | StampedPoses | None = None,
     *,
     extrinsic: ArrayLike | None = None,
-    topic: str | None = None,
+    topic: str | Sequence[str] | None = None,
     pose_topic: str | None = None,
     imu_topic: str | None = None,
     R_sensor_imu: ArrayLike | None = None,
@@ -85,8 +85,12 @@ def read(
         bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
-    topic, pose_topic : str, optional
-        In a bag, the topic of the scans, and of the poses (Odometry, PoseStamped, Path or TF). By default the only ones.
+    topic : str or sequence of str, optional
+        In a bag, the topics of the scans, which are merged in the order of their times. By default the radar's, if there is
+        one. Each message has the pose of the frame that its header names.
+    pose_topic : str, optional
+        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one that covers the times
+        of the scans; what was passed over is noted. Goals, plans and initial poses never count.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
@@ -140,7 +144,7 @@ def read(
     request = Request(
         poses=poses,
         extrinsic=extrinsic_of(extrinsic),
-        topic=topic,
+        topic=(topic,) if isinstance(topic, str) else tuple(topic or ()),
         pose_topic=pose_topic,
         imu_topic=imu_topic,
         R_sensor_imu=None if R_sensor_imu is None else checked_rotation(R_sensor_imu),
@@ -200,7 +204,7 @@ def _folder(folder: Path, request: Request) -> Scans:
 def _refuse_choices_of_bags(path: Path, request: Request) -> None:
     """Raises where a choice would have no effect."""
     for name in ("topic", "pose_topic", "imu_topic", "world_frame", "stamps"):
-        if getattr(request, name) is not None:
+        if getattr(request, name) not in (None, ()):
             msg = f"{path} is no bag: {name} is of bags alone"
             raise ValueError(msg)
 

@@ -72,6 +72,10 @@ class Notes:
             self.lines.append(line)
             _LOG.warning(line)
 
+    def ending(self) -> str:
+        """All sentences, to end an error with."""
+        return "".join(f"; {line}" for line in self.lines)
+
     def start_counts(self) -> None:
         """Forget the counts: the files are read again."""
         self._counts = {}
@@ -305,8 +309,7 @@ class Scans:
             yield scan
         self._notes.counted()
         if not poses:
-            why = "".join(f"; {line}" for line in self._notes.lines)
-            msg = f"{self._notes.about}: there is no scan with a return and a pose{why}"
+            msg = f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}"
             raise ValueError(msg)
         self._poses = np.stack(poses)
         self._times_s = None if None in times_s else np.array(times_s, np.float64)

@@ -30,7 +30,7 @@ NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite nu
 """What a note says of such returns, after their number."""
 
 WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
-"""Likewise of such scans."""
+"""What it says of such scans."""
 
 _NO_RETURNS = "scans left out: they hold no returns"
 _NOT_SCANS = {
@@ -58,7 +58,8 @@ class Request:
 
     poses: Any = None
     extrinsic: NDArray[np.float64] | None = None
-    topic: str | None = None
+    topic: tuple[str, ...] = ()
+    """Topics; none: the only one that can be meant."""
     pose_topic: str | None = None
     imu_topic: str | None = None
     R_sensor_imu: NDArray[np.float64] | None = None
@@ -80,41 +81,57 @@ class RawScan:
     time_s: float | None
     name: str
     """For errors."""
+    frame: str = ""
+    """Its frame, of a bag."""
+    topic: str = ""
+    """Its topic, of a bag: scans of one topic have the same fields."""
+    number: int | None = None
+    """Of its pose, where poses are in the order of the scans. None: the number of those before it."""
 
 
 def posed(
-    raw_scans: Callable[[], Iterable[RawScan]], poses: ScanPoses, request: Request
+    raw_scans: Callable[[], Iterable[RawScan]],
+    poses: ScanPoses | Callable[[str], ScanPoses | None],
+    request: Request,
 ) -> Callable[[], Iterator[Scan]]:
-    """What :meth:`Scans.of_source` takes: scans with poses and at least one return, in the order of the files."""
+    """What :meth:`Scans.of_source` takes: scans with poses and at least one return, in the order of the files.
+
+    `poses` are those of all scans, or give those of a frame, or None for one of which nothing is known.
+    """
     notes = request.notes
 
     def source() -> Iterator[Scan]:
-        fields: Fields | None = None
-        first_name, names = "", list[str]()
+        fields_of: dict[str, tuple[Fields, RawScan, list[str]]] = {}
         first_s: float | None = None
         taken = 0
-        for number, raw in enumerate(raw_scans()):
-            T_world_sensor = poses.of(number, raw.time_s)
+        matched: ScanPoses | None = None
+        for before, raw in enumerate(raw_scans()):
+            own = poses(raw.frame) if callable(poses) else poses
+            if own is None:
+                notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}", 1)
+                continue
+            matched = own
+            T_world_sensor = own.of(before if raw.number is None else raw.number, raw.time_s)
             if T_world_sensor is None:
                 first_s = raw.time_s if first_s is None else first_s
-                notes.count(WITHOUT_POSES.format(gap_s=poses.max_gap_s), 1)
+                notes.count(WITHOUT_POSES.format(gap_s=own.max_gap_s), 1)
                 continue
             taken += 1
             columns = raw.read()
             if not columns or len(next(iter(columns.values()))) == 0:
                 notes.count(_NO_RETURNS, 1)
                 continue
-            if fields is None:
-                fields, first_name, names = (
-                    Fields.of(list(columns), request.fields, raw.name),
-                    raw.name,
-                    list(columns),
-                )
+            if raw.topic not in fields_of:
+                fields = Fields.of(list(columns), request.fields, raw.name)
                 if fields.dialect is not None and fields.dialect.note:
                     notes.add(fields.dialect.note)
+                for other, _, _ in fields_of.values():
+                    _note_differences(fields, raw.topic, other, notes)
+                fields_of[raw.topic] = fields, raw, list(columns)
+            fields, first, names = fields_of[raw.topic]
             cloud = fields.read(columns, raw.name)
             if list(columns) != names:
-                fields.check_no_more(Fields.of(list(columns), request.fields, raw.name), raw.name, first_name)
+                fields.check_no_more(Fields.of(list(columns), request.fields, raw.name), raw.name, first.name)
             notes.count(NOT_FINITE, cloud.dropped)
             if len(cloud.points) == 0:
                 notes.count(_NO_RETURNS, 1)
@@ -122,14 +139,29 @@ def posed(
             yield Scan(
                 cloud.points, T_world_sensor, cloud.intensities, cloud.doppler_mps, raw.time_s, cloud.sigma
             )
-        if not taken and first_s is not None and not isinstance(poses.poses, np.ndarray):
-            msg = (
-                f"{notes.about}: no scan has a pose: the first scan is at {first_s:.3f} s, the poses are from {poses.poses.span()}, "
-                f"and a gap between poses may be {poses.max_gap_s} s: are both of one clock?"
-            )
-            raise ValueError(msg)
+        if taken or first_s is None or matched is None or isinstance(matched.poses, np.ndarray):
+            return
+        msg = (
+            f"{notes.about}: no scan has a pose: the first scan is at {first_s:.3f} s, the poses are from {matched.poses.span()}, "
+            f"and a gap between poses may be {matched.max_gap_s} s: are both of one clock?"
+        )
+        raise ValueError(msg)
 
     return source
+
+
+def _note_differences(fields: Fields, topic: str, other: Fields, notes: Notes) -> None:
+    """Scans of several sensors: what some of them lack, and intensities that may have other units."""
+    for role in ("intensity", "doppler", "sigma_range"):
+        if (role in fields.names) != (role in other.names):
+            notes.add(
+                f"some topics have {role}, others have none: it is not used where all scans must have it"
+            )
+    own, others = fields.names.get("intensity"), other.names.get("intensity")
+    if own and others and own != others:
+        notes.add(
+            f"intensities of {topic} are {own}, of other topics {others}: they are taken as of one unit"
+        )
 
 
 def cloud_files(folder: Path) -> list[Path]:

@@ -54,7 +54,10 @@ def unpack(packed: bytes, decompressor: Callable[[], Any], what: str) -> bytes:
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """Within it, rosbags unpacks chunks of MCAP files with a bound. Elsewhere it does as it always did."""
+    """Within it, rosbags unpacks chunks of MCAP files with a bound, and opens those of any profile and encoding.
+
+    Elsewhere it does as it always did.
+    """
     _teach_rosbags()
     token = _bounded.set(True)
     try:
@@ -110,6 +113,20 @@ def _teach_rosbags() -> None:
         storage.DECOMPRESSORS[name] = functools.partial(
             _unpack_chunk, decompressor=decompressor, unbounded=storage.DECOMPRESSORS[name]
         )
+    schema = storage.Schema
+
+    def read_string(file: Any) -> str:
+        start, raw = file.tell(), storage.read_bytes(file)
+        if not _bounded.get():
+            return str(raw.decode())
+        text = str(raw.decode(errors="replace"))
+        # What begins a record is the profile of the file, of which rosbags knows one, or a key.
+        return text if start or text == "offered_qos_profiles" else "ros2"
+
+    def any_schema(number: int, name: str, encoding: str, data: str) -> Any:
+        return schema(number, name, "ros2msg" if _bounded.get() else encoding, data)
+
+    storage.read_string, storage.Schema = read_string, any_schema
 
 
 def _unpack_chunk(

@@ -6,15 +6,17 @@ from __future__ import annotations
 
 import heapq
 import re
+from collections import Counter
 from collections.abc import Collection, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from radarsdf.extras import require
 from radarsdf.io.bags.messages import read_message
 from radarsdf.io.files import check_regular_file, in_utf8
+from radarsdf.io.scans import Notes
 from radarsdf.io.unpacking import bound_ros1, bounded, check_zstd_files, unpack_zstd
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -44,25 +46,19 @@ class Message:
     cdr: bool
     """Whether it is of ROS 2."""
     bag: Path
-
-    def read(self) -> Any:
-        """What it says; see :func:`radarsdf.io.bags.messages.read_message`.
-
-        Raises
-        ------
-        ValueError
-            If its bytes do not have the layout of its type.
-        """
-        try:
-            return read_message(self.raw, self.message_type, self.cdr)
-        except ValueError as error:
-            msg = f"{self.bag}: a message of {self.topic} is not a whole {self.message_type}: {error}"
-            raise ValueError(msg) from error
+    content: Any = None
+    """What it says; see :func:`radarsdf.io.bags.messages.read_message`."""
+    number: int = 0
+    """Of its topic, from 0."""
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the path is a bag by its name, or a folder that is a ROS 2 bag."""
-    return path.suffix.lower() in BAG_SUFFIXES or (path / _METADATA).is_file()
+    """Whether the path is a bag by its name, or a folder that is a ROS 2 bag, whose files were not renamed."""
+    if path.suffix.lower() in BAG_SUFFIXES or not (path / _METADATA).is_file():
+        return path.suffix.lower() in BAG_SUFFIXES
+    listed = (path / _METADATA).read_text(encoding="utf-8", errors="replace")
+    files = [file.name for file in path.iterdir() if file.suffix.lower() in BAG_SUFFIXES]
+    return not files or any(name in listed for name in files)
 
 
 def bags_in(folder: Path) -> list[Path]:
@@ -87,9 +83,21 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
                     raise _damaged(path, ValueError("a topic has no name or no type"))
                 before = topics[connection.topic].count if connection.topic in topics else 0
                 topics[connection.topic] = Topic(
-                    connection.topic, connection.msgtype, before + connection.msgcount
+                    connection.topic, _type_of(connection), before + connection.msgcount
                 )
     return topics
+
+
+def _type_of(connection: Any) -> str:
+    """As ROS 2 writes it, and the encoding where it is none of ROS, as MCAP files may have."""
+    package, slash, name = connection.msgtype.partition("/")
+    ros2 = connection.msgtype if not slash or "/" in name else f"{package}/msg/{name}"
+    encoding = _encoding(connection)
+    return ros2 if encoding in ("cdr", "ros1") else f"{ros2} in {encoding}"
+
+
+def _encoding(connection: Any) -> str:
+    return str(getattr(connection.ext, "serialization_format", "ros1"))
 
 
 def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
@@ -110,10 +118,37 @@ def messages_of(paths: list[Path], names: set[str]) -> Generator[Message, None, 
         yield from heapq.merge(*streams, key=lambda message: message.recorded_s)
 
 
+def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
+    """The same with their content. Those that are damaged are left out, and noted in the end.
+
+    Raises
+    ------
+    ValueError, OSError, ImportError
+        As :func:`messages_of`.
+    """
+    numbers: Counter[str] = Counter()
+    damaged: Counter[str] = Counter()
+    first: dict[str, str] = {}
+    for message in messages_of(paths, names):
+        numbers[message.topic] += 1
+        try:
+            content = read_message(message.raw, message.message_type, message.cdr)
+        except ValueError as error:
+            damaged[message.topic] += 1
+            first.setdefault(
+                message.topic,
+                f"{message.bag}: message {numbers[message.topic] - 1} of {message.topic}, at {message.recorded_s:.3f} s, "
+                f"is not a whole {message.message_type}: {error}",
+            )
+            continue
+        yield replace(message, content=content, number=numbers[message.topic] - 1)
+    for topic, count in damaged.items():
+        notes.add(f"messages left out: {count} of {numbers[topic]}; the first: {first[topic]}")
+
+
 def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
-    cdr = path.suffix.lower() != _ROS1_SUFFIX
     with _opened(path) as reader:
-        connections = [c for c in reader.connections if c.topic in names]
+        connections = [c for c in reader.connections if c.topic in names and _encoding(c) in ("cdr", "ros1")]
         if not connections:  # of none, rosbags would give all messages
             return
         messages = _messages(reader, connections)
@@ -128,7 +163,8 @@ def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
             # A database of SQLite may hold values of any type.
             if not (isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))):
                 raise _damaged(path, ValueError("a message has no time or no bytes"))
-            yield Message(connection.topic, connection.msgtype, 1e-9 * recorded_ns, raw, cdr, path)
+            cdr = _encoding(connection) == "cdr"
+            yield Message(connection.topic, _type_of(connection), 1e-9 * recorded_ns, raw, cdr, path)
 
 
 def _messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, Any, Any]]:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from radarsdf.io.bags.files import Topic, messages_of, topics_with
-from radarsdf.io.bags.messages import IMU, TRANSFORM_TYPES, Header, ImuMessage
+from radarsdf.io.bags.files import Topic, read_messages, topics_with
+from radarsdf.io.bags.messages import IMU, Header, ImuMessage
 from radarsdf.io.bags.poses import static_between
 from radarsdf.io.imu import Imu
 from radarsdf.io.sources import Request
@@ -42,7 +42,6 @@ def imu_topic(topics: dict[str, Topic], request: Request) -> Topic | None:
 
 def imu_in_bags(
     paths: list[Path],
-    topics: dict[str, Topic],
     topic: Topic,
     sensor_frame: str,
     by_record: bool,
@@ -55,8 +54,8 @@ def imu_in_bags(
     """
     stamps_s, recorded_s, rates, forces = (array("d") for _ in range(4))
     first: Header | None = None
-    for message in messages_of(paths, {topic.name}):
-        measured: ImuMessage = message.read()
+    for message in read_messages(paths, {topic.name}, request.notes):
+        measured: ImuMessage = message.content
         if measured.angular_velocity is None:
             request.notes.add(f"{topic.name} has no angular velocity: it is not used")
             return None
@@ -83,7 +82,6 @@ def imu_in_bags(
     has_force = np.isfinite(table).all() and table[:, 3:].any()
     R_sensor_imu = request.R_sensor_imu
     if R_sensor_imu is None and first is not None:
-        transforms = topics_with(TRANSFORM_TYPES, topics)
-        T_imu_sensor = static_between(paths, set(transforms), first.frame, sensor_frame)
+        T_imu_sensor = static_between(paths, first.frame, sensor_frame, request)
         R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
     return Imu(times_s[finite], table[:, :3], table[:, 3:] if has_force else None, R_sensor_imu)

@@ -21,6 +21,17 @@ _POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "
 _RADAR_RETURN = np.dtype(
     [(n, "<f4") for n in ("range", "azimuth", "elevation", "doppler_velocity", "amplitude")]
 )
+_ARS548_ANGLES_TO_RATE = [
+    (n, "f4") for n in ("elevation", "elevation_std", "range", "range_std", "range_rate", "range_rate_std")
+]
+_ARS548_IDENTITY = [("id", "u2"), ("existence", "u1"), ("class", "u1"), ("multi", "u1"), ("object", "u2"), ("ambiguity", "u1")]  # fmt: skip
+_ARS548_RETURN = [
+    *((n, "f4") for n in ("azimuth", "azimuth_std")), ("flags", "u1"), *_ARS548_ANGLES_TO_RATE, ("rcs", "i1"),
+    *_ARS548_IDENTITY, ("sort_index", "u2"),
+]  # fmt: skip
+"""As the radar sends it, and ars548_messages has it."""
+_NEBULA_RETURN = [(n, "V8" if n == "flags" else kind) for n, kind in _ARS548_RETURN[:-1]]
+_ARS548_LIST_BYTES, _ARS548_RETURNS_AT, _ARS548_COUNT_AT, _ARS548_MAX = 35336, 101, 35309, 800
 _CDR_HEADER = 4
 _MAX_CDR_PADDING = 7
 _NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
@@ -64,7 +75,7 @@ class ImuMessage:
     angular_velocity: tuple[float, ...] | None
     """rad/s. None: it does not measure it."""
     specific_force: tuple[float, ...] | None
-    """m/s²: acceleration less that of gravity. None: likewise."""
+    """m/s²: acceleration less that of gravity. None: it does not measure it."""
 
 
 class _Cursor:
@@ -102,6 +113,21 @@ class _Cursor:
         values = struct.unpack_from(f"<{count}d", self.raw, self.at)
         self.at += 8 * count
         return values
+
+    def skip(self, kinds: str) -> None:
+        for kind in kinds:
+            self.take(kind)
+
+    def records(self, fields: list[tuple[str, str]], count: int) -> NDArray[Any]:
+        """Structures whose first field is the widest, which CDR aligns as C does."""
+        dtype = np.dtype([(name, "<" + kind) for name, kind in fields], align=self.cdr)
+        if not count:
+            return np.zeros(0, dtype)
+        self._align(dtype.alignment)
+        last = fields[-1][0]
+        end = dtype.fields[last][1] + dtype[last].itemsize  # type: ignore[index] # the last is not padded
+        data = bytes(self._bytes(dtype.itemsize * (count - 1) + end))
+        return np.frombuffer(data.ljust(dtype.itemsize * count, b"\0"), dtype)
 
     def data(self) -> memoryview:
         return self._bytes(self.take("I"))
@@ -206,6 +232,54 @@ def _ti_radar_scan(cursor: _Cursor) -> CloudMessage:
     )
 
 
+def _nebula_list(cursor: _Cursor) -> CloudMessage:
+    """A ContinentalArs548DetectionList."""
+    header = cursor.header()
+    cursor.take("B")
+    cursor.doubles(3)  # where the sensor is on the vehicle
+    cursor.skip("ffffffffB")
+    returns = cursor.records(_NEBULA_RETURN, cursor.take("I"))
+    invalid = np.frombuffer(returns["flags"].tobytes(), bool).reshape(-1, 8)
+    return CloudMessage(header, lambda: _ars548_columns(returns, invalid))
+
+
+def _ars548_list(cursor: _Cursor) -> CloudMessage:
+    """A DetectionList of ars548_messages: as the radar sends it, always with space for 800 returns."""
+    header = cursor.header()
+    cursor.skip("QIIIIIBIBH" + "f" * 12 + "B")
+    returns = cursor.records(_ARS548_RETURN, _ARS548_MAX)
+    cursor.skip("ff")
+    returns = returns[: cursor.take("I")]
+    cursor.skip("ffB")
+    return CloudMessage(header, lambda: _ars548_columns(returns))
+
+
+def _nebula_packets(cursor: _Cursor) -> CloudMessage:
+    """What an ARS548 sent, among which lists of returns are found by their length."""
+    header, lists = cursor.header(), []
+    for _ in range(cursor.take("I")):
+        cursor.skip("iI" if cursor.cdr else "II")
+        packet = cursor.data()
+        if len(packet) == _ARS548_LIST_BYTES:
+            count = min(int.from_bytes(packet[_ARS548_COUNT_AT : _ARS548_COUNT_AT + 4], "big"), _ARS548_MAX)
+            record = np.dtype([(name, ">" + kind) for name, kind in _ARS548_RETURN])
+            lists.append(np.frombuffer(packet, record, count, _ARS548_RETURNS_AT))
+    returns = np.concatenate(lists) if lists else np.zeros(0, _ARS548_RETURN)
+    return CloudMessage(header, lambda: _ars548_columns(returns))
+
+
+def _ars548_columns(
+    returns: NDArray[Any], invalid: NDArray[np.bool_] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Columns of returns of an ARS548, NaN where it calls a value invalid: distance, azimuth, elevation and range rate,
+    each before its deviation. Azimuth is positive to the left, elevation upwards."""
+    if invalid is None:
+        invalid = np.unpackbits(returns["flags"][:, None], axis=1, bitorder="little").astype(bool)
+    names = ("range", "azimuth", "elevation", "range_rate")
+    columns = {n: np.where(invalid[:, 2 * i], np.nan, returns[n]) for i, n in enumerate(names)}
+    return columns | {n: returns[n] for n in ("rcs", "range_std", "azimuth_std", "elevation_std")}
+
+
 def _odometry(cursor: _Cursor) -> list[PoseMessage]:
     header, child = cursor.header(), cursor.string().lstrip("/")
     values = cursor.doubles(7)
@@ -248,6 +322,7 @@ def _imu(cursor: _Cursor) -> ImuMessage:
 
 
 POINT_A_MESSAGE = "ti_mmwave_rospkg/msg/RadarScan"
+PACKETS = "nebula_msgs/msg/NebulaPackets"
 PATH = "nav_msgs/msg/Path"
 IMU = "sensor_msgs/msg/Imu"
 
@@ -256,6 +331,9 @@ _CLOUDS = {
     "sensor_msgs/msg/PointCloud": _point_cloud,
     "radar_msgs/msg/RadarScan": _radar_scan,
     POINT_A_MESSAGE: _ti_radar_scan,
+    "continental_msgs/msg/ContinentalArs548DetectionList": _nebula_list,
+    "ars548_messages/msg/DetectionList": _ars548_list,
+    PACKETS: _nebula_packets,
 }
 _POSES = {
     "nav_msgs/msg/Odometry": _odometry,
@@ -283,6 +361,9 @@ def read_message(raw: bytes | memoryview, message_type: str, cdr: bool) -> Any:
         cursor = _Cursor(raw, cdr)
         message = _LAYOUTS[message_type](cursor)
         cursor.end()
+    except KeyError as error:
+        msg = "its topic has messages of other types, too"
+        raise ValueError(msg) from error
     except struct.error as error:
         msg = "it is cut off"
         raise ValueError(msg) from error

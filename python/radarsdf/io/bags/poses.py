@@ -4,22 +4,47 @@
 
 from __future__ import annotations
 
+import re
 from array import array
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.io.bags.files import Topic, messages_of, topics_of, topics_with
+from radarsdf.io.bags.files import read_messages, topics_of, topics_with
 from radarsdf.io.bags.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage
-from radarsdf.io.poses.reading import FIND_POSES, NoPoses, StampedPoses, TransformChain, trajectory_of
+from radarsdf.io.poses.reading import (
+    FIND_POSES,
+    NoPoses,
+    ScanPoses,
+    StampedPoses,
+    TransformChain,
+    trajectory_of,
+)
 from radarsdf.io.poses.trajectory import Trajectory
+from radarsdf.io.scans import Notes
 from radarsdf.io.sources import Request
+
+FindPoses = Callable[[str], ScanPoses | None]
+"""The poses of a frame of scans; None: none are known."""
 
 _STATIC = "static"  # in the name of a topic whose transforms hold for all times: /tf_static
 _SAME = 1e-9  # a transform that changes by no more is constant, though it is published again and again
+_MIN_QUATERNION, _MAX_QUATERNION = 0.49, 1.01  # largest of the four numbers of a unit quaternion
+_NOT_MEASURED = re.compile(
+    r"goal|set_?point|way_?point|initial_?pose|desired|(^|[/_.-])(plans?|planned|planner|target|cmd)(?![a-z])",
+    re.IGNORECASE,
+)
+"""In the names of topics with poses that somebody wants or assumes: no sensor was there."""
+_TF = "TF"
+_SAMPLES = 200  # scans whose times are compared with poses
+_SAME_LENGTH, _SAME_LENGTH_M = 0.3, 1.0  # of the paths of one vehicle: its parts swing, and poses are noisy
+_NEARLY_ALL = 0.9  # of what the best covers
+_SLOW_S, _SLOWER = 0.2, 3.0  # interval of poses that correct others, and its ratio to that of the others
 
 
 @dataclass
@@ -27,6 +52,7 @@ class _Track:
     """The poses of one frame in another, as they come."""
 
     parent: str
+    child: str = ""
     stamps_s: array[float] = field(default_factory=lambda: array("d"))
     recorded_s: array[float] = field(default_factory=lambda: array("d"))
     values: array[float] = field(default_factory=lambda: array("d"))
@@ -37,9 +63,22 @@ class _Track:
         self.recorded_s.append(recorded_s)
         self.values.extend(pose.values)
 
+    def usable(self) -> NDArray[np.bool_]:
+        """Mask (P,) of poses that are finite, with a unit quaternion."""
+        table = np.frombuffer(self.values, np.float64).reshape(-1, 7)
+        largest = np.abs(table[:, 3:]).max(axis=1)  # not the length, whose square overflows
+        unit = (largest >= _MIN_QUATERNION) & (largest <= _MAX_QUATERNION)
+        mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
+        return mask
+
     def table(self) -> NDArray[np.float64]:
-        """(P, 7) x, y, z, qx, qy, qz, qw."""
-        return np.frombuffer(self.values, np.float64).reshape(-1, 7)
+        """(P, 7) x, y, z, qx, qy, qz, qw of those that are usable."""
+        return np.frombuffer(self.values, np.float64).reshape(-1, 7)[self.usable()]
+
+    def extent(self, max_gap_s: float) -> tuple[float, int]:
+        """The time in which there are poses, to 0.1 s, and their number."""
+        gaps_s = np.diff(np.frombuffer(self.recorded_s, np.float64))
+        return round(float(gaps_s[gaps_s <= max_gap_s].sum()), 1), len(self.recorded_s)
 
     def is_constant(self) -> bool:
         table = self.table()
@@ -47,34 +86,50 @@ class _Track:
 
     def matrix(self) -> NDArray[np.float64]:
         """(4, 4) of a constant transform."""
-        table = self.table()
-        if not np.isfinite(table[-1]).all() or not table[-1, 3:].any():
-            msg = f"a transform from {self.parent} is not finite, or has no rotation"
-            raise ValueError(msg)
+        row = self.table()[-1]
         pose = np.eye(4)
-        pose[:3, 3] = table[-1, :3]
-        pose[:3, :3] = Rotation.from_quat(table[-1, 3:]).as_matrix()
+        pose[:3, 3] = row[:3]
+        pose[:3, :3] = Rotation.from_quat(row[3:]).as_matrix()
         return pose
 
-    def trajectory(self, name: str, request: Request) -> Trajectory:
-        stamps = np.frombuffer(self.stamps_s, np.float64)
+    def trajectory(self, name: str, request: Request, notes: Notes | None = None) -> Trajectory:
+        usable, stamps = self.usable(), np.frombuffer(self.stamps_s, np.float64)
+        if notes is not None and not usable.all():
+            notes.add(
+                f"poses of {name} left out: {(~usable).sum()} of {len(usable)} are not finite, or have no unit quaternion; "
+                f"the first, pose {np.argmin(usable)}, was recorded at {self.recorded_s[int(np.argmin(usable))]:.3f} s"
+            )
         if (
             request.stamps == "record"
             or not stamps.any()
             or (len(stamps) > 1 and (stamps == stamps[0]).all())
         ):
-            if request.stamps is None:
-                request.notes.add(
-                    f"the stamps of {name} are zero or stand still: the record time is used instead"
-                )
+            if notes is not None and request.stamps is None:
+                notes.add(f"the stamps of {name} are zero or stand still: the record time is used instead")
             stamps = np.frombuffer(self.recorded_s, np.float64)
         table = self.table()
-        return trajectory_of(stamps, table[:, :3], table[:, 3:], name)
+        return trajectory_of(stamps[usable], table[:, :3], table[:, 3:], name)
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """What may be the poses of the sensor."""
+
+    agrees: bool
+    """Whether its frames are connected with that of the scans."""
+    names_child: bool
+    """Whether it says whose poses it has."""
+    poses: StampedPoses
+    interval_s: float
 
 
 def poses_in_bags(
-    paths: list[Path], request: Request, sensor_frame: str, preferred: str | None
-) -> tuple[StampedPoses, NDArray[np.float64] | None]:
+    paths: list[Path],
+    request: Request,
+    frames: list[str],
+    preferred: str | None,
+    scan_times_s: Callable[[], NDArray[np.float64]],
+) -> FindPoses:
     """Poses by time in bags.
 
     Parameters
@@ -82,87 +137,245 @@ def poses_in_bags(
     paths : list of Path
         The bags.
     request : Request
-        What the user wants: `pose_topic`, `extrinsic`, `world_frame`, `stamps`. Its notes are told what was chosen.
-    sensor_frame : str
-        The frame of the scans, as their messages say.
+        What the user wants: `pose_topic`, `extrinsic`, `world_frame`, `stamps`. Its notes say what was chosen.
+    frames : list of str
+        The frames of the first scans, as their messages say.
     preferred : str or None
         The topic of poses that is taken before others, if it is there.
+    scan_times_s : callable
+        Reads the times of the scans, for a choice among several topics.
 
     Returns
     -------
-    poses : StampedPoses
-        T_world_base by time.
-    T_base_sensor : (4, 4) ndarray or None
-        The `extrinsic`, or that of the static transforms; None where the poses are the sensor's.
+    callable
+        Gives the poses of a frame of scans.
 
     Raises
     ------
-    ValueError
+    ValueError, OSError, ImportError
         If there are no poses, or several topics that could be meant.
     """
+    notes = request.notes
     topics = topics_of(paths)
     transforms = set(topics_with(TRANSFORM_TYPES, topics))
-    topic = _pose_topic(topics, transforms, request.pose_topic, preferred, paths[0])
-    if topic is None:
-        tree = _tree(paths, transforms)
-        return _of_tree(tree, sensor_frame, request)
-    track = _Track("")
-    child = ""
-    for message in messages_of(paths, {topic.name}):
-        poses: list[PoseMessage] = message.read()
-        if topic.message_type == PATH:  # each message holds the whole path so far: the last one counts
-            track = _Track("")
-        for pose in poses:
-            child = pose.child
-            track.add(pose, message.recorded_s)
-    if not track.values:
-        msg = f"{paths[0]}: {topic.name} holds no poses"
-        raise ValueError(msg)
-    trajectory = track.trajectory(topic.name, request)
-    request.notes.add(f"poses: {len(trajectory.times_s)} of {topic.name}")
-    if request.extrinsic is not None:
-        return trajectory, request.extrinsic
-    static = _tree(paths, transforms) if transforms else {}
-    return trajectory, _static_extrinsic(static, child, sensor_frame, topic.name, request)
-
-
-def _pose_topic(
-    topics: dict[str, Topic], transforms: set[str], wanted: str | None, preferred: str | None, path: Path
-) -> Topic | None:
-    """The topic of the poses; None means TF."""
     fitting = topics_with(POSE_TYPES, topics)
-    if wanted is not None:
-        if wanted in fitting:
-            return fitting[wanted]
-        if wanted in transforms or (wanted.strip("/") == "tf" and transforms):
-            return None
+    wanted = request.pose_topic
+    of_tree = wanted is not None and (
+        wanted in transforms or (wanted.strip("/") == "tf" and bool(transforms))
+    )
+    if wanted is not None and not of_tree and wanted not in fitting:
         listed = ", ".join(sorted([*fitting, *transforms]))
-        msg = f"{path} has no poses in {wanted}: topics with poses are {listed or 'none'}"
+        msg = f"{paths[0]} has no poses in {wanted}: topics with poses are {listed or 'none'}"
         raise ValueError(msg)
-    if preferred in fitting:
-        return fitting[preferred]
-    if len(fitting) == 1:
-        return next(iter(fitting.values()))
-    if fitting:
-        msg = f"{path} has several topics with poses: say by pose_topic which one counts, of {', '.join(sorted(fitting))}"
+    passed_over = {
+        name: "a goal, a plan or the like, by its name" for name in fitting if _NOT_MEASURED.search(name)
+    }
+    names = {wanted} & set(fitting) if wanted is not None else set(fitting) - set(passed_over)
+    tracks, tree = _tracks_and_tree(paths, names, transforms, request)
+    sensor = next((frame for frame in frames if frame in tree), frames[0])
+    if of_tree:
+        return _of_tree(tree, sensor, request)
+    if wanted is None:
+        name = _chosen(tracks, tree, sensor, passed_over, preferred, scan_times_s, request)
+        for other, why in sorted(passed_over.items()):
+            notes.add(f"poses of {other} are passed over ({why}); pose_topic chooses them")
+        if name is None:
+            return _of_tree(tree, sensor, request)
+    else:
+        name = wanted
+    track = tracks.get(name)
+    if track is None:
+        msg = f"{paths[0]}: {name} holds no poses"
         raise ValueError(msg)
-    if not transforms:
-        msg = f"{path} has no poses (Odometry, PoseStamped, Path or TF): give a file of poses, such as TUM; {FIND_POSES}"
+    trajectory = track.trajectory(name, request, notes)
+    notes.add(f"poses: {len(trajectory.times_s)} of {name}")
+    base = sensor if request.extrinsic is not None else _base(track, name, tree, sensor, notes)
+    return attached(trajectory, base, lambda: tree, request)
+
+
+def attached(
+    poses: StampedPoses, base: str, tree: Callable[[], dict[str, _Track]], request: Request
+) -> FindPoses:
+    """Poses of the frames that do not move against `base`, whose poses are given, but for the extrinsic of the user."""
+
+    @cache
+    def find(frame: str) -> ScanPoses | None:
+        T_base_sensor = np.eye(4) if frame == base else _fixed(tree(), base, frame)
+        if T_base_sensor is None:
+            return None
+        extrinsic = np.eye(4) if request.extrinsic is None else request.extrinsic
+        return ScanPoses(poses, extrinsic @ T_base_sensor, request.max_gap_s)
+
+    return find
+
+
+def transforms_of(paths: list[Path], request: Request) -> dict[str, _Track]:
+    """The transforms in bags; see :func:`attached`."""
+    return _tracks_and_tree(paths, set(), set(topics_with(TRANSFORM_TYPES, topics_of(paths))), request)[1]
+
+
+def _chosen(
+    tracks: dict[str, _Track],
+    tree: dict[str, _Track],
+    sensor: str,
+    passed_over: dict[str, str],
+    preferred: str | None,
+    scan_times_s: Callable[[], NDArray[np.float64]],
+    request: Request,
+) -> str | None:
+    """The topic of the poses; None means TF. Says why others are passed over."""
+    candidates: dict[str, _Candidate] = {}
+    for name, track in tracks.items():
+        try:
+            trajectory = track.trajectory(name, request)
+        except ValueError as error:
+            passed_over[name] = str(error)
+            continue
+        # In a frame that moves with the sensor are poses of other things.
+        agrees = not track.parent or _fixed(tree, track.parent, sensor) is None
+        if track.child and sensor in tree:
+            agrees = agrees and _fixed(tree, track.child, sensor) is not None
+        candidates[name] = _Candidate(agrees, bool(track.child), trajectory, _interval_s(trajectory))
+    about = request.notes.about
+    try:
+        of_tree = _of_tree(tree, sensor, request, quiet=True)(sensor) if tree else None
+        if of_tree is not None and isinstance(of_tree.poses, TransformChain):
+            candidates[_TF] = _Candidate(
+                True, True, of_tree.poses, max(map(_interval_s, of_tree.poses.moving()))
+            )
+    except ValueError as error:
+        if not candidates:
+            msg = f"{error}{_listed(passed_over)}"
+            raise type(error)(msg) from error
+    if not candidates:
+        msg = f"{about} has no poses (Odometry, PoseStamped, Path or TF): give a file of poses, such as TUM; {FIND_POSES}{_listed(passed_over)}"
         raise NoPoses(msg)
-    return None
+    if len(candidates) > 1:
+        passed_over |= _unfit(candidates, scan_times_s(), request.max_gap_s)
+    left = sorted(set(candidates) - set(passed_over) - {_TF})
+    if preferred in left:
+        return preferred
+    if len(left) > 1:
+        msg = (
+            f"{about} has several topics with poses: say by pose_topic which one counts, of {', '.join(left)}"
+        )
+        raise ValueError(msg)
+    return left[0] if left else None
 
 
-def _tree(paths: list[Path], transforms: set[str]) -> dict[str, _Track]:
-    """The transform to each frame from its parent."""
-    tree: dict[str, _Track] = {}
-    for message in messages_of(paths, transforms):
-        static = _STATIC in message.topic
-        for pose in message.read():
-            track = tree.get(pose.child)
-            if track is None or track.parent != pose.header.frame:
-                track = tree[pose.child] = _Track(pose.header.frame, static=static)
-            track.add(pose, message.recorded_s)
-    return tree
+def _listed(passed_over: dict[str, str]) -> str:
+    return "".join(f"; {name} is passed over ({why})" for name, why in sorted(passed_over.items()))
+
+
+def _interval_s(trajectory: Trajectory) -> float:
+    return float(np.median(np.diff(trajectory.times_s)))
+
+
+def _unfit(
+    candidates: dict[str, _Candidate], times_s: NDArray[np.float64], max_gap_s: float
+) -> dict[str, str]:
+    """Why some of the candidates do not count, by topic: by the frames, the times and the rate of the others."""
+    some = times_s[:: max(1, len(times_s) // _SAMPLES)].tolist()
+    positions_m = {name: _positions_m(c.poses, some, max_gap_s) for name, c in candidates.items()}
+    covered = {name: float(np.isfinite(xyz[:, 0]).mean()) for name, xyz in positions_m.items()}
+    best = max(covered.values())
+    unfit: dict[str, str] = {}
+    if any(c.agrees and covered[name] > best / 2 for name, c in candidates.items()):
+        unfit = {
+            n: "its frames do not lead to that of the scans" for n, c in candidates.items() if not c.agrees
+        }
+    for name, c in candidates.items():
+        if c.names_child or _TF not in candidates:
+            continue
+        both = np.isfinite(positions_m[name] + positions_m[_TF]).all(axis=1)
+        own_m, of_tree_m = (_length_m(positions_m[n][both]) for n in (name, _TF))
+        if abs(own_m - of_tree_m) > _SAME_LENGTH_M + _SAME_LENGTH * max(own_m, of_tree_m):
+            unfit.setdefault(name, f"it moved {own_m:.1f} m, the sensor {of_tree_m:.1f} m by TF")
+    best = max(share for name, share in covered.items() if name not in unfit)
+    unfit |= {
+        n: f"it covers {share:.0%} of the scans" for n, share in covered.items() if share < _NEARLY_ALL * best
+    }
+    fastest_s = min(c.interval_s for name, c in candidates.items() if name not in unfit)
+    for name, c in candidates.items():
+        if c.interval_s > max(_SLOW_S, _SLOWER * fastest_s):
+            unfit.setdefault(name, f"a pose every {c.interval_s:.2g} s, of others every {fastest_s:.2g} s")
+    return unfit
+
+
+def _positions_m(poses: StampedPoses, times_s: list[float], max_gap_s: float) -> NDArray[np.float64]:
+    """(N, 3) world frame; NaN where there are none."""
+    found = (poses.pose_at(time_s, max_gap_s) for time_s in times_s)
+    return np.array([np.full(3, np.nan) if pose is None else pose[:3, 3] for pose in found])
+
+
+def _length_m(positions_m: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(np.diff(positions_m, axis=0), axis=1).sum())
+
+
+def _base(track: _Track, name: str, tree: dict[str, _Track], sensor: str, notes: Notes) -> str:
+    """The frame whose poses a topic has. Where it names none, it is by convention that which moves with the sensor."""
+    base = track.child
+    if not base and sensor in tree:
+        chain = _ancestors(tree, sensor)
+        rigid = [tree[frame].is_constant() and tree[frame].parent != track.parent for frame in chain[:-1]]
+        base = chain[rigid.index(False) if False in rigid else len(rigid)]
+        if base != sensor:
+            notes.add(f"{name} names no child frame: its poses are taken as those of {base}")
+    if base and base == sensor and track.child:
+        return sensor
+    if base and base != sensor and _fixed(tree, base, sensor) is not None:
+        notes.add(f"extrinsic: of the static transforms, {base} -> {sensor}")
+        return base
+    notes.add(
+        f"no extrinsic is known between the frame of {name}, {base or '(unnamed)'}, and that of the scans, "
+        f"{sensor or '(unnamed)'}: the poses are taken as those of the radar; give extrinsic if they are not"
+    )
+    return sensor
+
+
+def _tracks_and_tree(
+    paths: list[Path], topics: set[str], transforms: set[str], request: Request
+) -> tuple[dict[str, _Track], dict[str, _Track]]:
+    """The poses of each of `topics` that has some, and the transform to each frame from its parent."""
+    by_topic: dict[str, _Track] = {}
+    edges: dict[str, dict[str, _Track]] = {}
+    for message in read_messages(paths, topics | transforms, request.notes):
+        if message.message_type == PATH:  # each message holds the whole path so far: the last one counts
+            by_topic.pop(message.topic, None)
+        for pose in message.content:
+            tracks, name = by_topic, message.topic
+            if message.topic in transforms:
+                tracks, name = edges.setdefault(pose.child, {}), pose.header.frame
+            if name not in tracks:
+                tracks[name] = _Track(pose.header.frame, static=_STATIC in message.topic)
+            tracks[name].child = pose.child
+            tracks[name].add(pose, message.recorded_s)
+    choices: dict[str, list[_Track]] = {}
+    for child, parents in edges.items():
+        usable = [track for track in parents.values() if track.usable().any()]
+        if usable:
+            choices[child] = sorted(usable, key=lambda track: track.extent(request.max_gap_s), reverse=True)
+    tree = {child: options[0] for child, options in choices.items()}
+    for child, options in choices.items():
+        if len(options) == 1:
+            continue
+        for track in (*options, options[0]):
+            tree[child] = track
+            if _moves(tree, child, request.world_frame):
+                break
+        listed = ", ".join(f"{track.parent} ({len(track.stamps_s)} transforms)" for track in options)
+        request.notes.add(f"{child} has several parents in TF, {listed}: {tree[child].parent} is used")
+    return by_topic, tree
+
+
+def _moves(tree: dict[str, _Track], frame: str, world: str | None) -> bool:
+    """Whether a frame moves in its root, and has the wanted world above it."""
+    try:
+        chain = _ancestors(tree, frame)
+    except ValueError:
+        return False
+    above = world is None or world.lstrip("/") in chain
+    return above and not all(tree[child].is_constant() for child in chain[:-1])
 
 
 def _ancestors(tree: dict[str, _Track], frame: str) -> list[str]:
@@ -177,53 +390,85 @@ def _ancestors(tree: dict[str, _Track], frame: str) -> list[str]:
     return chain
 
 
-def _of_tree(
-    tree: dict[str, _Track], sensor_frame: str, request: Request
-) -> tuple[StampedPoses, NDArray[np.float64] | None]:
+def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: bool = False) -> FindPoses:
+    """Poses of the frames below the world."""
+    notes = None if quiet else request.notes
     moving = [child for child, track in tree.items() if not track.is_constant()]
-    base = sensor_frame
-    if request.extrinsic is not None or sensor_frame not in tree:
+    base = sensor
+    if request.extrinsic is not None or sensor not in tree:
         # The frame that moves and has no other moving frame below it.
         above = {frame for child in moving for frame in _ancestors(tree, child)[1:]}
         lowest = [child for child in moving if child not in above]
         if request.extrinsic is None or len(lowest) != 1:
             msg = (
-                f"{request.notes.about}: the transforms do not lead to the frame of the scans, {sensor_frame or '(unnamed)'}: they have "
+                f"{request.notes.about}: the transforms do not lead to the frame of the scans, {sensor or '(unnamed)'}: they have "
                 f"{', '.join(sorted(tree)) or 'no frames'}; give extrinsic, the pose of the radar in the frame that moves"
             )
-            raise ValueError(msg)
+            raise (ValueError if moving else NoPoses)(msg)
         base = lowest[0]
     chain = _ancestors(tree, base)
-    if request.world_frame is not None:
-        wanted = request.world_frame.lstrip("/")
-        if wanted not in chain:
-            msg = f"world_frame {wanted} is not above {base}, whose frames are {' -> '.join(chain)}"
-            raise ValueError(msg)
-        chain = chain[: chain.index(wanted) + 1]
-    if not set(chain[:-1]) & set(moving):
-        msg = f"{request.notes.about}: no transform between {chain[-1]} and {base} moves: TF has no poses of the radar"
+    if request.world_frame is None:
+        world = _world(tree, chain, request)
+        if notes is not None and world in tree:
+            notes.add(
+                f"TF above {world} is passed over: it changes rarely; world_frame chooses another world"
+            )
+    else:
+        world = request.world_frame.lstrip("/")
+    if world not in chain:
+        msg = f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}"
         raise ValueError(msg)
-    links = [
-        tree[child].matrix()
-        if tree[child].is_constant()
-        else tree[child].trajectory(f"TF from {tree[child].parent} to {child}", request)
-        for child in reversed(chain[:-1])
-    ]
-    request.notes.add(f"poses: TF, {' -> '.join(reversed(chain))}")
-    return TransformChain(tuple(links)), request.extrinsic
+    if not set(chain[: chain.index(world)]) & set(moving):
+        msg = f"{request.notes.about}: no transform between {world} and {base} moves: TF has no poses of the radar"
+        raise NoPoses(msg)
+
+    def found(frame: str) -> ScanPoses | None:
+        chain = _ancestors(tree, frame)
+        if world not in chain[1:]:
+            return None
+        chain = chain[: chain.index(world) + 1]
+        links = [
+            tree[child].matrix()
+            if tree[child].is_constant()
+            else tree[child].trajectory(f"TF from {tree[child].parent} to {child}", request, notes)
+            for child in reversed(chain[:-1])
+        ]
+        if notes is not None:
+            notes.add(f"poses: TF, {' -> '.join(reversed(chain))}")
+        return ScanPoses(TransformChain(tuple(links)), np.eye(4), request.max_gap_s)
+
+    of_base = found(base)
+    assert of_base is not None
+    assert not isinstance(of_base.poses, np.ndarray)
+    if request.extrinsic is not None:
+        return attached(of_base.poses, sensor, lambda: tree, request)
+
+    @cache
+    def find(frame: str) -> ScanPoses | None:
+        try:
+            return of_base if frame == base else found(frame)
+        except ValueError:  # no poses, or a circle of frames
+            return None
+
+    return find
 
 
-def static_between(
-    paths: list[Path], transforms: set[str], base: str, sensor: str
-) -> NDArray[np.float64] | None:
-    """T_base_sensor (4, 4) by the static transforms in topics of bags; None where they do not lead from one to the other."""
-    if base and base == sensor:
-        return np.eye(4)
-    return _fixed(_tree(paths, transforms), base, sensor) if base and transforms else None
+def _world(tree: dict[str, _Track], chain: list[str], request: Request) -> str:
+    """The root; but the frame below it where that is corrected rarely, and its own poses are dense."""
+    moving = [frame for frame in chain[:-1] if not tree[frame].is_constant()]
+    intervals_s = [_interval_s(tree[frame].trajectory(frame, request)) for frame in moving]
+    if len(moving) > 1 and intervals_s[-1] > max(_SLOW_S, _SLOWER * min(intervals_s)):
+        return moving[-1]
+    return chain[-1]
+
+
+def static_between(paths: list[Path], base: str, sensor: str, request: Request) -> NDArray[np.float64] | None:
+    """T_base_sensor (4, 4) by the static transforms in bags; None where they do not lead from one to the other."""
+    return _fixed(transforms_of(paths, request), base, sensor) if base else None
 
 
 def _fixed(tree: dict[str, _Track], base: str, sensor: str) -> NDArray[np.float64] | None:
-    """T_base_sensor through frames that do not move against each other. None: there is no such way."""
+    """T_base_sensor through frames that do not move against each other. None: they do."""
     up_base, up_sensor = _ancestors(tree, base), _ancestors(tree, sensor)
     common = next((frame for frame in up_sensor if frame in up_base), None)
     if common is None:
@@ -233,22 +478,6 @@ def _fixed(tree: dict[str, _Track], base: str, sensor: str) -> NDArray[np.float6
     if not all(tree[frame].is_constant() for frame in (*down, *up)):
         return None
     return np.linalg.inv(_product(tree, up)) @ _product(tree, down)
-
-
-def _static_extrinsic(
-    tree: dict[str, _Track], base: str, sensor: str, topic: str, request: Request
-) -> NDArray[np.float64] | None:
-    """T_base_sensor by the static transforms; None where the frames are the same, or it is not known."""
-    if base and base == sensor:
-        return None
-    if base and (extrinsic := _fixed(tree, base, sensor)) is not None:
-        request.notes.add(f"extrinsic: of the static transforms, {base} -> {sensor}")
-        return extrinsic
-    request.notes.add(
-        f"no extrinsic is known between the frame of {topic}, {base or '(unnamed)'}, and that of the scans, "
-        f"{sensor or '(unnamed)'}: the poses are taken as those of the radar; give extrinsic if they are not"
-    )
-    return None
 
 
 def _product(tree: dict[str, _Track], upwards: list[str]) -> NDArray[np.float64]:

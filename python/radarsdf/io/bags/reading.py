@@ -4,23 +4,30 @@
 
 from __future__ import annotations
 
+import heapq
 import itertools
-from collections.abc import Iterator
-from contextlib import closing
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, suppress
+from dataclasses import replace
+from functools import cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from radarsdf.io.bags.files import Topic, bags_in, is_bag, messages_of, topics_of, topics_with
+from radarsdf.io.bags.files import Topic, bags_in, is_bag, read_messages, topics_of, topics_with
 from radarsdf.io.bags.imu import imu_in_bags, imu_topic
-from radarsdf.io.bags.messages import CLOUD_TYPES, POINT_A_MESSAGE, CloudMessage
-from radarsdf.io.bags.poses import poses_in_bags
+from radarsdf.io.bags.messages import CLOUD_TYPES, PACKETS, POINT_A_MESSAGE, CloudMessage
+from radarsdf.io.bags.poses import FindPoses, attached, poses_in_bags, transforms_of
+from radarsdf.io.clouds.fields import Fields
 from radarsdf.io.clouds.reading import Columns
 from radarsdf.io.imu import Imu
-from radarsdf.io.poses.reading import ScanPoses, poses_of
-from radarsdf.io.scans import Scans
+from radarsdf.io.poses.reading import UNPOSED, ScanPoses, StampedPoses, poses_of
+from radarsdf.io.scans import Notes, Scans
 from radarsdf.io.sources import RawScan, Request, posed, scan_poses
 
 __all__ = ["bags_in", "is_bag", "read_bags"]
@@ -33,6 +40,16 @@ KNOWN_TOPICS = {
 }
 """Topics of radars in data sets, and of the poses there. They are preferred to others."""
 
+_RADAR = re.compile(r"radar|ars_?\d{3}|srr_?\d{3}|oculii|mmwave", re.IGNORECASE)
+_POINTS = re.compile(_RADAR.pattern + "|lidar|cloud|points|detection|target|packets", re.IGNORECASE)
+_STATUS = re.compile(
+    "status|info|config|diagnos|imu|odom|twist|velocity|speed|rate|accel|steer|direction", re.IGNORECASE
+)
+"""In the names of types without points."""
+_STANDARD = re.compile(
+    r"((std|sensor|nav|geometry|visualization|diagnostic|lifecycle|tf2)_msgs|tf|rcl_interfaces|dynamic_reconfigure|bond)/[^ ]+$"
+)
+"""Types of packages whose other messages are no scans."""
 _PAUSE_S = 0.02  # the points of a scan are sent at once; scans are 30 ms apart or more
 _PEEKED_SCANS, _PEEKED_POINTS = 10, 400  # messages that are looked at for the clock: several scans
 
@@ -47,78 +64,138 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
             msg = f"{path} is no bag: only bags can be read together"
             raise ValueError(msg)
     topics = topics_of(paths)
-    topic = _scan_topic(topics, request.topic, paths)
-    peeked = _peek(paths, topic)
-    by_record = _by_record(peeked, topic, request)
-    poses: Any = request.poses
-    T_base_sensor = request.extrinsic
-    if poses is None or _is_bag_of_poses(poses):
-        pose_paths = paths if poses is None else [Path(poses)]
-        poses, T_base_sensor = poses_in_bags(
-            pose_paths, request, peeked[0].header.frame, KNOWN_TOPICS.get(topic.name)
-        )
-    else:
-        poses = poses_of(poses, request.notes)
+    scan_topics = _scan_topics(topics, paths, request)
+    peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
+    counted = Counter(cloud.header.frame for clouds in peeked.values() for cloud in clouds)
+    frames = [frame for frame, _ in counted.most_common()]
+    by_record = {topic.name: _by_record(peeked[topic.name], topic, request) for topic in scan_topics}
 
     def raw_scans() -> Iterator[RawScan]:
-        return _raw_scans(paths, topic, by_record)
+        streams = [_raw_scans(paths, topic, by_record[topic.name], request) for topic in scan_topics]
+        merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
+        return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
 
-    if isinstance(poses, np.ndarray):
-        count = sum(1 for _ in raw_scans()) if topic.message_type == POINT_A_MESSAGE else topic.count
-        matched, _ = scan_poses(poses, count, None, T_base_sensor, request)
+    def scan_times_s() -> NDArray[np.float64]:
+        return np.array([raw.time_s for raw in raw_scans()], np.float64)
+
+    poses = request.poses
+    find: Any
+    if poses is None or _is_bag_of_poses(poses):
+        pose_paths = paths if poses is None else [Path(poses)]
+        find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name), scan_times_s)
     else:
-        matched = ScanPoses(poses, np.eye(4) if T_base_sensor is None else T_base_sensor, request.max_gap_s)
+        find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
     of_imu = imu_topic(topics, request)
 
     def imu() -> Imu | None:
         if of_imu is None:
             return None
-        return imu_in_bags(paths, topics, of_imu, peeked[0].header.frame, by_record, request)
+        return imu_in_bags(paths, of_imu, frames[0], by_record[scan_topics[0].name], request)
 
     truth = request.truth or (lambda: None)
-    return Scans.of_source(posed(raw_scans, matched, request), request.notes, truth, imu)
+    return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
+
+
+def _given(
+    poses: StampedPoses | NDArray[np.float64],
+    paths: list[Path],
+    topics: list[Topic],
+    frames: list[str],
+    raw_scans: Callable[[], Iterator[RawScan]],
+    request: Request,
+) -> ScanPoses | FindPoses:
+    """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
+    if isinstance(poses, np.ndarray):
+        numbered = len(topics) == 1 and topics[0].message_type != POINT_A_MESSAGE
+        count = topics[0].count if numbered else sum(1 for _ in raw_scans())
+        return scan_poses(poses, count, None, request.extrinsic, request)[0]
+    if poses is UNPOSED:
+        if len(frames) > 1:
+            listed = ", ".join(frames)
+            request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
+        return ScanPoses(poses, np.eye(4), request.max_gap_s)
+    return attached(poses, frames[0], cache(lambda: transforms_of(paths, request)), request)
 
 
 def _is_bag_of_poses(poses: Any) -> bool:
     return isinstance(poses, (str, PathLike)) and is_bag(Path(poses))
 
 
-def _scan_topic(topics: dict[str, Topic], wanted: str | None, paths: list[Path]) -> Topic:
-    """The topic of the scans: the wanted one, or the only one that can be meant."""
+def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) -> list[Topic]:
+    """The topics of the scans: the wanted ones, or the only one that can be meant. Says which others there are."""
     where = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
     fitting = topics_with(CLOUD_TYPES, topics)
-    listed = ", ".join(f"{name} ({t.message_type})" for name, t in sorted(fitting.items()))
-    if wanted is not None:
+    for wanted in request.topic:
         if wanted in fitting:
-            return fitting[wanted]
+            continue
         if wanted in topics:
             msg = f"{where}: {wanted} has messages {topics[wanted].message_type}, or none; scans are {', '.join(CLOUD_TYPES)}"
         else:
-            msg = f"{where} has no topic {wanted}: topics with points are {listed or 'none'}"
+            msg = (
+                f"{where} has no topic {wanted}: topics with points are {_listed(fitting.values()) or 'none'}"
+            )
         raise ValueError(msg)
+    if request.topic:
+        return [fitting[name] for name in dict.fromkeys(request.topic)]
+    unread = [t for t in topics.values() if t.count and t.name not in fitting and _may_have_points(t)]
     if not fitting:
-        found = ", ".join(f"{name} ({t.message_type})" for name, t in sorted(topics.items()))
-        msg = f"{where} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {found or 'no topics'}"
+        msg = f"{where} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {_listed(topics.values()) or 'no topics'}"
         raise ValueError(msg)
-    choices: tuple[list[Topic], ...] = (
-        list(fitting.values()),
-        [t for name, t in fitting.items() if name in KNOWN_TOPICS],
-        [t for name, t in fitting.items() if "radar" in name.lower() or "radar" in t.message_type.lower()],
-    )
-    for choice in choices:
-        if len(choice) == 1:
-            return choice[0]
-    msg = f"{where} has several topics with points: say by topic which is the radar's, of {listed}"
-    raise ValueError(msg)
+    decoded = [t for t in fitting.values() if t.message_type != PACKETS]
+    chosen: list[Topic] = []
+    for fits in (
+        lambda _: True,
+        lambda t: t.name in KNOWN_TOPICS,
+        _is_radar,
+        lambda t: _has_doppler(paths, t),
+    ):
+        chosen = [t for t in decoded or fitting.values() if fits(t)]
+        if len(chosen) == 1:
+            break
+    else:
+        msg = f"{where} has several topics with points: say by topic which is the radar's, one or several of {_listed(fitting.values())}"
+        raise ValueError(msg)
+    radars = [t for t in unread if _is_radar(t)]
+    if radars and not _is_radar(chosen[0]) and not _has_doppler(paths, chosen[0]):
+        msg = (
+            f"{where}: messages of the radar cannot be read, {_listed(radars)}. The only points are those of {_listed(chosen)}, whose "
+            f"name and fields are not a radar's: give topic {chosen[0].name} to map them"
+        )
+        raise ValueError(msg)
+    if others := [t for t in (*fitting.values(), *unread) if t is not chosen[0]]:
+        request.notes.add(f"scans: those of {_listed(chosen)}; not read: {_listed(others)}")
+    return chosen
 
 
-def _peek(paths: list[Path], topic: Topic) -> list[CloudMessage]:
+def _listed(topics: Iterable[Topic]) -> str:
+    return ", ".join(f"{t.name} ({t.message_type})" for t in sorted(topics, key=lambda t: t.name))
+
+
+def _is_radar(topic: Topic) -> bool:
+    return bool(_RADAR.search(f"{topic.name} {topic.message_type}"))
+
+
+def _may_have_points(topic: Topic) -> bool:
+    """Whether messages of a type that cannot be read are probably scans."""
+    kind = topic.message_type
+    named = _POINTS.search(f"{topic.name} {kind}") and not _STATUS.search(kind)
+    return bool(named) and not _STANDARD.match(kind)
+
+
+def _has_doppler(paths: list[Path], topic: Topic) -> bool:
+    with closing(read_messages(paths, {topic.name}, Notes())) as messages, suppress(ValueError):
+        for message in messages:
+            return "doppler" in Fields.of(list(message.content.columns())).names
+    return False
+
+
+def _peek(paths: list[Path], topic: Topic, request: Request) -> list[CloudMessage]:
     """The first messages of a topic, as many as it takes to know its clock."""
     count = _PEEKED_POINTS if topic.message_type == POINT_A_MESSAGE else _PEEKED_SCANS
-    with closing(messages_of(paths, {topic.name})) as messages:
-        peeked = [message.read() for message in itertools.islice(messages, count)]
+    with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
+        peeked = [message.content for message in itertools.islice(messages, count)]
     if not peeked:
-        msg = f"{paths[0]}: the topic {topic.name} has no messages"
+        msg = f"{paths[0]}: the topic {topic.name} has no messages that can be read{request.notes.ending()}"
         raise ValueError(msg)
     return peeked
 
@@ -137,37 +214,38 @@ def _by_record(peeked: list[CloudMessage], topic: Topic, request: Request) -> bo
     return False
 
 
-def _raw_scans(paths: list[Path], topic: Topic, by_record: bool) -> Iterator[RawScan]:
+def _raw_scans(paths: list[Path], topic: Topic, by_record: bool, request: Request) -> Iterator[RawScan]:
     if topic.message_type == POINT_A_MESSAGE:
-        yield from _grouped(paths, topic, by_record)
+        yield from _grouped(paths, topic, by_record, request)
         return
-    for number, message in enumerate(messages_of(paths, {topic.name})):
-        cloud: CloudMessage = message.read()
+    for message in read_messages(paths, {topic.name}, request.notes):
+        cloud: CloudMessage = message.content
         time_s = message.recorded_s if by_record else cloud.header.stamp_s
-        yield RawScan(cloud.columns, time_s, f"{message.bag}: message {number} of {topic.name}")
+        name = f"{message.bag}: message {message.number} of {topic.name}"
+        yield RawScan(cloud.columns, time_s, name, cloud.header.frame, topic.name, message.number)
 
 
-def _grouped(paths: list[Path], topic: Topic, by_record: bool) -> Iterator[RawScan]:
+def _grouped(paths: list[Path], topic: Topic, by_record: bool, request: Request) -> Iterator[RawScan]:
     """Scans of messages of one point each. A scan begins where the number of the point does not grow, or after a pause."""
     points: list[CloudMessage] = []
     last, last_s, start_s, number = -1, 0.0, 0.0, 0
-    for message in messages_of(paths, {topic.name}):
-        cloud: CloudMessage = message.read()
+    for message in read_messages(paths, {topic.name}, request.notes):
+        cloud: CloudMessage = message.content
         point_id = -1 if cloud.point_id is None else cloud.point_id
         if points and (point_id <= last or message.recorded_s > last_s + _PAUSE_S):
-            yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}")
+            yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}", topic)
             points, number = [], number + 1
         if not points:
             start_s = message.recorded_s if by_record else cloud.header.stamp_s
         points.append(cloud)
         last, last_s = point_id, message.recorded_s
     if points:
-        yield _joined(points, start_s, f"{paths[-1]}: scan {number} of {topic.name}")
+        yield _joined(points, start_s, f"{paths[-1]}: scan {number} of {topic.name}", topic)
 
 
-def _joined(points: list[CloudMessage], time_s: float, name: str) -> RawScan:
+def _joined(points: list[CloudMessage], time_s: float, name: str, topic: Topic) -> RawScan:
     def columns() -> Columns:
         rows = [point.columns() for point in points]
         return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}
 
-    return RawScan(columns, time_s, name)
+    return RawScan(columns, time_s, name, points[0].header.frame, topic.name)

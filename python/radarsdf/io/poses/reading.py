@@ -79,9 +79,13 @@ class TransformChain:
             pose = pose @ part
         return pose
 
+    def moving(self) -> list[Trajectory]:
+        """The links that are not constant."""
+        return [link for link in self.links if isinstance(link, Trajectory)]
+
     def span(self) -> str:
         """First and last time of its moving links, for messages."""
-        return ", ".join(link.span() for link in self.links if isinstance(link, Trajectory))
+        return ", ".join(link.span() for link in self.moving())
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Bags of several sensors: the frame of each message, the topic that has the poses, and messages that are damaged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from radarsdf.io import NoPoses, read
+
+from ..conftest import pose
+
+pytest.importorskip("rosbags", reason="the extra ros is not installed")
+
+from bench.reading.bag_writing import BagWriter
+
+from .test_bags import MOUNTING, START_S, moved, odometry
+
+TIMES_S = START_S + np.arange(10) * 0.1
+POINT = {"x": [5.0], "y": [0.0], "z": [0.0], "doppler": [-1.0]}
+REAR = pose([0.0, 0.0, 0.0], np.pi)
+
+
+def straight(time_s):
+    return pose([time_s - START_S, 0, 0])
+
+
+def tf(bag, edges, moving=straight, times_s=TIMES_S):
+    """odom -> base moves, and the `edges` are constant."""
+    bag.write("/tf_static", bag.transforms(START_S, edges), START_S - 1)
+    for time_s in times_s:
+        bag.write("/tf", bag.transforms(time_s, {("odom", "base"): moving(time_s)}), time_s)
+
+
+def clouds(bag, topic="/radar", frame="radar", times_s=TIMES_S, cloud=POINT):
+    for time_s in times_s:
+        bag.write(topic, bag.cloud2(time_s, cloud, frame), time_s)
+
+
+def bag_of(tmp_path, *parts, kind="mcap"):
+    """A bag that each of `parts` writes to."""
+    path = tmp_path / ("drive.bag" if kind == "ros1" else "drive")
+    with BagWriter(path, kind) as bag:
+        for part in parts:
+            part(bag)
+    return path
+
+
+def seen(scans):
+    """What the scans see in the world, in the order of their times."""
+    return [scan.world_points[0].round(3).tolist() for scan in scans]
+
+
+EDGES = {("base", "front"): np.eye(4), ("base", "rear"): REAR}
+
+
+def test_each_message_has_the_pose_of_its_own_frame(tmp_path):
+    path = bag_of(
+        tmp_path,
+        lambda bag: tf(bag, EDGES),
+        lambda bag: clouds(bag, frame="front", times_s=TIMES_S[:4]),
+        lambda bag: clouds(bag, frame="rear", times_s=TIMES_S[4:8]),
+        lambda bag: clouds(bag, frame="unknown", times_s=TIMES_S[8:]),
+    )
+    scans = read(path)
+    front = [[5 + 0.1 * i, 0, 0] for i in range(4)]
+    assert_allclose(seen(scans), front + [[0.1 * i - 5, 0, 0] for i in range(4, 8)], atol=1e-3)
+    assert "2 scans left out: no poses lead to their frame, unknown" in scans.notes
+
+
+def test_a_first_message_of_an_unknown_frame_refuses_nothing(tmp_path):
+    path = bag_of(
+        tmp_path,
+        lambda bag: tf(bag, EDGES),
+        lambda bag: clouds(bag, frame="", times_s=TIMES_S[:1]),
+        lambda bag: clouds(bag, frame="rear", times_s=TIMES_S[1:]),
+    )
+    assert len(read(path)) == 9
+
+
+@pytest.mark.parametrize("poses", ["odometry", "file"])
+def test_several_topics_are_merged_by_time(tmp_path, poses):
+    """The rear radar has other fields."""
+
+    def rear(bag):
+        clouds(bag, "/rear", "rear", TIMES_S + 0.03, {"x": [5.0], "y": [0.0], "z": [0.0], "rcs": [3.0]})
+
+    def odom(bag):
+        if poses == "odometry":
+            for time_s in np.append(TIMES_S, TIMES_S[-1] + 0.1):
+                bag.write("/odom", bag.odometry(time_s, straight(time_s), child="base"), time_s)
+        bag.write("/tf_static", bag.transforms(START_S, EDGES), START_S - 1)
+
+    path = bag_of(tmp_path, odom, lambda bag: clouds(bag, "/front", "front"), rear)
+    rows = [f"{t:.6f} {t - START_S:.6f} 0 0 0 0 0 1" for t in np.append(TIMES_S, TIMES_S[-1] + 0.1)]
+    (tmp_path / "base.tum").write_text("\n".join(rows))
+    scans = read(path, None if poses == "odometry" else tmp_path / "base.tum", topic=["/front", "/rear"])
+    assert len(scans) == 20
+    assert (np.diff(scans.times_s) > 0).all()
+    assert_allclose(np.array(seen(scans))[::2, 0], 5 + 0.1 * np.arange(10), atol=1e-3)
+    assert_allclose(np.array(seen(scans))[1::2, 0], 0.1 * np.arange(10) + 0.03 - 5, atol=1e-3)
+    assert [scan.intensities is None for scan in scans][:2] == [True, False]
+    assert any("some topics have doppler, others have none" in note for note in scans.notes)
+    with pytest.raises(ValueError, match="has no topic /up"):
+        read(path, topic=["/front", "/up"])
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "/goal_pose",
+        "/robot1/goal_pose",
+        "/move_base_simple/goal",
+        "/initialpose",
+        "/robotGoalPose",
+        "/mavros/setpoint_position/local",
+    ],
+)
+def test_what_somebody_wants_is_no_pose_of_the_sensor(tmp_path, topic):
+    """Though it is as dense as the scans."""
+
+    def goals(bag):
+        for time_s in TIMES_S:
+            bag.write(topic, bag.pose_stamped(time_s, pose([50.0, 3, 0])), time_s)
+
+    path = bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), clouds, goals)
+    scans = read(path)
+    assert_allclose(scans.poses[0], MOUNTING, atol=1e-9)
+    assert any(note.startswith(f"poses of {topic} are passed over") for note in scans.notes)
+    assert read(path, pose_topic=topic).poses[0, 0, 3] == 50.5  # what is asked for is read
+    only = tmp_path / "only"
+    only.mkdir()
+    with pytest.raises(NoPoses, match=f"{topic} is passed over"):
+        read(bag_of(only, clouds, goals))
+
+
+def test_poses_that_are_rare_or_not_of_the_sensor_are_passed_over(tmp_path):
+    def others(bag):
+        for time_s in START_S + np.arange(-2, 5) * 0.5:  # corrections
+            bag.write("/amcl_pose", bag.pose_stamped(time_s, pose([70.0, 0, 0])), time_s)
+        for time_s in TIMES_S[3:5]:
+            bag.write("/short", bag.pose_stamped(time_s, pose([80.0, 0, 0])), time_s)
+        for time_s in TIMES_S:
+            bag.write("/tag", bag.pose_stamped(time_s, pose([2.0, 0, 0]), "base"), time_s)  # of a thing seen
+            bag.write("/person", bag.pose_stamped(time_s, pose([10 * (time_s - START_S), 0, 0])), time_s)
+            bag.write("/leader", bag.odometry(time_s, pose([90.0, 0, 0]), "odom", "leader"), time_s)
+            plan = {time_s: pose([1.0, 0, 0])}  # without stamps
+            message = bag.path({**plan, time_s + 1: pose([2.0, 0, 0])})
+            for stamped in message.poses:
+                stamped.header.stamp.sec = stamped.header.stamp.nanosec = 0
+            bag.write("/route", message, time_s)
+
+    path = bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), clouds, others)
+    scans = read(path)
+    assert_allclose(scans.poses[0], MOUNTING, atol=1e-9)
+    passed = [note.split()[2] for note in scans.notes if note.startswith("poses of")]
+    assert passed == ["/amcl_pose", "/leader", "/person", "/route", "/short", "/tag"]
+
+
+@pytest.mark.parametrize("which", ["mocap", "filter", "path", "odom"])
+def test_poses_that_are_of_the_sensor(tmp_path, which):
+    """A topic that names no frame has the poses of the base, which moves with the radar."""
+
+    def write(bag):
+        bag.write("/tf_static", bag.transforms(START_S, {("base", "radar"): MOUNTING}), START_S - 1)
+        dense_s = START_S + np.arange(-5, 55) * 0.02
+        for time_s in dense_s:
+            if which == "mocap":
+                bag.write("/vrpn/robot/pose", bag.pose_stamped(time_s, moved(time_s), "world"), time_s)
+            if which == "filter":  # as accurate as TF, which it is published with
+                stamped = bag.pose_stamped(time_s, moved(time_s))
+                covariance = bag.make("geometry_msgs/msg/PoseWithCovariance", stamped.pose, np.zeros(36))
+                kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+                bag.write("/ekf/pose", bag.make(kind, stamped.header, covariance), time_s)
+                bag.write("/tf", bag.transforms(time_s, {("odom", "base"): moved(time_s)}), time_s)
+            if which == "odom":
+                bag.write("/wheel/odom", bag.odometry(time_s, moved(time_s), child="base"), time_s)
+        if which == "path":
+            bag.write("/slam/path", bag.path({t: moved(t) for t in dense_s}), dense_s[-1])
+
+    scans = read(bag_of(tmp_path, write, clouds))
+    assert_allclose(scans.poses, [moved(t) @ MOUNTING for t in TIMES_S], atol=1e-3)
+    assert any(note.startswith("poses: 60 of") for note in scans.notes)
+
+
+@pytest.mark.parametrize("other", ["as good", "constant", "short"])
+def test_of_two_parents_the_one_with_poses_counts(tmp_path, other):
+    times_s = {"as good": TIMES_S, "constant": TIMES_S.repeat(3), "short": START_S + np.arange(50) * 0.002}[
+        other
+    ]
+
+    def second(bag):
+        for time_s in times_s:
+            T_parent_base = pose([7.0, 0, 0]) if other == "constant" else straight(time_s)
+            bag.write("/tf", bag.transforms(time_s, {("camera_init", "base"): T_parent_base}), time_s)
+
+    scans = read(bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), second, clouds))
+    assert_allclose(scans.poses, [straight(t) @ MOUNTING for t in TIMES_S], atol=1e-6)
+    assert any("several parents in TF" in note and "odom is used" in note for note in scans.notes)
+
+
+def test_a_world_that_is_corrected_rarely_is_passed_over(tmp_path):
+    def corrections(bag):
+        for time_s, shift_m in ((START_S - 0.5, 3.0), (START_S + 0.5, 4.0), (START_S + 1.5, 5.0)):
+            bag.write("/tf", bag.transforms(time_s, {("map", "odom"): pose([shift_m, 0, 0])}), time_s)
+
+    path = bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), corrections, clouds)
+    scans = read(path)
+    assert_allclose(scans.poses, [straight(t) @ MOUNTING for t in TIMES_S], atol=1e-6)
+    assert any("TF above odom is passed over" in note for note in scans.notes)
+    assert_allclose(read(path, world_frame="map", max_gap_s=1.1).poses[0, 0, 3], 4.0)
+
+
+def test_poses_that_are_not_usable_are_left_out(tmp_path):
+    def write(bag):
+        for i, time_s in enumerate(TIMES_S):
+            message = bag.odometry(time_s, straight(time_s), child="radar")
+            if i in (0, 5):
+                message.pose.pose.orientation.w = 0.0
+            if i == 7:
+                message.pose.pose.position.x = np.nan
+            bag.write("/odom", message, time_s)
+
+    scans = read(bag_of(tmp_path, write, clouds))
+    assert len(scans) == 9
+    assert_allclose(scans.poses[:, 0, 3], 0.1 * np.arange(1, 10), atol=1e-6)
+    (note,) = (note for note in scans.notes if "3 of 10" in note)
+    assert f"pose 0, was recorded at {START_S:.3f} s" in note
+
+
+def test_transforms_that_are_not_usable_are_left_out(tmp_path):
+    def write(bag):
+        bag.write("/tf_static", bag.transforms(START_S, {("base", "radar"): MOUNTING}), START_S - 1)
+        message = bag.transforms(START_S, {("base", "camera"): np.eye(4)})
+        message.transforms[0].transform.translation.x = np.nan
+        bag.write("/tf_static", message, START_S - 1)
+        for i, time_s in enumerate(TIMES_S):
+            message = bag.transforms(time_s, {("odom", "base"): straight(time_s)})
+            message.transforms[0].transform.rotation.w *= i != 4
+            bag.write("/tf", message, time_s)
+
+    scans = read(bag_of(tmp_path, write, clouds))
+    assert_allclose(scans.poses, [straight(t) @ MOUNTING for t in TIMES_S], atol=1e-6)
+    assert any("1 of 10" in note for note in scans.notes)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+@pytest.mark.parametrize("number", [0, 6])
+def test_a_damaged_message_is_left_out_and_named(tmp_path, kind, number):
+    def write(bag):
+        odometry(bag)
+        for i, time_s in enumerate(TIMES_S[:5].repeat(2)[:10]):
+            message = bag.cloud2(time_s + 0.01 * (i % 2), POINT)
+            if i == number:
+                message.data = message.data[:5]
+            if i == 8:  # a radar that saw nothing
+                message.width, message.data = 0, message.data[:0]
+            bag.write("/radar", message, time_s + 0.01 * (i % 2))
+
+    scans_path = bag_of(tmp_path, write, kind=kind)
+    scans = read(scans_path)
+    assert len(scans) == 8
+    (note,) = (note for note in scans.notes if note.startswith("messages left out: 1 of 10"))
+    assert f"message {number} of /radar, at" in note
+    assert "1 scans left out: they hold no returns" in scans.notes
+    in_order = read(scans_path, [pose([i, 0, 0]) for i in range(10)])  # still one for each message
+    assert in_order.poses[:, 0, 3].tolist() == [i for i in range(10) if i not in (8, number)]
