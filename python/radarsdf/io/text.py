@@ -29,19 +29,17 @@ _IN_CELL = re.compile(rf"(?:^|;)[ \t]*{_DECIMAL_COMMA}(?=[ \t]*(?:;|$))", re.MUL
 def read_text(path: Path) -> str:
     """The text of a file, with a line feed after each line.
 
-    It is in UTF-8, or in another encoding of Unicode that a byte order mark names, which is left out. Lines may end as
-    those of any system.
+    It is in UTF-8, or in another encoding of Unicode that a byte order mark names, which is left out. What does not
+    decode, such as a comment in Latin-1, becomes replacement characters. Lines may end as those of any system.
 
     Raises
     ------
-    ValueError
-        If the file is no such text.
     OSError
         If it cannot be read.
     """
     data = path.read_bytes()
     encoding = next((encoding for mark, encoding in _MARKS if data.startswith(mark)), "utf-8")
-    return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+    return data.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def with_points(text: str) -> str:
