@@ -83,7 +83,7 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.f
         mesh = mesh.copy()
         mesh.vertices = vertices - origin
     if suffix == ".glb":
-        scene = trimesh.Scene()
+        scene: Any = trimesh.Scene()
         scene.add_geometry(mesh, transform=_T_GLTF_WORLD)
         exported: Any = scene.export(file_type="glb")
     else:

@@ -41,6 +41,7 @@ from radarsdf.io.sources import (
     in_order_of_time,
     scan_poses,
     scans_of_files,
+    viewpoint_poses,
 )
 
 _STAMPS = (None, "header", "record")
@@ -215,6 +216,10 @@ def _files(files: list[Path], folder: Path, request: Request, truth: Truth = lam
         if poses is not None and poses.parent != folder:  # which is easily overlooked
             request.notes.add(f"poses: of {poses}")
         if poses is None:
+            files, times_s, _ = in_order_of_time(files, UNPOSED, request.notes)
+            viewpoints = viewpoint_poses(files, request.notes)
+            if viewpoints is not None:
+                return scans_of_files(files, times_s, viewpoints, request.extrinsic, request, truth)
             what = files[0] if len(files) == 1 else folder
             msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
             raise NoPoses(msg)
@@ -237,6 +242,7 @@ def _npz(path: Path, request: Request) -> Scans:
         raise ValueError(msg)
     _refuse_choices_of_bags(path, request)
     scans = read_scans(path)
+    lost = np.flatnonzero(~np.isfinite(scans.poses).all(axis=(1, 2)))
     matched = None if given is None else _other_poses(given, scans, path, request)
     if matched is not None and request.truth is None and scans.ground_truth is not None:
         request.notes.add(
@@ -245,6 +251,9 @@ def _npz(path: Path, request: Request) -> Scans:
 
     def source() -> Iterator[Scan]:
         for number, scan in enumerate(scans):
+            if matched is None and number in lost:
+                request.notes.count("scans left out: their poses are not finite", 1, f"scan {number}")
+                continue
             T_world_sensor = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
             if T_world_sensor is None:
                 request.notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s), 1)

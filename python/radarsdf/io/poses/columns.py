@@ -30,7 +30,9 @@ def pose_columns(names: list[str]) -> dict[str, int] | None:
     times: dict[str, int] = {}
     for column, name in enumerate(names):
         lower, _ = without_unit(name)
-        tokens = re.findall(r"[a-z]+|\d+", re.sub(r"(orientation|position|quat|pos)(?=[wxyz]$)", r"\1 ", lower))
+        tokens = re.findall(
+            r"[a-z]+|\d+", re.sub(r"(orientation|position|quat|pos)(?=[wxyz]$)", r"\1 ", lower)
+        )
         role = _role(tokens)
         if role is not None:
             found.setdefault(role, column)

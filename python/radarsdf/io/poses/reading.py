@@ -184,6 +184,32 @@ def read_poses(
     check_regular_file(path)
     if path.suffix.lower() == ".npy":
         return usable_poses(np.array(array_in(path)), str(path), notes)
+    heads, rows = _rows_of(path)
+    width = Counter(len(words) for _, words in rows).most_common(1)[0][0]
+    heads = [head for head in heads if len(head) == width]
+    table, lines = numbers_of(rows, width), [line for line, _ in rows]
+    for head in reversed(heads):
+        if (columns := pose_columns(head)) is not None:
+            return _named(table, columns, head, path, notes, lines)
+    if width == _TUM_COLUMNS:
+        if heads:
+            notes.add(
+                f"{path.name}: its columns are taken as time x y z qx qy qz qw: names above them are not known"
+            )
+        return _stamped(table, path, notes, lines)
+    if width == _KITTI_COLUMNS:
+        return _kitti(table, path, notes, lines, calibration)
+    if width == _MATRIX_COLUMNS or (width == 4 and len(table) % 4 == 0):
+        return usable_poses(table.reshape(-1, 4, 4), str(path), notes, lines[:: 16 // width])
+    msg = (
+        f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four in blocks "
+        "of four lines; or name the columns in the first line, such as time,x,y,z,qw,qx,qy,qz"
+    )
+    raise ValueError(msg)
+
+
+def _rows_of(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]:
+    """What may be names of columns, and the rows with their lines, of which one has a number at its end."""
     try:
         heads, rows = text_rows(path)
     except ValueError as error:
@@ -195,40 +221,7 @@ def read_poses(
     if not any(are_numbers(words[-1:]) for _, words in rows):
         msg = f"{path} is not a table of poses: it has no rows of numbers"
         raise ValueError(msg)
-    width = Counter(len(words) for _, words in rows).most_common(1)[0][0]
-    heads = [head for head in heads if len(head) == width]
-    table, lines = numbers_of(rows, width), [line for line, _ in rows]
-    for head in reversed(heads):
-        if (columns := pose_columns(head)) is not None:
-            return _named(table, columns, head, path, notes, lines)
-    if width == _TUM_COLUMNS:
-        if heads:
-            notes.add(f"{path.name}: its columns are taken as time x y z qx qy qz qw: names above them are not known")
-        return _stamped(table, path, notes, lines)
-    if width == _KITTI_COLUMNS:
-        poses = np.tile(np.eye(4), (len(table), 1, 1))
-        poses[:, :3] = table.reshape(-1, 3, 4)
-        checked = usable_poses(poses, str(path), notes, lines)
-        for file in calibration:
-            if file.is_file() and (T_camera_sensor := read_calibration(file)) is not None:
-                notes.add(
-                    f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr, the world is the first scan"
-                )
-                moved: NDArray[np.float64] = np.linalg.inv(T_camera_sensor) @ checked @ T_camera_sensor
-                return moved
-        notes.add(
-            f"{path.name} has KITTI poses and there is no calibration Tr: they are taken as T_world_sensor"
-        )
-        return checked
-    if width == _MATRIX_COLUMNS:
-        return usable_poses(table.reshape(-1, 4, 4), str(path), notes, lines)
-    if width == 4 and len(table) % 4 == 0:
-        return usable_poses(table.reshape(-1, 4, 4), str(path), notes, lines[::4])
-    msg = (
-        f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four in blocks "
-        "of four lines; or name the columns in the first line, such as time,x,y,z,qw,qx,qy,qz"
-    )
-    raise ValueError(msg)
+    return heads, rows
 
 
 def read_calibration(path: Path) -> NDArray[np.float64] | None:
@@ -302,6 +295,24 @@ def _named(
     return _stamped(poses, path, notes, lines)
 
 
+def _kitti(
+    table: NDArray[np.float64], path: Path, notes: Notes, lines: list[int], calibration: Sequence[Path]
+) -> NDArray[np.float64]:
+    """Poses of rows (F, 12), turned from the camera to the sensor if there is a calibration."""
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3] = table.reshape(-1, 3, 4)
+    checked = usable_poses(poses, str(path), notes, lines)
+    for file in calibration:
+        if file.is_file() and (T_camera_sensor := read_calibration(file)) is not None:
+            notes.add(
+                f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr, the world is the first scan"
+            )
+            moved: NDArray[np.float64] = np.linalg.inv(T_camera_sensor) @ checked @ T_camera_sensor
+            return moved
+    notes.add(f"{path.name} has KITTI poses and there is no calibration Tr: they are taken as T_world_sensor")
+    return checked
+
+
 def _stamped(table: NDArray[np.float64], path: Path, notes: Notes, lines: list[int]) -> Trajectory:
     """The trajectory in rows (P, 8) of time, position and quaternion. What is no pose is left out, and named."""
     with np.errstate(over="ignore"):
@@ -321,7 +332,9 @@ def _stamped(table: NDArray[np.float64], path: Path, notes: Notes, lines: list[i
     table[:, 0] = in_seconds(table[:, 0], path, notes)
     back = np.diff(table[:, 0], prepend=-np.inf) < 0
     if back.any():
-        notes.add(f"{path.name} is not in the order of its times, and sorted: {_listed(back, np.array(lines)[rows])}")
+        notes.add(
+            f"{path.name} is not in the order of its times, and sorted: {_listed(back, np.array(lines)[rows])}"
+        )
     _, first = np.unique(table[:, 0], return_index=True)
     again = np.ones(len(table), bool)
     again[first] = False
@@ -331,7 +344,11 @@ def _stamped(table: NDArray[np.float64], path: Path, notes: Notes, lines: list[i
             f"{_listed(again, np.array(lines)[rows])}"
         )
     if len(first) < 2:
-        why = f", of {len(lines)} lines: {_listed(bad, lines)} not finite or without a rotation" if bad.any() else ""
+        why = (
+            f", of {len(lines)} lines: {_listed(bad, lines)} not finite or without a rotation"
+            if bad.any()
+            else ""
+        )
         msg = f"{path} must hold at least two poses at different times, not {len(first)}{why}"
         raise ValueError(msg)
     return trajectory_of(table[:, 0], table[:, 1:4], table[:, 4:], str(path))
@@ -364,7 +381,9 @@ def usable_poses(
         raise ValueError(msg)
     if bad.any():
         which = _listed(bad, lines or range(len(bad)), "pose" if lines is None else "line")
-        notes.add(f"scans left out: {bad.sum()} of {len(bad)} poses of {name} are not finite and rigid: {which}")
+        notes.add(
+            f"scans left out: {bad.sum()} of {len(bad)} poses of {name} are not finite and rigid: {which}"
+        )
     return np.where(bad[:, None, None], np.nan, matrices)
 
 
@@ -382,5 +401,5 @@ def _matrices(table: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _listed(mask: NDArray[np.bool_], numbers: Sequence[int] | NDArray[np.int64], what: str = "line") -> str:
     """The first of those that a mask names."""
-    named = [str(numbers[i]) for i in np.flatnonzero(mask)]
+    named = [str(numbers[int(i)]) for i in np.flatnonzero(mask)]
     return f"{what} {', '.join(named[:_LISTED])}{', …' if len(named) > _LISTED else ''}"
