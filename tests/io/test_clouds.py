@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
-from radarsdf.io import read, read_points
+from radarsdf.io import read, read_mesh, read_points
 from radarsdf.io.clouds.lzf import unpack_lzf
 from radarsdf.io.clouds.reading import read_columns
 
@@ -225,6 +225,19 @@ def test_pcd_comments_of_any_encoding(tmp_path, encoding):
     data = (tmp_path / "a.pcd").read_bytes()
     (tmp_path / "a.pcd").write_bytes("# Straße\n".encode(encoding) + data)
     check(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_ply_comments_of_any_encoding(tmp_path, encoding):
+    box = trimesh.creation.box()
+    for mesh in (box, trimesh.PointCloud(box.vertices)):
+        data = mesh.export(file_type="ply")
+        (tmp_path / "a.ply").write_bytes(
+            data.replace(b"element", "comment Straße\nelement".encode(encoding), 1)
+        )
+        if mesh is box:
+            assert len(read_mesh(tmp_path / "a.ply").faces) == 12
+        assert_array_equal(read_points(tmp_path / "a.ply"), box.vertices)
 
 
 def test_viewpoint(tmp_path):

@@ -183,7 +183,7 @@ def test_angles_of_several_meanings_are_refused():
 @pytest.mark.parametrize(
     ("field", "role"),
     [("scalar_Intensity", "intensity"), ("snr_linear", "intensity"), ("RCS [dBsm]", "intensity"), ("rdot", "doppler"),
-     ("v_radial", "doppler"), ("Doppler (m/s)", "doppler")],
+     ("v_radial", "doppler"), ("RadialVelocity", "doppler"), ("Doppler (m/s)", "doppler")],
 )  # fmt: skip
 def test_names_of_other_programs(field, role):
     assert Fields.of(["x", "y", "z", field]).names[role] == field

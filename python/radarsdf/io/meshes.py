@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from os import PathLike
 from pathlib import Path
@@ -16,7 +17,7 @@ from radarsdf.checks import path_of
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.origin import origin_for, origin_of, write_origin
-from radarsdf.io.records import Columns, face_records, ply_header, records
+from radarsdf.io.records import Columns, face_records, ply_header, records, without_ply_comments
 
 if TYPE_CHECKING:
     import trimesh
@@ -124,7 +125,9 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     with whole_import():
         import trimesh  # noqa: PLC0415 - takes long
     try:
-        mesh: Any = trimesh.load_mesh(file, process=False)
+        ply = file.suffix.lower() == ".ply"
+        source: Any = io.BytesIO(without_ply_comments(file.read_bytes())) if ply else file
+        mesh: Any = trimesh.load_mesh(source, file_type="ply" if ply else None, process=False)
     except OSError:
         raise
     except Exception as error:  # damaged files raise exceptions of many kinds

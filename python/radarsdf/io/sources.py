@@ -43,6 +43,7 @@ _JUDGED_SCANS = 30  # by whose numbers the unit of angles is known
 _SCAN_FIELDS = ("frame", "scan", "scan_id", "frame_id", "scan_index", "frame_index", "scan_number", "frame_number",
                 "sweep", "sweep_id", "cycle", "cycle_id")  # fmt: skip
 _TIME_FIELDS = ("time", "timestamp", "stamp", "t")
+_UNREADABLE = "scans left out: they cannot be read"
 _NO_RETURNS = "scans left out: they hold no returns"
 _NOT_SCANS = {
     *POSE_FILES,
@@ -119,13 +120,22 @@ def posed(
                 notes.count(_NO_RETURNS, 1)
                 continue
             if fields is None:
-                fields, first_name, names = (
-                    Fields.of(list(columns), request.fields, raw.name),
-                    raw.name,
-                    list(columns),
-                )
+                try:
+                    fields, first_name, names = (
+                        Fields.of(list(columns), request.fields, raw.name),
+                        raw.name,
+                        list(columns),
+                    )
+                except ValueError as error:
+                    if request.fields:
+                        raise
+                    notes.count(_UNREADABLE, 1, str(error))
+                    continue
                 fields = fields.judged(_first_clouds(raw_scans), notes)
                 fields.note_use(names, notes, chosen=bool(request.fields))
+            if not fields.place(columns):
+                notes.count(_UNREADABLE, 1, f"{raw.name} has no positions, but {', '.join(columns)}")
+                continue
             cloud = fields.read(columns, raw.name)
             if list(columns) != names:
                 fields.check_no_more(Fields.of(list(columns), request.fields, raw.name), raw.name, first_name)
@@ -151,7 +161,7 @@ def _read(raw: RawScan, notes: Notes) -> Columns | None:
     try:
         return raw.read()
     except ValueError as error:
-        notes.count("scans left out: they cannot be read", 1, str(error))
+        notes.count(_UNREADABLE, 1, str(error))
         return None
 
 

@@ -85,6 +85,7 @@ def check_header(words: list[str]) -> None:
 def words_of(line: str) -> list[str]:
     """The words of a line, separated by commas, semicolons, tabs or else white space."""
     separator = next((sign for sign in (",", ";", "\t") if sign in line), None)
+    line = line if separator else re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
     return [word.strip().strip('"') for word in line.split(separator)]
 
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -139,15 +140,17 @@ class Fields:
         ValueError
             If a role or a field does not exist, or there are no positions.
         """
-        lower = {_plain(name)[0]: name for name in reversed(names)} | {
-            name.lower(): name for name in reversed(names)
-        }
+        lower = {name.lower(): name for name in reversed(names)}
+        lower = {_plain(name)[0]: name for name in reversed(names)} | lower
+        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
         dialect = _dialect(lower)
         if dialect is not None:
             found = {role: lower[name] for role, name in _roles(dialect).items()}
         for role, aliases in ({axis: (axis,) for axis in _XYZ} | _ALIASES).items():
-            name = next((lower[alias] for alias in aliases if alias in lower), None)
+            name = next(
+                (squeezed[_squeezed(alias)] for alias in aliases if _squeezed(alias) in squeezed), None
+            )
             if role not in found and name is not None and name not in found.values():
                 found[role] = name
         for role, field in (overrides or {}).items():
@@ -170,6 +173,10 @@ class Fields:
     def polar(self) -> bool:
         """Whether positions are of range and angles."""
         return not set(_XYZ) <= set(self.names)
+
+    def place(self, columns: Mapping[str, NDArray[Any]]) -> bool:
+        """Whether a cloud has the fields of the positions."""
+        return {self.names[role] for role in (_POLAR if self.polar else _XYZ)} <= set(columns)
 
     def judged(self, clouds: Iterable[Mapping[str, NDArray[Any]]], notes: Notes) -> Fields:
         """These fields with the unit of their angles: of their names, or else by the numbers in some clouds."""
@@ -203,7 +210,7 @@ class Fields:
             notes.add(
                 f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
             )
-        unused = [name for name in names if name not in self.names.values()]
+        unused = [name for name in names if name and name not in self.names.values()]
         if unused and not chosen:
             notes.add(
                 f"fields that are not used: {', '.join(unused)}; fields={{role: name}} or --field chooses others"
@@ -297,6 +304,11 @@ class Fields:
 def _plain(name: str) -> tuple[str, str]:
     """A name in lower case as radars give it, and its unit: without the prefix of CloudCompare."""
     return without_unit(name.lower().removeprefix("scalar_"))
+
+
+def _squeezed(name: str) -> str:
+    """A name without what separates its words: AzimuthAngle, azimuth_angle and Azimuth Angle are one."""
+    return re.sub(r"[\W_]+", "", name)
 
 
 def _are_degrees(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> bool:

@@ -23,6 +23,7 @@ from radarsdf.io.clouds.pcd import read_pcd, read_viewpoint
 from radarsdf.io.clouds.raw_binary import read_bin
 from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.origin import origin_of
+from radarsdf.io.records import without_ply_comments
 from radarsdf.io.scans import Notes
 from radarsdf.io.text import (
     COMMENTS,
@@ -32,6 +33,7 @@ from radarsdf.io.text import (
     text_rows,
     with_points,
     without_comment,
+    words_of,
 )
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
@@ -159,7 +161,9 @@ def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
         return {name: np.zeros(0) for name in names_of(3, None)}
     first = without_comment(first.lstrip("/#% "))  # names may be after a comment sign
     separator = next(s for s in _SEPARATORS if s is None or s in first)
-    words = [word.strip().strip('"') for word in first.split(separator)]
+    words = (
+        words_of(first) if separator is None else [word.strip().strip('"') for word in first.split(separator)]
+    )
     header = not are_numbers(words)
     if header:
         check_header(words)
@@ -195,9 +199,9 @@ def _ply(path: Path) -> Columns:
     with whole_import():
         import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
-    with path.open("rb") as file:
-        # Of an open file, and without materials: a PLY file may name an image, which is then not looked for.
-        loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
+    # Of its bytes, and without materials: a PLY file may name an image, which is then not looked for.
+    file = io.BytesIO(without_ply_comments(path.read_bytes()))
+    loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
     vertex = loaded.metadata.get("_ply_raw", {}).get("vertex")
     if vertex is None or not vertex["length"]:
         return {axis: np.zeros(0) for axis in "xyz"}
