@@ -67,7 +67,8 @@ def read(
     """Reads scans with poses from a file, a folder or bags.
 
     What was assumed and what was left out is logged as a warning of the logger ``radarsdf.io``, a line each, and kept in
-    ``notes`` of the scans. Returns with a coordinate or an intensity that is not finite are left out, and counted.
+    ``notes`` of the scans. Returns with a coordinate or an intensity that is not finite, files that cannot be read, and
+    scans whose poses are not finite are left out, and counted.
 
     Parameters
     ----------
@@ -76,14 +77,14 @@ def read(
 
         - our ``.npz`` (see :func:`read_scans`);
         - a folder with a file a scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
-          file. Files are read in natural order, or in the order of the times in their names. Ground truth is
-          ``lidar.pcd`` or ``lidar.ply`` in the folder;
+          file, whose column such as frame or scan_id splits it into scans. Files are read in natural order, or in the order
+          of the times in their names. Ground truth is ``lidar.pcd`` or ``lidar.ply`` in the folder;
         - a folder of a data set that :mod:`radarsdf.io.datasets.published` knows by its shape;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
-        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices. By
-        default what the data set says, or the ``.npz`` has; in a folder, a file of `radarsdf.io.poses.reading.POSE_FILES`; in a
-        bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
+        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices,
+        or a table that names its columns. By default what the data set says, or the ``.npz`` has; in a folder, a file of
+        `radarsdf.io.poses.reading.POSE_FILES`, or the ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
     topic, pose_topic : str, optional
@@ -102,7 +103,8 @@ def read(
         Field of the file by role, if the table of :mod:`radarsdf.io.clouds.fields` is wrong: ``{"intensity": "Power"}``. Numbers
         mean columns, None leaves a role out. Roles are those of `radarsdf.io.clouds.fields.ROLES`.
     columns : int or sequence of str, optional
-        Of files without names of columns: how many a point has, or their names.
+        Of files without names of columns: how many a point has, or their names. By default the content of several files
+        decides for ``.bin``.
     max_gap_s : float
         Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
     ground_truth : path-like or (M, 3) array_like, optional

@@ -155,7 +155,8 @@ def numbers_of(rows: list[tuple[int, list[str]]], width: int) -> NDArray[np.floa
     table = np.full((len(rows), width), np.nan)
     for values, (_, words) in zip(table, rows, strict=True):
         if len(words) == width:
-            for column, word in enumerate(words):
-                if are_numbers([word]):
-                    values[column] = float(word)
+            try:
+                values[:] = [float(word) for word in words]
+            except ValueError:
+                values[:] = [float(word) if are_numbers([word]) else np.nan for word in words]
     return table
