@@ -82,7 +82,10 @@ def test_tum(tmp_path, separator):
         ("1 0 0 0 0 0 0 one\n", "not a table of poses"),
         ("1 0 0 0 0 0 0 1\n", "at least two poses"),
         ("1 0 0 0 0 0 0 2\n2 0 0 0 0 0 0 1\n", "unit quaternions"),
-        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "two poses at different times, not 1.*line 3"),
+        (
+            "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n",
+            "two poses at different times, not 1.*line 3",
+        ),
         (" ".join(["1"] * 12), "rigid"),
         (" ".join(["1"] * 16), "rigid"),
         ("\x00\x01", "not a table of poses"),

@@ -84,7 +84,8 @@ def read(
     poses : path-like, array_like or poses by time, optional
         (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices,
         or a table that names its columns. By default what the data set says, or the ``.npz`` has; in a folder, a file of
-        `radarsdf.io.poses.reading.POSE_FILES`, or the ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
+        `radarsdf.io.poses.reading.POSE_FILES`, or the ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`.
+        `radarsdf.io.UNPOSED` reads scans that have none.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
     topic, pose_topic : str, optional
