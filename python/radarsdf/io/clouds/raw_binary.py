@@ -18,7 +18,8 @@ _MAX_FILES, _MAX_NUMBERS = 20, 100_000  # that are judged, and of each file
 _MAX_POSITION_M, _SMALLEST, _LARGEST = 1e7, 1e-20, 1e12  # other numbers are bytes of another type
 _PLAUSIBLE = 0.98
 _CHANCE = 1e-6
-_PREFERRED = 100  # times as probable by chance as another layout, KITTI's is still taken
+_LITTLE = 0.9  # of the variance that is left: more columns must explain more
+_PREFERRED = 30  # times as probable by chance as another layout, KITTI's is still taken
 
 
 class BinLayout(NamedTuple):
@@ -71,8 +72,15 @@ def bin_layout(paths: Sequence[Path], width: int | None = None) -> BinLayout:
             return next(iter(spreads))
         if spreads:
             best = min(spreads, key=lambda layout: spreads[layout].variance)
-            for layout, spread in spreads.items():  # a multiple of the width explains a little more by chance
-                if best.width % layout.width == 0 and spreads[best].chance(spread) > _CHANCE:
+            for (
+                layout,
+                spread,
+            ) in spreads.items():  # every second return may differ, as of two lasers by turns
+                little = (
+                    spreads[best].variance > _LITTLE * spread.variance
+                    or spreads[best].chance(spread) > _CHANCE
+                )
+                if best.width % layout.width == 0 and little:
                     best = layout
                     break
             if spreads[best].chance() < _CHANCE:
