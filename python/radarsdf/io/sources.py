@@ -120,19 +120,10 @@ def posed(
                 notes.count(_NO_RETURNS, 1)
                 continue
             if fields is None:
-                try:
-                    fields, first_name, names = (
-                        Fields.of(list(columns), request.fields, raw.name),
-                        raw.name,
-                        list(columns),
-                    )
-                except ValueError as error:
-                    if request.fields:
-                        raise
-                    notes.count(_UNREADABLE, 1, str(error))
+                fields = _fields_of(columns, raw, raw_scans, request)
+                if fields is None:
                     continue
-                fields = fields.judged(_first_clouds(raw_scans), notes)
-                fields.note_use(names, notes, chosen=bool(request.fields))
+                first_name, names = raw.name, list(columns)
             if not fields.place(columns):
                 notes.count(_UNREADABLE, 1, f"{raw.name} has no positions, but {', '.join(columns)}")
                 continue
@@ -163,6 +154,22 @@ def _read(raw: RawScan, notes: Notes) -> Columns | None:
     except ValueError as error:
         notes.count(_UNREADABLE, 1, str(error))
         return None
+
+
+def _fields_of(
+    columns: Columns, raw: RawScan, raw_scans: Callable[[], Iterable[RawScan]], request: Request
+) -> Fields | None:
+    """What the columns of the first scan mean; None, and counted, if it has no positions, unless a user chose them."""
+    try:
+        fields = Fields.of(list(columns), request.fields, raw.name)
+    except ValueError as error:
+        if request.fields:
+            raise
+        request.notes.count(_UNREADABLE, 1, str(error))
+        return None
+    fields = fields.judged(_first_clouds(raw_scans), request.notes)
+    fields.note_use(columns, request.notes, chosen=bool(request.fields))
+    return fields
 
 
 def _first_clouds(raw_scans: Callable[[], Iterable[RawScan]]) -> Iterator[Columns]:
