@@ -95,7 +95,9 @@ def test_words_that_are_wrong(folder, capsys, words, said):
 def test_options_are_the_parameters_of_read(tmp_path):
     (tmp_path / "scans").mkdir()
     for i in range(4):
-        np.array([[9, 5 + i, 1, 2], [9, 6 + i, 2, 3]], "<f4").tofile(tmp_path / "scans" / f"{100 + 2 * i}.0.bin")
+        np.array([[9, 5 + i, 1, 2], [9, 6 + i, 2, 3]], "<f4").tofile(
+            tmp_path / "scans" / f"{100 + 2 * i}.0.bin"
+        )
     (tmp_path / "poses.tum").write_text("".join(f"{100 + 4 * i} {i} 0 0 0 0 0 1\n" for i in range(3)))
     words = [tmp_path / "scans", tmp_path / "poses.tum", "--columns", "power,x,y,z"]
     for more, count in (([], 2), (["--max-gap", "5"], 4)):
