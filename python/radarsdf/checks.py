@@ -144,7 +144,7 @@ def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
     if matrix.shape != (4, 4):
         msg = f"{name} must have shape (4, 4), not {matrix.shape}"
         raise ValueError(msg)
-    if not _are_rigid(matrix[None]).all():
+    if not are_rigid(matrix[None]).all():
         msg = f"{name} is not a rigid transform ({_RIGID})"
         raise ValueError(msg)
     return matrix
@@ -159,14 +159,14 @@ def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.fl
         If the shape is wrong, or a pose is not a rigid transform. The error names the first such pose.
     """
     T_world_sensor = pose_matrices(poses, num_scans)
-    rigid = _are_rigid(T_world_sensor)
+    rigid = are_rigid(T_world_sensor)
     if not rigid.all():
         msg = f"pose {int(np.argmin(rigid))} is not a rigid transform ({_RIGID})"
         raise ValueError(msg)
     return T_world_sensor
 
 
-def _are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Mask (F,) of the matrices (F, 4, 4) that are rigid transforms."""
     rotation = poses[:, :3, :3]
     with np.errstate(all="ignore"):  # those that are not finite are none

@@ -12,6 +12,7 @@ import trimesh
 from radarsdf.evaluation import KNNIntensity
 from radarsdf.io.clouds.writing import write_cloud
 from radarsdf.io.ground_truth import read_ground_truth
+from radarsdf.io.meshes import write_mesh
 from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.io.scans import Scans
 
@@ -155,7 +156,7 @@ PLANE = trimesh.Trimesh([[9, -4, 0], [18, -4, 0], [18, 4, 0], [9, 4, 0]], [[0, 1
 def test_surfaces_of_all_formats_are_the_same_ground_truth(tmp_path, suffix):
     found = []
     for path in (tmp_path / "plane.ply", tmp_path / f"plane{suffix}"):
-        PLANE.export(path)
+        write_mesh(path, PLANE)
         found.append(read_ground_truth(path))
     np.testing.assert_allclose(*found, atol=1e-5)
 

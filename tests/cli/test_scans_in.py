@@ -4,9 +4,12 @@
 
 from __future__ import annotations
 
+import argparse
+
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf.cli.scans_in import add_scans, scans_of, words_of
 from radarsdf.io.npz import read_scans
 from scipy.spatial.transform import Rotation
 
@@ -101,3 +104,24 @@ def test_words_that_are_wrong(folder, capsys, words, said):
     words = [folder / word if word.endswith(".tum") else word for word in words]
     arguments = ["fit", folder / "clouds", folder / "poses.tum", "-o", folder / "map.safetensors", *words]
     assert said in refusal(capsys, folder, *arguments)
+
+
+def test_options_are_the_parameters_of_read(tmp_path):
+    (tmp_path / "scans").mkdir()
+    for i in range(4):
+        np.array([[9, 5 + i, 1, 2], [9, 6 + i, 2, 3]], "<f4").tofile(
+            tmp_path / "scans" / f"{100 + 2 * i}.0.bin"
+        )
+    (tmp_path / "poses.tum").write_text("".join(f"{100 + 4 * i} {i} 0 0 0 0 0 1\n" for i in range(3)))
+    words = [tmp_path / "scans", tmp_path / "poses.tum", "--columns", "power,x,y,z"]
+    for more, count in (([], 2), (["--max-gap", "5"], 4)):
+        parser = argparse.ArgumentParser()
+        add_scans(parser)
+        options = parser.parse_args([str(word) for word in (*words, *more)])
+        scans = scans_of(options)
+        assert len(scans) == count
+        np.testing.assert_array_equal(scans.points[0], [[5, 1, 2], [6, 2, 3]])
+        assert parser.parse_args(words_of(options)) == options
+    for more in (["--stamps", "record"], ["--world-frame", "map"]):
+        with pytest.raises(ValueError, match=f"no bag: {more[0][2:].replace('-', '_')}"):
+            scans_of(parser.parse_args([str(word) for word in (*words, *more)]))

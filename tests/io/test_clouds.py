@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
-from radarsdf.io import read, read_points
+from radarsdf.io import read, read_mesh, read_points
 from radarsdf.io.clouds.lzf import unpack_lzf
 from radarsdf.io.clouds.reading import read_columns
 
@@ -137,10 +137,42 @@ def test_bin_with_names(tmp_path):
     check(tmp_path / "a.bin", columns=5, fields={"x": 1, "y": 2, "z": 3, "intensity": 0, "doppler": None})
     with pytest.raises(ValueError, match="no column 5 for intensity: it has 5"):
         one(tmp_path / "a.bin", columns=5, fields={"intensity": 5})
-    with pytest.raises(ValueError, match=r"a\.bin.*no whole number of points of 4 float32.*columns"):
+    with pytest.raises(ValueError, match=r"a\.bin.*5 x float32 or 10 x float32.*--columns"):
         one(tmp_path / "a.bin")
-    with pytest.raises(ValueError, match="three numbers or more"):
+    with pytest.raises(ValueError, match=r"a\.bin.*no whole number of points of 4 float32"):
+        one(tmp_path / "a.bin", columns=4)
+    with pytest.raises(ValueError, match="three or more"):
         one(tmp_path / "a.bin", columns=2)
+
+
+def drive(width, scans, dtype, seed=0):
+    """Scans of a radar as tables (N, width): x, y, z, intensity, Doppler, and others."""
+    rng = np.random.default_rng(seed)
+    for i in range(scans):
+        ranges, azimuth, elevation = rng.uniform((2, -1, -0.2), (60, 1, 0.2), (40 + 7 * i, 3)).T
+        xyz = [ranges * np.cos(azimuth), ranges * np.sin(azimuth), ranges * np.sin(elevation)]
+        others = [rng.uniform(5, 30, len(ranges)), rng.normal(0, 2, len(ranges)), ranges, azimuth, elevation]
+        yield np.stack([*xyz, *others], axis=1)[:, :width].astype(dtype)
+
+
+@pytest.mark.parametrize("dtype", ["<f4", "<f8"])
+@pytest.mark.parametrize("width", [3, 4, 5, 6, 7, 8])
+def test_the_content_of_bin_files_decides_how_many_numbers_a_return_has(tmp_path, width, dtype):
+    tables = list(drive(width, 5, dtype))
+    for i, table in enumerate(tables):
+        data = table.tobytes()
+        (tmp_path / f"{i}.bin").write_bytes(data[:-3] if i == 2 else data)
+    scans = read(tmp_path, np.tile(IDENTITY, (5, 1, 1)))
+    assert [len(scan) for scan in scans] == [40, 47, 61, 68]
+    assert_array_equal(scans.points[1], tables[1][:, :3])
+    assert any("2.bin" in note and note.startswith("1 scans left out") for note in scans.notes)
+    assert any(f"have {width} numbers" in note for note in scans.notes) == ((width, dtype) != (4, "<f4"))
+
+
+def test_bin_files_of_other_types_are_refused(tmp_path):
+    np.random.default_rng(0).normal(0, 3000, (100, 4)).astype("<i2").tofile(tmp_path / "a.bin")
+    with pytest.raises(ValueError, match=r"a\.bin.*--columns"):
+        one(tmp_path / "a.bin")
 
 
 def test_npy(tmp_path):
@@ -176,12 +208,64 @@ def test_text(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    "text", ["x,y,z\n1,2\n", "1 2 3\n4 five 6\n", "x,y,x\n1,2,3\n", "1 2\n3 4\n", "\xff\xfe"]
+    "text", ["x,y,z\n1,2\n", "1 2 3\n4 five 6\n7\n", "x,y,x\n1,2,3\n", "1 2\n3 4\n", "\xff\xfe"]
 )
 def test_damaged_text(tmp_path, text):
     (tmp_path / "a.txt").write_bytes(text.encode("latin-1"))
     with pytest.raises(ValueError, match=r"a\.txt"):
         one(tmp_path / "a.txt")
+
+
+HALF = np.sqrt(0.5)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_pcd_comments_of_any_encoding(tmp_path, encoding):
+    write_pcd(tmp_path / "a.pcd", COLUMNS)
+    data = (tmp_path / "a.pcd").read_bytes()
+    (tmp_path / "a.pcd").write_bytes("# Straße\n".encode(encoding) + data)
+    check(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_ply_comments_of_any_encoding(tmp_path, encoding):
+    box = trimesh.creation.box()
+    for mesh in (box, trimesh.PointCloud(box.vertices)):
+        data = mesh.export(file_type="ply")
+        (tmp_path / "a.ply").write_bytes(
+            data.replace(b"element", "comment Straße\nelement".encode(encoding), 1)
+        )
+        if mesh is box:
+            assert len(read_mesh(tmp_path / "a.ply").faces) == 12
+        assert_array_equal(read_points(tmp_path / "a.ply"), box.vertices)
+
+
+def test_viewpoint(tmp_path):
+    """A quarter of a turn to the left, 100 m along x: points of ground truth move; poses place scans, given ones first."""
+    for i in range(2):
+        write_pcd(tmp_path / f"{i}.pcd", COLUMNS, VIEWPOINT=f"{100 + i} 0 0 {HALF} 0 0 {HALF}")
+    moved = [[102, 1.5, 3], [95, 4, 6]]
+    assert_allclose(read_points(tmp_path / "0.pcd"), moved, rtol=1e-6)
+    scans = read(tmp_path)
+    assert_allclose(next(iter(scans)).world_points, moved, rtol=1e-6)
+    assert scans.notes == ["poses: VIEWPOINT of the PCD files"]
+    scans = read(tmp_path, np.tile(IDENTITY, (2, 1, 1)))
+    assert_array_equal(scans.points[0], TABLE[:, :3])
+    assert any("VIEWPOINT" in note and "not applied" in note for note in scans.notes)
+
+
+@pytest.mark.parametrize("name", ["frame", "Scan_ID", "scalar_scan"])
+def test_a_table_of_several_scans(tmp_path, name):
+    (tmp_path / "a.csv").write_text(f"{name},time,x,y,z\n3,0.3,1,0,0\n1,0.1,2,0,0\n3,0.3,4,0,0\n")
+    poses = np.tile(IDENTITY, (4, 1, 1))
+    poses[:, 0, 3] = [0, 10, 20, 30]
+    for given in (poses, poses[[1, 3]]):  # scans without returns have poses, or none
+        scans = read(tmp_path / "a.csv", given)
+        assert [scan.points[:, 0].tolist() for scan in scans] == [[2], [1, 4]]
+        assert scans.poses[:, 0, 3].tolist() == [10, 30]
+        assert scans.times_s.tolist() == [0.1, 0.3]
+    with pytest.raises(ValueError, match="2 scans but 1 poses"):
+        read(tmp_path / "a.csv", IDENTITY)
 
 
 def test_ply(tmp_path):

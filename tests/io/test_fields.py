@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.clouds.fields import DIALECTS, Fields
+from radarsdf.io.scans import Notes
 
 from .test_folders import write_pcd
 
@@ -116,4 +117,73 @@ def test_what_must_be_known_of_the_numbers(tmp_path):
     write_pcd(tmp_path / "0.pcd", {name: np.ones(1, np.float32) for name in names})
     scans = read(tmp_path, np.eye(4)[None])
     assert len(scans) == 1
-    assert scans.notes == ["the intensities of ARS548 clouds with these fields are RCS + 128"]
+    assert scans.notes[0] == "the intensities of ARS548 clouds with these fields are RCS + 128"
+    assert "not used: doppler_std;" in scans.notes[1]
+    scans = read(tmp_path, np.eye(4)[None], fields={"doppler": None})
+    assert len(scans) == len(scans.notes) == 1  # who chooses fields knows the others
+
+
+def polar(text):
+    """The points of a table in text, and what was said."""
+    names, *rows = [line.split() for line in text.splitlines()]
+    columns = dict(zip(names, np.array(rows, np.float64).T, strict=True))
+    notes = Notes()
+    return Fields.of(names).judged([columns], notes).read(columns, "a").points, notes.lines
+
+
+LEFT = np.array([[1, 1, 0]]) * 10 / np.sqrt(2)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("range azimuth elevation\n10 45 0", "degrees by their numbers"),
+        ("r az el\n10 45 0", "degrees by their numbers"),
+        ("r_m az_deg el_deg\n10 45 0", None),
+        ("range(mm) azimuth[deg] elevation\n10000 45 0", "degrees as azimuth is by its name"),
+        ("range azimuth_rad elevation_rad\n10 0.78539816339745 0", None),
+        ("range azimuth elevation\n10 0.78539816339745 0", "rad by their numbers"),
+        (
+            "scalar_Range scalar_Azimuth_Angle scalar_Elevation_Angle\n10 0.78539816339745 0",
+            "rad by their numbers",
+        ),
+        (
+            "range azimuth elevation\n10 0.78539816339745 0\n1 6.2 0.1",
+            "rad by their numbers",
+        ),  # from 0 to a turn
+    ],
+)
+def test_units_of_angles(text, said):
+    points, notes = polar(text)
+    assert_allclose(points[:1], LEFT, rtol=1e-6)
+    assert len(notes) == (said is not None)
+    assert said is None or said in notes[0]
+
+
+def test_narrow_angles_in_steps_are_degrees():
+    steps = np.arange(-12, 13) / 4
+    points, notes = polar("r az el\n" + "".join(f"10 {a} 0\n" * 2 for a in steps))
+    assert_allclose(points[0], [10 * np.cos(np.deg2rad(3)), -10 * np.sin(np.deg2rad(3)), 0], rtol=1e-6)
+    assert "degrees" in notes[0]
+
+
+def test_the_unit_of_angles_is_that_of_all_scans(tmp_path):
+    """A first scan that could be in rad does not decide."""
+    for i, azimuth in enumerate((1, 45)):
+        (tmp_path / f"{i}.csv").write_text(f"range,azimuth,elevation\n10,{azimuth},0\n")
+    scans = list(read(tmp_path, np.tile(np.eye(4), (2, 1, 1))))
+    assert_allclose(scans[0].points, [[10 * np.cos(np.deg2rad(1)), 10 * np.sin(np.deg2rad(1)), 0]], rtol=1e-6)
+
+
+def test_angles_of_several_meanings_are_refused():
+    with pytest.raises(ValueError, match=r"lacks the fields azimuth, elevation.*theta and phi"):
+        Fields.of(["r", "theta", "phi"])
+
+
+@pytest.mark.parametrize(
+    ("field", "role"),
+    [("scalar_Intensity", "intensity"), ("snr_linear", "intensity"), ("RCS [dBsm]", "intensity"), ("rdot", "doppler"),
+     ("v_radial", "doppler"), ("RadialVelocity", "doppler"), ("Doppler (m/s)", "doppler")],
+)  # fmt: skip
+def test_names_of_other_programs(field, role):
+    assert Fields.of(["x", "y", "z", field]).names[role] == field

@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.io.meshes import MESH_SUFFIXES, write_mesh
+from radarsdf.io.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 from radarsdf.io.origin import origin_path
 
 UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
@@ -28,11 +28,20 @@ def test_vertices_are_right_to_a_tenth_of_a_millimetre(tmp_path, suffix):
     origin = write_mesh(path, mesh)
     read = trimesh.load_mesh(path, process=False)
     vertices = np.asarray(read.triangles).reshape(-1, 3)
+    if suffix == ".glb":  # x right, y up, z towards the viewer
+        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
     if origin is not None:
         assert json.loads(origin_path(path).read_text())["origin"] == origin.tolist()
         vertices = vertices + origin
     np.testing.assert_allclose(vertices, np.asarray(mesh.triangles).reshape(-1, 3), atol=1e-4)
     assert (origin is None) == (suffix not in (".stl", ".glb"))
+
+
+def test_glb_stands_upright_in_programs_that_read_gltf(tmp_path):
+    tower = trimesh.creation.box([1.0, 2.0, 30.0])
+    write_mesh(tmp_path / "tower.glb", tower)
+    np.testing.assert_allclose(trimesh.load_scene(tmp_path / "tower.glb").extents, [1, 30, 2])
+    np.testing.assert_allclose(read_mesh(tmp_path / "tower.glb").extents, [1, 2, 30])
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".glb"])

@@ -77,12 +77,15 @@ def test_tum(tmp_path, separator):
     [
         ("", "not a table of poses"),
         ("1 2 3\n4 5 6\n", "has 3 columns: poses have 8"),
-        ("1 2 3 4 5 6 7 8\n1 2 3\n", "not a table of poses"),
+        ("1 2 3 4 5 6 7 8\n1 2 3\n", "not unit quaternions: line 1"),
         ("1 0 0 0 0 0 0 nan\n", "finite"),
         ("1 0 0 0 0 0 0 one\n", "not a table of poses"),
         ("1 0 0 0 0 0 0 1\n", "at least two poses"),
         ("1 0 0 0 0 0 0 2\n2 0 0 0 0 0 0 1\n", "unit quaternions"),
-        ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "order of their times"),
+        (
+            "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n",
+            "two poses at different times, not 1.*line 3",
+        ),
         (" ".join(["1"] * 12), "rigid"),
         (" ".join(["1"] * 16), "rigid"),
         ("\x00\x01", "not a table of poses"),
@@ -93,6 +96,61 @@ def test_damaged_files(tmp_path, text, message):
     with pytest.raises(ValueError, match=message) as error:
         read_poses(tmp_path / "poses.txt", Notes())
     assert str(tmp_path / "poses.txt") in str(error.value)
+
+
+HALF = np.sqrt(0.5)
+NAMED = {
+    "w first": "timestamp,x,y,z,qw,qx,qy,qz\n{t},1,2,3,{h},0,0,{h}\n",
+    "TUM in a comment": "# timestamp tx ty tz qx qy qz qw\n{t} 1 2 3 0 0 {h} {h}\n",
+    "index and more": "id;q_z;q_w;q_x;q_y;time;pos_z;pos_y;pos_x;vx\n7;{h};{h};0;0;{t};3;2;1;9\n",
+    "EuRoC": "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1]\n"
+    "{t}000000000,1,2,3,{h},0,0,{h},0.5\n",
+    "rostopic": "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.pose.pose.position.x,field.pose.pose.position.y,"
+    "field.pose.pose.position.z,field.pose.pose.orientation.x,field.pose.pose.orientation.y,field.pose.pose.orientation.z,"
+    "field.pose.pose.orientation.w,field.pose.covariance0,field.twist.twist.linear.x\n"
+    "{t}500000000,1,{t}000000000,map,1,2,3,0,0,{h},{h},0,0.1\n",
+    "seconds and nanoseconds": "secs,nsecs,x,y,z,qx,qy,qz,qw\n{t},0,1,2,3,0,0,{h},{h}\n",
+    "angles in degrees": "t,x,y,z,roll,pitch,yaw\n{t},1,2,3,0,0,90\n",
+    "angles in rad": "t,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad\n{t},1,2,3,0,0,1.5707963267948966\n",
+}
+
+
+@pytest.mark.parametrize("layout", NAMED)
+def test_names_decide_what_columns_mean(tmp_path, layout):
+    head, row = NAMED[layout].format(h=HALF, t="1700000000").splitlines()
+    (tmp_path / "a.csv").write_text("\n".join([head, row, row.replace("1700000000", "1700000001")]))
+    found = read_poses(tmp_path / "a.csv", Notes())
+    assert found.times_s.tolist() == [1_700_000_000, 1_700_000_001]
+    assert_allclose(found.poses(found.times_s, 1.0), [pose([1.0, 2, 3], np.pi / 2)] * 2, atol=1e-9)
+
+
+def test_named_poses_without_times_and_g2o_are_in_order(tmp_path):
+    (tmp_path / "a.csv").write_text(f"frame,qw,qx,qy,qz,x,y,z\n0,{HALF},0,0,{HALF},1,2,3\n1,1,0,0,0,0,0,0\n")
+    lines = f"VERTEX_SE3:QUAT 0 1 2 3 0 0 {HALF} {HALF}\nVERTEX_SE3:QUAT 1 0 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1\n"
+    (tmp_path / "a.g2o").write_text(lines)
+    for name in ("a.csv", "a.g2o"):
+        found = read_poses(tmp_path / name, Notes())
+        assert_allclose(found, [pose([1.0, 2, 3], np.pi / 2), np.eye(4)], atol=1e-9)
+
+
+def test_one_bad_pose_is_left_out_and_named(tmp_path):
+    rows = [f"{t} {t} 0 0 0 0 0 1" for t in range(10)]
+    rows[2], rows[4], rows[6] = "2 nan 0 0 0 0 0 1", "4 4 0 0 0 0 0 0", "6 6 0 0 0 oops 0 1"
+    rows[7], rows[8] = rows[8], rows[7]
+    (tmp_path / "a.tum").write_text("# mine\n" + "\n".join([*rows, rows[9], "10 1 2"]))
+    notes = Notes()
+    assert read_poses(tmp_path / "a.tum", notes).times_s.tolist() == [0, 1, 3, 5, 7, 8, 9]
+    assert [note.split(": ")[-1] for note in notes.lines] == ["line 4, 6, 8, 13", "line 10", "line 12"]
+    assert "4 of 12 poses left out" in notes.lines[0]
+    notes = Notes()
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[1, 0, 3], poses[3, :3, :3] = np.nan, 0
+    for given in (poses, written(tmp_path / "k.txt", poses.reshape(5, 16))):
+        found = poses_of(given, notes)
+        assert np.isfinite(found).all(axis=(1, 2)).tolist() == [True, False, True, False, True]
+    assert [note[-9:] for note in notes.lines] == ["pose 1, 3", "line 2, 4"]
+    with pytest.raises(ValueError, match="no pose is finite"):
+        poses_of(np.full((2, 4, 4), np.nan), Notes())
 
 
 def test_poses_as_users_give_them(tmp_path):

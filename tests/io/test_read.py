@@ -63,14 +63,41 @@ def test_it_is_what_scans_always_were(tmp_path):
     assert_array_equal(np.concatenate(again.doppler_mps), np.concatenate(scans.doppler_mps))
 
 
-def test_reading_is_lazy(tmp_path):
+def test_reading_is_lazy_and_damaged_scans_are_left_out(tmp_path):
     clouds(tmp_path)
-    (tmp_path / "scan_5.pcd").write_bytes(b"damaged")
+    whole = (tmp_path / "scan_7.pcd").read_bytes()
     scans = read(tmp_path, POSES)
     stream = iter(scans)
-    assert [len(next(stream)) for _ in range(5)] == [1, 2, 3, 4, 5]
-    with pytest.raises(ValueError, match=r"scan_5\.pcd is not a whole \.pcd file of points"):
-        next(stream)
+    assert [len(next(stream)) for _ in range(3)] == [1, 2, 3]
+    for number, data in ((5, b"damaged"), (7, whole[:-2]), (8, b"")):
+        (tmp_path / f"scan_{number}.pcd").write_bytes(data)
+    assert [len(scan) for scan in stream] == [4, 5, 7, 10, 11]
+    assert_array_equal(scans.poses, POSES[[0, 1, 2, 3, 4, 6, 9, 10]])
+    (note,) = scans.notes
+    assert note.startswith("3 scans left out")
+    assert "scan_5.pcd is not a whole .pcd file" in note
+
+
+def test_a_file_without_positions_is_no_scan(tmp_path):
+    for i, text in enumerate(("class,count\n1,2\n", "x,y,z\n1,2,3\n", "a,b\n1,2\n", "x,y,z\n4,5,6\n")):
+        (tmp_path / f"{i}.csv").write_text(text)
+    scans = read(tmp_path, POSES[:4])
+    assert_array_equal(scans.poses, POSES[[1, 3]])
+    assert scans.notes[0].startswith("2 scans left out")
+    assert "0.csv" in scans.notes[0]
+
+
+def test_scans_of_bad_poses_are_left_out(tmp_path):
+    poses = POSES.copy()
+    poses[3, 0, 0] = np.nan
+    scans = read(clouds(tmp_path), poses)
+    assert [len(scan) for scan in scans] == [1, 2, 3, *range(5, 12)]
+    assert "1 of 11 poses" in scans.notes[0]
+    assert scans.notes[0].endswith("pose 3")
+    write_scans(tmp_path / "a.npz", Scans([np.ones((1, 3))] * 11, poses))
+    scans = read(tmp_path / "a.npz")
+    assert len(scans) == 10
+    assert scans.notes == ["1 scans left out: their poses are not finite; the first: scan 3"]
 
 
 def test_memory_is_that_of_a_scan(tmp_path):

@@ -146,6 +146,8 @@ def _rotation(quaternion: list[float]) -> Any:
 
 
 def _poses_of_file(path: Path) -> NDArray[np.float64]:
+    import numpy as np
+
     from radarsdf.io.poses.reading import read_poses
     from radarsdf.io.poses.trajectory import Trajectory
     from radarsdf.io.scans import Notes
@@ -154,4 +156,4 @@ def _poses_of_file(path: Path) -> NDArray[np.float64]:
     if isinstance(found, Trajectory):
         return found.poses(found.times_s, max_gap_s=0.0)
     assert not hasattr(found, "pose_at")  # files have no poses of another kind
-    return found
+    return found[np.isfinite(found).all(axis=(1, 2))]

@@ -66,6 +66,24 @@ def add_scan_options(parser: argparse.ArgumentParser) -> None:
         metavar="ROLE=NAME",
         help="the field of the file for x, y, z, intensity or doppler, such as intensity=Power; may be repeated",
     )
+    parser.add_argument(
+        "--columns",
+        type=_columns,
+        metavar="N",
+        help="of files without names: how many numbers a return has, or their names, such as x,y,z,intensity,doppler",
+    )
+    parser.add_argument(
+        "--max-gap",
+        type=float,
+        metavar="S",
+        help="longest time between two poses over which poses are interpolated, s; default: 0.5",
+    )
+    parser.add_argument("--world-frame", metavar="NAME", help="in a bag with TF: the frame of the world")
+    parser.add_argument(
+        "--stamps",
+        choices=("header", "record"),
+        help="in a bag: the time of a scan; default: of its header, unless stamps are zero or stand still",
+    )
 
 
 def inputs_of(options: argparse.Namespace) -> list[Path]:
@@ -99,6 +117,10 @@ def scans_of(options: argparse.Namespace, poses: StampedPoses | None = None) -> 
             "rotation: that is a 3 x 3 matrix R_sensor_imu, three lines of three numbers",
         ),
         fields=dict(_field(text) for text in options.field) or None,
+        columns=options.columns,
+        world_frame=options.world_frame,
+        stamps=options.stamps,
+        **({} if options.max_gap is None else {"max_gap_s": options.max_gap}),
     )
 
 
@@ -111,6 +133,11 @@ def _matrix(path: Path | None, size: int, what: str) -> Any:
     except ValueError as error:
         msg = f"{path} is no {what}"
         raise ValueError(msg) from error
+
+
+def _columns(text: str) -> int | list[str]:
+    """A number of columns, or their names."""
+    return int(text) if text.isdecimal() else text.split(",")
 
 
 def _field(text: str) -> tuple[str, str]:
@@ -129,4 +156,8 @@ def words_of(options: argparse.Namespace) -> list[str]:
         words += [f"--{name.replace('_', '-')}", value] if value is not None else []
     for option, texts in (("--topic", options.topic or []), ("--field", options.field)):
         words += [word for text in texts for word in (option, text)]
+    for name in ("columns", "max_gap", "world_frame", "stamps"):
+        value = getattr(options, name)
+        text = ",".join(value) if isinstance(value, list) else value
+        words += [] if value is None else [f"--{name.replace('_', '-')}", text]
     return [str(word) for word in words if word is not None]

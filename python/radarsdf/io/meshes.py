@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from os import PathLike
 from pathlib import Path
@@ -16,14 +17,14 @@ from radarsdf.checks import path_of
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.origin import origin_for, origin_of, write_origin
-from radarsdf.io.records import Columns, face_records, ply_header, records
+from radarsdf.io.records import Columns, face_records, ply_header, records, without_ply_comments
 
 if TYPE_CHECKING:
     import trimesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
-
+_T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
 
 _FACES = re.compile(rb"element\s+face\s+0*[1-9]")
 _HEADER_BYTES = 1 << 16
@@ -51,7 +52,8 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.f
 
     PLY, OBJ and OFF keep float64 coordinates. STL and GLB hold float32, which at UTM coordinates is a grid of half a
     metre. A mesh further than 1000 m from the world's origin is written to them in a local frame: the world axes, with
-    an origin subtracted that is written beside the mesh, as ``NAME.origin.json``.
+    an origin subtracted that is written beside the mesh, as ``NAME.origin.json``. GLB has its y axis up, as glTF demands,
+    by a rotation of its root.
 
     Parameters
     ----------
@@ -76,10 +78,17 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.f
     suffix = Path(path).suffix.lower()
     vertices = np.asarray(mesh.vertices, np.float64)
     origin = origin_for(vertices) if suffix in _FLOAT32_SUFFIXES else None
+    with whole_import():
+        import trimesh  # noqa: PLC0415 - takes long
     if origin is not None:
         mesh = mesh.copy()
         mesh.vertices = vertices - origin
-    exported: Any = _ply(mesh) if suffix == ".ply" else mesh.export(file_type=suffix[1:])
+    if suffix == ".glb":
+        scene: Any = trimesh.Scene()
+        scene.add_geometry(mesh, transform=_T_GLTF_WORLD)
+        exported: Any = scene.export(file_type="glb")
+    else:
+        exported = _ply(mesh) if suffix == ".ply" else mesh.export(file_type=suffix[1:])
     data: bytes = exported.encode() if isinstance(exported, str) else exported
     if suffix in _FLOAT32_SUFFIXES:
         write_origin(path, origin)
@@ -93,7 +102,8 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     Parameters
     ----------
     path : path-like
-        One of `MESH_SUFFIXES`. If :func:`write_mesh` wrote an origin beside it, that is added.
+        One of `MESH_SUFFIXES`. If :func:`write_mesh` wrote an origin beside it, that is added. GLB, whose y axis is up, is
+        turned to z up.
 
     Returns
     -------
@@ -115,7 +125,9 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     with whole_import():
         import trimesh  # noqa: PLC0415 - takes long
     try:
-        mesh: Any = trimesh.load_mesh(file, process=False)
+        ply = file.suffix.lower() == ".ply"
+        source: Any = io.BytesIO(without_ply_comments(file.read_bytes())) if ply else file
+        mesh: Any = trimesh.load_mesh(source, file_type="ply" if ply else None, process=False)
     except OSError:
         raise
     except Exception as error:  # damaged files raise exceptions of many kinds
@@ -125,6 +137,8 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
         if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
             msg = f"{path} is damaged: a triangle has a corner that is none of its {len(mesh.vertices)} vertices"
             raise ValueError(msg)
+        if file.suffix.lower() == ".glb":
+            mesh.apply_transform(_T_GLTF_WORLD.T)
         if (origin := origin_of(file)) is not None:
             mesh.vertices = np.asarray(mesh.vertices, np.float64) + origin
         return mesh

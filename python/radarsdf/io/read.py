@@ -41,6 +41,7 @@ from radarsdf.io.sources import (
     in_order_of_time,
     scan_poses,
     scans_of_files,
+    viewpoint_poses,
 )
 
 _STAMPS = (None, "header", "record")
@@ -66,7 +67,8 @@ def read(
     """Reads scans with poses from a file, a folder or bags.
 
     What was assumed and what was left out is logged as a warning of the logger ``radarsdf.io``, a line each, and kept in
-    ``notes`` of the scans. Returns with a coordinate or an intensity that is not finite are left out, and counted.
+    ``notes`` of the scans. Returns with a coordinate or an intensity that is not finite, files that cannot be read, and
+    scans whose poses are not finite are left out, and counted.
 
     Parameters
     ----------
@@ -75,14 +77,15 @@ def read(
 
         - our ``.npz`` (see :func:`read_scans`);
         - a folder with a file a scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
-          file. Files are read in natural order, or in the order of the times in their names. Ground truth is
-          ``lidar.pcd`` or ``lidar.ply`` in the folder;
+          file, whose column such as frame or scan_id splits it into scans. Files are read in natural order, or in the order
+          of the times in their names. Ground truth is ``lidar.pcd`` or ``lidar.ply`` in the folder;
         - a folder of a data set that :mod:`radarsdf.io.datasets.published` knows by its shape;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
-        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices. By
-        default what the data set says, or the ``.npz`` has; in a folder, a file of `radarsdf.io.poses.reading.POSE_FILES`; in a
-        bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
+        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices,
+        or a table that names its columns. By default what the data set says, or the ``.npz`` has; in a folder, a file of
+        `radarsdf.io.poses.reading.POSE_FILES`, or the ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`.
+        `radarsdf.io.UNPOSED` reads scans that have none.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
     topic : str or sequence of str, optional
@@ -105,7 +108,8 @@ def read(
         Field of the file by role, if the table of :mod:`radarsdf.io.clouds.fields` is wrong: ``{"intensity": "Power"}``. Numbers
         mean columns, None leaves a role out. Roles are those of `radarsdf.io.clouds.fields.ROLES`.
     columns : int or sequence of str, optional
-        Of files without names of columns: how many a point has, or their names.
+        Of files without names of columns: how many a point has, or their names. By default the content of several files
+        decides for ``.bin``.
     max_gap_s : float
         Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
     ground_truth : path-like or (M, 3) array_like, optional
@@ -219,6 +223,10 @@ def _files(files: list[Path], folder: Path, request: Request, truth: Truth = lam
         if poses is not None and poses.parent != folder:  # which is easily overlooked
             request.notes.add(f"poses: of {poses}")
         if poses is None:
+            files, times_s, _ = in_order_of_time(files, UNPOSED, request.notes)
+            viewpoints = viewpoint_poses(files, request.notes)
+            if viewpoints is not None:
+                return scans_of_files(files, times_s, viewpoints, request.extrinsic, request, truth)
             what = files[0] if len(files) == 1 else folder
             msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
             raise NoPoses(msg)
@@ -241,6 +249,7 @@ def _npz(path: Path, request: Request) -> Scans:
         raise ValueError(msg)
     _refuse_choices_of_bags(path, request)
     scans = read_scans(path)
+    lost = np.flatnonzero(~np.isfinite(scans.poses).all(axis=(1, 2)))
     matched = None if given is None else _other_poses(given, scans, path, request)
     if matched is not None and request.truth is None and scans.ground_truth is not None:
         request.notes.add(
@@ -249,6 +258,9 @@ def _npz(path: Path, request: Request) -> Scans:
 
     def source() -> Iterator[Scan]:
         for number, scan in enumerate(scans):
+            if matched is None and number in lost:
+                request.notes.count("scans left out: their poses are not finite", 1, f"scan {number}")
+                continue
             T_world_sensor = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
             if T_world_sensor is None:
                 request.notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s), 1)

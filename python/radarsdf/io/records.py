@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -42,3 +43,9 @@ def ply_header(
     if num_faces is not None:
         lines += [f"element face {num_faces}", "property list uchar int vertex_indices"]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+
+def without_ply_comments(data: bytes) -> bytes:
+    """A PLY file without the comments of its header, which may be in any encoding."""
+    head, end, body = data.partition(b"end_header")
+    return re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]*[\r\n]+", b"", head) + end + body

@@ -65,6 +65,7 @@ class Notes:
         self.about = about
         self.lines: list[str] = []
         self._counts: dict[str, int] = {}
+        self._first: dict[str, str] = {}
 
     def add(self, line: str) -> None:
         """Keep a sentence, and log it if it is new."""
@@ -80,15 +81,16 @@ class Notes:
         """Forget the counts: the files are read again."""
         self._counts = {}
 
-    def count(self, what: str, number: int) -> None:
-        """Add to the count of what was left out."""
+    def count(self, what: str, number: int, example: str = "") -> None:
+        """Add to the count of what was left out, of which the first example is said."""
         if number:
+            self._first.setdefault(what, f"; the first: {example}" if example else "")
             self._counts[what] = self._counts.get(what, 0) + number
 
     def counted(self) -> None:
         """Turn the counts into sentences, in the end of a pass through the files."""
         for what, number in self._counts.items():
-            self.add(f"{number} {what}")
+            self.add(f"{number} {what}{self._first[what]}")
 
 
 class Scans:

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.clouds.fields import Fields
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_columns
+from radarsdf.io.clouds.pcd import read_viewpoint
+from radarsdf.io.clouds.raw_binary import KITTI, bin_layout
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, names_of, read_columns
 from radarsdf.io.poses.reading import POSE_FILES, ScanPoses, StampedPoses
-from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, in_seconds
+from radarsdf.io.poses.trajectory import MAX_GAP_S, TIME_UNITS, Trajectory, in_seconds
 from radarsdf.io.scans import Notes, Scan, Scans
-from radarsdf.io.text import number_rows
+from radarsdf.io.text import number_rows, without_unit
 
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
 """Names of files with a time, s, for each scan, one a line."""
@@ -29,9 +33,17 @@ SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD
 NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 """What a note says of such returns, after their number."""
 
+VIEWPOINTS = "poses: VIEWPOINT of the PCD files"
+"""What a note says of them."""
+
 WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
 """What it says of such scans."""
 
+_JUDGED_SCANS = 30  # by whose numbers the unit of angles is known
+_SCAN_FIELDS = ("frame", "scan", "scan_id", "frame_id", "scan_index", "frame_index", "scan_number", "frame_number",
+                "sweep", "sweep_id", "cycle", "cycle_id")  # fmt: skip
+_TIME_FIELDS = ("time", "timestamp", "stamp", "t")
+_UNREADABLE = "scans left out: they cannot be read"
 _NO_RETURNS = "scans left out: they hold no returns"
 _NOT_SCANS = {
     *POSE_FILES,
@@ -114,21 +126,27 @@ def posed(
             T_world_sensor = own.of(before if raw.number is None else raw.number, raw.time_s)
             if T_world_sensor is None:
                 first_s = raw.time_s if first_s is None else first_s
-                notes.count(WITHOUT_POSES.format(gap_s=own.max_gap_s), 1)
+                if not isinstance(own.poses, np.ndarray):  # else it was named when the poses were read
+                    notes.count(WITHOUT_POSES.format(gap_s=own.max_gap_s), 1)
                 continue
             taken += 1
-            columns = raw.read()
+            columns = _read(raw, notes)
+            if columns is None:
+                continue
             if not columns or len(next(iter(columns.values()))) == 0:
                 notes.count(_NO_RETURNS, 1)
                 continue
             if raw.topic not in fields_of:
-                fields = Fields.of(list(columns), request.fields, raw.name)
-                if fields.dialect is not None and fields.dialect.note:
-                    notes.add(fields.dialect.note)
+                fields = _fields_of(columns, raw, raw_scans, request)
+                if fields is None:
+                    continue
                 for other, _, _ in fields_of.values():
                     _note_differences(fields, raw.topic, other, notes)
                 fields_of[raw.topic] = fields, raw, list(columns)
             fields, first, names = fields_of[raw.topic]
+            if not fields.place(columns):
+                notes.count(_UNREADABLE, 1, f"{raw.name} has no positions, but {', '.join(columns)}")
+                continue
             cloud = fields.read(columns, raw.name)
             if list(columns) != names:
                 fields.check_no_more(Fields.of(list(columns), request.fields, raw.name), raw.name, first.name)
@@ -148,6 +166,38 @@ def posed(
         raise ValueError(msg)
 
     return source
+
+
+def _read(raw: RawScan, notes: Notes) -> Columns | None:
+    """The columns of a scan; None, and counted, if it is damaged."""
+    try:
+        return raw.read()
+    except ValueError as error:
+        notes.count(_UNREADABLE, 1, str(error))
+        return None
+
+
+def _fields_of(
+    columns: Columns, raw: RawScan, raw_scans: Callable[[], Iterable[RawScan]], request: Request
+) -> Fields | None:
+    """What the columns of the first scan mean; None, and counted, if it has no positions, unless a user chose them."""
+    try:
+        fields = Fields.of(list(columns), request.fields, raw.name)
+    except ValueError as error:
+        if request.fields:
+            raise
+        request.notes.count(_UNREADABLE, 1, str(error))
+        return None
+    fields = fields.judged(_first_clouds(raw_scans, raw.topic), request.notes)
+    fields.note_use(columns, request.notes, chosen=bool(request.fields))
+    return fields
+
+
+def _first_clouds(raw_scans: Callable[[], Iterable[RawScan]], topic: str) -> Iterator[Columns]:
+    """The first scans of a topic, or of files, that can be read, to judge their numbers by."""
+    for raw in itertools.islice((raw for raw in raw_scans() if raw.topic == topic), _JUDGED_SCANS):
+        with contextlib.suppress(ValueError):
+            yield raw.read()
 
 
 def _note_differences(fields: Fields, topic: str, other: Fields, notes: Notes) -> None:
@@ -312,14 +362,103 @@ def scans_of_files(
     ValueError
         As :func:`scan_poses`.
     """
-    matched, known_s = scan_poses(poses, len(files), times_s, T_base_sensor, request)
+    tables: list[Columns] | None = None
+    columns: Any = request.columns
+    suffixes = {path.suffix.lower() for path in files}
+    if ".bin" in suffixes:
+        columns = bin_columns(files, columns, request.notes)
+    if ".pcd" in suffixes:
+        note_viewpoint(files[0], request.notes)
+    if len(files) == 1:
+        tables, times_s, poses = _split(files[0], columns, times_s, poses, request.notes)
+    count = len(files) if tables is None else len(tables)
+    matched, known_s = scan_poses(poses, count, times_s, T_base_sensor, request)
 
     def raw_scans() -> Iterator[RawScan]:
-        for i, path in enumerate(files):
+        for i in range(count):
+            path = files[i] if tables is None else files[0]
             yield RawScan(
-                lambda path=path: read_columns(path, request.columns),  # type: ignore[misc]
+                lambda i=i, path=path: read_columns(path, columns) if tables is None else tables[i],  # type: ignore[misc]
                 None if known_s is None else known_s[i],
-                str(path),
+                str(path) if tables is None else f"{path}: scan {i}",
             )
 
     return Scans.of_source(posed(raw_scans, matched, request), request.notes, request.truth or truth)
+
+
+def _split(
+    path: Path,
+    columns: Any,
+    times_s: Sequence[float] | None,
+    poses: StampedPoses | NDArray[np.float64],
+    notes: Notes,
+) -> tuple[list[Columns] | None, Sequence[float] | None, StampedPoses | NDArray[np.float64]]:
+    """The scans in the one table of a recording, by a column with their numbers or times; None if it is one scan."""
+    try:
+        table = read_columns(path, columns)
+    except ValueError:  # which is said when the scan is read
+        return None, times_s, poses
+    plain = {without_unit(name.lower().removeprefix("scalar_"))[0]: name for name in reversed(table)}
+    number = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
+    time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
+    one_pose = isinstance(poses, np.ndarray) and len(poses) == 1
+    key = number if number is not None or one_pose else time
+    if key is None or table[key].dtype.kind not in "biuf":
+        return None, times_s, poses
+    rows = np.flatnonzero(np.isfinite(table[key]))
+    values, first, part = np.unique(table[key][rows], return_index=True, return_inverse=True)
+    if len(values) < 2 or (key != number and 2 * len(values) > len(rows)):
+        return None, times_s, poses
+    notes.add(f"{path.name} is read as {len(values)} scans, by its field {key}")
+    if len(rows) < len(table[key]):
+        notes.add(f"{path.name}: {len(table[key]) - len(rows)} rows left out: their {key} is not a number")
+    order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
+    if time is not None and table[time].dtype.kind in "iuf":
+        scale = TIME_UNITS.get(without_unit(time)[1], 1.0)
+        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path, notes).tolist()
+    if (
+        isinstance(poses, np.ndarray)
+        and len(poses) > len(values)
+        and 0 <= values[0] <= values[-1] < len(poses)
+    ):
+        poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
+    return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
+
+
+def bin_columns(files: list[Path], columns: Any, notes: Notes) -> Any:
+    """What :func:`read_columns` needs to know of files ``.bin``, by the content of several of them."""
+    if columns is not None and not isinstance(columns, int):
+        return columns
+    try:
+        layout = bin_layout([path for path in files if path.suffix.lower() == ".bin"], columns)
+    except ValueError as error:
+        msg = f"{notes.about}: {error}"
+        raise ValueError(msg) from error
+    if layout != KITTI:
+        names = ", ".join(names_of(layout.width, None))
+        notes.add(
+            f"the .bin files have {layout.width} numbers a return, {np.dtype(layout.dtype).name}, taken as {names}"
+        )
+    return layout
+
+
+def note_viewpoint(path: Path, notes: Notes) -> None:
+    """Says that the ``VIEWPOINT`` of scans is where they were taken, which poses say, too: it is not applied twice."""
+    with contextlib.suppress(ValueError):
+        if (read_viewpoint(path) != np.eye(4)).any() and VIEWPOINTS not in notes.lines:
+            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")
+
+
+def viewpoint_poses(files: list[Path], notes: Notes) -> NDArray[np.float64] | None:
+    """T_world_sensor (F, 4, 4) of the ``VIEWPOINT`` of PCD files, if they tell where the scans were taken."""
+    if {path.suffix.lower() for path in files} != {".pcd"}:
+        return None
+    poses = np.full((len(files), 4, 4), np.nan)
+    for pose, path in zip(poses, files, strict=True):
+        with contextlib.suppress(ValueError):
+            pose[:] = read_viewpoint(path)
+    known = poses[np.isfinite(poses).all(axis=(1, 2))]
+    if not len(known) or (known == (np.eye(4) if len(files) == 1 else known[0])).all():
+        return None
+    notes.add(VIEWPOINTS)
+    return poses

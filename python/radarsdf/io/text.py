@@ -9,6 +9,9 @@ import itertools
 import re
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from radarsdf.io.files import are_numbers
 
 # Of UTF-32 before UTF-16, whose mark is the beginning of the other's.
@@ -25,23 +28,25 @@ _COMMENT = re.compile("(" + "|".join(COMMENTS) + ").*")
 _DECIMAL_COMMA = r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?"
 _IN_CELL = re.compile(rf"(?:^|;)[ \t]*{_DECIMAL_COMMA}(?=[ \t]*(?:;|$))", re.MULTILINE)
 
+_UNIT = re.compile(
+    r"[\s_]+(m|cm|mm|km|s|ms|us|ns|rad|mrad|radians?|deg|degrees?|mps|kmh|kph|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
+)
+
 
 def read_text(path: Path) -> str:
     """The text of a file, with a line feed after each line.
 
-    It is in UTF-8, or in another encoding of Unicode that a byte order mark names, which is left out. Lines may end as
-    those of any system.
+    It is in UTF-8, or in another encoding of Unicode that a byte order mark names, which is left out. What does not
+    decode, such as a comment in Latin-1, becomes replacement characters. Lines may end as those of any system.
 
     Raises
     ------
-    ValueError
-        If the file is no such text.
     OSError
         If it cannot be read.
     """
     data = path.read_bytes()
     encoding = next((encoding for mark, encoding in _MARKS if data.startswith(mark)), "utf-8")
-    return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+    return data.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def with_points(text: str) -> str:
@@ -77,10 +82,52 @@ def check_header(words: list[str]) -> None:
         raise ValueError(msg)
 
 
-def number_rows(path: Path) -> list[list[str]]:
-    """The rows of a text file of numbers, which are separated by commas, semicolons or white space.
+def words_of(line: str) -> list[str]:
+    """The words of a line, separated by commas, semicolons, tabs or else white space."""
+    separator = next((sign for sign in (",", ";", "\t") if sign in line), None)
+    line = line if separator else re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
+    return [word.strip().strip('"') for word in line.split(separator)]
 
-    Comments after ``#``, ``//`` or ``%`` and blank lines are left out, and a first line of names.
+
+def without_unit(name: str) -> tuple[str, str]:
+    """The name of a column in lower case without its unit, and the unit: of ``azimuth_deg``, ``x [m]``, ``time(ns)``."""
+    found = _UNIT.search(name.strip().lower())
+    if found is None or not found.start():
+        return name.strip().lower(), ""
+    return name.strip().lower()[: found.start()], found[1] if found[1] is not None else found[2].strip()
+
+
+def text_rows(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]:
+    """What may be the names of columns in a text file, and its rows with the numbers of their lines, from 1.
+
+    Names are above the rows: comments after ``#``, ``//`` or ``%``, or a line without a number. Words of a row are
+    separated by commas, semicolons or white space. Other comments and blank lines are left out.
+
+    Raises
+    ------
+    ValueError
+        If the numbers have decimal commas between spaces.
+    OSError
+        If the file cannot be read.
+    """
+    heads: list[list[str]] = []
+    rows: list[tuple[int, list[str]]] = []
+    named = False
+    for number, line in enumerate(with_points(read_text(path)).split("\n"), 1):
+        bare = without_comment(line)
+        if bare:
+            words = re.split(r"\s*[,;]\s*|\s+", bare.rstrip(",; \t"))
+            if rows or named or any(are_numbers([word]) for word in words):
+                rows.append((number, words))
+                continue
+            named = True
+        if line.strip() and not rows:
+            heads.append(words_of((bare or line.strip().lstrip("/#% ")).rstrip(",; \t")))
+    return heads, rows
+
+
+def number_rows(path: Path) -> list[list[str]]:
+    """The rows of a text file of numbers, without names above them; see :func:`text_rows`.
 
     Raises
     ------
@@ -89,23 +136,27 @@ def number_rows(path: Path) -> list[list[str]]:
     OSError
         If the file cannot be read.
     """
-    rows: list[list[str]] = []
-    above = 0
-    for number, line in enumerate(with_points(read_text(path)).split("\n"), 1):
-        bare = without_comment(line)
-        if not bare:
-            continue
-        words = re.split(r"\s*[,;]\s*|\s+", bare.rstrip(",; \t"))
-        if not (rows or above or are_numbers(words)):
-            check_header(words)
-            above = number
-            continue
+    _, rows = text_rows(path)
+    for number, words in rows:
         if not are_numbers(words):
+            if number == rows[0][0]:
+                check_header(words)
             wrong = next(word for word in words if not are_numbers([word]))
             msg = f"line {number} has {wrong!r:.50} where a number must be"
             raise ValueError(msg)
-        if rows and len(words) != len(rows[0]):
-            msg = f"line {number} has {len(words)} numbers, and lines before it have {len(rows[0])}"
+        if len(words) != len(rows[0][1]):
+            msg = f"line {number} has {len(words)} numbers, and lines before it have {len(rows[0][1])}"
             raise ValueError(msg)
-        rows.append(words)
-    return rows
+    return [words for _, words in rows]
+
+
+def numbers_of(rows: list[tuple[int, list[str]]], width: int) -> NDArray[np.float64]:
+    """(R, width) the numbers of rows; NaN for a word that is none, and in a row of another width."""
+    table = np.full((len(rows), width), np.nan)
+    for values, (_, words) in zip(table, rows, strict=True):
+        if len(words) == width:
+            try:
+                values[:] = [float(word) for word in words]
+            except ValueError:
+                values[:] = [float(word) if are_numbers([word]) else np.nan for word in words]
+    return table

@@ -4,12 +4,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from radarsdf.io.scans import Notes
+from radarsdf.io.text import without_unit
 
 ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
          "sigma_range", "sigma_azimuth", "sigma_elevation")  # fmt: skip
@@ -18,6 +22,13 @@ ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
 _SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
+
+
+_SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "mrad": 1e-3, "kmh": 1 / 3.6, "kph": 1 / 3.6, "km/h": 1 / 3.6,
+           "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180}  # fmt: skip
+"""Units in names of fields, in m, rad or m/s."""
+_BEYOND = 1.05  # angles that exceed a limit by rounding
+_STEPS, _ENOUGH = 4, 30  # parts of a degree, and angles that lie in such steps not by chance
 
 
 @dataclass(frozen=True)
@@ -62,12 +73,14 @@ DIALECTS = (
 
 _ALIASES: dict[str, tuple[str, ...]] = {
     # For clouds of no dialect: the first name that a cloud has. Existing files of ours come first.
-    "intensity": ("power", "intensity", "rcs", "snr", "snr_db", "amplitude", "reflectivity"),
+    "intensity": ("power", "intensity", "rcs", "snr", "snr_db", "amplitude", "reflectivity", "reflectance", "magnitude",
+                  "rssi", "signal_power", "signal_strength"),
     "doppler": ("doppler", "velocity", "doppler_velocity", "v_doppler_mps", "radial_speed", "radial_velocity",
-                "range_rate", "v_r", "vr", "speed"),
-    "range": ("range", "distance"),
-    "azimuth": ("azimuth", "azimuth_angle"),
-    "elevation": ("elevation", "elevation_angle"),
+                "range_rate", "v_r", "vr", "speed", "rdot", "r_dot", "v_radial", "vrad", "v_rad", "vel_r", "vel",
+                "radial_vel", "velocity_radial", "doppler_speed", "v_doppler", "rangerate", "relative_velocity"),
+    "range": ("range", "distance", "r", "rng", "dist", "radius", "slant_range"),
+    "azimuth": ("azimuth", "azimuth_angle", "az", "azi", "azim", "angle_azimuth"),
+    "elevation": ("elevation", "elevation_angle", "el", "ele", "elev", "angle_elevation"),
     "sigma_range": ("sigma_range", "range_std", "rangestd"),
     "sigma_azimuth": ("sigma_azimuth", "azimuth_std", "azimuthstd"),
     "sigma_elevation": ("sigma_elevation", "elevation_std", "elevationstd"),
@@ -104,6 +117,8 @@ class Fields:
     """Field by role, of `ROLES`."""
     dialect: Dialect | None = None
     """The dialect that was recognised."""
+    in_degrees: bool = False
+    """Whether angles whose names have no unit are in degrees."""
 
     @classmethod
     def of(
@@ -126,12 +141,16 @@ class Fields:
             If a role or a field does not exist, or there are no positions.
         """
         lower = {name.lower(): name for name in reversed(names)}
+        lower = {_plain(name)[0]: name for name in reversed(names)} | lower
+        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
         dialect = _dialect(lower)
         if dialect is not None:
             found = {role: lower[name] for role, name in _roles(dialect).items()}
         for role, aliases in ({axis: (axis,) for axis in _XYZ} | _ALIASES).items():
-            name = next((lower[alias] for alias in aliases if alias in lower), None)
+            name = next(
+                (squeezed[_squeezed(alias)] for alias in aliases if _squeezed(alias) in squeezed), None
+            )
             if role not in found and name is not None and name not in found.values():
                 found[role] = name
         for role, field in (overrides or {}).items():
@@ -142,10 +161,60 @@ class Fields:
             if field is not None:
                 found[role] = _field(field, names, lower, role, what)
         if not set(_XYZ) <= set(found) and not set(_POLAR) <= set(found):
-            missing = ", ".join(axis for axis in _XYZ if axis not in found)
+            wanted = _POLAR if "range" in found and "x" not in found else _XYZ
+            missing = ", ".join(role for role in wanted if role not in found)
             msg = f"{what} lacks the fields {missing}: it has {', '.join(names) or 'none'}"
+            if {"theta", "phi"} & set(lower):
+                msg += "; theta and phi have several meanings: name the azimuth and the elevation above the horizon"
             raise ValueError(msg)
         return cls(found, dialect)
+
+    @property
+    def polar(self) -> bool:
+        """Whether positions are of range and angles."""
+        return not set(_XYZ) <= set(self.names)
+
+    def place(self, columns: Mapping[str, NDArray[Any]]) -> bool:
+        """Whether a cloud has the fields of the positions."""
+        return {self.names[role] for role in (_POLAR if self.polar else _XYZ)} <= set(columns)
+
+    def judged(self, clouds: Iterable[Mapping[str, NDArray[Any]]], notes: Notes) -> Fields:
+        """These fields with the unit of their angles: of their names, or else by the numbers in some clouds."""
+        if not self.polar:
+            return self
+        units = {role: _plain(self.names[role])[1] for role in ("azimuth", "elevation")}
+        named = next((unit for unit in units.values() if unit), "")
+        if all(units.values()):
+            return self
+        names = [self.names[role] for role in units]
+        angles = [np.stack([cloud[name] for name in names]) for cloud in clouds if set(names) <= set(cloud)]
+        azimuth, elevation = np.concatenate([np.zeros((2, 0)), *angles], axis=1).astype(np.float64)
+        in_degrees = named.startswith("deg") if named else _are_degrees(azimuth, elevation)
+        by = (
+            f"as {'azimuth' if units['azimuth'] else 'elevation'} is by its name"
+            if named
+            else "by their numbers"
+        )
+        if in_degrees or (self.dialect is None and not named):
+            notes.add(
+                f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
+                "names such as azimuth_deg or azimuth_rad decide"
+            )
+        return replace(self, in_degrees=in_degrees)
+
+    def note_use(self, names: Iterable[str], notes: Notes, *, chosen: bool) -> None:
+        """Says what to know of the numbers, and which of these fields are passed over, unless a user has chosen some."""
+        if self.dialect is not None and self.dialect.note:
+            notes.add(self.dialect.note)
+        if "intensity" in self.names and _plain(self.names["intensity"])[1] == "linear":
+            notes.add(
+                f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
+            )
+        unused = [name for name in names if name and name not in self.names.values()]
+        if unused and not chosen:
+            notes.add(
+                f"fields that are not used: {', '.join(unused)}; fields={{role: name}} or --field chooses others"
+            )
 
     def read(self, columns: Mapping[str, NDArray[Any]], what: str) -> Cloud:
         """The cloud in these columns, (N,) each, without returns that are not finite.
@@ -198,17 +267,26 @@ class Fields:
     def _column(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[np.float32] | None:
         if role not in self.names:
             return None
-        return np.ascontiguousarray(columns[self.names[role]], np.float32)
+        return np.ascontiguousarray(self._values(columns, role), np.float32)
+
+    def _values(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[Any]:
+        """A column in m, rad or m/s, where its name has another unit, or angles are in degrees."""
+        unit = _plain(self.names[role])[1]
+        if not unit and self.in_degrees and role.endswith(("azimuth", "elevation")):
+            unit = "deg"
+        scale = _SCALES.get(unit)
+        values = columns[self.names[role]]
+        return values if scale is None else values * np.float64(scale)
 
     def _positions(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
         if set(_XYZ) <= set(self.names):
-            parts = [columns[self.names[axis]] for axis in _XYZ]
+            parts = [self._values(columns, axis) for axis in _XYZ]
             dtype = np.float64 if any(part.dtype.itemsize > 4 for part in parts) else np.float32
             points = np.zeros((len(parts[0]), 3), dtype)
             for axis, part in enumerate(parts):
                 points[:, axis] = part
             return points
-        ranges, azimuth, elevation = (columns[self.names[role]].astype(np.float64) for role in _POLAR)
+        ranges, azimuth, elevation = (self._values(columns, role).astype(np.float64) for role in _POLAR)
         with np.errstate(invalid="ignore"):  # what is not finite is dropped later
             flat = ranges * np.cos(elevation)
             xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
@@ -217,10 +295,35 @@ class Fields:
     def _sigma(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32] | None:
         if not set(_SIGMA) <= set(self.names):
             return None
-        sigma = np.stack([columns[self.names[role]] for role in _SIGMA], axis=1).astype(np.float32)
+        sigma = np.stack([self._values(columns, role) for role in _SIGMA], axis=1).astype(np.float32)
         if self.dialect is not None and self.dialect.sigma_in_degrees:
             sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
         return sigma
+
+
+def _plain(name: str) -> tuple[str, str]:
+    """A name in lower case as radars give it, and its unit: without the prefix of CloudCompare."""
+    return without_unit(name.lower().removeprefix("scalar_"))
+
+
+def _squeezed(name: str) -> str:
+    """A name without what separates its words: AzimuthAngle, azimuth_angle and Azimuth Angle are one."""
+    return re.sub(r"[\W_]+", "", name)
+
+
+def _are_degrees(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> bool:
+    """Whether angles (N,) are in degrees: beyond what rad can be, or in steps that only degrees have."""
+    finite = np.isfinite(azimuth) & np.isfinite(elevation)
+    if not finite.any():
+        return False
+    azimuth, elevation = azimuth[finite], elevation[finite]
+    largest, highest = (np.quantile(np.abs(angles), 0.99) / np.pi for angles in (azimuth, elevation))
+    if highest > _BEYOND / 2 or largest > 2 * _BEYOND:
+        return True
+    if largest > _BEYOND:  # rad from 0 to a whole turn have no other sign
+        return bool(azimuth.min() < 0)
+    steps = azimuth * _STEPS
+    return bool(len(steps) >= _ENOUGH and steps.any() and (steps == np.round(steps)).all())
 
 
 def _roles(dialect: Dialect) -> dict[str, str]:

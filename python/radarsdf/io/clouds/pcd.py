@@ -6,10 +6,11 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from radarsdf.io.clouds.lzf import unpack_lzf
 
@@ -25,7 +26,7 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
     Parameters
     ----------
     path : Path
-        A PCD file, version 0.7 or earlier. Its ``VIEWPOINT`` is ignored.
+        A PCD file, version 0.7 or earlier. Its ``VIEWPOINT`` is not applied: :func:`read_viewpoint` has it.
 
     Returns
     -------
@@ -41,13 +42,7 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
         If the file cannot be read.
     """
     with path.open("rb") as file:
-        header: dict[str, list[str]] = {}
-        for _ in range(_MAX_HEADER_LINES):
-            words = file.readline(_MAX_LINE).decode("ascii").split()
-            if words and not words[0].startswith("#"):
-                header[words[0]] = words[1:]
-            if "DATA" in header:
-                break
+        header = _header(file)
         if missing := [
             key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA") if not header.get(key)
         ]:
@@ -75,6 +70,41 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
         raise ValueError(msg)
     # The name _ means padding, and several fields may have it.
     return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
+
+
+def read_viewpoint(path: Path) -> NDArray[np.float64]:
+    """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a file, which is tx ty tz qw qx qy qz; the identity without one.
+
+    Raises
+    ------
+    ValueError
+        If it does not hold seven finite numbers.
+    OSError
+        If the file cannot be read.
+    """
+    with path.open("rb") as file:
+        numbers = np.array(_header(file).get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
+    if numbers.shape != (7,) or not np.isfinite(numbers).all():
+        msg = "its VIEWPOINT is not seven finite numbers: tx ty tz qw qx qy qz"
+        raise ValueError(msg)
+    T_world_sensor = np.eye(4)
+    T_world_sensor[:3, 3] = numbers[:3]
+    if numbers[3:].any():  # some programs write zeros where nothing is known
+        T_world_sensor[:3, :3] = Rotation.from_quat(numbers[[4, 5, 6, 3]]).as_matrix()
+    return T_world_sensor
+
+
+def _header(file: BinaryIO) -> dict[str, list[str]]:
+    """The lines of a header by their first words. Comments are in any encoding."""
+    header: dict[str, list[str]] = {}
+    for _ in range(_MAX_HEADER_LINES):
+        line = file.readline(_MAX_LINE).lstrip()
+        if line and not line.startswith(b"#"):
+            key, *words = line.decode("ascii").split()
+            header[key] = words
+        if "DATA" in header:
+            break
+    return header
 
 
 def _binary(body: bytes, types: list[str], counts: list[int], points: int) -> list[NDArray[Any]]:

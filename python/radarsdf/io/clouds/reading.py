@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -18,13 +19,24 @@ from radarsdf.checks import path_of
 from radarsdf.interrupts import whole_import
 from radarsdf.io.clouds.fields import COLUMNS, Fields
 from radarsdf.io.clouds.las import read_las
-from radarsdf.io.clouds.pcd import read_pcd
+from radarsdf.io.clouds.pcd import read_pcd, read_viewpoint
+from radarsdf.io.clouds.raw_binary import read_bin
 from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.origin import origin_of
-from radarsdf.io.text import COMMENTS, check_header, read_text, with_points, without_comment
+from radarsdf.io.records import without_ply_comments
+from radarsdf.io.scans import Notes
+from radarsdf.io.text import (
+    COMMENTS,
+    check_header,
+    numbers_of,
+    read_text,
+    text_rows,
+    with_points,
+    without_comment,
+    words_of,
+)
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
-_KITTI_COLUMNS = 4
 _PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
 _SEPARATORS = (";", ",", "\t", None)  # None: any white space
 
@@ -39,8 +51,8 @@ def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Colu
     path : Path
         A file of `CLOUD_SUFFIXES`.
     columns : int or sequence of str, optional
-        Of files without names: how many numbers a point has, or their names. A ``.bin`` file has four by default: x, y,
-        z, intensity.
+        Of files without names: how many numbers a point has, or their names. Of a ``.bin`` file, its content decides by
+        default.
 
     Raises
     ------
@@ -82,7 +94,7 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        (M, 3) float64, frame of the file, m; the world's, if :func:`radarsdf.io.write_cloud` wrote an origin beside
+        (M, 3) float64, frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places them; the world's, if :func:`radarsdf.io.write_cloud` wrote an origin beside
         it. Points that are not finite are left out.
 
     Raises
@@ -96,7 +108,10 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     """
     columns = read_columns(path_of(path, "path"))
     fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
-    points = fields.read(columns, str(path)).points.astype(np.float64)
+    points = fields.judged([columns], Notes(str(path))).read(columns, str(path)).points.astype(np.float64)
+    if path_of(path, "path").suffix.lower() == ".pcd":
+        T_world_sensor = read_viewpoint(path_of(path, "path"))
+        points = points @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
     if len(points) == 0:
         msg = f"{path} holds no points"
         raise ValueError(msg)
@@ -120,19 +135,7 @@ def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
 
 
 def _bin(path: Path, columns: int | Sequence[str] | None) -> Columns:
-    width = _KITTI_COLUMNS if columns is None else columns if isinstance(columns, int) else len(columns)
-    if width < 3:
-        msg = f"a point has three numbers or more, not {width}"
-        raise ValueError(msg)
-    size = path.stat().st_size
-    if size % (4 * width):
-        msg = (
-            f"its {size} bytes are no whole number of points of {width} float32 each: "
-            "say by columns how many there are, or their names"
-        )
-        raise ValueError(msg)
-    table = np.fromfile(path, "<f4").reshape(-1, width)
-    return dict(zip(names_of(width, columns), table.T, strict=True))
+    return read_bin(path, columns, names_of)
 
 
 def _npy(path: Path, columns: int | Sequence[str] | None) -> Columns:
@@ -158,12 +161,23 @@ def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
         return {name: np.zeros(0) for name in names_of(3, None)}
     first = without_comment(first.lstrip("/#% "))  # names may be after a comment sign
     separator = next(s for s in _SEPARATORS if s is None or s in first)
-    words = [word.strip().strip('"') for word in first.split(separator)]
+    words = (
+        words_of(first) if separator is None else [word.strip().strip('"') for word in first.split(separator)]
+    )
     header = not are_numbers(words)
     if header:
         check_header(words)
-    rows = io.StringIO(text)
-    table = np.loadtxt(rows, delimiter=separator, skiprows=skipped + header, ndmin=2, comments=COMMENTS)
+    try:
+        table = np.loadtxt(
+            io.StringIO(text), delimiter=separator, skiprows=skipped + header, ndmin=2, comments=COMMENTS
+        )
+    except ValueError:  # a row that is none becomes NaN, which is left out, and counted
+        _, rows = text_rows(path)
+        width = len(words) if header else Counter(len(row) for _, row in rows).most_common(1)[0][0]
+        table = numbers_of(rows, width)
+        numeric = ~np.isnan(table).all(axis=0)  # others hold labels, say
+        if 2 * np.isfinite(table[:, numeric]).all(axis=1).sum() < len(table) or not numeric.any():
+            raise
     if header:
         if table.size == 0:
             return {name: np.zeros(0) for name in words}
@@ -185,9 +199,9 @@ def _ply(path: Path) -> Columns:
     with whole_import():
         import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
-    with path.open("rb") as file:
-        # Of an open file, and without materials: a PLY file may name an image, which is then not looked for.
-        loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
+    # Of its bytes, and without materials: a PLY file may name an image, which is then not looked for.
+    file = io.BytesIO(without_ply_comments(path.read_bytes()))
+    loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
     vertex = loaded.metadata.get("_ply_raw", {}).get("vertex")
     if vertex is None or not vertex["length"]:
         return {axis: np.zeros(0) for axis in "xyz"}

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -14,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checks import check_pose, check_poses, real_array
-from radarsdf.io.files import check_regular_file
+from radarsdf.checks import are_rigid, check_pose, check_poses, pose_matrices, real_array
+from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.npz import array_in
-from radarsdf.io.poses.trajectory import Trajectory, in_seconds, read_table, trajectory_of_table
+from radarsdf.io.poses.columns import pose_columns, rotations_of
+from radarsdf.io.poses.trajectory import MAX_NORM_ERROR, TIME_UNITS, Trajectory, in_seconds
 from radarsdf.io.scans import Notes
-from radarsdf.io.text import read_text
+from radarsdf.io.text import numbers_of, read_text, text_rows, without_unit
 
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 """Names of files of poses that are found beside scans."""
@@ -29,6 +31,8 @@ FIND_POSES = "radarsdf poses finds them from the radar alone"
 
 _TUM_COLUMNS, _KITTI_COLUMNS, _MATRIX_COLUMNS = 8, 12, 16
 _MIN_QUATERNION, _MAX_QUATERNION = 0.49, 1.01  # largest of the four numbers of a unit quaternion
+_G2O = "VERTEX_SE3"
+_LISTED = 5  # lines that a note names
 _CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam")
 
 
@@ -101,6 +105,8 @@ class ScanPoses:
         """T_world_sensor (4, 4) of scan `number`, which was taken at `time_s`; None if it has none."""
         if isinstance(self.poses, np.ndarray):
             T_world_base = self.poses[number] if number < len(self.poses) else None
+            if T_world_base is not None and np.isnan(T_world_base[0, 0]):
+                return None
         elif time_s is None:
             return None
         else:
@@ -135,7 +141,7 @@ def poses_of(
     if matrices.ndim != 3:
         msg = f"poses must be (F, 4, 4) T_world_sensor, or a file of poses, not an array {matrices.shape}"
         raise ValueError(msg)
-    return check_poses(matrices)
+    return usable_poses(matrices, "the given array", notes)
 
 
 def read_poses(
@@ -148,15 +154,20 @@ def read_poses(
     path : Path
         One of
 
+        - a table whose first line, or a comment above it, names its columns, in any order: a time, x, y and z, and
+          qx, qy, qz and qw or roll, pitch and yaw, as in files of EuRoC, evo and ``rostopic echo -p``. T_world_base by
+          time, or without a time in order; other columns are not used;
         - TUM: lines of ``time x y z qx qy qz qw``, s and m: T_world_base by time;
+        - g2o: its lines ``VERTEX_SE3:QUAT``, in order;
         - KITTI: lines of twelve numbers, the first three rows of a matrix. With a calibration ``Tr``, the transform from
           the sensor to the camera, T_world_sensor = inv(Tr) · P · Tr, so that the world is the first scan's sensor frame;
           without one, the lines are taken as T_world_base;
         - our own: 4 x 4 matrices T_world_base, as lines of sixteen numbers or blocks of four lines, or an array
           (F, 4, 4) in an ``.npy`` file.
 
-        Text may have commas or semicolons, names in its first line, and comments after ``#``. Times of TUM may be in ms,
-        µs or ns since 1970.
+        Text may have commas or semicolons, and comments after ``#``. Times may be in ms, µs or ns since 1970, or in the
+        unit of their name. Poses that are not finite or have no unit quaternion, and those whose time repeats, are left
+        out; times out of order are sorted.
     notes : Notes
         Is told what was assumed.
     calibration : sequence of Path
@@ -176,35 +187,45 @@ def read_poses(
     """
     check_regular_file(path)
     if path.suffix.lower() == ".npy":
-        return _checked(np.array(array_in(path)), path)
-    table = read_table(path)
-    if table.shape[1] == _TUM_COLUMNS:
-        table[:, 0] = in_seconds(table[:, 0], path, notes)
-        return trajectory_of_table(table, path)
-    if table.shape[1] == _KITTI_COLUMNS:
-        poses = np.tile(np.eye(4), (len(table), 1, 1))
-        poses[:, :3] = table.reshape(-1, 3, 4)
-        checked = _checked(poses, path)
-        for file in calibration:
-            if file.is_file() and (T_camera_sensor := read_calibration(file)) is not None:
-                notes.add(
-                    f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr, the world is the first scan"
-                )
-                moved: NDArray[np.float64] = np.linalg.inv(T_camera_sensor) @ checked @ T_camera_sensor
-                return moved
-        notes.add(
-            f"{path.name} has KITTI poses and there is no calibration Tr: they are taken as T_world_sensor"
-        )
-        return checked
-    if table.shape[1] == _MATRIX_COLUMNS:
-        return _checked(table.reshape(-1, 4, 4), path)
-    if table.shape[1] == 4 and len(table) % 4 == 0:
-        return _checked(table.reshape(-1, 4, 4), path)
+        return usable_poses(np.array(array_in(path)), str(path), notes)
+    heads, rows = _rows_of(path)
+    width = Counter(len(words) for _, words in rows).most_common(1)[0][0]
+    heads = [head for head in heads if len(head) == width]
+    table, lines = numbers_of(rows, width), [line for line, _ in rows]
+    for head in reversed(heads):
+        if (columns := pose_columns(head)) is not None:
+            return _named(table, columns, head, path, notes, lines)
+    if width == _TUM_COLUMNS:
+        if heads:
+            notes.add(
+                f"{path.name}: its columns are taken as time x y z qx qy qz qw: names above them are not known"
+            )
+        return _stamped(table, path, notes, lines)
+    if width == _KITTI_COLUMNS:
+        return _kitti(table, path, notes, lines, calibration)
+    if width == _MATRIX_COLUMNS or (width == 4 and len(table) % 4 == 0):
+        return usable_poses(table.reshape(-1, 4, 4), str(path), notes, lines[:: 16 // width])
     msg = (
-        f"{path} has {table.shape[1]} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four "
-        "in blocks of four lines"
+        f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four in blocks "
+        "of four lines; or name the columns in the first line, such as time,x,y,z,qw,qx,qy,qz"
     )
     raise ValueError(msg)
+
+
+def _rows_of(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]:
+    """What may be names of columns, and the rows with their lines, of which one has a number at its end."""
+    try:
+        heads, rows = text_rows(path)
+    except ValueError as error:
+        msg = f"{path} is not a table of poses: {error}"
+        raise ValueError(msg) from error
+    if any(words[0].startswith(_G2O) for _, words in rows):
+        rows = [(line, words[1:]) for line, words in rows if words[0].startswith(_G2O)]
+        heads = [["id", "x", "y", "z", "qx", "qy", "qz", "qw"]]
+    if not any(are_numbers(words[-1:]) for _, words in rows):
+        msg = f"{path} is not a table of poses: it has no rows of numbers"
+        raise ValueError(msg)
+    return heads, rows
 
 
 def read_calibration(path: Path) -> NDArray[np.float64] | None:
@@ -229,8 +250,7 @@ def read_calibration(path: Path) -> NDArray[np.float64] | None:
     except ValueError as error:
         msg = f"{path} is not a KITTI calibration: {error}"
         raise ValueError(msg) from error
-    checked: NDArray[np.float64] = _checked(T_camera_sensor[None], path)[0]
-    return checked
+    return check_pose(T_camera_sensor, f"{path}: Tr")
 
 
 def trajectory_of(
@@ -256,12 +276,134 @@ def trajectory_of(
     return Trajectory(times, xyz, Rotation.from_quat(quats), name)
 
 
-def _checked(poses: NDArray[Any], path: Path) -> NDArray[np.float64]:
+def _named(
+    table: NDArray[np.float64],
+    columns: dict[str, int],
+    head: list[str],
+    path: Path,
+    notes: Notes,
+    lines: list[int],
+) -> StampedPoses | NDArray[np.float64]:
+    """Poses of named columns: by time, or in their order."""
+    if missing := [role for role in ("z", "roll", "pitch") if "qw" not in columns and role not in columns]:
+        notes.add(f"{path.name} has no {', '.join(missing)}: taken as 0")
+    position = [table[:, columns[axis]] if axis in columns else np.zeros(len(table)) for axis in "xyz"]
+    quaternions = rotations_of(table, columns, head, path.name, notes)
+    poses = np.column_stack([np.zeros(len(table)), *position, quaternions])
+    if "nsec" in columns:
+        poses[:, 0] = table[:, columns["sec"]] + 1e-9 * table[:, columns["nsec"]]
+    elif "time" in columns:
+        poses[:, 0] = table[:, columns["time"]] * TIME_UNITS.get(without_unit(head[columns["time"]])[1], 1.0)
+    else:
+        return usable_poses(_matrices(poses), str(path), notes, lines)
+    return _stamped(poses, path, notes, lines)
+
+
+def _kitti(
+    table: NDArray[np.float64], path: Path, notes: Notes, lines: list[int], calibration: Sequence[Path]
+) -> NDArray[np.float64]:
+    """Poses of rows (F, 12), turned from the camera to the sensor if there is a calibration."""
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3] = table.reshape(-1, 3, 4)
+    checked = usable_poses(poses, str(path), notes, lines)
+    for file in calibration:
+        if file.is_file() and (T_camera_sensor := read_calibration(file)) is not None:
+            notes.add(
+                f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr, the world is the first scan"
+            )
+            moved: NDArray[np.float64] = np.linalg.inv(T_camera_sensor) @ checked @ T_camera_sensor
+            return moved
+    notes.add(f"{path.name} has KITTI poses and there is no calibration Tr: they are taken as T_world_sensor")
+    return checked
+
+
+def _stamped(table: NDArray[np.float64], path: Path, notes: Notes, lines: list[int]) -> Trajectory:
+    """The trajectory in rows (P, 8) of time, position and quaternion. What is no pose is left out, and named."""
+    with np.errstate(over="ignore"):
+        missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
+        wrong = ~missing & (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > MAX_NORM_ERROR)
+    bad = missing | wrong
+    if 2 * wrong.sum() >= max((~missing).sum(), 1):
+        msg = f"{path}: its quaternions qx qy qz qw are not unit quaternions: {_listed(wrong, lines)}"
+        raise ValueError(msg)
+    if bad.any():
+        notes.add(
+            f"{path.name}: {bad.sum()} of {len(table)} poses left out, which are not finite or have no unit quaternion: "
+            f"{_listed(bad, lines)}"
+        )
+    rows = np.flatnonzero(~bad)
+    table = table[rows]
+    table[:, 0] = in_seconds(table[:, 0], path, notes)
+    back = np.diff(table[:, 0], prepend=-np.inf) < 0
+    if back.any():
+        notes.add(
+            f"{path.name} is not in the order of its times, and sorted: {_listed(back, np.array(lines)[rows])}"
+        )
+    _, first = np.unique(table[:, 0], return_index=True)
+    again = np.ones(len(table), bool)
+    again[first] = False
+    if again.any():
+        notes.add(
+            f"{path.name}: {again.sum()} of {len(table)} poses left out, whose times repeat: "
+            f"{_listed(again, np.array(lines)[rows])}"
+        )
+    if len(first) < 2:
+        why = (
+            f", of {len(lines)} lines: {_listed(bad, lines)} not finite or without a rotation"
+            if bad.any()
+            else ""
+        )
+        msg = f"{path} must hold at least two poses at different times, not {len(first)}{why}"
+        raise ValueError(msg)
+    return trajectory_of(table[:, 0], table[:, 1:4], table[:, 4:], str(path))
+
+
+def usable_poses(
+    poses: NDArray[Any], name: str, notes: Notes, lines: Sequence[int] | None = None
+) -> NDArray[np.float64]:
+    """Poses (F, 4, 4) in the order of scans. Those that are not finite or rigid are NaN, and named: their scans have none.
+
+    Raises
+    ------
+    ValueError
+        If no pose is rigid, or half of those that are finite are not.
+    """
     if poses.ndim != 3 or poses.dtype.kind not in "iuf":
-        msg = f"{path} must hold poses (F, 4, 4), not {poses.dtype} {poses.shape}"
+        msg = f"{name} must hold poses (F, 4, 4), not {poses.dtype} {poses.shape}"
         raise ValueError(msg)
     try:
-        return check_poses(poses)
+        matrices = pose_matrices(poses)
+        missing = ~np.isfinite(matrices).all(axis=(1, 2)) | ~matrices[:, :3, :3].any(axis=(1, 2))
+        bad = ~are_rigid(matrices)
+        if 2 * (bad & ~missing).sum() >= max((~missing).sum(), 1):
+            check_poses(matrices[~missing])
     except ValueError as error:
-        msg = f"{path}: {error}"
+        msg = f"{name}: {error}"
         raise ValueError(msg) from error
+    if bad.all() and len(bad):
+        msg = f"{name}: no pose is finite"
+        raise ValueError(msg)
+    if bad.any():
+        which = _listed(bad, lines or range(len(bad)), "pose" if lines is None else "line")
+        notes.add(
+            f"scans left out: {bad.sum()} of {len(bad)} poses of {name} are not finite and rigid: {which}"
+        )
+    return np.where(bad[:, None, None], np.nan, matrices)
+
+
+def _matrices(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, 4, 4) of rows (P, 8) of time, position and quaternion; NaN where a quaternion is none."""
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, 3] = table[:, 1:4]
+    with np.errstate(over="ignore", invalid="ignore"):
+        unit = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) <= MAX_NORM_ERROR
+    poses[~unit] = np.nan
+    if unit.any():
+        poses[unit, :3, :3] = Rotation.from_quat(table[unit, 4:]).as_matrix()
+    return poses
+
+
+def _listed(mask: NDArray[np.bool_], numbers: Sequence[int] | NDArray[np.int64], what: str = "line") -> str:
+    """The first of those that a mask names."""
+    named = [str(numbers[int(i)]) for i in np.flatnonzero(mask)]
+    return f"{what} {', '.join(named[:_LISTED])}{', …' if len(named) > _LISTED else ''}"

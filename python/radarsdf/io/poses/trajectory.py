@@ -20,7 +20,10 @@ MAX_GAP_S = 0.5
 """Longest time between two poses over which poses are interpolated, by default."""
 
 _UNITS = ((1e17, "ns", 1e-9), (1e14, "µs", 1e-6), (1e11, "ms", 1e-3))  # from so much on, since 1970
-_MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
+TIME_UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+"""Units of times in names of columns, s."""
+
+MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
 _ROUNDED_S = 1e-3
 _NEARLY_SAME = 1 - 1e-9  # cosine of half an angle so small that its sine and itself are equal to rounding
 
@@ -195,7 +198,7 @@ def trajectory_of_table(table: NDArray[np.float64], path: Path) -> Trajectory:
     if len(table) < 2 or not (np.diff(table[:, 0]) > 0).all():
         msg = f"{path} must hold at least two poses, in the order of their times"
         raise ValueError(msg)
-    if (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > _MAX_NORM_ERROR).any():
+    if (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > MAX_NORM_ERROR).any():
         msg = f"{path}: the last four columns are not unit quaternions qx qy qz qw"
         raise ValueError(msg)
     return Trajectory(table[:, 0], table[:, 1:4], Rotation.from_quat(table[:, 4:]), str(path))
