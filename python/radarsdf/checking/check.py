@@ -95,30 +95,33 @@ def _sorted(findings: list[Finding]) -> list[Finding]:
 def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
     """All findings. `config` None: only the cheap ones."""
     found, recording = _usable(recording)
-    if any(finding.severity == "error" for finding in found):
+    if _stops(found):
         return found  # nothing below can be computed
     found += trajectory.check_times(recording)
     found += before_fit.check_elevation(recording)
     found += trajectory.check_rounding(recording)
     found += check_intensities(recording)
     found += trajectory.check_duplicates(recording)
-    wrong = (
-        frames.check_still(recording, effort)
-        or frames.check_frames(recording, effort)
-        or trajectory.check_lengths(recording)
-    )
-    if not wrong:  # else the scans do not agree, whatever the clock
-        wrong = trajectory.check_jumps(recording, effort)
+    wrong = frames.check_still(recording, effort) or frames.check_frames(recording, effort)
+    if not _stops(wrong):
+        wrong += trajectory.check_lengths(recording)
+    if not _stops(wrong):  # else the scans do not agree, whatever the clock
+        wrong += trajectory.check_jumps(recording, effort)
         wrong += check_doppler(recording)
         if config is not None and not any(finding.severity != "note" for finding in wrong):
             wrong += frames.check_clock(recording, effort)
         wrong += before_fit.check_ground(recording)
     found += wrong
-    if config is not None and not any(finding.severity == "error" for finding in found):
+    if config is not None and not _stops(found):
         found += before_fit.check_noise_and_cost(recording, config)
-        if not any(finding.severity == "error" for finding in found):
+        if not _stops(found):
             found += check_drift(recording, config)
     return found
+
+
+def _stops(findings: list[Finding]) -> bool:
+    """Whether a finding is an error."""
+    return any(finding.severity == "error" for finding in findings)
 
 
 def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
