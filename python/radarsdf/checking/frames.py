@@ -33,7 +33,7 @@ _MIN_SIGNIFICANCE = 4.0
 # on good recordings, and the smallest of right ones on broken data.
 _ERROR_GAIN = 0.12
 # To shrink positions, or to take points for points in the world, moves the cells of the sensor onto each other.
-_ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25}
+_ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.08, "clock_offset": _MIN_GAIN}
 # Points in the world frame agree as badly if the poses move them forwards as if backwards. Measured: at most 0.06; on good
 # recordings of a sensor with coarse cells, 0.15 and more.
 _FORWARDS_GAIN = 0.1
@@ -123,7 +123,7 @@ def check_still(recording: Recording, effort: Effort = FULL) -> list[Finding]:
     change = float(far.mean() - near.mean())
     few = min(len(near), len(far)) < _MIN_PAIRS
     error = np.inf if few else float(np.sqrt(near.var(ddof=1) / len(near) + far.var(ddof=1) / len(far)))
-    moved = change > max(_ERROR_GAIN, _MIN_SIGNIFICANCE * error)
+    moved = change > max(_MIN_GAIN, _MIN_SIGNIFICANCE * error)
     evidence = f"All {len(recording)} poses have the same position"
     if moved:
         evidence += (
@@ -203,16 +203,18 @@ def _best(
     upright = np.array([guess.up for guess in guesses]) @ _skewness(recording) > _UPSIDE_DOWN
     # Neighbours first: scans far apart see different things, and agree best where a wrong motion makes their fields
     # of view overlap. What is clearly worse than the data as given for neighbours is not tried on scans farther apart.
+    noted = None
     for lag in np.unique(lags):
         used = lags <= lag
         if used.sum() < _MIN_PAIRS:
             continue
         best = _best_of(guesses, scores[:, used], possible, upright)
-        if best is not None:
+        if best is not None and _severity(best[1], best[0].finding) == "error":
             return best
+        noted = noted or best
         comparison = Comparison.of(scores[0, used], scores[1:, used])
         possible &= (comparison.gains > -_MIN_GAIN) | (comparison.significance > -_MIN_SIGNIFICANCE)
-    return None
+    return noted
 
 
 def _best_of(
