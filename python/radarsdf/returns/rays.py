@@ -203,7 +203,7 @@ def _checked(
             if not np.isfinite(values).all():
                 values = np.where(np.isfinite(values), values, np.float32(np.nan))
         returns = measured(scan)
-        num_rows = len(scan) - np.count_nonzero(returns)
+        num_rows = len(scan) - int(np.count_nonzero(returns))
         if num_rows:
             scan = np.where(returns[:, None], scan, 0.0)
         left_out.given += len(scan)
