@@ -5,12 +5,15 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 
 import numpy as np
 import radarsdf
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checking.doppler import velocity_of_poses
+from radarsdf.io.poses.trajectory import Trajectory
+from scipy.spatial.transform import Rotation
 
 from bench.breakages.ways import NEED_DOPPLER, WAYS, Data, with_other_sign
 from bench.timing import timed
@@ -29,6 +32,8 @@ _FASTEST_MPS = 55.0
 _NAMED, _UNTRIED = "named", "–"
 _GOOD = {name: (range(1, 8), (3, 5, 8, 15, 40)) for name in ("hugin", "oculii", "wall", "astyx")}
 """Seeds and numbers of scans of good recordings."""
+_SLOW_M = (0.02, 0.05, 0.2)
+"""Steps of slow ones."""
 
 
 def simulated(name: str, frames: int, seed: int = 0) -> Data:
@@ -43,6 +48,37 @@ def simulated(name: str, frames: int, seed: int = 0) -> Data:
         speeds = -away @ velocity_mps + rng.normal(0, 0.05, len(scan))
         doppler.append(speeds + np.where(rng.random(len(scan)) < 0.1, 3.0, 0.0))
     return Data(scans.points, scans.poses, scans.intensities, doppler, times_s)
+
+
+def slow(name: str, step_m: float, seed: int = 0, cell: float = 0.0) -> Data:
+    """A simulated place from a sensor that moves `step_m` between 24 scans, after half of them were taken from one position.
+
+    `cell`: range, m, and angles, 0.1 rad, that the sensor rounds to; 0: none.
+    """
+    drive = (dict(radarsdf.simulate.SCENES) | dict(radarsdf.simulate.KINDS))[name](seed=seed, frames=12)
+    usual_m = np.linalg.norm(np.diff(drive.poses[:2, :3, 3], axis=0))
+    at = np.maximum(np.arange(24.0) - 12, 0) * min(step_m / usual_m, 1)
+    along = Trajectory(np.arange(12.0), drive.poses[:, :3, 3], Rotation.from_matrix(drive.poses[:, :3, :3]))
+    scans = radarsdf.simulate.simulate(
+        drive.scene, drive.sensor, along.poses(at, np.inf), name=name, seed=seed
+    )
+    points = scans.points
+    if cell:
+        points = [_rounded(scan, cell) for scan in points]
+    intensities = [values[: len(scan)] for values, scan in zip(scans.intensities, points, strict=True)]
+    return Data(points, scans.poses, intensities)
+
+
+def _rounded(scan: np.ndarray, cell_m: float) -> np.ndarray:
+    """A scan (N, 3) by a sensor with cells, each of which reports one return."""
+    range_m = np.linalg.norm(scan, axis=1)
+    angles = np.stack([np.arctan2(scan[:, 1], scan[:, 0]), np.arcsin(scan[:, 2] / range_m)])
+    azimuth, elevation = 0.1 * np.round(angles / 0.1)
+    range_m = cell_m * np.maximum(np.round(range_m / cell_m), 1)
+    cells = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    return np.unique(np.float32(range_m * cells).T, axis=0)
 
 
 def recorded(path: Path) -> Data:
@@ -97,6 +133,9 @@ def main() -> None:
     if not options.quick:
         for name, (seeds, lengths) in _GOOD.items():
             good |= {f"{name} {f} seed {s}": simulated(name, f, s) for s in seeds for f in lengths}
+        kinds = [*radarsdf.simulate.SCENES, *radarsdf.simulate.KINDS]
+        for name, step_m, cell in itertools.product(kinds, _SLOW_M, (0.0, 0.5)):
+            good[f"{name} {step_m} m a scan, cells of {cell} m"] = slow(name, step_m, cell=cell)
     alarms = {}
     with timed() as taken:
         for name, data in good.items():

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 MAX_POSITION_M = 1e12
 """Largest coordinate, m. Squares of it, and products of three, are far from overflow in float64."""
@@ -164,6 +165,40 @@ def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.fl
         msg = f"pose {int(np.argmin(rigid))} is not a rigid transform ({_RIGID})"
         raise ValueError(msg)
     return T_world_sensor
+
+
+def usable_poses(
+    poses: ArrayLike, num_scans: int | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """:func:`check_poses`, but a minority of poses that are not rigid transforms is replaced by interpolation.
+
+    Returns
+    -------
+    T_world_sensor : ndarray
+        (F, 4, 4) float64, m.
+    rigid : ndarray
+        (F,) bool: which poses are as given. The scans of the others are to be left out.
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong, or half of the poses or more are not rigid transforms.
+    """
+    T_world_sensor = pose_matrices(poses, num_scans)
+    rigid = are_rigid(T_world_sensor)
+    if 2 * np.count_nonzero(~rigid) >= max(len(rigid), 1):
+        return check_poses(T_world_sensor), rigid
+    if not rigid.all():
+        given, known = np.arange(len(rigid)), np.flatnonzero(rigid)
+        at = np.clip(given, known[0], known[-1])
+        filled = np.tile(np.eye(4), (len(rigid), 1, 1))
+        if len(known) > 1:
+            rotations = Slerp(known, Rotation.from_matrix(T_world_sensor[known, :3, :3]))
+            filled[:, :3, :3] = rotations(at).as_matrix()
+        for axis in range(3):
+            filled[:, axis, 3] = np.interp(at, known, T_world_sensor[known, axis, 3])
+        T_world_sensor = np.where(rigid[:, None, None], T_world_sensor, filled)
+    return T_world_sensor, rigid
 
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:

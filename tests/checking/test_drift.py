@@ -13,6 +13,8 @@ from radarsdf.checking.recording import Recording
 from radarsdf.io import Scans
 from radarsdf.simulate import drifted
 
+from tests.conftest import recorded_file
+
 SCANS = 36
 CONFIG = radarsdf.FitConfig(num_threads=1)
 
@@ -39,6 +41,13 @@ def test_a_drift_is_found_with_its_figures(drive):
 def test_true_poses_do_not_drift(drive):
     assert check_drift(recording(drive, drive.poses), CONFIG) == []
     assert check_drift(recording(drive, drive.poses, slice(0, 3)), CONFIG) == []
+
+
+def test_a_gain_without_effect_is_no_drift():
+    with np.load(recorded_file("aimotive_motorway/radar.npz")) as drive:
+        points = np.split(drive["F_LRR_C_points"], np.cumsum(drive["F_LRR_C_counts"])[:-1])
+        poses = drive["F_LRR_C_poses"]
+    assert check_drift(Recording.of(points, poses, None, None, None), CONFIG) == []
 
 
 def test_large_recordings_are_looked_at_in_windows(drive, monkeypatch):

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking.check import check_cheaply
+from radarsdf.checking.frames import FULL, check_frames
 from radarsdf.checking.hypotheses import hypotheses
+from radarsdf.checking.recording import Recording
 from scipy.spatial.transform import Rotation
 
-from tests.conftest import recorded_scans
+from bench.breakages.__main__ import slow
+from tests.conftest import recorded_file, recorded_scans
 
 _CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
@@ -126,6 +129,23 @@ def test_a_slow_sensor_has_no_finding(scans):
     poses = np.repeat(np.eye(4)[None], scans, axis=0)
     poses[:, 0, 3] = 0.02 * np.arange(scans)
     assert worse_than_notes(radarsdf.check(room_of(poses, np.random.default_rng(0)), poses)) == []
+
+
+def test_a_slow_sensor_with_coarse_cells_has_no_finding():
+    data = slow("yard", 0.2, seed=1, cell=0.5)
+    assert worse_than_notes(check_cheaply(data.points, data.poses)) == []
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(-40, None)])
+def test_a_small_gain_is_no_error_however_certain(rows):
+    with np.load(recorded_file("other_simulator/loading_yard.npz")) as yard:
+        points = [yard["points"][yard["frame"] == i] for i in range(len(yard["poses"]))]
+        poses = yard["poses"].astype(np.float64)
+    recording = Recording.of(points[rows], poses[rows], None, None, None)
+    (found,) = check_frames(recording, FULL)
+    assert found.severity == "note"
+    feet = Recording.of(points[rows], with_positions(poses, poses[:, :3, 3] / 0.3048)[rows], None, None, None)
+    assert [(f.name, f.severity) for f in check_frames(feet, FULL)] == [("units", "error")]
 
 
 @pytest.mark.parametrize(("frames", "seed"), [(6, 2), (4, 1), (5, 3), (8, 1)])

@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf.checking.check import check_cheaply
 
 
 @pytest.fixture(scope="module")
@@ -93,12 +94,36 @@ def test_matrices_that_are_no_poses_are_named(good, name, broken, words):
     assert words in found[0].evidence
 
 
-def test_returns_and_scans_that_are_none_are_named(good):
+@pytest.mark.usefixtures("right_frames")
+def test_what_a_fit_leaves_out_is_noted(good):
     points, poses = good
-    hole = points[3].copy()
+    hole, poses = points[3].copy(), poses.copy()
     hole[::2] = np.nan
-    assert names(radarsdf.check([*points[:3], hole, *points[4:]], poses)) == ["returns_not_finite"]
-    assert names(radarsdf.check([*points[:3], hole[:0], *points[4:]], poses)) == ["empty_scans"]
+    padded = [np.concatenate([scan, np.zeros((3 * len(scan), 3))]) for scan in points[:3]]
+    poses[9] = np.nan
+    found = radarsdf.check([*padded, hole, hole[:0], *points[5:]], poses)
+    assert names(found) == ["poses_not_rigid"]
+    assert found[0].evidence.startswith("1 of 30 poses are not finite or not rigid, the first is pose 9")
+    assert {"returns_not_finite", "padding", "empty_scans"} <= {f.name for f in found if f.severity == "note"}
+    none = radarsdf.check([scan[:0] for scan in points], good[1])
+    assert [(finding.name, finding.severity) for finding in none] == [("empty_scans", "error")]
+
+
+@pytest.mark.usefixtures("right_frames")
+def test_utm_coordinates_in_float32_are_named_with_their_steps(good):
+    points, poses = good
+    poses = poses.copy()
+    poses[:, :3, 3] += [4.5e5, 5.4e6, 100.0]
+    assert names(check_cheaply(points, poses)) == []
+    (found,) = [f for f in check_cheaply(points, poses.astype(np.float32)) if f.severity != "note"]
+    assert (found.name, found.severity) == ("positions_rounded", "warning")
+    assert "steps of 0.5 m" in found.evidence
+
+
+@pytest.mark.usefixtures("right_frames")
+def test_a_radar_without_elevation_is_named(good):
+    points, poses = good
+    assert names(check_cheaply([scan * np.float32([1, 1, 0]) for scan in points], poses)) == ["no_elevation"]
 
 
 @pytest.mark.usefixtures("right_frames")

@@ -14,6 +14,7 @@ from radarsdf import FitConfig
 from radarsdf.budget.schedule import Schedule
 from radarsdf.fitting.sampling import Dropout, RaySampler
 from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.rays import prepare
 
 from ..conftest import ground_and_wall
 
@@ -262,15 +263,21 @@ class TestBadInput:
         with pytest.raises(ValueError, match=r"scan 0 must have shape \(N, 3\)"):
             radarsdf.fit([p[:, :2] for p in points], poses)
 
-    def test_values_that_are_not_finite_are_counted(self):
+    def test_rows_that_are_no_returns_are_left_out_and_counted(self, caplog):
         points, poses, intensities = self.scans()
         points[1][3:5, 0] = np.nan
+        points[0] = np.concatenate([points[0], np.zeros((200, 3))])  # as drivers fill clouds of fixed size
+        points[2] = np.concatenate([points[2], np.full((200, 3), -1.0)])
+        intensities[0] = np.concatenate([intensities[0], np.zeros(200)])
+        intensities[2] = np.concatenate([intensities[2], np.zeros(200)])
         intensities[2][7] = np.inf
-        with pytest.raises(ValueError, match="3 of 120 returns are not finite, the first in scan 1"):
-            radarsdf.fit(points, poses, intensities)
+        rays = prepare(points, poses, intensities)
+        assert np.bincount(rays.scans).tolist() == [40, 38, 40]
+        assert np.isnan(rays.intensities).sum() == 1
+        assert "402 of 520 returns" in caplog.text
 
-    @pytest.mark.parametrize("fault", ["scale", "shear", "mirror", "nan", "row"])
-    def test_poses_that_are_not_rigid(self, fault):
+    @pytest.mark.parametrize("fault", ["scale", "shear", "mirror", "nan", "row", "zero"])
+    def test_scans_of_poses_that_are_not_rigid_are_left_out(self, fault, caplog):
         points, poses, _ = self.scans()
         match fault:
             case "scale":
@@ -283,15 +290,23 @@ class TestBadInput:
                 poses[1, 0, 3] = np.nan
             case "row":
                 poses[1, 3, 0] = 1
+            case "zero":
+                poses[1] = 0
+        assert radarsdf.fit(points, poses).report["returns_used"] <= 80
+        assert "1 scans whose pose is not a rigid transform (the first is scan 1)" in caplog.text
+        assert set(prepare(points, poses).scans) == {0, 2}
+        poses[2] = 0
         with pytest.raises(ValueError, match="pose 1 is not a rigid transform"):
             radarsdf.fit(points, poses)
 
-    def test_empty_scans(self):
+    def test_empty_scans(self, caplog):
         points, poses, _ = self.scans()
         with pytest.raises(ValueError, match="no scans"):
             radarsdf.fit([], np.zeros((0, 4, 4)))
-        with pytest.raises(ValueError, match="scan 2 is empty"):
-            radarsdf.fit([*points[:2], np.zeros((0, 3))], poses)
+        assert set(prepare([*points[:2], np.zeros((0, 3))], poses).scans) == {0, 1}
+        assert "1 scans without returns (the first is scan 2)" in caplog.text
+        with pytest.raises(ValueError, match="none of 0 returns"):
+            radarsdf.fit([p[:0] for p in points], poses)
         with pytest.raises(ValueError, match="none of 120 returns"):
             radarsdf.fit([p * 0.01 for p in points], poses)
 

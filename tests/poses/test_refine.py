@@ -184,3 +184,16 @@ def test_wrong_arguments_are_refused(street):
         radarsdf.refine_poses(points, poses, times=[0.0, 2, 1])
     with pytest.raises(ValueError, match="sigma_m"):
         radarsdf.refine_poses(points, poses, sigma_m=-1)
+
+
+def test_scans_that_cannot_be_used_are_left_out():
+    scans = radarsdf.simulate.wall(frames=12)
+    motion = radarsdf.simulate.measured_motion(scans)
+    points, speeds, poses = list(scans.points), list(motion.doppler_mps), scans.poses.copy()
+    points[2], speeds[2], poses[5] = points[2][:0], speeds[2][:0], np.nan
+    refined = radarsdf.refine_poses(points, poses, doppler_mps=speeds, times=motion.times_s)
+    assert np.linalg.norm(refined.poses[5, :3, 3] - scans.poses[5, :3, 3]) < 0.5
+    assert [note.count("scan 2") + 2 * note.count("scan 5") for note in refined.report["notes"]] == [1, 2]
+    found = radarsdf.odometry(points, doppler_mps=speeds, times=motion.times_s)
+    assert np.isfinite(found.poses).all()
+    assert "1 scans without returns (the first is scan 2)" in found.report["notes"][0]

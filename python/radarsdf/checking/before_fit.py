@@ -21,6 +21,24 @@ _BIN_M = 0.25
 _DEPTH_M, _DEPTH_PER_M = 1.0, 0.1  # below the ground by this, and by this share of the range
 _SOME, _MANY = 0.01, 0.1  # share of the close returns. Six real drives have up to 0.063
 _FEW_RETURNS = 100
+_FLAT = 1e-5  # thickness of the plane of the returns over its extent: float32 rounds to 1e-7
+
+
+def check_elevation(recording: Recording) -> list[Finding]:
+    """Tells whether the sensor measures no elevation: then all returns lie in one plane of its frame."""
+    scans = [np.asarray(recording.points[i], np.float64) for i in recording.some_scans().tolist()]
+    points = np.concatenate(scans)
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if len(points) < _FEW_RETURNS or spread[2] > _FLAT * spread[0]:
+        return []
+    return [
+        Finding(
+            "no_elevation",
+            "warning",
+            f"All {len(points)} returns that were compared lie in one plane of the sensor's frame: the radar measures no elevation.",
+            "Read the map from above only: heights of its surface are those of the sensor, not of what it sees.",
+        )
+    ]
 
 
 def check_ground(recording: Recording) -> list[Finding]:

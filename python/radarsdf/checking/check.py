@@ -15,9 +15,10 @@ from radarsdf.checking.drift import check_drift
 from radarsdf.checking.finding import SEVERITIES, Finding
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import Recording
-from radarsdf.checks import MISSING_POSES, instance
+from radarsdf.checks import MISSING_POSES, are_rigid, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans, filled
+from radarsdf.returns.rays import measured
 
 
 def check(
@@ -94,67 +95,68 @@ def _sorted(findings: list[Finding]) -> list[Finding]:
 def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
     """All findings. `config` None: only the cheap ones."""
     found, recording = _usable(recording)
-    found += trajectory.check_rigid(recording)
-    found += trajectory.check_times(recording)
-    if any(finding.name != "times" for finding in found if finding.severity == "error"):
+    if _stops(found):
         return found  # nothing below can be computed
+    found += trajectory.check_times(recording)
+    found += before_fit.check_elevation(recording)
+    found += trajectory.check_rounding(recording)
     found += check_intensities(recording)
     found += trajectory.check_duplicates(recording)
-    wrong = (
-        frames.check_still(recording, effort)
-        or frames.check_frames(recording, effort)
-        or trajectory.check_lengths(recording)
-    )
-    if not wrong:  # else the scans do not agree, whatever the clock
-        wrong = trajectory.check_jumps(recording, effort)
+    wrong = frames.check_still(recording, effort) or frames.check_frames(recording, effort)
+    if not _stops(wrong):
+        wrong += trajectory.check_lengths(recording)
+    if not _stops(wrong):  # else the scans do not agree, whatever the clock
+        wrong += trajectory.check_jumps(recording, effort)
         wrong += check_doppler(recording)
         if config is not None and not any(finding.severity != "note" for finding in wrong):
             wrong += frames.check_clock(recording, effort)
         wrong += before_fit.check_ground(recording)
     found += wrong
-    if config is not None and not any(finding.severity == "error" for finding in found):
+    if config is not None and not _stops(found):
         found += before_fit.check_noise_and_cost(recording, config)
-        if not any(finding.severity == "error" for finding in found):
+        if not _stops(found):
             found += check_drift(recording, config)
     return found
 
 
+def _stops(findings: list[Finding]) -> bool:
+    """Whether a finding is an error."""
+    return any(finding.severity == "error" for finding in findings)
+
+
 def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
-    """Findings about returns that are no numbers and scans without returns, and the recording without them."""
+    """Findings about rows, scans and poses that a fit leaves out, and the recording without them."""
     found = []
-    bad = [~np.isfinite(scan).all(axis=1) for scan in recording.points]
-    count, total = sum(int(mask.sum()) for mask in bad), sum(map(len, bad))
-    if count:
-        found.append(
-            Finding(
-                "returns_not_finite",
-                "error",
-                f"{count} of {total} returns have coordinates that are not finite.",
-                "Leave out these returns.",
-            )
-        )
-        recording = _without(recording, bad)
-    empty = np.array([len(scan) == 0 for scan in recording.points])
+    kept = [measured(scan) for scan in recording.points]
+    finite = sum(int(np.isfinite(scan).all(axis=1).sum()) for scan in recording.points)
+    rows, total = sum(int(mask.sum()) for mask in kept), sum(map(len, kept))
+    left_out = "Nothing needs to be done: a fit leaves them out."
+    for count, name, what in (
+        (total - finite, "returns_not_finite", "have coordinates that are not finite"),
+        (finite - rows, "padding", "are no measurements: 0 0 0, or one point many times in succession"),
+    ):
+        if count > 0:
+            found.append(Finding(name, "note", f"{count} of {total} returns {what}.", left_out))
+    if rows < total:
+        recording = _without(recording, kept)
+    empty = np.array([not mask.any() for mask in kept])
     if empty.any():
-        if not count:
-            found.append(
-                Finding(
-                    "empty_scans",
-                    "error",
-                    f"{int(empty.sum())} of {len(recording)} scans have no returns, the first is scan {int(np.argmax(empty))}.",
-                    "Leave out these scans and their poses.",
-                )
-            )
-        recording = recording.select(np.flatnonzero(~empty))
-    return found, recording
+        evidence = f"{int(empty.sum())} of {len(empty)} scans have no returns, the first is scan {int(np.argmax(empty))}."
+        if empty.all():
+            return [*found, Finding("empty_scans", "error", evidence, "Pass the returns.")], recording
+        found.append(Finding("empty_scans", "note", evidence, left_out))
+    found += trajectory.check_rigid(recording)
+    return found, recording.select(np.flatnonzero(~empty & are_rigid(recording.poses)))
 
 
-def _without(recording: Recording, bad: list[np.ndarray]) -> Recording:
+def _without(recording: Recording, masks: list[np.ndarray]) -> Recording:
+    """The rows of each scan in its mask (N_i,)."""
+
     def kept(arrays: list[np.ndarray] | None) -> list[np.ndarray] | None:
-        return None if arrays is None else [a[~mask] for a, mask in zip(arrays, bad, strict=True)]
+        return None if arrays is None else [a[mask] for a, mask in zip(arrays, masks, strict=True)]
 
     return Recording(
-        [scan[~mask] for scan, mask in zip(recording.points, bad, strict=True)],
+        [scan[mask] for scan, mask in zip(recording.points, masks, strict=True)],
         recording.poses,
         kept(recording.intensities),
         kept(recording.doppler_mps),

@@ -23,20 +23,26 @@ def check_intensities(recording: Recording) -> list[Finding]:
     if recording.intensities is None:
         return []
     whole = np.concatenate(recording.intensities)  # one value in any scan can stretch the scale of all
-    finite = np.isfinite(whole)
+    finite, found = np.isfinite(whole), []
     if not finite.all():
-        return [
+        found = [
             Finding(
                 "intensity_not_finite",
-                "error",
+                "note" if finite.any() else "error",
                 f"{1 - finite.mean():.2%} of the intensities are not finite.",
-                "Leave out these returns, or fit without intensities.",
+                "Nothing needs to be done: a fit leaves them out of the reflectance."
+                if finite.any()
+                else "Fit without intensities.",
             )
         ]
+        whole = whole[finite]
+        if not len(whole):
+            return found
     plausible = Plausible.of(whole)
     wild = whole[~plausible.holds(whole)]
-    found = _wild(wild, whole, plausible) if len(wild) else []
+    found += _wild(wild, whole, plausible) if len(wild) else []
     scans = [np.asarray(recording.intensities[i], np.float64) for i in recording.some_scans()]
+    scans = [scan[np.isfinite(scan)] for scan in scans]
     scans = [scan[plausible.holds(scan)] for scan in scans]
     values = np.concatenate(scans)
     if len(values) == 0:

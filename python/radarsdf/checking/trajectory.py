@@ -13,12 +13,14 @@ from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, rela
 from radarsdf.checking.finding import Finding, Severity
 from radarsdf.checking.frames import FULL, Effort
 from radarsdf.checking.recording import FloatArray, Recording
+from radarsdf.checks import are_rigid
 from radarsdf.poses.rigid import steps, turned_by
 from radarsdf.returns.doppler import folding_interval_mps, sensor_velocity
 
 _MAX_ROTATION_ERROR = 1e-3  # as of the poses that a fit accepts
 # No radar that gives points sees most of them from farther away, and none has most of them at its own housing.
 _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
+_COARSE_M = 0.01  # steps of positions. Smaller ones are less than the noise of any radar
 _FAST_MPS = 100.0  # faster than cars and drones
 _JUMP = 3.0  # times the steps round it
 _ROUND = 3  # steps before and after
@@ -31,7 +33,16 @@ _CAUGHT_UP = 1.5  # times the median step
 
 def check_rigid(recording: Recording) -> list[Finding]:  # noqa: PLR0911 - one for each thing they may be
     """Tells whether the matrices are rigid transforms, and what they may be if not."""
-    poses = recording.poses
+    poses, usable = recording.poses, are_rigid(recording.poses)
+    if 0 < 2 * (~usable).sum() < len(usable):
+        return [
+            Finding(
+                "poses_not_rigid",
+                "warning",
+                f"{int((~usable).sum())} of {len(poses)} poses are not finite or not rigid, the first is pose {int(np.argmin(usable))}.",
+                "A fit leaves out their scans. Make rotations from unit quaternions in the order x y z w.",
+            )
+        ]
     finite = np.isfinite(poses).all(axis=(1, 2))
     if not finite.all():
         return [
@@ -94,6 +105,24 @@ def _not_rigid(evidence: str, mend: str) -> Finding:
     return Finding("poses_not_rigid", "error", evidence, mend)
 
 
+def check_rounding(recording: Recording) -> list[Finding]:
+    """Tells whether the positions were rounded to float32 far from the origin, as with UTM coordinates."""
+    positions = recording.poses[:, :3, 3]
+    rounded = positions.astype(np.float32)
+    step_m = float(np.spacing(np.abs(rounded).max()))
+    if step_m < _COARSE_M or (rounded != positions).any():
+        return []
+    return [
+        Finding(
+            "positions_rounded",
+            "warning",
+            f"The positions of the poses are float32, which has steps of {step_m:.3g} m there: they are off by up to "
+            f"{step_m / 2:.3g} m.",
+            "Keep poses in float64, or subtract an origin before they become float32.",
+        )
+    ]
+
+
 def check_lengths(recording: Recording) -> list[Finding]:
     """Tells whether ranges and speeds can be in metres. The poses must be finite."""
     medians = []
@@ -125,7 +154,14 @@ def check_times(recording: Recording) -> list[Finding]:
     if times is None or len(times) < 2:
         return []
     if not np.isfinite(times).all():
-        return [Finding("times", "error", "Some times are not finite.", "Leave out these scans.")]
+        return [
+            Finding(
+                "times",
+                "warning",
+                f"{int((~np.isfinite(times)).sum())} of {len(times)} times are not finite: none is used.",
+                "Leave out these scans.",
+            )
+        ]
     if recording.ascending_times_s is not None:
         return []
     waits = np.diff(times)

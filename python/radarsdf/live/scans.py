@@ -42,7 +42,7 @@ def checked_scan(
     config: ReturnsConfig,
 ) -> LoggedScan:
     """A scan (N, 3) with what was measured of its returns (N,). Raises a ValueError if it is none. Its pose is not known yet."""
-    scans, values = check_scans([points], None if intensities is None else [intensities])
+    scans, values, _ = check_scans([points], None if intensities is None else [intensities])
     scan = scans[0].copy()
     speeds, standing = None, None
     if doppler_mps is not None:

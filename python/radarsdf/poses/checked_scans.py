@@ -49,18 +49,18 @@ class CheckedScans:
             msg = "Doppler needs times: when each scan was taken, s"
             raise ValueError(msg)
         given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
-        scans, _ = check_scans(given)
+        scans, _, left_out = check_scans(given)
         times_s = None if times is None else _checked_times(times, len(scans))
         begin_s = 0.0 if times_s is None else float(times_s[0])
         times_s = None if times_s is None else times_s - begin_s
         if doppler_mps is None or times_s is None:
-            return cls(scans, times_s, begin_s, None, 0, [])
+            return cls(scans, times_s, begin_s, None, 0, left_out.notes)
         velocities = SensorVelocities.of(scans, checked_doppler(scans, doppler_mps), times_s)
         if velocities is None:
-            return cls(scans, times_s, begin_s, None, 0, [NO_VELOCITY])
+            return cls(scans, times_s, begin_s, None, 0, [*left_out.notes, NO_VELOCITY])
         movers = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
-        return cls(standing, times_s, begin_s, velocities, movers, [])
+        return cls(standing, times_s, begin_s, velocities, movers, left_out.notes)
 
 
 def _checked_times(times: ArrayLike, num_scans: int) -> Floats:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import MISSING_POSES, check_poses, instance, not_negative
+from radarsdf.checks import MISSING_POSES, instance, not_negative, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import DopplerMotion
@@ -22,6 +22,7 @@ from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.rigid import Floats, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
+from radarsdf.returns.rays import LeftOut
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 from radarsdf.threads import Workers
 
@@ -112,7 +113,11 @@ def refine_poses(
         raise ValueError(MISSING_POSES)
     checked = CheckedScans.of(points, doppler_mps, times)
     scans, times_s, velocities = checked.scans, checked.times_s, checked.velocities
-    given = check_poses(poses, len(scans))
+    given, rigid = usable_poses(poses, len(scans))
+    notes = checked.notes
+    if not rigid.all():
+        notes = [*notes, *LeftOut(poses=np.flatnonzero(~rigid).tolist()).notes]
+        scans = [scan if usable else scan[:0] for scan, usable in zip(scans, rigid, strict=True)]
     known = sigma_m is not None, sigma_rad is not None
     unsteady_m, unsteady_rad = unsteadiness(given, times_s)
     sigma_m = max(_FIRST_SIGMA_M, unsteady_m) if sigma_m is None else not_negative(sigma_m, "sigma_m")
@@ -144,7 +149,7 @@ def refine_poses(
         "bias": steps_given.bias.tolist(),
         **moved_by(given, found.poses),
         "noise": vars(found.noise).copy(),
-        "notes": checked.notes,
+        "notes": notes,
         "movers": checked.movers,
         "scans": len(scans),
         "returns": len(returns),

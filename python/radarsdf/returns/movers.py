@@ -47,7 +47,7 @@ class Movers:
         TypeError, ValueError
             If `doppler_mps` are not numbers, their shapes do not fit to `points`, or a fit refuses these.
         """
-        scans, _ = check_scans(points)
+        scans, _, _ = check_scans(points)
         speeds = checked_doppler(scans, doppler_mps)
         none = [np.zeros(len(scan), bool) for scan in scans]
         tried = [i for i, scan in enumerate(scans) if len(scan) >= MIN_DOPPLER_RETURNS]

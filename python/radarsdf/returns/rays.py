@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -16,13 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import (
     MAX_POSITION_M,
     check_equal_numbers,
-    check_poses,
     check_scan_shape,
     check_scan_shapes,
     check_values_of_scan,
     number,
     one_for_each_scan,
+    pose_matrices,
     real_array,
+    usable_poses,
     whole_number,
 )
 from radarsdf.checks import positions as check_positions
@@ -30,6 +32,8 @@ from radarsdf.lattice import WorldLattice
 from radarsdf.products import turned
 from radarsdf.returns.plausible import Plausible
 
+_LOG = logging.getLogger("radarsdf.returns")
+_PADDING = 8  # rows that repeat the one before. Sensors with coarse cells repeat some
 _MISSING: Any = object()  # where there are fewer scans of one kind
 
 
@@ -116,24 +120,70 @@ class Rays:
             yield points.reshape(-1, 3)
 
 
+def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
+    """Mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor itself, and no padding.
+
+    Drivers fill a cloud of fixed size with one point: a row that is repeated at once, many times, measures nothing.
+    """
+    returns: NDArray[np.bool_] = (np.abs(scan) <= MAX_POSITION_M).all(axis=1) & scan.any(axis=1)
+    again = scan[1:, 0] == scan[:-1, 0]
+    if np.count_nonzero(again) >= _PADDING:
+        again &= (scan[1:] == scan[:-1]).all(axis=1)
+        points, counts = np.unique(scan[1:][again], axis=0, return_counts=True)
+        if np.count_nonzero(counts >= _PADDING) == 1:
+            returns &= (scan != points[np.argmax(counts)]).any(axis=1)
+    return returns
+
+
+@dataclass
+class LeftOut:
+    """What of the scans cannot be used."""
+
+    given: int = 0
+    """Number of rows."""
+    rows: int = 0
+    """Number of rows that are no returns: see :func:`measured`."""
+    empty: list[int] = dataclasses.field(default_factory=list)
+    """Scans without returns."""
+    poses: list[int] = dataclasses.field(default_factory=list)
+    """Scans whose pose is not a rigid transform."""
+
+    @property
+    def notes(self) -> list[str]:
+        """A sentence if anything is left out."""
+        parts = [
+            f"{self.rows} of {self.given} returns (not finite, at the sensor, or padding)"
+            if self.rows
+            else "",
+            _named(self.empty, "without returns"),
+            _named(self.poses, "whose pose is not a rigid transform"),
+        ]
+        return [f"Left out: {', '.join(filter(None, parts))}."] if any(parts) else []
+
+
+def _named(scans: list[int], what: str) -> str:
+    return f"{len(scans)} scans {what} (the first is scan {scans[0]})" if scans else ""
+
+
 def check_scans(
     points: Iterable[ArrayLike], intensities: Iterable[ArrayLike] | None = None
-) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None]:
-    """Scans (N_i, 3) and intensities (N_i,) as arrays, if :func:`prepare` takes them; else its ValueError."""
-    checked = list(_checked(points, intensities))
+) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None, LeftOut]:
+    """Scans (N_i, 3) and intensities (N_i,) as arrays, if :func:`prepare` takes them; else its ValueError.
+
+    Rows that are no returns become 0 0 0, so that all arrays of a scan keep their length; intensities that are not
+    finite become NaN.
+    """
+    left_out = LeftOut()
+    checked = list(_checked(points, intensities, left_out))
     values = None if intensities is None else [value for _, value in checked if value is not None]
-    return [scan for scan, _ in checked], values
+    return [scan for scan, _ in checked], values, left_out
 
 
 def _checked(
-    points: Iterable[ArrayLike], intensities: Iterable[ArrayLike] | None
+    points: Iterable[ArrayLike], intensities: Iterable[ArrayLike] | None, left_out: LeftOut
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32] | None]]:
-    """One scan (N_i, 3) after another, with its intensities (N_i,): only one is in float64 at a time.
-
-    Raises the ValueError of :func:`prepare` where a scan is none, and in the end for returns that are not finite: it says
-    how many they are.
-    """
-    num_scans = num_values = num_returns = num_bad = first_bad = 0
+    """:func:`check_scans`, one scan after another: only one is in float64 at a time."""
+    num_scans = num_values = 0
     both = zip_longest(
         points,
         () if intensities is None else one_for_each_scan(intensities, "intensities"),
@@ -146,29 +196,25 @@ def _checked(
             continue  # they are only counted
         scan = real_array(given, f"scan {i}")
         check_scan_shape(scan, i)
-        if len(scan) == 0:
-            msg = f"scan {i} is empty: leave out the scan and its pose"
-            raise ValueError(msg)
         values = None
         if intensities is not None:
             values = real_array(given_values, f"intensities of scan {i}", np.float32)
             check_values_of_scan(values, scan, "intensities", i)
-        num_returns += len(scan)
-        # A question for all, NaN among them: one for each return takes five times as long.
-        if not (np.abs(scan).max() <= MAX_POSITION_M and (values is None or np.isfinite(values).all())):
-            fine = (np.abs(scan) <= MAX_POSITION_M).all(axis=1)
-            fine &= True if values is None else np.isfinite(values)
-            first_bad = first_bad if num_bad else i
-            num_bad += len(fine) - int(fine.sum())
-        if not num_bad:
-            yield scan, values
+            if not np.isfinite(values).all():
+                values = np.where(np.isfinite(values), values, np.float32(np.nan))
+        returns = measured(scan)
+        num_rows = len(scan) - int(np.count_nonzero(returns))
+        if num_rows:
+            scan = np.where(returns[:, None], scan, 0.0)
+        left_out.given += len(scan)
+        left_out.rows += num_rows
+        if num_rows == len(scan):
+            left_out.empty.append(i)
+        yield scan, values
     if num_scans == 0:
         check_scan_shapes([])
     if intensities is not None:
         check_equal_numbers(num_values, num_scans, "intensities")
-    if num_bad:
-        msg = f"{num_bad} of {num_returns} returns are not finite, the first in scan {first_bad}: remove them"
-        raise ValueError(msg)
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -236,16 +282,20 @@ def prepare(
     Raises
     ------
     ValueError
-        If lengths or shapes do not match, a scan is empty, a return or an intensity is not finite, a pose is
-        not rigid, all intensities are equal or are too far apart for float32, or no return is within the
-        ranges.
+        If lengths or shapes do not match, half of the poses or more are not rigid, all intensities are equal or are too
+        far apart for float32, or no return is within the ranges.
+
+    Notes
+    -----
+    Rows that are no returns (not finite, 0 0 0, padding), and scans whose pose is not rigid, are left out. They are counted
+    in a warning of the logger ``radarsdf.returns``. Intensities that are not finite are NaN.
     """
     # Of an iterator, the number of scans is known only in the end.
     points = one_for_each_scan(points, "points")
     num_scans = len(points) if isinstance(points, Sized) else len(np.atleast_1d(real_array(poses, "poses")))
     if num_scans == 0:
         check_scan_shapes([])
-    T_world_sensor = check_poses(poses, num_scans)
+    T_world_sensor, rigid = usable_poses(poses, num_scans)
     positions = T_world_sensor[:, :3, 3]
     if origin is not None:
         local_origin = check_positions(real_array(origin, "origin")[None], "origin")[0]
@@ -258,14 +308,13 @@ def prepare(
     whole_number(accumulate_scans, "accumulate_scans", 1)
 
     kept: list[list[Any]] = [[], [], [], []]
-    number_of_scan, num_given = 0, 0
-    for i, (scan, of_scan) in enumerate(_checked(points, intensities)):
+    number_of_scan, left_out = 0, LeftOut(poses=np.flatnonzero(~rigid).tolist())
+    for i, (scan, of_scan) in enumerate(_checked(points, intensities, left_out)):
         number_of_scan = i + 1
         if number_of_scan > num_scans:
             continue  # it is only counted
-        num_given += len(scan)
         seen_from = positions[middle_scan(i, num_scans, accumulate_scans)]
-        keep = within_ranges(scan, min_range_m, max_range_m)
+        keep = within_ranges(scan, min_range_m, max_range_m) & rigid[i]
         values = None if of_scan is None else of_scan[keep]
         local = turned(scan if keep.all() else scan[keep], T_world_sensor[i, :3, :3])
         local += positions[i] - local_origin
@@ -273,14 +322,19 @@ def prepare(
         for column, part in zip(kept, (local.astype(np.float32), *polar, values), strict=True):
             if part is not None:
                 column.append(part)
-    check_poses(poses, number_of_scan)
+    pose_matrices(poses, number_of_scan)
     counts = [len(part) for part in kept[0]]
     if sum(counts) == 0 and whole:
-        msg = f"none of {num_given} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
-        raise ValueError(msg)
+        msg = f"none of {left_out.given} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
+        raise ValueError("; ".join([msg, *left_out.notes]))
+    for note in left_out.notes if whole else ():
+        _LOG.warning(note)
     intensity = None if intensities is None else _joined(kept[3])
     if intensity is not None and whole:
         intensity = Plausible.of(intensity).kept(intensity)
+        if np.isnan(intensity).all():
+            msg = "no intensity is finite: leave them out if the sensor does not measure them"
+            raise ValueError(msg)
         check_range(float(np.nanmin(intensity)), float(np.nanmax(intensity)))
     return Rays(
         origin=local_origin,
@@ -290,7 +344,7 @@ def prepare(
         intensities=intensity,
         scans=np.repeat(np.arange(num_scans, dtype=np.int32), counts),
         up_of_scan=T_world_sensor[:, :3, 2].copy(),
-        num_given=num_given,
+        num_given=left_out.given,
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import check_poses, number, real_array
+from radarsdf.checks import number, real_array, usable_poses
 from radarsdf.io.scans import Scans
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.plausible import Plausible
@@ -169,7 +169,7 @@ class Sensor:
     @classmethod
     def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:
         """The sensor that took `rays`, with poses (F, 4, 4) T_world_sensor, m: :meth:`of` the same returns."""
-        T_world_sensor = check_poses(poses, len(rays.up_of_scan))
+        T_world_sensor, _ = usable_poses(poses, len(rays.up_of_scan))
         rows = np.arange(0, len(rays), -(-len(rays) // _MAX_RETURNS))
         scans = rays.scans[rows]
         # Coordinate by coordinate: a matrix for each return takes three times as long.

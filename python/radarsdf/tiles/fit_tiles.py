@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor
@@ -15,13 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from radarsdf.checks import flag, instance, one_for_each_scan, path_of, positive
+from radarsdf.checks import are_rigid, flag, instance, one_for_each_scan, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.io.files import write_whole
 from radarsdf.io.poses.reading import UNPOSED, NoPoses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.returns.noise import NOISE_SETTINGS
+from radarsdf.returns.rays import LeftOut
 from radarsdf.tiles.drive_poses import POSES, TRAJECTORY, DrivePoses, DriveToPose
 from radarsdf.tiles.grid import TileGrid
 from radarsdf.tiles.input_digest import InputDigest
@@ -33,6 +35,7 @@ from radarsdf.tiles.running import run_tasks
 from radarsdf.tiles.tile_fit import fit_tile, is_done
 from radarsdf.tiles.tiled_map import TiledMap
 
+_LOG = logging.getLogger("radarsdf.tiles")
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
 _OURS = {PLAN, LOCK, POSES, TRAJECTORY, TILES, SCANS_FILE}
@@ -171,7 +174,7 @@ def _given(
             scans = read(path, UNPOSED if find else None)
         except NoPoses:
             scans, find = read(path, UNPOSED), True
-    checked = _Checked(scans)
+    checked = _Checked(scans, with_poses=not find)
     if not (refine or find):
         return None, checked
     if iter(scans) is scans:
@@ -228,12 +231,16 @@ def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> Til
 
 
 class _Checked:
-    """Scans, checked one after another each time that they are read."""
+    """Scans, checked one after another each time that they are read.
 
-    def __init__(self, scans: Iterable[Any]) -> None:
-        self._scans = scans
+    `with_poses`: those whose pose is not a rigid transform are left out.
+    """
+
+    def __init__(self, scans: Iterable[Any], *, with_poses: bool) -> None:
+        self._scans, self._with_poses = scans, with_poses
 
     def __iter__(self) -> Iterator[Scan]:
+        rigid = []
         for i, scan in enumerate(one_for_each_scan(self._scans, "scans")):
             if not isinstance(scan, Scan):
                 msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
@@ -241,7 +248,15 @@ class _Checked:
             if np.shape(scan.T_world_sensor) != (4, 4):
                 msg = f"scan {i} has no pose: T_world_sensor must be (4, 4), not {np.shape(scan.T_world_sensor)}"
                 raise ValueError(msg)
-            yield scan
+            rigid.append(not self._with_poses or bool(are_rigid(np.asarray(scan.T_world_sensor)[None])[0]))
+            if rigid[-1]:
+                yield scan
+        bad = np.flatnonzero(~np.array(rigid, bool)).tolist()
+        if bad and 2 * len(bad) >= len(rigid):
+            msg = f"{len(bad)} of {len(rigid)} poses are not rigid transforms, the first is pose {bad[0]}"
+            raise ValueError(msg)
+        for note in LeftOut(poses=bad).notes:
+            _LOG.warning(note)
 
 
 def _check_same(folder: Path, plan: Plan, config: FitConfig, grid: TileGrid, digest: str) -> None:
