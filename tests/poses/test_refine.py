@@ -197,3 +197,30 @@ def test_scans_that_cannot_be_used_are_left_out():
     found = radarsdf.odometry(points, doppler_mps=speeds, times=motion.times_s)
     assert np.isfinite(found.poses).all()
     assert "1 scans without returns (the first is scan 2)" in found.report["notes"][0]
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_zeros_for_doppler_do_not_draw_true_poses_together(share):
+    drive = radarsdf.simulate.hugin(seed=8, frames=30)
+    motion, rng = radarsdf.simulate.measured_motion(drive), np.random.default_rng(0)
+    speeds = [np.where(rng.random(len(v)) < share, 0.0, v) for v in motion.doppler_mps]
+    found = radarsdf.refine_poses(drive.points, drive.poses, doppler_mps=speeds, times=motion.times_s)
+    np.testing.assert_array_equal(found.poses, drive.poses)
+    assert f"{share:.0%}" in found.report["notes"][0]
+
+
+def test_doppler_that_contradicts_the_given_poses_is_left_out(street):
+    motion = radarsdf.simulate.measured_motion(street)
+    speeds = [0.2 * v for v in motion.doppler_mps]
+    found = radarsdf.refine_poses(street.points, street.poses, doppler_mps=speeds, times=motion.times_s)
+    np.testing.assert_array_equal(found.poses, street.poses)
+    assert "contradicts 64%" in found.report["notes"][0]
+
+
+def test_covariance_of_kept_poses_spans_those_that_were_not_excluded(street):
+    one = [street.points[i] if i == 12 else points[:9] for i, points in enumerate(street.points)]
+    given = drifted(street.poses, 0.05, 0.004, 1)
+    found = radarsdf.refine_poses(one, given)
+    assert not found.improved
+    variances = np.einsum("fii->f", found.covariance[:, :3, :3])
+    assert variances[[0, -1]].min() > found.report["moved_m"] ** 2 / 4

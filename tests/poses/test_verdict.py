@@ -3,6 +3,7 @@
 """Tests of what decides whether poses are better."""
 
 import numpy as np
+import radarsdf
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.verdict import Verdict
 from radarsdf.returns.noise import SensorNoise
@@ -14,6 +15,20 @@ def test_one_thing_that_moves_does_not_call_poses_improved():
     assert one.gain > 0
     assert not one.improved
     assert many.improved
+
+
+def test_scans_on_top_of_each_other_do_not_agree_better():
+    drive = radarsdf.simulate.KINDS["tunnel"](seed=8, frames=30)
+    returns = SensorReturns.of(drive.points, 0.1, None)
+    held = np.random.default_rng(0).random(len(returns)) < 0.2
+    for share in (0.0, 0.3, 0.6):  # of the distance driven
+        after = drive.poses.copy()
+        after[:, :3, 3] *= share
+        verdict = Verdict.of(
+            returns.select(held), returns.select(~held), drive.poses, after, SensorNoise(0.1, 0.01, 0.01)
+        )
+        assert verdict.gain > 0  # their density alone says so
+        assert not verdict.improved
 
 
 def _verdict(things: int) -> Verdict:

@@ -24,6 +24,7 @@ _ERRORS = 3.0  # standard errors of a difference that is no chance
 # Measured (Astyx drives): a velocity is off by more than its returns say, since they are not independent. So is one of
 # elevations that all have the same error.
 LEAST_MPS = 0.02
+_COMPARED = 8  # steps, over which errors of single poses are small
 _LEAST_STEP_M = 1e-4  # deviation of a step, to divide by
 
 
@@ -133,6 +134,24 @@ class DopplerMotion(Motion):
             turn = rotation_vector(step[:3, :3], self.turns[i])
             step[:3, 3] = way(turn, means[i], means[i + 1], float(self.durations_s[i]))
         return dataclasses.replace(self, steps=between)
+
+
+def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
+    """Share of the squared displacements of poses (F, 4, 4), over some steps each, that the velocities contradict.
+
+    0 where they contradict no more than their own errors.
+    """
+    ways = np.einsum("fij,fj->fi", poses[:-1, :3, :3], motion.steps[:, :3, 3])
+    count = min(_COMPARED, len(ways))
+    measured, variance = (
+        np.diff(np.pad(np.cumsum(rows, axis=0), ((1, 0), (0, 0)))[::count], axis=0)
+        for rows in (ways, motion.shares[:, :3])
+    )
+    given = np.diff(poses[::count, :3, 3], axis=0)
+    squares = float(((measured - given) ** 2).sum())
+    if squares <= _ERRORS**2 * float(variance.sum()):
+        return 0.0
+    return squares / max(float((given**2).sum()), float((measured**2).sum()))
 
 
 def _likely_turns(velocities: SensorVelocities, durations_s: Floats, given: Floats) -> Floats:

@@ -14,6 +14,7 @@ from radarsdf.checks import real_array
 from radarsdf.io.scans import Scans, filled
 from radarsdf.poses.by_doppler import SensorVelocities
 from radarsdf.poses.rigid import Floats
+from radarsdf.returns.doppler import without_filler
 from radarsdf.returns.movers import checked_doppler
 from radarsdf.returns.rays import check_scans
 
@@ -55,12 +56,14 @@ class CheckedScans:
         times_s = None if times_s is None else times_s - begin_s
         if doppler_mps is None or times_s is None:
             return cls(scans, times_s, begin_s, None, 0, left_out.notes)
-        velocities = SensorVelocities.of(scans, checked_doppler(scans, doppler_mps), times_s)
+        speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
+        notes = left_out.notes if filler is None else [*left_out.notes, f"{filler}."]
+        velocities = SensorVelocities.of(scans, speeds, times_s)
         if velocities is None:
-            return cls(scans, times_s, begin_s, None, 0, [*left_out.notes, NO_VELOCITY])
+            return cls(scans, times_s, begin_s, None, 0, [*notes, NO_VELOCITY])
         movers = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
-        return cls(standing, times_s, begin_s, velocities, movers, left_out.notes)
+        return cls(standing, times_s, begin_s, velocities, movers, notes)
 
 
 def _checked_times(times: ArrayLike, num_scans: int) -> Floats:

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import MISSING_POSES, instance, not_negative, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
-from radarsdf.poses.by_doppler import DopplerMotion
+from radarsdf.poses.by_doppler import DopplerMotion, unexplained_motion
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
@@ -29,6 +30,7 @@ from radarsdf.threads import Workers
 # The least errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees
 # end with the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
 _FIRST_SIGMA_M, _FIRST_SIGMA_RAD = 0.1, 0.01
+_CONTRADICTED = 0.5  # share of the squared motion, from which on Doppler and poses cannot be of one drive
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class RefinedPoses:
     """(F, 4, 4) T_world_sensor: the refined poses if they are an improvement, else the given ones. As a whole, they are
     neither moved nor turned: mean position and mean rotation are those of the given poses."""
     covariance: Floats
-    """(F, 6, 6) of the refined poses, relative to that of the scan in the middle: translation, m, and rotation vector about
+    """(F, 6, 6) of `poses`, relative to that of the scan in the middle: translation, m, and rotation vector about
     the sensor, rad, in world axes. Loops over more than 32 scans are left out, so it is rather too large there."""
     improved: bool
     """Whether returns that took no part agree better with those of other scans, by more than chance gives one of a thousand."""
@@ -114,9 +116,9 @@ def refine_poses(
     checked = CheckedScans.of(points, doppler_mps, times)
     scans, times_s, velocities = checked.scans, checked.times_s, checked.velocities
     given, rigid = usable_poses(poses, len(scans))
-    notes = checked.notes
+    notes = [*checked.notes]
     if not rigid.all():
-        notes = [*notes, *LeftOut(poses=np.flatnonzero(~rigid).tolist()).notes]
+        notes += LeftOut(poses=np.flatnonzero(~rigid).tolist()).notes
         scans = [scan if usable else scan[:0] for scan, usable in zip(scans, rigid, strict=True)]
     known = sigma_m is not None, sigma_rad is not None
     unsteady_m, unsteady_rad = unsteadiness(given, times_s)
@@ -132,7 +134,14 @@ def refine_poses(
     if velocities is not None and times_s is not None:
         if (velocities.mean_mps[:-1] * steps(given)[:, :3, 3]).sum() < 0:
             velocities = velocities.turned
-        motions.append(DopplerMotion.by(velocities, times_s, given))
+        motion = DopplerMotion.by(velocities, times_s, given)
+        if (unexplained := unexplained_motion(motion, given)) < _CONTRADICTED:
+            motions.append(motion)
+        else:
+            notes.append(
+                f"The Doppler is not used: it contradicts {unexplained:.0%} of the motion of the given poses. If it is right, "
+                "leave the poses out: radarsdf.odometry"
+            )
     cell_m = LEAVES_PER_SURFEL * config.leaf_size_m
     with Workers(config.num_threads) as workers:
         held = held_out(len(returns), config.seed)
@@ -156,9 +165,21 @@ def refine_poses(
         "rounds": found.rounds,
         "seconds": time.perf_counter() - begin,
     }
-    return RefinedPoses(
-        found.poses if verdict.improved else given, found.covariance, verdict.improved, report
+    if verdict.improved:
+        return RefinedPoses(found.poses, found.covariance, True, report)
+    # Neither trajectory is excluded, so the errors of the given one may be as large as their difference.
+    return RefinedPoses(given, found.covariance + _squared_differences(given, found.poses), False, report)
+
+
+def _squared_differences(given: Floats, found: Floats) -> Floats:
+    """(F, 6, 6) outer products of the increments from given poses to others, once the scans in the middle coincide."""
+    middle = len(given) // 2
+    placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found[middle]), found)
+    turns = np.einsum("fij,fkj->fik", placed[:, :3, :3], given[:, :3, :3])
+    increments = np.concatenate(
+        [placed[:, :3, 3] - given[:, :3, 3], Rotation.from_matrix(turns).as_rotvec()], axis=1
     )
+    return np.einsum("fi,fj->fij", increments, increments)
 
 
 def _kept(given: Floats, returns: int, why: str, begin: float) -> RefinedPoses:

@@ -33,6 +33,8 @@ _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimat
 # Of the last scans, that it is estimated from: so many tell a deviation to a percent. With all 25 scans of 2,000 returns, it took
 # three times as long as a scan.
 _NOISE_RETURNS = 10_000
+_SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells: further than returns of one thing reach
+_SURE = 0.05  # cells: deviation of an expected translation that needs no returns
 _LEAST_VARIANCE = 1e-12
 _PARTS = slice(0, 3), slice(3, 6)  # of an increment: translation, rotation
 
@@ -153,9 +155,34 @@ class Tracker:
         middle = self.last.pose @ expected.pose(turn)
         prior = self._in_world(expected.covariance(turn)) + _LEAST_VARIANCE * np.eye(6)
         pose, covariance, agreeing = self._settled(scan, middle if start is None else start, middle, prior)
+        covariance = self._without_chance(scan, pose, prior, covariance)
         turned = rotation_vector(self.last.pose[:3, :3].T @ pose[:3, :3], turn)
         told = tuple(_taken_away(prior[part, part], covariance[part, part]) for part in _PARTS)
         return Tracked(pose, covariance, agreeing, self.last.piece, turned, (told[0], told[1]))
+
+    def _without_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
+        """The covariance without what returns seem to say along the least certain axis wherever the scan is put.
+
+        Along a tunnel, returns match walls everywhere, and some of the matches hold the scan by chance.
+        """
+        assert self._noise is not None
+        cell_m = _CELLS[-1] * self.cell_size_m
+        axis = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
+        before, left = axis @ prior[:3, :3] @ axis, axis @ covariance[:3, :3] @ axis
+        if before < (_SURE * cell_m) ** 2:
+            return covariance
+        information = []
+        for shift in _SHIFTS:
+            shifted = pose.copy()
+            shifted[:3, 3] += shift * cell_m * axis
+            hessian, gradient, doubt, _ = self._planes[-1].beside(scan, shifted, self._noise.variances)
+            hessian, _ = _told(hessian, gradient, doubt)
+            information.append(1 / (axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis))
+        chance = min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
+        widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
+        covariance = covariance.copy()
+        covariance[:3, :3] += max(widened, 0.0) * np.outer(axis, axis)
+        return covariance
 
     def _settled(
         self, scan: Floats, pose: Floats, middle: Floats, prior: Floats
@@ -183,24 +210,28 @@ class Tracker:
     def _searched(
         self, scan: Floats, expected: ExpectedStep, capture_m: float, radius_m: float
     ) -> Tracked | None:
-        """The best of many poses, if the returns agree there clearly better than at places where the sensor cannot be."""
+        """The best of many poses, if the returns agree there clearly better than at any other place and where it cannot be."""
         assert self.last is not None
         assert self._noise is not None
         coarse, variances = self._planes[0], self._noise.variances
         asked = thinned(scan, _SEARCHED)
         turns, steps = expected.candidates(capture_m, radius_m)
         poses = np.ascontiguousarray(np.einsum("ij,kjl->kil", self.last.pose, steps))
-        found = [
-            self._fitted(scan, expected, turns[i], poses[i]) for i in _best(coarse, asked, poses, variances)
-        ]
+        scores = coarse.scores(asked, poses, variances).mean(axis=1)
+        best = _best(scores)
+        # In a scene that repeats itself, the best poses may all be near one place, and the true one be another.
+        elsewhere = np.flatnonzero(_apart_m(poses, poses[best[0]], radius_m) > 2 * capture_m)
+        best += elsewhere[_best(scores[elsewhere])].tolist()
+        found = [self._fitted(scan, expected, turns[i], poses[i]) for i in best]
         at = np.stack([one.pose for one in found])
         chance = self._elsewhere()
-        chance = chance[_best(coarse, asked, chance, variances)]
-        scores, by_chance = (coarse.scores(asked, poses, variances) for poses in (at, chance))
-        best = int(np.argmax(scores.mean(axis=1)))
-        gains = scores[best] - by_chance
+        chance = chance[_best(coarse.scores(asked, chance, variances).mean(axis=1))]
+        of_found, by_chance = (coarse.scores(asked, tried, variances) for tried in (at, chance))
+        first = int(np.argmax(of_found.mean(axis=1)))
+        rivals = of_found[_apart_m(at, at[first], radius_m) > capture_m]
+        gains = of_found[first] - np.concatenate([by_chance, rivals])
         clear = gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(asked))
-        return found[best] if clear.all() else None
+        return found[first] if clear.all() else None
 
     def _elsewhere(self) -> Floats:
         """(_ELSEWHERE, 4, 4) upright poses among those of the last scans, that look anywhere but where they looked."""
@@ -228,14 +259,20 @@ def _taken_away(prior: Floats, covariance: Floats) -> float:
     """Share of the variance before that is gone, in the direction where it is least."""
     root = np.linalg.cholesky(prior)
     left = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
-    return 1 - float(np.linalg.eigvalsh(left)[-1])
+    return max(1 - float(np.linalg.eigvalsh(left)[-1]), 0.0)
 
 
-def _best(planes: LocalPlanes, scan: Floats, poses: Floats, variances: list[float]) -> list[int]:
-    """Rows of the poses on which most returns agree."""
-    scores = planes.scores(scan, poses, variances).mean(axis=1)
+def _best(scores: Floats) -> list[int]:
+    """Rows of the highest scores."""
     rows: list[int] = np.argsort(-scores, kind="stable")[:_FOLLOWED].tolist()
     return rows
+
+
+def _apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
+    """(K,) by how far poses (K, 4, 4) move a return at this range from where another pose puts it, m, at most."""
+    turns = Rotation.from_matrix(np.einsum("kij,lj->kil", poses[:, :3, :3], pose[:3, :3])).magnitude()
+    apart: Floats = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) + radius_m * turns
+    return apart
 
 
 def _told(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:

@@ -19,10 +19,12 @@ from radarsdf.returns.noise import SensorNoise
 _NEIGHBOURS = 16  # of a return, of which those of other scans make the density there
 _MOST_RETURNS = 20_000  # that are asked
 _BY_CHANCE = 1e-3  # probability that true poses seem improved
-# However certain, a smaller gain is none. Measured: up to 0.0003 with true poses, 0.004 and more where a drift of 0.02 m and 0.1
+# However certain, a smaller gain is none. Measured: up to 0.0006 with true poses, 0.0015 and more where a drift of 0.01 m and 0.05
 # degrees a step is found.
-_LEAST_GAIN = 0.002
+_LEAST_GAIN = 0.001
 _HELD_OUT = 0.2  # of the returns
+_NEARBY = 0.5  # edge, likewise, of a cell whose returns of other scans only say that scans overlap there
+_MOST_COUNTED = 100_000  # returns of these cells
 _PLACE = 0.25  # edge of a place, in median ranges: what is seen as one thing from near and far is smaller
 
 
@@ -42,13 +44,17 @@ class Verdict:
     """Its standard error."""
     parts: int
     """Number of scans that tell it, or of places, if these are fewer."""
+    crowding: float = 0.0
+    """The same gain of the density in cells that are far larger than errors of poses. Where scans are drawn together, on
+    top of each other in the end, all densities rise, whether or not surfaces agree."""
 
     @property
     def needed(self) -> float:
-        """The gain that matters and is no chance: Student's t. With few scans or places, the standard error is uncertain, too."""
+        """The gain that matters and that neither chance nor crowding explains: Student's t, since of few scans or places the standard error
+        is uncertain, too."""
         if self.parts < 2:
             return np.inf
-        return max(_LEAST_GAIN, float(student.ppf(1 - _BY_CHANCE, self.parts - 1)) * self.error)
+        return max(_LEAST_GAIN, float(student.ppf(1 - _BY_CHANCE, self.parts - 1)) * self.error, self.crowding)
 
     @property
     def improved(self) -> bool:
@@ -58,7 +64,9 @@ class Verdict:
     @property
     def words(self) -> str:
         """One sentence."""
-        figures = f"their density changes by {self.gain:+.2%}, by chance, or without effect, up to {self.needed:.2%}"
+        figures = (
+            f"their density changes by {self.gain:+.2%}, by chance and overlap alone up to {self.needed:.2%}"
+        )
         if self.improved:
             return f"The refined poses make a sharper map: returns that took no part agree better with those of other scans ({figures})."
         return f"The given poses are kept: returns that took no part do not agree better with those of other scans ({figures})."
@@ -84,7 +92,8 @@ class Verdict:
         parts = min(by_scans.parts, int(places.max()) + 1)
         if parts < 2:
             return cls(0.0, np.inf, parts)
-        return cls(by_scans.gain, max(by_scans.error, _error_of_places(gains, places)), parts)
+        crowding = cls.by_groups(_crowding(asked, used, before, after), asked.scans).gain
+        return cls(by_scans.gain, max(by_scans.error, _error_of_places(gains, places)), parts, crowding)
 
     @classmethod
     def by_groups(cls, gains: Floats, groups: NDArray[np.integer[Any]]) -> Verdict:
@@ -121,6 +130,27 @@ def _gains(
     then = _Neighbours.of(asked, used, after).density(of_asked, of_used)
     gains: Floats = np.log((then + floor) / (density + floor))
     return gains
+
+
+def _crowding(asked: SensorReturns, used: SensorReturns, before: Floats, after: Floats) -> Floats:
+    """(N,) by how much the logarithm of the number of other scans' returns in the cell of each asked return rises."""
+    edge_m = _NEARBY * float(np.median(asked.ranges_m))
+    used = used.every(-(-len(used) // _MOST_COUNTED))
+    counts = []
+    for poses in (before, after):
+        points = np.concatenate([asked.posed(poses).points, used.posed(poses).points])
+        cells = np.unique(np.floor(points / edge_m), axis=0, return_inverse=True)[1].ravel()
+        of_asked, of_used = np.split(cells, [len(asked)])
+        own, of_scan = (
+            cell * len(poses) + scan for cell, scan in ((of_asked, asked.scans), (of_used, used.scans))
+        )
+        scan_cells, of_scans = np.unique(of_scan, return_counts=True)
+        place = np.searchsorted(scan_cells, own).clip(max=len(scan_cells) - 1)
+        in_cell = np.bincount(of_used, minlength=int(cells.max()) + 1)[of_asked]
+        counts.append(in_cell - np.where(scan_cells[place] == own, of_scans[place], 0))
+    floor = max(float(np.median(counts[0])), 1.0)
+    crowding: Floats = np.log((counts[1] + floor) / (counts[0] + floor))
+    return crowding
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,10 @@ _SIGMA_MPS = 0.15  # a return is off if its Doppler differs by three times the n
 _ROUNDS = 4
 _MIN_AGREEING = 0.4  # share of the returns that must agree on a velocity
 _MAX_CONDITION = 1e3  # of the normal equations: returns in one direction tell no velocity
+_FILLER = 0.2  # share of all returns with one and the same speed, from which on it may be none
+_ONLY_FILLER = (
+    0.9  # likewise, from which on a sensor that stands still cannot be told from one that does not measure
+)
 _FOLDS = (-1.0, 0.0, 1.0)  # intervals by which all three returns of a draw may be folded
 
 
@@ -175,3 +179,37 @@ def sensor_velocities(
     agreeing = [sum(int(velocity.static.sum()) for velocity in found) for found in choices]
     # Folding lets more returns agree by chance, so that it must explain clearly more.
     return choices[-1] if agreeing[-1] > 1.2 * agreeing[0] else choices[0]
+
+
+def without_filler(
+    points: Sequence[NDArray[Any]], doppler_mps: Sequence[NDArray[Any]]
+) -> tuple[list[FloatArray], str | None]:
+    """Doppler of K scans with NaN where a driver wrote a fixed value because it measured none, and a note on that.
+
+    Many equal speeds are a filler if the other returns show a velocity of the sensor that contradicts them, or if there are
+    hardly any others. A sensor that stands still and resolves speeds coarsely has many equal ones, too.
+    """
+    speeds = [np.asarray(values, np.float64) for values in doppler_mps]
+    values, counts = np.unique(np.concatenate([v[np.isfinite(v)] for v in speeds]), return_counts=True)
+    if len(values) == 0 or counts.max() < _FILLER * counts.sum():
+        return speeds, None
+    filler, share = values[counts.argmax()] + 0.0, counts.max() / counts.sum()  # + 0.0: not -0
+    others = [np.where(v == filler, np.nan, v) for v in speeds]
+    contradicting, asked = 0, 0
+    for x, v, velocity in zip(points, speeds, sensor_velocities(points, others), strict=True):
+        filled = (v == filler) & x.any(axis=1)
+        if velocity.found and filled.any():
+            away = -x[filled] / np.linalg.norm(x[filled], axis=1)[:, None]
+            contradicting += int(
+                (
+                    np.abs(product(velocity.velocity_mps[None], np.ascontiguousarray(away.T)) - filler)
+                    > 3 * _SIGMA_MPS
+                ).sum()
+            )
+            asked += int(filled.sum())
+    if 2 * contradicting > asked or (asked == 0 and share > _ONLY_FILLER):
+        return (
+            others,
+            f"{share:.0%} of the Doppler values are {filler:g} m/s: they were not measured, and are left out",
+        )
+    return speeds, None

@@ -15,7 +15,7 @@ from radarsdf.checks import check_values_of_scans, one_for_each_scan, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.io.scans import Scans
-from radarsdf.returns.doppler import MIN_DOPPLER_RETURNS, sensor_velocities
+from radarsdf.returns.doppler import MIN_DOPPLER_RETURNS, sensor_velocities, without_filler
 from radarsdf.returns.rays import Rays, check_scans, prepare
 
 _MIN_SHARE_WITH_VELOCITY = 0.5  # of the scans that have enough returns
@@ -48,13 +48,15 @@ class Movers:
             If `doppler_mps` are not numbers, their shapes do not fit to `points`, or a fit refuses these.
         """
         scans, _, _ = check_scans(points)
-        speeds = checked_doppler(scans, doppler_mps)
+        speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
         none = [np.zeros(len(scan), bool) for scan in scans]
         tried = [i for i, scan in enumerate(scans) if len(scan) >= MIN_DOPPLER_RETURNS]
         found = sensor_velocities([scans[i] for i in tried], [speeds[i] for i in tried])
         telling = [(i, velocity) for i, velocity in zip(tried, found, strict=True) if velocity.found]
         if len(telling) < max(1, _MIN_SHARE_WITH_VELOCITY * len(tried)):
-            return cls(none, f"only {len(telling)} of {len(scans)} scans agree on a velocity of the sensor")
+            return cls(
+                none, filler or f"only {len(telling)} of {len(scans)} scans agree on a velocity of the sensor"
+            )
         masks = list(none)
         for i, velocity in telling:
             masks[i] = ~velocity.static & np.isfinite(speeds[i]) & scans[i].any(axis=1)
