@@ -25,6 +25,9 @@ _ERRORS = 3.0  # standard errors of a difference that is no chance
 # elevations that all have the same error.
 LEAST_MPS = 0.02
 _LEAST_STEP_M = 1e-4  # deviation of a step, to divide by
+# Share of the speed that all velocities of a drive may have too much, in any direction: the axes and the scale of a radar are known
+# to this. Two radars on a motorway: 0.003 along it, 0.002 and 0.006 across.
+_IN_COMMON = 0.003
 
 
 @dataclass(frozen=True)
@@ -118,8 +121,19 @@ class DopplerMotion(Motion):
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
         nothing = np.tile(np.eye(4), (len(durations_s), 1, 1))
         spans = spans_of(times_s, len(times_s))
+        speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
+        common = np.repeat([_IN_COMMON * speed_mps * np.median(durations_s), 0.0], 3)
         return cls(
-            nothing, np.zeros(6), np.ones(2), shares, (True, True), spans, velocities, durations_s, turns
+            nothing,
+            np.zeros(6),
+            np.ones(2),
+            shares,
+            (True, True),
+            spans,
+            velocities,
+            durations_s,
+            turns,
+            bias_sigma=common,
         ).at(poses)
 
     def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002

@@ -15,10 +15,10 @@ from radarsdf.poses.by_doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.expected import ExpectedStep
 from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion
+from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rates import Habits, Rate
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector
 from radarsdf.poses.tracking import Tracked, Tracker
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 
 # What a drive begins with. Its own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
 # scans were lost, up to 9 degrees.
@@ -26,6 +26,8 @@ _TURNS = Habits(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 _MOVES = Habits(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 _PASSES = 3
 _NO_CHANCE = 3.0  # standard deviations
+# Deviation of the acceleration across the way: what moves fast turns slowly. Vehicles on roads: about 1; drones and hands: 2.
+_LATERAL_MPS2 = 2.0
 _TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until the estimate finds them
 
 
@@ -72,9 +74,13 @@ class Drive:
         if self.velocities is None:
             return [motion]
         turns = np.stack([found.turn for found in tracked[rows][1:]])
+        # Few returns hardly change what was expected of a turn: all steps may have turned as much more.
+        speed_mps = np.sqrt((self.velocities.mean_mps[rows] ** 2).sum(axis=1).mean())
+        rate = np.minimum(np.sqrt(_TURNS.usual), _LATERAL_MPS2 / max(speed_mps, 1e-9))
+        common = np.concatenate([np.zeros(3), rate * np.median(np.diff(times_s))])
         # Tracked translations beside Doppler, or in its place, double the errors of positions on simulated drives.
         return [
-            motion.rotations_only(),
+            dataclasses.replace(motion.rotations_only(), bias_sigma=common),
             DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns),
         ]
 
@@ -167,9 +173,10 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rat
 def followed(drive: Drive, config: FitConfig, num_threads: int) -> tuple[Drive, list[Tracked]]:
     """The drive with its habits, and its scans where the last pass found them."""
     gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
+    cell_m = plane_cell_m(drive.scans, config.leaf_size_m)
     tracked: list[Tracked] = []
     for i in range(_PASSES):
-        tracker = Tracker(LEAVES_PER_SURFEL * config.leaf_size_m, config.returns, num_threads)
+        tracker = Tracker(cell_m, config.returns, num_threads)
         found = _Pass.of(drive, tracker)
         tracked, drive = found.tracked, drive.learnt(found)
         if i == 0 and gyroscope is not None:

@@ -23,11 +23,10 @@ from radarsdf.poses.drive import Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import Gyroscope, UnknownAxesError
 from radarsdf.poses.inertial import Inertial, levelled
-from radarsdf.poses.planes import SensorReturns
+from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
 from radarsdf.returns.rays import within_ranges
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 from radarsdf.threads import Workers
 
 # Of a step's variance, that the returns must take away where nothing else measures the way. Below a half, the motion before
@@ -190,7 +189,7 @@ def _together(
     """Poses and covariances of all scans of each piece at once."""
     poses = np.stack([found.pose for found in tracked])
     covariance = np.zeros((len(poses), 6, 6))
-    limits, cell_m = config.returns, LEAVES_PER_SURFEL * config.leaf_size_m
+    limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for rows in pieces_of(tracked):
         returns = SensorReturns.of(drive.told_anew(tracked, rows), limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
