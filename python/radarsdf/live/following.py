@@ -11,7 +11,7 @@ import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.scan_log import LoggedScan
-from radarsdf.poses.by_doppler import LEAST_MPS, SensorVelocities, doppler_sign
+from radarsdf.poses.by_doppler import LEAST_MPS, SensorVelocities, doppler_sign, upright
 from radarsdf.poses.drive import Drive, rates_of
 from radarsdf.poses.odometry import LEAST_TOLD
 from radarsdf.poses.rates import Rate
@@ -146,6 +146,7 @@ class Follower:
             if step.velocity is not None and step.velocity.found:
                 mean[i] = sign * step.velocity.velocity_mps
                 covariance[i] = step.velocity.covariance + LEAST_MPS**2 * np.eye(3)
+        mean, covariance, _ = upright(mean, covariance)
         known = [step for step in self._steps if step.velocity is not None and step.velocity.found]
         speeds = np.array([step.velocity.velocity_mps for step in known if step.velocity is not None])
         duration_s = max(known[-1].time_s - known[0].time_s, 1e-9) if known else 1.0

@@ -12,12 +12,10 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import real_array
 from radarsdf.io.scans import Scans, filled
-from radarsdf.poses.by_doppler import SensorVelocities
+from radarsdf.poses.by_doppler import NoVelocityError, SensorVelocities
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.movers import checked_doppler
 from radarsdf.returns.rays import check_scans
-
-NO_VELOCITY = "The Doppler is not used: less than half of the scans agree on a velocity of the sensor."
 
 
 @dataclass(frozen=True)
@@ -55,12 +53,19 @@ class CheckedScans:
         times_s = None if times_s is None else times_s - begin_s
         if doppler_mps is None or times_s is None:
             return cls(scans, times_s, begin_s, None, 0, [])
-        velocities = SensorVelocities.of(scans, checked_doppler(scans, doppler_mps), times_s)
-        if velocities is None:
-            return cls(scans, times_s, begin_s, None, 0, [NO_VELOCITY])
+        try:
+            velocities = SensorVelocities.of(scans, checked_doppler(scans, doppler_mps), times_s)
+        except NoVelocityError as why:
+            return cls(scans, times_s, begin_s, None, 0, [f"The Doppler is not used: {why}."])
+        notes = []
+        if velocities.climb_assumed:
+            notes.append(
+                f"Assumed: the sensor climbs by about a tenth of its speed, up or down; the Doppler of {velocities.climb_assumed} of "
+                f"{len(scans)} scans does not measure its vertical velocity as well."
+            )
         movers = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
-        return cls(standing, times_s, begin_s, velocities, movers, [])
+        return cls(standing, times_s, begin_s, velocities, movers, notes)
 
 
 def _checked_times(times: ArrayLike, num_scans: int) -> Floats:

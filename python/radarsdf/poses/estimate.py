@@ -28,7 +28,7 @@ _MOST_ROUNDS = 12  # with cells as small as a map's surfels
 # ends with the same errors in half the time.
 _SETTLED = 0.3
 _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
-_EXACT = 1e-4  # likewise, where differences of solutions count
+_EXACT = 1e-3  # likewise, where differences of solutions count
 _WEAK = (
     1e-4  # information about each pose, 1/m² and 1/rad²: what returns and steps leave free stays where it is
 )
