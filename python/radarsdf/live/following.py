@@ -78,7 +78,11 @@ class Follower:
             raise Lost(msg)
         told = [step.found.told[0] for step in self._steps][-_TOLD_STEPS:]
         if drive.velocities is None and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
-            msg = "the returns alone do not tell how the sensor moves: give their Doppler (doppler_mps), or poses"
+            missing = "their Doppler (doppler_mps), or poses"
+            if logged.doppler_mps is not None:
+                why = "the last two scans agree on no velocity" if self._sign else "its sign is not known yet"
+                missing = f"poses. The Doppler is not used: {why}"
+            msg = f"the returns alone do not tell how the sensor moves: give {missing}"
             raise Lost(msg)
         return Step(scan, time_s, velocity, found)
 
