@@ -101,9 +101,11 @@ def test_speeds_of_no_sensor_have_no_velocity(doppler):
     assert not found.static.any()
 
 
-def test_returns_in_one_direction_have_no_velocity():
+def test_returns_in_one_direction_have_a_velocity_along_it():
     points = np.outer(np.linspace(3, 30, 100), [1.0, 0, 0])
-    assert not sensor_velocity(points, np.full(100, -7.0)).found
+    found = sensor_velocity(points, np.full(100, -7.0))
+    np.testing.assert_allclose(found.velocity_mps, [7, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), [0, 100, 100], atol=0.1)
 
 
 @pytest.mark.usefixtures("right_frames")

@@ -78,13 +78,17 @@ def test_the_way_along_a_wall_is_not_guessed():
     scans = radarsdf.simulate.wall(seed=91, frames=24)
     live = LiveMap(SETTINGS)
 
-    def follow():
+    def follow(speeds=None):
         for i in range(len(scans)):
-            live.integrate(scans.points[i], time=0.1 * i)
+            live.integrate(scans.points[i], time=0.1 * i, doppler_mps=None if speeds is None else speeds[i])
 
-    with pytest.raises(Lost, match="do not tell how the sensor moves"):
+    with pytest.raises(Lost, match="do not tell how the sensor moves: give their Doppler"):
         follow()
     assert len(live) < len(scans)
+    live, rng = LiveMap(SETTINGS), np.random.default_rng(0)
+    speeds = [rng.uniform(-20, 20, len(scan)) for scan in scans.points]
+    with pytest.raises(Lost, match="The Doppler is not used"):
+        follow(speeds)
 
 
 def test_a_sensor_that_stands_leaves_the_sign_of_its_doppler_open(drive):

@@ -11,7 +11,7 @@ import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.scan_log import LoggedScan
-from radarsdf.poses.by_doppler import LEAST_MPS, SensorVelocities, doppler_sign
+from radarsdf.poses.by_doppler import LEAST_MPS, SensorVelocities, doppler_sign, upright
 from radarsdf.poses.drive import Drive, rates_of
 from radarsdf.poses.odometry import LEAST_TOLD
 from radarsdf.poses.rates import Rate
@@ -78,7 +78,11 @@ class Follower:
             raise Lost(msg)
         told = [step.found.told[0] for step in self._steps][-_TOLD_STEPS:]
         if drive.velocities is None and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
-            msg = "the returns alone do not tell how the sensor moves: give their Doppler (doppler_mps), or poses"
+            missing = "their Doppler (doppler_mps), or poses"
+            if logged.doppler_mps is not None:
+                why = "the last two scans agree on no velocity" if self._sign else "its sign is not known yet"
+                missing = f"poses. The Doppler is not used: {why}"
+            msg = f"the returns alone do not tell how the sensor moves: give {missing}"
             raise Lost(msg)
         return Step(scan, time_s, velocity, found)
 
@@ -146,6 +150,7 @@ class Follower:
             if step.velocity is not None and step.velocity.found:
                 mean[i] = sign * step.velocity.velocity_mps
                 covariance[i] = step.velocity.covariance + LEAST_MPS**2 * np.eye(3)
+        mean, covariance, _ = upright(mean, covariance)
         known = [step for step in self._steps if step.velocity is not None and step.velocity.found]
         speeds = np.array([step.velocity.velocity_mps for step in known if step.velocity is not None])
         duration_s = max(known[-1].time_s - known[0].time_s, 1e-9) if known else 1.0

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf.poses.motion import Motion, spans_of
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector, steps
-from radarsdf.returns.doppler import sensor_velocities
+from radarsdf.returns.doppler import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _ASKED = 400  # returns of a scan, and
 _PAIRS = 40  # pairs of neighbouring scans, that tell the sign
@@ -25,7 +25,20 @@ _ERRORS = 3.0  # standard errors of a difference that is no chance
 # elevations that all have the same error.
 LEAST_MPS = 0.02
 _COMPARED = 8  # steps, over which errors of single poses are small
+# Of what moves upright, where Doppler measures its vertical velocity worse: a share of the speed. Slopes of roads: 0.05.
+_CLIMB = 0.1
 _LEAST_STEP_M = 1e-4  # deviation of a step, to divide by
+# Share of the speed that all velocities of a drive may have too much, in any direction: the axes and the scale of a radar are known
+# to this. Two radars on a motorway: 0.003 along it, 0.002 and 0.006 across.
+_IN_COMMON = 0.003
+
+
+NOT_USED = "The Doppler is not used"
+"""How notes begin on Doppler that was given, before they say why."""
+
+
+class NoVelocityError(ValueError):
+    """The Doppler of a drive yields no velocities."""
 
 
 @dataclass(frozen=True)
@@ -42,18 +55,27 @@ class SensorVelocities:
     """Of each scan (N_i,): returns that do not contradict the velocity. All, where none was found."""
     found: NDArray[np.bool_]
     """(F,) whether the returns of a scan agree on a velocity. Elsewhere it is that between its neighbours."""
+    climb_assumed: int = 0
+    """Number of scans whose vertical velocity is assumed to be small, because their Doppler measures it worse than that."""
 
     @classmethod
     def of(
         cls, scans: Sequence[Floats], doppler_mps: Sequence[NDArray[Any]], times_s: Floats
-    ) -> SensorVelocities | None:
-        """Of scans (N_i, 3), sensor frame, m. None: fewer than half of them tell a velocity."""
+    ) -> SensorVelocities:
+        """Of scans (N_i, 3), sensor frame, m. Raises a NoVelocityError if fewer than half of them, or than two, have a velocity."""
         each = sensor_velocities(scans, doppler_mps)
         found = np.array([velocity.found for velocity in each], bool)
         if 2 * found.sum() < max(len(found), 2):
-            return None
-        mean = np.stack([velocity.velocity_mps for velocity in each])
-        covariance = np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3)
+            few = sum(int(np.isfinite(speeds).sum() < MIN_DOPPLER_RETURNS) for speeds in doppler_mps)
+            msg = (
+                f"{found.sum()} of {len(found)} scans agree on a velocity of the sensor; {few} have fewer than "
+                f"{MIN_DOPPLER_RETURNS} returns with Doppler, in {len(found) - few - found.sum()} fewer than 40 % of the returns agree"
+            )
+            raise NoVelocityError(msg)
+        mean, covariance, weak = upright(
+            np.stack([velocity.velocity_mps for velocity in each]),
+            np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3),
+        )
         static = [
             velocity.static if velocity.found else np.ones(len(scan), bool)
             for velocity, scan in zip(each, scans, strict=True)
@@ -68,7 +90,7 @@ class SensorVelocities:
             mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
             away_s = np.abs(at - times_s[i]).min()
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
-        return cls(mean, covariance, change, static, found)
+        return cls(mean, covariance, change, static, found, weak)
 
     def select(self, rows: slice) -> SensorVelocities:
         """Of these scans."""
@@ -86,6 +108,21 @@ class SensorVelocities:
         ends = (self.covariance[i] + self.covariance[i + 1]) * duration_s**2 / 4
         between: Floats = ends + np.diag(self.change) * duration_s**3 / 12
         return between
+
+
+def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
+    """Means (F, 3) and covariances (F, 3, 3) of velocities of a sensor that climbs little, and the number of those that this changes.
+
+    Only where a vertical velocity is known less well than a share of the speed, and than it is large where it is known better: a
+    radar whose returns all lie in a plane does not measure it.
+    """
+    variances = covariance[:, 2, 2]
+    climbed = np.nansum(mean_mps[:, 2] ** 2 / variances) / np.nansum(1 / variances)
+    variance = max(_CLIMB**2 * np.nanmean((mean_mps[:, :2] ** 2).sum(axis=1)), climbed, LEAST_MPS**2)
+    weak = variances > variance
+    gain = np.where(weak[:, None], covariance[:, :, 2] / (covariance[:, 2, 2] + variance)[:, None], 0.0)
+    mean = mean_mps - gain * mean_mps[:, 2:]
+    return mean, covariance - np.einsum("fi,fj->fij", gain, covariance[:, 2]), int(weak.sum())
 
 
 def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
@@ -119,8 +156,19 @@ class DopplerMotion(Motion):
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
         nothing = np.tile(np.eye(4), (len(durations_s), 1, 1))
         spans = spans_of(times_s, len(times_s))
+        speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
+        common = np.repeat([_IN_COMMON * speed_mps * np.median(durations_s), 0.0], 3)
         return cls(
-            nothing, np.zeros(6), np.ones(2), shares, (True, True), spans, velocities, durations_s, turns
+            nothing,
+            np.zeros(6),
+            np.ones(2),
+            shares,
+            (True, True),
+            spans,
+            velocities,
+            durations_s,
+            turns,
+            bias_sigma=common,
         ).at(poses)
 
     def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002

@@ -12,13 +12,11 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import real_array
 from radarsdf.io.scans import Scans, filled
-from radarsdf.poses.by_doppler import SensorVelocities
+from radarsdf.poses.by_doppler import NOT_USED, NoVelocityError, SensorVelocities
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.doppler import without_filler
 from radarsdf.returns.movers import checked_doppler
 from radarsdf.returns.rays import check_scans
-
-NO_VELOCITY = "The Doppler is not used: less than half of the scans agree on a velocity of the sensor."
 
 
 @dataclass(frozen=True)
@@ -58,9 +56,15 @@ class CheckedScans:
             return cls(scans, times_s, begin_s, None, 0, left_out.notes)
         speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
         notes = left_out.notes if filler is None else [*left_out.notes, f"{filler}."]
-        velocities = SensorVelocities.of(scans, speeds, times_s)
-        if velocities is None:
-            return cls(scans, times_s, begin_s, None, 0, [*notes, NO_VELOCITY])
+        try:
+            velocities = SensorVelocities.of(scans, speeds, times_s)
+        except NoVelocityError as why:
+            return cls(scans, times_s, begin_s, None, 0, [*notes, f"{NOT_USED}: {why}."])
+        if velocities.climb_assumed:
+            notes.append(
+                f"Assumed: the sensor climbs by about a tenth of its speed, up or down; the Doppler of {velocities.climb_assumed} of "
+                f"{len(scans)} scans does not measure its vertical velocity as well."
+            )
         movers = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
         return cls(standing, times_s, begin_s, velocities, movers, notes)

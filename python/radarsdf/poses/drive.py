@@ -15,10 +15,10 @@ from radarsdf.poses.by_doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.expected import ExpectedStep
 from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion
+from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rates import Habits, Rate
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector
 from radarsdf.poses.tracking import Tracked, Tracker
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 
 # What a drive begins with. Its own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
 # scans were lost, up to 9 degrees.
@@ -26,6 +26,11 @@ _TURNS = Habits(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 _MOVES = Habits(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 _PASSES = 3
 _NO_CHANCE = 3.0  # standard deviations
+LATERAL_MPS2 = 2.0
+"""Deviation of the acceleration across the trajectory: what moves fast turns slowly. Vehicles on roads: about 1; drones and hands: 2."""
+# Deviation of the rate of turning up to which it may stay unknown from step to step: all scans together, and the covariance, hold
+# for small rotations. That of a sensor faster than 20 m/s.
+_SLOW_TURN_RAD_S = 0.1
 _TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until the estimate finds them
 
 
@@ -60,6 +65,20 @@ class Drive:
         rate = self.moves.after(move, elapsed_s)
         return ExpectedStep(by, rate.mean, rate.mean, rate.covariance * duration_s**2, duration_s)
 
+    @property
+    def usual_turn_rad_s(self) -> float:
+        """Deviation of the rates at which a sensor with these velocities turns, before its returns say more."""
+        usual = float(np.sqrt(_TURNS.usual[0]))
+        if self.velocities is None:
+            return usual
+        speed_mps = np.sqrt((self.velocities.mean_mps**2).sum(axis=1).mean())
+        return min(usual, LATERAL_MPS2 / max(float(speed_mps), 1e-9))
+
+    @property
+    def turns_slowly(self) -> bool:
+        """Whether it is so fast that it cannot turn far from scan to scan."""
+        return self.usual_turn_rad_s < _SLOW_TURN_RAD_S
+
     def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
         """What was measured of the motion from scan to scan among these."""
         times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
@@ -72,9 +91,14 @@ class Drive:
         if self.velocities is None:
             return [motion]
         turns = np.stack([found.turn for found in tracked[rows][1:]])
+        # What few returns hardly change of an expected turn is an error that all steps have in common.
+        common = np.full((2, 3), [[0.0], [self.usual_turn_rad_s]])
+        if self.gyroscope is not None:
+            common[1] = np.sqrt(self.gyroscope.bias.covariance.diagonal())
+        common = common.ravel() * np.median(np.diff(times_s))
         # Tracked translations beside Doppler, or in its place, double the errors of positions on simulated drives.
         return [
-            motion.rotations_only(),
+            dataclasses.replace(motion.rotations_only(), bias_sigma=common),
             DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns),
         ]
 
@@ -167,11 +191,17 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rat
 def followed(drive: Drive, config: FitConfig, num_threads: int) -> tuple[Drive, list[Tracked]]:
     """The drive with its habits, and its scans where the last pass found them."""
     gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
+    cell_m = plane_cell_m(drive.scans, config.leaf_size_m)
     tracked: list[Tracked] = []
     for i in range(_PASSES):
-        tracker = Tracker(LEAVES_PER_SURFEL * config.leaf_size_m, config.returns, num_threads)
+        tracker = Tracker(cell_m, config.returns, num_threads)
         found = _Pass.of(drive, tracker)
-        tracked, drive = found.tracked, drive.learnt(found)
+        tracked = found.tracked
+        if i == 0 and tracked[-1].piece > 0 and drive.turns_slowly:
+            # Its returns agree nowhere. The next passes search less far.
+            usual = np.full(3, drive.usual_turn_rad_s**2)
+            drive = dataclasses.replace(drive, turns=Habits(usual, usual, True))
+        drive = drive.learnt(found)
         if i == 0 and gyroscope is not None:
             # Rotations that were found with its help could not tell its bias.
             drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(*found.rotations(drive.times_s)))

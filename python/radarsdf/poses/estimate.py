@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +28,7 @@ _MOST_ROUNDS = 12  # with cells as small as a map's surfels
 # ends with the same errors in half the time.
 _SETTLED = 0.3
 _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
+_EXACT = 1e-3  # likewise, where differences of solutions count
 _WEAK = (
     1e-4  # information about each pose, 1/m² and 1/rad²: what returns and steps leave free stays where it is
 )
@@ -79,7 +80,32 @@ class PosesEstimate:
         diagonal, below, gradient = _prior(motions, poses)
         diagonal[len(given) // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
-        return cls(poses, covariance, motions, noise, rounds)
+
+        def solved(more: Floats | float) -> Floats:
+            return planes.solve(
+                diagonal, below, gradient + more, _EXACT, _MOST_ITERATIONS, False, num_threads
+            )[0]
+
+        return cls(poses, covariance + _by_biases(motions, poses, solved), motions, noise, rounds)
+
+
+def _by_biases(
+    motions: Sequence[Motion], poses: Floats, solved: Callable[[Floats | float], Floats]
+) -> Floats:
+    """(F, 6, 6) covariance of the poses that errors make which all steps have in common, as far as returns leave them open.
+
+    `solved` are the increments (F, 6) once something is added to the gradient. The biases are unknowns, too, which the poses
+    are eliminated from (the Schur complement).
+    """
+    by, own = (np.concatenate(parts) for parts in zip(*(m.by_bias(poses) for m in motions), strict=True))
+    if len(by) == 0:
+        return np.zeros((len(poses), 6, 6))
+    moved_by = np.stack([solved(each) for each in by]) - solved(0.0)
+    information = np.diag(own) + np.einsum("kfi,lfi->kl", by, moved_by)
+    values, axes = np.linalg.eigh((information + information.T) / 2)
+    root = np.einsum("kfi,kl->lfi", moved_by, axes / np.sqrt(1 + np.maximum(values, 0.0)))
+    found: Floats = np.einsum("lfi,lfj->fij", root, root)
+    return found
 
 
 def _prior(motions: Sequence[Motion], poses: Floats) -> tuple[Floats, Floats, Floats]:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,6 +32,8 @@ class Motion:
     """Whether the variances of translations, and of rotations, stay as they are."""
     spans: Floats
     """(F - 1,) duration of each step over the median. Biases grow with it."""
+    bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
+    """(6,) deviation of the part of the bias that no measurement of this source can find."""
 
     @classmethod
     def of(
@@ -102,6 +104,15 @@ class Motion:
             diagonal[rows] += np.einsum("fki,fk,fkj->fij", jacobian, information, jacobian)
             gradient[rows] += np.einsum("fki,fk->fi", jacobian, errors)
         return diagonal, np.einsum("fki,fk,fkj->fij", second, information, first), gradient
+
+    def by_bias(self, poses: Floats) -> tuple[Floats, Floats]:
+        """By components of the bias that are uncertain, in their deviations: derivatives of the gradient (K, F, 6), information (K,)."""
+        rows = np.flatnonzero(self.bias_sigma)
+        weights = self.spans[:, None] / (np.repeat(self.variances, 3) * self.shares) * self.bias_sigma
+        found = np.zeros((len(rows), len(poses), 6))
+        for scans, jacobian in zip((slice(None, -1), slice(1, None)), self._jacobians(poses), strict=True):
+            found[:, scans] -= np.einsum("fki,fk->kfi", jacobian[:, rows], weights[:, rows])
+        return found, (weights * self.spans[:, None] * self.bias_sigma).sum(axis=0)[rows]
 
     def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> Motion:
         """With the bias and the deviations that `poses` show.

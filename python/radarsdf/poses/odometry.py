@@ -17,17 +17,16 @@ from radarsdf.checks import instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
-from radarsdf.poses.by_doppler import doppler_sign
+from radarsdf.poses.by_doppler import NOT_USED, doppler_sign
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.drive import Drive, followed
+from radarsdf.poses.drive import LATERAL_MPS2, Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import Gyroscope, UnknownAxesError
 from radarsdf.poses.inertial import Inertial, levelled
-from radarsdf.poses.planes import SensorReturns
+from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
 from radarsdf.returns.rays import within_ranges
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 from radarsdf.threads import Workers
 
 # Of a step's variance, that the returns must take away where nothing else measures the way. Below a half, the motion before
@@ -60,7 +59,7 @@ class Odometry:
     step's translation and rotation that the returns took away, in the direction that they tell least of, median; `doppler` and
     `gyroscope`, whether they were used; `doppler_sign`, -1 if the radar's Doppler is positive as the sensor comes nearer;
     `gyroscope_bias`, rad/s; `imu`, None or how it was found to sit: `R_sensor_imu`, its deviation `sigma_rad`, `late_s`, by which the
-    times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes; `movers`, returns that were left out; `notes`; `scans`, `seconds`."""
+    times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes; `movers`, returns that were left out; `notes` on what was not used and what was assumed; `scans`, `seconds`."""
 
     def longest_piece(self) -> slice:
         """The scans of the piece with the most scans: those to make a map of."""
@@ -114,7 +113,8 @@ def odometry(
     ------
     ValueError
         If scans, Doppler, times or rates are invalid, if there are no times, or if the returns do not tell what nothing
-        else measures: without Doppler, the way along a wall, say; without a gyroscope, the turns of a radar with few returns.
+        else measures: without Doppler, the way along a wall, say; without a gyroscope, the turns of a radar with few returns
+        that is slower than 20 m/s. If Doppler was given and not used, the error says why.
 
     Notes
     -----
@@ -156,7 +156,8 @@ def odometry(
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
             drive, tracked = followed(drive, config, workers.num_threads)
-        told = _checked_told(tracked, drive, inertial)
+        notes = [*checked.notes, *inertial.notes]
+        told = _checked_told(tracked, drive, notes)
         poses, covariance = _together(drive, tracked, config, workers.num_threads)
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
@@ -176,7 +177,7 @@ def odometry(
         "gyroscope_bias": None if drive.gyroscope is None else drive.gyroscope.bias.mean.tolist(),
         "imu": inertial.report,
         "movers": checked.movers,
-        "notes": [*checked.notes, *inertial.notes],
+        "notes": notes,
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
     }
@@ -190,7 +191,7 @@ def _together(
     """Poses and covariances of all scans of each piece at once."""
     poses = np.stack([found.pose for found in tracked])
     covariance = np.zeros((len(poses), 6, 6))
-    limits, cell_m = config.returns, LEAVES_PER_SURFEL * config.leaf_size_m
+    limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for rows in pieces_of(tracked):
         returns = SensorReturns.of(drive.told_anew(tracked, rows), limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
@@ -202,22 +203,35 @@ def _together(
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance
 
 
-def _checked_told(tracked: list[Tracked], drive: Drive, inertial: Inertial) -> tuple[float, float]:
-    """What the returns tell of translations and rotations. Raises a NotToldError where nothing does."""
+def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tuple[float, float]:
+    """What the returns tell of translations and rotations. Raises a NotToldError where nothing does; notes what is assumed."""
     if len(tracked) < 2:
         return 0.0, 0.0
     way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
+    dropped = any(note.startswith(NOT_USED) for note in notes)
+    doppler = "Doppler that most returns of a scan agree on" if dropped else "their Doppler (doppler_mps)"
     for told, least, measured, moved, missing in (
-        (way, LEAST_TOLD, drive.velocities is not None, "moved", "their Doppler (doppler_mps)"),
-        (turn, _LEAST_TOLD_TURN, drive.gyroscope is not None, "turned", "its angular_velocity"),
+        (way, LEAST_TOLD, drive.velocities is not None, "moved", doppler),
+        (
+            turn,
+            _LEAST_TOLD_TURN,
+            drive.gyroscope is not None or drive.turns_slowly,
+            "turned",
+            "its angular_velocity",
+        ),
     ):
         if not measured and told < least:
             msg = (
                 f"the returns alone do not tell how the sensor {moved}: of a step's variance, they take away {told:.1%}, and "
                 f"{least:.0%} is needed. Give {missing}, or poses"
             )
-            msg = ". ".join([msg, *(note.rstrip(".") for note in inertial.notes)])
+            msg = ". ".join([msg, *(note.rstrip(".") for note in notes)])
             raise NotToldError(msg)
+    if drive.gyroscope is None and turn < _LEAST_TOLD_TURN:
+        notes.append(
+            f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
+            "trajectory make of its speed; the returns of a scan hardly measure it."
+        )
     return way, turn
 
 

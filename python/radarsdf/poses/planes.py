@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from radarsdf._core import CommonPlanes
 from radarsdf.config.groups import ReturnsConfig
@@ -22,6 +23,18 @@ from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
 # Scans in the band that is factored. 16 to 128 take the same time, since fewer need more iterations.
 _TOGETHER = 32
 _LEAST_RANGE_M = 1e-6  # to divide by
+# Cells are at least a quarter as wide as returns of one scan are apart: with 40 returns over 150 m, planes of smaller cells have too
+# few of them. Radars of 500 to 2,000 returns a scan have 0.2 to 0.5 m between them, so that their cells are those of a map.
+_CELLS_APART = 4
+_ASKED_SCANS = 16
+
+
+def plane_cell_m(scans: Sequence[Floats], leaf_size_m: float) -> float:
+    """Edge of the cell of a plane, m: as of a map's surfel, or larger where scans (N_i, 3) are sparse."""
+    asked = [scan for scan in scans if len(scan) > 1]
+    asked = asked[:: max(1, len(asked) // _ASKED_SCANS)]
+    apart_m = [float(np.median(cKDTree(scan).query(scan, 2)[0][:, 1])) for scan in asked]
+    return max(LEAVES_PER_SURFEL * leaf_size_m, float(np.median(apart_m or [0.0])) / _CELLS_APART)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from radarsdf.checks import MISSING_POSES, instance, not_negative, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
-from radarsdf.poses.by_doppler import DopplerMotion, unexplained_motion
+from radarsdf.poses.by_doppler import NOT_USED, DopplerMotion, unexplained_motion
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
@@ -139,7 +139,7 @@ def refine_poses(
             motions.append(motion)
         else:
             notes.append(
-                f"The Doppler is not used: it contradicts {unexplained:.0%} of the motion of the given poses. If it is right, "
+                f"{NOT_USED}: it contradicts {unexplained:.0%} of the motion of the given poses. If it is right, "
                 "leave the poses out: radarsdf.odometry"
             )
     cell_m = LEAVES_PER_SURFEL * config.leaf_size_m

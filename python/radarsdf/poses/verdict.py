@@ -54,7 +54,9 @@ class Verdict:
         is uncertain, too."""
         if self.parts < 2:
             return np.inf
-        return max(_LEAST_GAIN, float(student.ppf(1 - _BY_CHANCE, self.parts - 1)) * self.error, self.crowding)
+        return max(
+            _LEAST_GAIN, float(student.ppf(1 - _BY_CHANCE, self.parts - 1)) * self.error, self.crowding
+        )
 
     @property
     def improved(self) -> bool:

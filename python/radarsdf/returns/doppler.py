@@ -27,13 +27,15 @@ _DRAWS = (
     64  # of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999
 )
 _SIGMA_MPS = 0.15  # a return is off if its Doppler differs by three times the noise, and by at least this
+_LEAST_SIGMA_MPS = 1e-3
 _ROUNDS = 4
 _MIN_AGREEING = 0.4  # share of the returns that must agree on a velocity
-_MAX_CONDITION = 1e3  # of the normal equations: returns in one direction tell no velocity
 _FILLER = 0.2  # share of all returns with one and the same speed, from which on it may be none
 _ONLY_FILLER = (
     0.9  # likewise, from which on a sensor that stands still cannot be told from one that does not measure
 )
+# Deviation of any velocity. Across the directions of all returns, as the vertical of a flat field of view, nothing else is known.
+_ANY_MPS = 100.0
 _FOLDS = (-1.0, 0.0, 1.0)  # intervals by which all three returns of a draw may be folded
 
 
@@ -44,7 +46,7 @@ class SensorVelocity:
     velocity_mps: FloatArray
     """(3,) velocity of the sensor in its own frame, m/s. NaN if the returns do not agree on one."""
     covariance: FloatArray
-    """(3, 3) its covariance, m²/s². NaN if there is no velocity."""
+    """(3, 3) its covariance, m²/s², large in directions that no return measures. NaN if there is no velocity."""
     static: NDArray[np.bool_]
     """(N,) whether each return agrees with it, so that it stands still. All False if there is no velocity."""
 
@@ -71,8 +73,8 @@ def sensor_velocity(
     Returns
     -------
     SensorVelocity
-        Without a velocity if there are fewer than 10 returns, if less than 40 % of them agree, or if they all lie in
-        one direction.
+        Without a velocity if there are fewer than 10 returns, or if less than 40 % of them agree. A component that no
+        return measures is 0 m/s, with a deviation of 100 m/s.
     """
     x, speeds = np.asarray(points, np.float64), np.asarray(doppler_mps, np.float64)
     ranges = np.linalg.norm(x, axis=1)
@@ -91,25 +93,24 @@ def sensor_velocity(
         return off if interval_mps is None else off - interval_mps * np.round(off / interval_mps)
 
     velocity = _most_agreed(away, measured, residuals, interval_mps)
-    if velocity is None:
-        return unknown
     sigma = _SIGMA_MPS / 3
     for _ in range(_ROUNDS):
         off = residuals(velocity[None])[0]
         agrees = np.abs(off) < max(_SIGMA_MPS, 3 * sigma)
         if agrees.sum() < max(MIN_DOPPLER_RETURNS / 2, _MIN_AGREEING * len(rows)):
             return unknown
-        normal = normal_matrix(away[agrees], away[agrees])
-        if np.linalg.cond(normal) > _MAX_CONDITION:
-            return unknown
-        velocity = velocity + np.linalg.solve(normal, normal_matrix(away[agrees], off[agrees, None])[:, 0])
+        weak = sigma**2 / _ANY_MPS**2
+        normal = normal_matrix(away[agrees], away[agrees]) + weak * np.eye(3)
+        right = normal_matrix(away[agrees], off[agrees, None])[:, 0] - weak * velocity
+        velocity = velocity + np.linalg.solve(normal, right)
         # The median is not drawn by what moves.
         sigma = min(1.4826 * float(np.median(np.abs(residuals(velocity[None])[0][agrees]))), _SIGMA_MPS)
+        sigma = max(sigma, _LEAST_SIGMA_MPS)
     static = np.zeros(len(x), bool)
     off = residuals(velocity[None])[0]
     static[rows] = np.abs(off) < max(_SIGMA_MPS, 3 * sigma)
     spread = float(np.sum(off[agrees] ** 2)) / max(int(agrees.sum()) - 3, 1)
-    covariance: FloatArray = np.multiply(spread, np.linalg.inv(normal))
+    covariance: FloatArray = np.multiply(max(spread, _LEAST_SIGMA_MPS**2), np.linalg.inv(normal))
     return SensorVelocity(velocity, covariance, static)
 
 
@@ -118,7 +119,7 @@ def _most_agreed(
     measured: FloatArray,
     residuals: Callable[[FloatArray], FloatArray],
     interval_mps: float | None,
-) -> FloatArray | None:
+) -> FloatArray:
     """The velocity (3,) of those of random draws of three returns with which most returns agree."""
     rng = np.random.default_rng(0)
     drawn = rng.integers(0, len(measured), (_DRAWS, 3))
@@ -127,10 +128,8 @@ def _most_agreed(
         speeds = np.concatenate([speeds + fold * interval_mps for fold in _FOLDS])
         drawn = np.tile(drawn, (len(_FOLDS), 1))
     matrices = away[drawn]
-    solvable = np.abs(np.linalg.det(matrices)) > 1e-4
-    if not solvable.any():
-        return None
-    velocities = np.linalg.solve(matrices[solvable], speeds[solvable, :, None])[:, :, 0]
+    normal = np.einsum("kij,kil->kjl", matrices, matrices) + (_SIGMA_MPS / _ANY_MPS) ** 2 * np.eye(3)
+    velocities = np.linalg.solve(normal, np.einsum("kij,ki->kj", matrices, speeds)[:, :, None])[:, :, 0]
     counts = (np.abs(residuals(velocities)) < _SIGMA_MPS).sum(axis=1)
     best: FloatArray = velocities[int(np.argmax(counts))]
     return best
