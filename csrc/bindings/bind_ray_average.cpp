@@ -1,6 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 #include <algorithm>
+#include <utility>
 
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
@@ -22,25 +23,29 @@ void bind_ray_average(VertexTableClass& table) {
           throw std::invalid_argument("weights must have shape (N,)");
         }
         Array<float> distances(static_cast<py::ssize_t>(t.num_rows()));
+        Array<std::int8_t> sides(static_cast<py::ssize_t>(t.num_rows()));
         float* result = distances.mutable_data();
+        std::int8_t* of_vertices = sides.mutable_data();
         const AveragedRays rays{points.data(), directions.data(), normals.data(), weights.data(), count};
         {
           const py::gil_scoped_release release;
-          average_rays(t, rays, truncation_m, result, num_threads);
+          average_rays(t, rays, truncation_m, result, of_vertices, num_threads);
         }
-        return distances;
+        return std::pair(distances, sides);
       },
       "points"_a.noconvert(), "directions"_a.noconvert(), "normals"_a.noconvert(), "weights"_a.noconvert(),
       "truncation_m"_a, "num_threads"_a = 0,
       "Of an octree: for each vertex (num_rows,) float32 the mean of its signed distances, m, to planes through "
       "the "
       "`points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of "
-      "its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame.");
+      "its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame. And "
+      "(num_rows,) int8: 1 if many rays passed the vertex, -1 if "
+      "it lies behind many returns where nothing was seen, else 0.");
   table.attr("SMOOTHING_REACH") = kSmoothingReach;
   table.def(
       "smoothed",
       [](const VertexTable& t, const Array<float>& distances_m, const Array<float>& points, const Array<float>& normals,
-         const Array<float>& information, int iterations, int num_threads) {
+         const Array<float>& information, const Array<std::int8_t>& sides, int iterations, int num_threads) {
         const std::int64_t count = check_points(points);
         check_shape(normals, count, 3, "normals");
         if (check_column(information, "information") != count) {
@@ -49,23 +54,28 @@ void bind_ray_average(VertexTableClass& table) {
         if (check_column(distances_m, "distances_m") != t.num_rows()) {
           throw std::invalid_argument("distances_m must have shape (num_rows,)");
         }
+        if (check_column(sides, "sides") != t.num_rows()) {
+          throw std::invalid_argument("sides must have shape (num_rows,)");
+        }
         Array<float> result(distances_m.size());
         std::copy_n(distances_m.data(), distances_m.size(), result.mutable_data());
         float* moved = result.mutable_data();
+        const std::int8_t* of_vertices = sides.data();
         const KnownPlanes planes{points.data(), normals.data(), information.data(), count};
         {
           const py::gil_scoped_release release;
-          smooth_distances(t, planes, iterations, moved, num_threads);
+          smooth_distances(t, planes, of_vertices, iterations, moved, num_threads);
         }
         return result;
       },
       "distances_m"_a.noconvert(), "points"_a.noconvert(), "normals"_a.noconvert(), "information"_a.noconvert(),
-      "iterations"_a, "num_threads"_a = 0,
+      "sides"_a.noconvert(), "iterations"_a, "num_threads"_a = 0,
       "Of an octree: `distances_m` (num_rows,) float32 after so many steps towards distances that agree with the "
       "planes "
       "through `points` (N, 3) with these `normals` (N, 3) and this `information` (N,), m^-2, all float32, local "
       "frame, "
-      "and bend as little as they can. An iteration carries what is known SMOOTHING_REACH vertices far.");
+      "and bend as little as they can. Vertices stay on the `sides` (num_rows,) int8 of `average_rays`. An iteration "
+      "carries what is known SMOOTHING_REACH vertices far.");
 }
 
 }  // namespace radarsdf

@@ -14,18 +14,38 @@
 namespace radarsdf {
 namespace {
 
-constexpr std::int64_t kRaysOfGroup = 1 << 13, kMaxGroups = 8;
+constexpr std::int64_t kRaysOfGroup = 1 << 13, kMaxGroups = 5;
+
+// Measured; see bench/history/surface.md. With fewer returns, planes are too uncertain to constrain what is smoothed.
+constexpr std::uint32_t kCertainInFront = 64, kCertainBehind = 512;
+constexpr std::uint64_t kPassed = 4, kNoise = 50;  // one ray of so many is enough in front, and too many behind
 
 // In integers, whose sum does not depend on the order, and not on rays that are far away.
 struct Sum {
-  std::int64_t weight = 0, distance = 0;
+  std::int64_t distance = 0;
+  std::uint32_t weight = 0, positive = 0, in_front = 0, behind = 0;  // the last two more than a leaf cell away
+
+  Sum& operator+=(const Sum& other) {
+    weight += other.weight;
+    distance += other.distance;
+    positive += other.positive;
+    in_front += other.in_front;
+    behind += other.behind;
+    return *this;
+  }
+
+  std::int8_t side() const {
+    if (in_front >= kCertainInFront && kPassed * in_front > weight) return kInFront;
+    if (behind >= kCertainBehind && 2 * std::uint64_t{behind} > weight && kNoise * positive <= weight) return kBehind;
+    return 0;
+  }
 };
 constexpr float kQuanta = 1 << 23;  // in the truncated distance: as many as a float tells apart
 
 }  // namespace
 
 void average_rays(const VertexTable& table, const AveragedRays& rays, double truncation_m, float* distances_m,
-                  int num_threads) {
+                  std::int8_t* sides, int num_threads) {
   if (table.encoding() != Encoding::kOctree) throw std::invalid_argument("only an octree has vertices in space");
   check_rays(rays.points, rays.directions, rays.count, table.leaf_size_m(), truncation_m);
   const CellBlocks leaves(table.leaf_keys().data(), static_cast<std::int64_t>(table.leaf_keys().size()));
@@ -35,7 +55,7 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   const auto add_ray = [&](std::int64_t i, std::vector<Sum>& sums) {
     NearbyRows leaf_rows(leaves);
     const float *n = rays.normals + 3 * i, *p = rays.points + 3 * i;
-    const auto weight = static_cast<std::int64_t>(rays.weights[i]);
+    const auto weight = static_cast<std::uint32_t>(rays.weights[i]);
     const float dx = size_m * n[0], dy = size_m * n[1], dz = size_m * n[2];
     CellWalk cell(p, rays.directions + 3 * i, -truncation_m, truncation_m, table.leaf_size_m());
     for (; cell.inside(); cell.next()) {
@@ -50,7 +70,10 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
         const float cut_m = std::min(std::max(distance_m, -limit_m), limit_m);
         Sum& sum = sums[static_cast<std::size_t>(rows[c])];
         sum.weight += weight;
-        sum.distance += weight * static_cast<std::int32_t>(quanta * cut_m);
+        sum.positive += distance_m > 0 ? weight : 0;
+        sum.in_front += distance_m > size_m ? weight : 0;
+        sum.behind += distance_m < -size_m ? weight : 0;
+        sum.distance += std::int64_t{weight} * static_cast<std::int32_t>(quanta * cut_m);
       }
     }
   };
@@ -67,12 +90,10 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   parallel_blocks(table.num_rows(), 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (auto row = static_cast<std::size_t>(begin); row < static_cast<std::size_t>(end); ++row) {
       Sum total;
-      for (const std::vector<Sum>& sums : groups) {
-        total.weight += sums[row].weight;
-        total.distance += sums[row].distance;
-      }
+      for (const std::vector<Sum>& sums : groups) total += sums[row];
       const double weight = static_cast<double>(total.weight) * static_cast<double>(quanta);
       distances_m[row] = total.weight > 0 ? static_cast<float>(static_cast<double>(total.distance) / weight) : 0;
+      sides[row] = total.side();
     }
   });
 }

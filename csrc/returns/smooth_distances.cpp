@@ -11,6 +11,7 @@
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
 #include "lattice/morton.hpp"
+#include "returns/ray_average.hpp"
 #include "util/parallel.hpp"
 #include "util/stable_order.hpp"
 
@@ -20,6 +21,7 @@ namespace {
 constexpr std::int64_t kBlock = 1 << 13;  // vertices or cells of a thread, at least
 constexpr int kPlaces = 3;                // of a plane where its distance is known
 constexpr double kBend = 2;               // leaf cells: second difference of a distance whose slope turns from -1 to 1
+constexpr double kClear = 0.25;           // leaf cells: least distance of a vertex whose side is known
 
 // A place where the distance is known, and the corners of the cell that it is in.
 struct Place {
@@ -45,11 +47,12 @@ class Plates {
     connect();
   }
 
-  void relax(int iterations, float* distances_m) {
+  void relax(const std::int8_t* sides, int iterations, float* distances_m) {
     // Errors whose eigenvalues are in [least, 1] shrink to 1 / cosh(4). No eigenvalue is above 1: see
     // Vertex::stiffness.
     const float least = 4 / std::max(4.1F, static_cast<float>(iterations) * static_cast<float>(iterations));
     const float middle = (1 + least) / 2, half = (1 - least) / 2;
+    const auto least_m = static_cast<float>(kClear * table_->leaf_size_m());
     std::vector<float> step(vertices_.size(), 0.0F);
     float rho = half / middle;
     for (int k = 0; k < iterations; ++k) {
@@ -62,8 +65,12 @@ class Plates {
                         for (auto v = static_cast<std::size_t>(begin); v < static_cast<std::size_t>(end); ++v) {
                           const Vertex& vertex = vertices_[v];
                           if (!(vertex.stiffness > 0)) continue;
-                          step[v] = keep * step[v] - gain * (slope(vertex, v) / vertex.stiffness);
-                          distances_m[v] += step[v];
+                          const float before_m = distances_m[v];
+                          float after_m = before_m + keep * step[v] - gain * (slope(vertex, v) / vertex.stiffness);
+                          if (sides[v] == kInFront) after_m = std::max(after_m, least_m);
+                          if (sides[v] == kBehind) after_m = std::min(after_m, -least_m);
+                          step[v] = after_m - before_m;
+                          distances_m[v] = after_m;
                         }
                       });
     }
@@ -95,6 +102,7 @@ class Plates {
     const CellBlocks leaves(table_->leaf_keys().data(), static_cast<std::int64_t>(table_->leaf_keys().size()));
     std::vector<std::int32_t> cells(static_cast<std::size_t>(count));
     leaves.rows(keys.data(), count, cells.data(), num_threads_);
+    drop_beyond_thin_walls(planes, cells);
     const auto scale = static_cast<float>(kBend * kBend * size_m * size_m / kPlaces);
     for (const std::int32_t at : stable_order(keys.data(), count)) {
       const auto i = static_cast<std::size_t>(at);
@@ -113,6 +121,22 @@ class Plates {
       found.target_m = static_cast<float>(static_cast<double>(at % kPlaces - 1) * size_m);
     }
     first_.push_back(places_.size());
+  }
+
+  // cells: of the places, -1 for those that do not count.
+  void drop_beyond_thin_walls(const KnownPlanes& planes, std::vector<std::int32_t>& cells) const {
+    std::vector<std::int64_t> plane_of(table_->leaf_keys().size(), -1);
+    for (std::int64_t i = 0; i < planes.count; ++i) {
+      const std::int32_t own = cells[static_cast<std::size_t>(kPlaces * i + 1)];
+      if (own >= 0) plane_of[static_cast<std::size_t>(own)] = i;
+    }
+    for (std::int64_t i = 0; i < planes.count; ++i) {
+      std::int32_t& behind = cells[static_cast<std::size_t>(kPlaces * i)];
+      const std::int64_t other = behind >= 0 ? plane_of[static_cast<std::size_t>(behind)] : -1;
+      if (other < 0) continue;
+      const float *normal = planes.normals + 3 * i, *opposite = planes.normals + 3 * other;
+      if (normal[0] * opposite[0] + normal[1] * opposite[1] + normal[2] * opposite[2] < 0) behind = -1;
+    }
   }
 
   // Neighbours are vertices of the same cell.
@@ -218,10 +242,10 @@ class Plates {
 
 }  // namespace
 
-void smooth_distances(const VertexTable& table, const KnownPlanes& planes, int iterations, float* distances_m,
-                      int num_threads) {
+void smooth_distances(const VertexTable& table, const KnownPlanes& planes, const std::int8_t* sides, int iterations,
+                      float* distances_m, int num_threads) {
   if (table.encoding() != Encoding::kOctree) throw std::invalid_argument("only an octree has vertices in space");
-  Plates(table, planes, num_threads).relax(iterations, distances_m);
+  Plates(table, planes, num_threads).relax(sides, iterations, distances_m);
 }
 
 }  // namespace radarsdf

@@ -198,9 +198,9 @@ class VertexTable:
         weights: numpy.typing.NDArray[numpy.float32],
         truncation_m: typing.SupportsFloat | typing.SupportsIndex,
         num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-    ) -> numpy.typing.NDArray[numpy.float32]:
+    ) -> tuple[numpy.typing.NDArray[numpy.float32], numpy.typing.NDArray[numpy.int8]]:
         """
-        Of an octree: for each vertex (num_rows,) float32 the mean of its signed distances, m, to planes through the `points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame.
+        Of an octree: for each vertex (num_rows,) float32 the mean of its signed distances, m, to planes through the `points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame. And (num_rows,) int8: 1 if many rays passed the vertex, -1 if it lies behind many returns where nothing was seen, else 0.
         """
     @typing.overload
     def begin_adam_step(
@@ -412,11 +412,12 @@ class VertexTable:
         points: numpy.typing.NDArray[numpy.float32],
         normals: numpy.typing.NDArray[numpy.float32],
         information: numpy.typing.NDArray[numpy.float32],
+        sides: numpy.typing.NDArray[numpy.int8],
         iterations: typing.SupportsInt | typing.SupportsIndex,
         num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
     ) -> numpy.typing.NDArray[numpy.float32]:
         """
-        Of an octree: `distances_m` (num_rows,) float32 after so many steps towards distances that agree with the planes through `points` (N, 3) with these `normals` (N, 3) and this `information` (N,), m^-2, all float32, local frame, and bend as little as they can. An iteration carries what is known SMOOTHING_REACH vertices far.
+        Of an octree: `distances_m` (num_rows,) float32 after so many steps towards distances that agree with the planes through `points` (N, 3) with these `normals` (N, 3) and this `information` (N,), m^-2, all float32, local frame, and bend as little as they can. Vertices stay on the `sides` (num_rows,) int8 of `average_rays`. An iteration carries what is known SMOOTHING_REACH vertices far.
         """
     @property
     def encoding(self) -> Encoding: ...

@@ -120,7 +120,7 @@ def test_the_average_is_that_of_the_reference(num_levels):
     rays = some_rays(400)
     occupied = keys_along(*(np.ascontiguousarray(a[::2]) for a in rays[:2]), 0.4)
     table = VertexTable(occupied, LEAF_M, num_levels, Encoding.OCTREE)
-    average = table.average_rays(*rays, 0.6)
+    average, _ = table.average_rays(*rays, 0.6)
     expected = reference(table, *rays, 0.6)
     assert (expected != 0).mean() > 0.9
     np.testing.assert_allclose(average[: len(expected)], expected, atol=2e-6)
@@ -130,21 +130,22 @@ def test_the_average_is_that_of_the_reference(num_levels):
 def test_the_same_bits_for_any_number_of_threads():
     rays = some_rays(40_000, spread_m=4.0)  # several groups
     table = VertexTable(keys_along(rays[0], rays[1], 0.4), LEAF_M, 1, Encoding.OCTREE)
-    one = table.average_rays(*rays, 0.6, num_threads=1)
+    one, sides = table.average_rays(*rays, 0.6, num_threads=1)
     for num_threads in (2, 3, 8):
-        assert table.average_rays(*rays, 0.6, num_threads=num_threads).tobytes() == one.tobytes()
+        again = table.average_rays(*rays, 0.6, num_threads=num_threads)
+        assert (again[0].tobytes(), again[1].tobytes()) == (one.tobytes(), sides.tobytes())
     backwards = [
         np.ascontiguousarray(a[::-1]) for a in rays
     ]  # another order of sums, and no ray lost between groups
-    np.testing.assert_allclose(table.average_rays(*backwards, 0.6), one, atol=1e-5)
+    np.testing.assert_allclose(table.average_rays(*backwards, 0.6)[0], one, atol=1e-5)
 
 
 def test_no_ray_and_no_cell():
     rays = some_rays(20)
     table = VertexTable(keys_along(rays[0], rays[1], 0.4), LEAF_M, 1, Encoding.OCTREE)
-    assert (table.average_rays(*(a[:0] for a in rays), 0.6) == 0).all()
+    assert not np.any(table.average_rays(*(a[:0] for a in rays), 0.6))
     empty = VertexTable(np.zeros(0, np.uint64), LEAF_M, 1, Encoding.OCTREE)
-    assert len(empty.average_rays(*rays, 0.6)) == 0
+    assert len(empty.average_rays(*rays, 0.6)[0]) == 0
     assert [len(a) for a in empty.leaf_vertices()] == [0, 0]
 
 
@@ -168,3 +169,19 @@ def test_wrong_arrays_are_refused():
     ):
         with pytest.raises(ValueError, match="shape"):
             table.average_rays(*(np.ascontiguousarray(a) for a in wrong), 0.6)
+
+
+def test_the_side_of_a_vertex_is_known_where_many_rays_passed_it_and_behind_many_more():
+    x, y = np.meshgrid(*[np.arange(-0.95, 1, 0.1)] * 2)
+    points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)]).astype(np.float32)
+    down = np.tile(np.float32([0, 0, -1]), (x.size, 1))
+    table = VertexTable(keys_along(points, down, 0.6), LEAF_M, 1, Encoding.OCTREE)
+    corners, _ = table.leaf_vertices()
+    inner = (np.abs(corners[:, :2]) < 5).all(axis=1)
+    height_m = corners[inner, 2] * LEAF_M - 0.03
+    # 16 rays in the four columns of cells round a vertex, each once or twice.
+    for weight, in_front, behind in ((1, 0, 0), (8, 1, 0), (64, 1, -1)):
+        weights = np.full(x.size, weight, np.float32)
+        _, sides = table.average_rays(points, down, -down, weights, 0.6)
+        expected = np.where(height_m > LEAF_M, in_front, np.where(height_m < -LEAF_M, behind, 0))
+        np.testing.assert_array_equal(sides[: len(corners)][inner], expected)

@@ -32,6 +32,12 @@ def scene(seed=0, count=300, half_m=1.2, lower=0.0):
     return table, rough, points, normals, information
 
 
+def smoothed(table, distances, *planes, **threads):
+    """By ``table.smoothed``, where no vertex has a known side. `planes`: with the iterations."""
+    *arrays, iterations = planes
+    return table.smoothed(distances, *arrays, np.zeros(len(distances), np.int8), iterations, **threads)
+
+
 def system(table, points, normals, information):
     """Rows A and targets b of the sum of squares |A d - b|² that the core names."""
     corners, of_cells = table.leaf_vertices()
@@ -79,8 +85,8 @@ def test_many_iterations_come_to_the_least_sum_of_squares():
     def sum_of_squares(distances):
         return np.square(matrix @ distances - targets).sum()
 
-    sums = [sum_of_squares(table.smoothed(rough, *planes, iterations)) for iterations in (0, 4, 24)]
-    again = table.smoothed(table.smoothed(rough, *planes, 50), *planes, 50)
+    sums = [sum_of_squares(smoothed(table, rough, *planes, iterations)) for iterations in (0, 4, 24)]
+    again = smoothed(table, smoothed(table, rough, *planes, 50), *planes, 50)
     sums.append(sum_of_squares(again))
     assert sums[0] == sum_of_squares(rough)
     assert sums == sorted(sums, reverse=True)
@@ -94,7 +100,7 @@ def test_what_is_flat_stays():
     points[:, 2], normals[:] = 0.03, [0, 0, 1]
     distances = (table.leaf_vertices()[0][:, 2] * LEAF_M - 0.03).astype(np.float32)
     np.testing.assert_allclose(
-        table.smoothed(distances, points, normals, information, 50), distances, atol=2e-6
+        smoothed(table, distances, points, normals, information, 50), distances, atol=2e-6
     )
 
 
@@ -103,7 +109,7 @@ def test_a_vertex_gets_what_is_in_reach_to_the_bit():
     reach_m = iterations * VertexTable.SMOOTHING_REACH * LEAF_M
     table, rough, points, normals, information = scene(count=900, half_m=3.0)
     corners, _ = table.leaf_vertices()
-    whole = table.smoothed(rough, points, normals, information, iterations)
+    whole = smoothed(table, rough, points, normals, information, iterations)
     # The half of it with x < 1: planes, cells and vertices.
     kept = points[:, 0] < 1.0
     cells = CellSet(LEAF_M)
@@ -112,7 +118,7 @@ def test_a_vertex_gets_what_is_in_reach_to_the_bit():
     own, _ = half.leaf_vertices()
     number = {tuple(corner): i for i, corner in enumerate(corners.tolist())}
     rows = [number[tuple(corner)] for corner in own.tolist()]
-    part = half.smoothed(rough[rows], points[kept], normals[kept], information[kept], iterations)
+    part = smoothed(half, rough[rows], points[kept], normals[kept], information[kept], iterations)
     # Cells along a ray reach 0.4 m away from its point, and a place lies a leaf away from it.
     inner = own[:, 0] * LEAF_M < 1.0 - reach_m - 0.4 - 2 * LEAF_M
     assert inner.sum() > 100
@@ -123,30 +129,66 @@ def test_a_vertex_gets_what_is_in_reach_to_the_bit():
 def test_any_number_of_threads_gives_the_same_bits():
     table, rough, *planes = scene(count=20_000, half_m=8.0)
     assert table.num_rows > 2 * 2**13
-    one = table.smoothed(rough, *planes, 5, num_threads=1)
+    one = smoothed(table, rough, *planes, 5, num_threads=1)
     for num_threads in (2, 3):
-        assert table.smoothed(rough, *planes, 5, num_threads=num_threads).tobytes() == one.tobytes()
+        assert smoothed(table, rough, *planes, 5, num_threads=num_threads).tobytes() == one.tobytes()
 
 
 def test_without_planes_it_only_bends_less():
     table, rough, *planes = scene()
-    smoothed = table.smoothed(rough, *(a[:0] for a in planes), 10)
+    found = smoothed(table, rough, *(a[:0] for a in planes), 10)
     matrix, _ = system(table, *(a[:0] for a in planes))
-    assert np.square(matrix @ smoothed).sum() < 0.1 * np.square(matrix @ rough).sum()
+    assert np.square(matrix @ found).sum() < 0.1 * np.square(matrix @ rough).sum()
     empty = VertexTable(np.zeros(0, np.uint64), LEAF_M, 1, Encoding.OCTREE)
-    assert len(empty.smoothed(rough[:0], *planes, 3)) == 0
+    assert len(smoothed(empty, rough[:0], *planes, 3)) == 0
 
 
 def test_what_cannot_be_smoothed_is_refused():
     table, rough, points, normals, information = scene()
     with pytest.raises(ValueError, match="distances_m"):
-        table.smoothed(rough[1:], points, normals, information, 3)
+        smoothed(table, rough[1:], points, normals, information, 3)
     with pytest.raises(ValueError, match="information"):
-        table.smoothed(rough, points, normals, information[1:], 3)
+        smoothed(table, rough, points, normals, information[1:], 3)
     with pytest.raises(ValueError, match="normals"):
-        table.smoothed(rough, points, normals[:, :2].copy(), information, 3)
+        smoothed(table, rough, points, normals[:, :2].copy(), information, 3)
     with pytest.raises(ValueError, match="million cells"):
-        table.smoothed(rough, points + np.float32(np.nan), normals, information, 3)
+        smoothed(table, rough, points + np.float32(np.nan), normals, information, 3)
     planes = VertexTable(table.leaf_keys(), LEAF_M, 1, Encoding.TRI_QUADTREE)
     with pytest.raises(ValueError, match="octree"):
-        planes.smoothed(np.zeros(planes.num_rows, np.float32), points, normals, information, 3)
+        smoothed(planes, np.zeros(planes.num_rows, np.float32), points, normals, information, 3)
+
+
+def test_no_vertex_leaves_its_known_side():
+    table, rough, *planes = scene()
+    sides = np.random.default_rng(1).integers(-1, 2, len(rough)).astype(np.int8)
+    free = smoothed(table, rough, *planes, 24)
+    kept = table.smoothed(rough, *planes, sides, 24)
+    known = sides != 0
+    assert (free[known] * sides[known] < 0).mean() > 0.3
+    assert (kept[known] * sides[known]).min() >= np.float32(LEAF_M / 4)
+    assert (kept[~known] != free[~known]).any()
+    with pytest.raises(ValueError, match="sides"):
+        table.smoothed(rough, *planes, sides[1:], 24)
+
+
+def test_planes_of_the_two_sides_of_a_thin_wall_both_stay():
+    x, y = (a.ravel() for a in np.meshgrid(*[np.arange(-0.9, 1, 0.2)] * 2))
+    half_m = 0.08
+    points = np.float32([[*p, z] for p in zip(x, y, strict=True) for z in (-half_m, half_m)])
+    normals = np.float32([[0, 0, np.sign(z)] for z in points[:, 2]])
+    cells = CellSet(LEAF_M)
+    cells.insert_rays(points, normals, 0.4)
+    table = VertexTable(cells.sorted_keys(), LEAF_M, 1, Encoding.OCTREE)
+    corners, _ = table.leaf_vertices()
+    z = corners[:, 2] * LEAF_M
+    found = smoothed(
+        table,
+        np.zeros(len(z), np.float32),
+        points,
+        normals,
+        np.full(len(z), 500, np.float32)[: len(points)],
+        50,
+    )
+    inner = (np.abs(corners[:, :2]) < 4).all(axis=1)
+    assert (found[inner & (np.abs(z) < 0.1)] < 0).all()
+    assert (found[inner & (np.abs(z) > 0.1)] > 0).all()

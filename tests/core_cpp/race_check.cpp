@@ -217,10 +217,11 @@ void sums_and_rays(int threads, Results& results) {
   results.add(looks.data(), num_leaves);
   const radarsdf::VertexTable table(leaf_keys, 0.2, 1, radarsdf::Encoding::kOctree, threads);
   std::vector<float> weights(kPoints, 1.0F), distances(static_cast<std::size_t>(table.num_rows()));
+  std::vector<std::int8_t> sides(distances.size());
   radarsdf::average_rays(table, {points.data(), directions.data(), directions.data(), weights.data(), kPoints}, 0.6,
-                         distances.data(), threads);
-  radarsdf::smooth_distances(table, {points.data(), directions.data(), weights.data(), kPoints}, 3, distances.data(),
-                             threads);
+                         distances.data(), sides.data(), threads);
+  radarsdf::smooth_distances(table, {points.data(), directions.data(), weights.data(), kPoints}, sides.data(), 3,
+                             distances.data(), threads);
   results.add(distances.data(), table.num_rows());
 }
 

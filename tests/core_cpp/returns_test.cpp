@@ -316,8 +316,9 @@ TEST_CASE("rays that meet a plane straight average to its distance, cut at the t
   const auto vertices = radarsdf::leaf_vertices(table);
   for (const int threads : test::kThreads) {
     std::vector<float> distances(static_cast<std::size_t>(table.num_rows()));
+    std::vector<std::int8_t> sides(distances.size());
     radarsdf::average_rays(table, {points.data(), directions.data(), normals.data(), weights.data(), kRays},
-                           kTruncation, distances.data(), threads);
+                           kTruncation, distances.data(), sides.data(), threads);
     for (std::size_t row = 0; row < distances.size(); ++row) {
       const double z = vertices.coordinates[3 * row + 2] * kSize - static_cast<double>(kHeight);
       REQUIRE(static_cast<double>(distances[row]) ==
@@ -329,8 +330,9 @@ TEST_CASE("rays that meet a plane straight average to its distance, cut at the t
     std::vector<float> distances(static_cast<std::size_t>(table.num_rows()));
     for (std::size_t row = 0; row < distances.size(); ++row)
       distances[row] = static_cast<float>(vertices.coordinates[3 * row + 2] * kSize) - kHeight;
-    radarsdf::smooth_distances(table, {points.data(), normals.data(), weights.data(), kRays}, 5, distances.data(),
-                               threads);
+    const std::vector<std::int8_t> unknown(distances.size());
+    radarsdf::smooth_distances(table, {points.data(), normals.data(), weights.data(), kRays}, unknown.data(), 5,
+                               distances.data(), threads);
     for (std::size_t row = 0; row < distances.size(); ++row) {
       const double z = vertices.coordinates[3 * row + 2] * kSize - static_cast<double>(kHeight);
       REQUIRE(static_cast<double>(distances[row]) == doctest::Approx(z).epsilon(1e-4));
@@ -338,9 +340,10 @@ TEST_CASE("rays that meet a plane straight average to its distance, cut at the t
   }
   const radarsdf::VertexTable planes(cells.sorted_keys(1), kSize, 1, radarsdf::Encoding::kTriQuadtree, 1);
   float none = 0;
-  CHECK_THROWS_AS(radarsdf::smooth_distances(planes, {nullptr, nullptr, nullptr, 0}, 1, &none, 1),
+  std::int8_t side = 0;
+  CHECK_THROWS_AS(radarsdf::smooth_distances(planes, {nullptr, nullptr, nullptr, 0}, &side, 1, &none, 1),
                   std::invalid_argument);
-  CHECK_THROWS_AS(radarsdf::average_rays(planes, {nullptr, nullptr, nullptr, nullptr, 0}, kTruncation, &none, 1),
+  CHECK_THROWS_AS(radarsdf::average_rays(planes, {nullptr, nullptr, nullptr, nullptr, 0}, kTruncation, &none, &side, 1),
                   std::invalid_argument);
 }
 

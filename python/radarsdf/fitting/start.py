@@ -153,6 +153,9 @@ def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> NDArray[np
     plane = surfels.flat_planes_of_leaves(rays.keys, num_threads)
     of_planes = surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0
     normals: NDArray[np.float32] = np.where(plane[:, None] >= 0, of_planes, -rays.directions)
+    # A surfel of returns from both sides of a thin wall faces one of them alone.
+    away = np.einsum("ij,ij->i", normals, rays.directions) > 0
+    normals[away] *= -1
     return normals
 
 
@@ -168,7 +171,7 @@ def average_at_vertices(
 
     What a vertex gets depends on what is within :func:`cells_smoothed` leaf cells of the cells of its rays, to the bit.
     """
-    distances_m: NDArray[np.float32] = table.average_rays(
+    distances_m, sides = table.average_rays(
         rays.points,
         rays.directions,
         np.ascontiguousarray(normals, np.float32),
@@ -182,6 +185,7 @@ def average_at_vertices(
             rays.points,
             np.ascontiguousarray(normals, np.float32),
             told.information,
+            sides,
             _SMOOTHINGS,
             num_threads,
         )
