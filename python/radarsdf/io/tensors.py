@@ -77,7 +77,7 @@ def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[T
 
 
 def _checksum_of(array: Any) -> str:
-    numbers = np.asarray(array)
+    numbers: Any = np.asarray(array)
     return f"{zlib.crc32(numbers, zlib.crc32(f'{numbers.dtype} {numbers.shape}'.encode())):08x}"
 
 

@@ -189,7 +189,7 @@ class LiveMap:
         scan = checked_scan(points, intensities, doppler_mps, self._state.config.returns)
         given = None if pose is None else check_pose(pose, "pose").copy()
         time_s = None if time is None else finite_time(time)
-        instance(scan_id, Hashable, "scan_id")
+        instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         if given is None and time_s is None:
             msg = "a scan needs a pose, or a time"
             raise ValueError(msg)
@@ -258,7 +258,7 @@ class LiveMap:
         """
         checked = {
             scan_id: check_pose(pose, f"the pose of scan {scan_id!r:.50}")
-            for scan_id, pose in instance(poses, Mapping, "poses").items()
+            for scan_id, pose in instance(poses, Mapping, "poses").items()  # type: ignore[type-abstract]
         }
         with self._lock:
             change, moved = self._state.change(), []

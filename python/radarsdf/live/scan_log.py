@@ -107,7 +107,8 @@ class ScanLog:
 
     def get(self, scan_id: ScanId) -> LoggedScan:
         """A scan. Raises a KeyError if there is none of this id, SealedScan if it was let go."""
-        if instance(scan_id, Hashable, "scan_id") in self._sealed:
+        instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
+        if scan_id in self._sealed:
             msg = f"scan {scan_id!r} cannot be moved or taken out: it was let go to keep to max_bytes; give the map a folder to keep scans in"
             raise SealedScan(msg)
         if scan_id not in self._scans:

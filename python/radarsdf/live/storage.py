@@ -134,7 +134,9 @@ def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
     state = State(**by_name(json.loads(arrays["described"].tobytes()), "state"))
     sums = checked_sums(arrays)
     check_arrays(arrays, {"counts": (np.int64, len(state.held))})
-    ids, held, counts = state.ids, state.held, arrays["counts"].tolist()
+    ids: list[ScanId] = [*state.ids]
+    held: list[list[str]] = [[*names] for names in state.held]
+    counts = arrays["counts"].tolist()
     all_ids = {*ids, *state.sealed}
     if len(all_ids) < len(ids) + len(state.sealed) or state.next_id in all_ids or min(counts, default=1) < 1:
         msg = "ids are there twice, or a scan is empty"
@@ -161,7 +163,7 @@ def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
         next_id=state.next_id,
         with_intensities=state.with_intensities,
         max_bytes=state.max_bytes,
-        sealed=state.sealed,
+        sealed=[*state.sealed],
         scans=scans,
         **sums,
     )
