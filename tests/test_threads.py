@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 
@@ -179,3 +181,25 @@ def test_fits_at_once_give_the_bits_of_fits_in_turn(scene):
         for name, value in one.field.state_dict().items():
             assert torch.equal(value, other.field.state_dict()[name]), name
     assert torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize("kind", ["daemon", "other"])
+def test_a_fit_in_a_thread_while_the_interpreter_ends(kind):
+    code = f"""
+import threading, time
+import radarsdf
+from radarsdf import FitConfig
+from tests.conftest import ground_and_wall
+from tests.test_threads import QUICK
+scene = ground_and_wall()
+config = QUICK.override(training={{"sdf_iterations": 10**6 if {kind == "daemon"} else 300}})
+def work():
+    print("begins", flush=True)
+    found = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+    print("done", found.report["iterations_done"]["sdf"], len(found.mesh(0.4, progress=False).faces) > 0, flush=True)
+threading.Thread(target=work, daemon={kind == "daemon"}).start()
+time.sleep(1.0)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    expected = ["begins"] if kind == "daemon" else ["begins", "done 300 True"]
+    assert (ended.returncode, ended.stdout.splitlines(), ended.stderr) == (0, expected, "")

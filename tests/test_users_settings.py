@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What users set in PyTorch for themselves changes no bit of ours. Streams and disks are in test_streams.py and cli."""
+"""What users set in PyTorch and NumPy for themselves changes no bit of ours. Streams and disks are in test_streams.py and cli."""
 
 from __future__ import annotations
 
@@ -56,6 +56,7 @@ SETTINGS = {
     "inference mode": torch.inference_mode,
     "no gradients": torch.no_grad,
     "deterministic": deterministic,
+    "errors of NumPy": lambda: np.errstate(all="raise"),
 }
 TRAINING = {"sdf_iterations": 4, "intensity_iterations": 8, "batch_size": 256, "intensity_batch_size": 128}
 CONFIGS = {

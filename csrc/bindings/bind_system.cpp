@@ -1,6 +1,11 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 #include <pybind11/stl.h>
+#ifdef __unix__
+#include <unistd.h>
+#endif
+
+#include <exception>
 
 #include "bindings/arrays.hpp"
 #include "bindings/held_crew.hpp"
@@ -15,11 +20,30 @@
 namespace radarsdf {
 namespace {
 
-// Python runs its handlers of signals, Ctrl-C's among them, only when a call returns, unless it is asked to.
+unsigned long main_thread = 0;  // as PyThread_get_thread_ident has it
+
+// Python runs its handlers of signals, Ctrl-C's among them, only when a call returns, unless it is asked to. It does so
+// in the main thread alone. Others must not ask for the lock here: while the interpreter ends, that would end them.
 void check_signals() {
+  if (PyThread_get_thread_ident() != main_thread) return;
   const py::gil_scoped_acquire hold;
   if (PyErr_CheckSignals() != 0) throw py::error_already_set();
 }
+
+#if defined(__GLIBC__) && PY_VERSION_HEX < 0x030E0000
+#define RADARSDF_UNWINDS_DAEMONS
+
+std::terminate_handler terminate_before = nullptr;
+
+// A daemon thread that wants Python's lock while the interpreter ends is ended by unwinding its stack. No destructor of
+// C++ lets that pass, such as those that take the lock again here and in PyTorch: the whole process would abort. The
+// thread waits for the end of the process instead, as it does from Python 3.14 on.
+void wait_or_terminate() {
+  const bool ended = Py_IsInitialized() == 0 && PyThread_get_thread_ident() != main_thread;
+  while (ended && !std::current_exception()) pause();
+  terminate_before();
+}
+#endif
 
 // What Python must know of the core's arrays. It is defined in the core's headers and nowhere else.
 void bind_numbers(py::module_& m) {
@@ -38,7 +62,11 @@ void bind_numbers(py::module_& m) {
 }  // namespace
 
 void bind_system(py::module_& m) {
+  main_thread = py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
   set_interrupt_check(&check_signals);
+#ifdef RADARSDF_UNWINDS_DAEMONS
+  terminate_before = std::set_terminate(&wait_or_terminate);
+#endif
   using namespace py::literals;
   py::class_<HeldCrew>(m, "Crew",
                        "Threads for short pieces of work, the calling one among them. They end with the object. One "

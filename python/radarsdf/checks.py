@@ -17,10 +17,13 @@ from scipy.spatial.transform import Rotation, Slerp
 MAX_POSITION_M = 1e12
 """Largest coordinate, m. Squares of it, and products of three, are far from overflow in float64."""
 
+MAX_TIME_S = 1e11
+"""Latest time, s, before or after 0: times since 1970 in milliseconds or smaller units are beyond it."""
+
 _Kind = TypeVar("_Kind")
 
 _MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; scaled or sheared ones do not
-_RIGID = "rotation, translation, last row 0 0 0 1"
+_RIGID = f"rotation, translation within {MAX_POSITION_M:g} m, last row 0 0 0 1"
 
 
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:

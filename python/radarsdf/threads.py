@@ -19,7 +19,7 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
@@ -191,11 +191,22 @@ class Workers:
         assert self._pool is not None
         if self.num_threads == 1 or len(items) <= 1:
             return map(function, items)
-        if len(items) > self.num_threads:
-            return self._pool.map(function, items)
-        # Every item gets a thread. The calling thread computes the first one itself: to sleep and be woken
+        # If every item gets a thread, the calling thread computes the first one itself: to sleep and be woken
         # would take a noticeable part of an iteration.
-        others = self._pool.map(function, items[1:])
+        own = 0 if len(items) > self.num_threads else 1
+        futures: list[Future[_Result]] = []
+        try:
+            for item in items[own:]:
+                futures.append(self._pool.submit(function, item))
+        except RuntimeError as error:
+            # Pools take nothing more once the main thread is done, while the interpreter still waits for this thread.
+            if "cannot schedule" not in str(error):
+                raise
         with torch.enable_grad():  # as in the threads of the pool
-            first = function(items[0])
-        return itertools.chain([first], others)
+            first = [function(item) for item in items[:own]]
+            rest = [function(item) for item in items[own + len(futures) :]]
+        futures.reverse()
+        submitted = (
+            futures.pop().result() for _ in range(len(futures))
+        )  # a result is let go once it is used
+        return itertools.chain(first, submitted, rest)

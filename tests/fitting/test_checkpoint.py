@@ -16,8 +16,8 @@ import radarsdf
 import torch
 from radarsdf import FitConfig, Interrupted
 from radarsdf.fitting.training import Training
+from radarsdf.io.tensors import open_tensors, tensor_bytes
 from safetensors import safe_open
-from safetensors.torch import save_file
 
 from ..conftest import ground_and_wall
 from ..settings import grouped
@@ -215,12 +215,11 @@ class TestOtherFiles:
 
     @staticmethod
     def rewrite(path, tensors=None, **identity):
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata()
-            old = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+        with open_tensors(path) as file:
+            metadata = file.metadata
+            old = {name: file.array(name).clone() for name in file.names}
         metadata["identity"] = json.dumps(json.loads(metadata["identity"]) | identity)
-        save_file(old | (tensors or {}), path, metadata)
-        return old
+        path.write_bytes(tensor_bytes(old | (tensors or {}), metadata))
 
     @pytest.mark.parametrize(
         ("name", "value"),

@@ -139,7 +139,9 @@ def with_config(group, **changes):
     header = json.loads(data[8 : 8 + size])
     description = json.loads(header["__metadata__"]["description"])
     description["config"][group].update(changes)
-    header["__metadata__"]["description"] = json.dumps(description)
+    # Older files have no checksums, which would find the change.
+    kept = {k: v for k, v in header["__metadata__"].items() if not k.startswith("crc32")}
+    header["__metadata__"] = kept | {"description": json.dumps(description)}
     text = json.dumps(header).encode()
     return len(text).to_bytes(8, "little") + text + data[8 + size :]
 

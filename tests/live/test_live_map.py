@@ -225,6 +225,13 @@ def test_scans_move_together_or_not_at_all():
     with pytest.raises(KeyError, match="no scan 9"):
         live.move_all({0: moved[0], 9: moved[1]})
     assert state(live) == before
+    for wrong in (list(moved[:4]), None, moved):
+        with pytest.raises(TypeError, match="poses must be a Mapping"):
+            live.move_all(wrong)
+    with pytest.raises(ValueError, match="the pose of scan 1"):
+        live.move_all({0: moved[0], 1: moved[1, :3]})
+    with pytest.raises(TypeError, match="scan_id must be a Hashable"):
+        live.integrate(SCENE.points[0], SCENE.poses[0], SCENE.intensities[0], scan_id=[7])
     changed = live.move_all(dict(enumerate(moved[:4])))
     assert state(live) == state(map_of(range(4), poses=moved))
     assert len(changed) > 10

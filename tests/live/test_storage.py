@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import io
+import json
+import math
 import subprocess
 import time
 
@@ -81,3 +83,20 @@ for i in range(10**6):
         k = i % len(SCENE.points)
         other.integrate(SCENE.points[k], SCENE.poses[k], SCENE.intensities[k])
     assert state(live) == state(other)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("format", 2), ("origin", [1.0]), ("origin", None), ("origin", [1e300] * 3), ("noise", [math.nan] * 3), ("noise_of", math.inf),
+     ("next_id", 1e308), ("next_id", 1), ("with_intensities", "x"), ("with_intensities", False), ("max_bytes", []), ("max_bytes", -1),
+     ("sealed", 3), ("sealed", [[1]]), ("sealed", [0]), ("ids", [0, 0]), ("held", [["points"]] * 2), ("config", [])],
+)  # fmt: skip
+def test_odd_metadata_is_refused(tmp_path, name, value):
+    file = tmp_path / "live.npz"
+    map_of(range(2)).save(file)
+    with np.load(file) as loaded:
+        arrays = dict(loaded)
+    described = json.loads(arrays["described"].tobytes()) | {name: value}
+    np.savez(file, **arrays | {"described": np.frombuffer(json.dumps(described).encode(), np.uint8)})
+    with pytest.raises(ValueError, match=r"live\.npz"):
+        LiveMap.load(file)

@@ -16,7 +16,7 @@ import radarsdf
 import torch
 from radarsdf import FitConfig
 from radarsdf.io import files
-from safetensors import safe_open
+from radarsdf.io.tensors import open_tensors, tensor_bytes
 from safetensors.torch import load_file, save_file
 
 from ..settings import grouped
@@ -41,14 +41,12 @@ def saved_parts(radar_map, folder):
     """A map, its file in this folder, and the file's parts."""
     path = folder / "map.safetensors"
     radar_map.save(path)
-    with safe_open(path, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        metadata = file.metadata()
-    return radar_map, path, tensors, metadata
+    with open_tensors(path) as file:
+        return radar_map, path, {name: file.array(name).clone() for name in file.names}, file.metadata
 
 
 def write(path, tensors, metadata):
-    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path, metadata)
+    path.write_bytes(tensor_bytes(tensors, metadata))
     return path
 
 

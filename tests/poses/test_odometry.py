@@ -239,6 +239,24 @@ def test_wrong_arguments_are_refused(drive, motion):
             angular_velocity=rates,
             angular_velocity_times=times + 1e9,
         )
+    none = np.zeros(0)
+    for wrong, name in (
+        ({"times": times * 1e300}, "times"),
+        ({"angular_velocity": rates + 1e300}, "angular_velocity"),
+        ({"angular_velocity": rates[:0], "angular_velocity_times": none}, "angular_velocity"),
+        ({"angular_velocity": rates, "angular_velocity_times": times * 1e300}, "angular_velocity"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name} "):
+            radarsdf.odometry(points, **{"doppler_mps": speeds, "times": times} | wrong)
+
+
+def test_scans_without_poses(drive, motion):
+    scans = radarsdf.io.Scans(
+        drive.points[:8], None, doppler_mps=motion.doppler_mps[:8], times_s=motion.times_s[:8]
+    )
+    assert len(radarsdf.odometry(scans).poses) == 8
+    with pytest.raises(ValueError, match="poses are missing"):
+        radarsdf.fit(scans)
 
 
 def test_scans_of_a_sensor_that_stands_do_not_count_again(drive):

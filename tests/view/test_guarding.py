@@ -8,7 +8,7 @@ import socket
 from types import SimpleNamespace
 
 import pytest
-from radarsdf.view.guarding import bounded, why_refused
+from radarsdf.view.guarding import bounded, others_reach, why_refused
 
 NAN, INF = float("nan"), float("inf")
 
@@ -182,3 +182,9 @@ def test_wild_values_are_left_out(message):
 )  # fmt: skip
 def test_messages_that_the_page_does_not_send_are_left_out(message):
     assert bounded(message, CONTROLS) is None
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "0", "::", "10.1.2.3"])
+def test_others_reach_what_is_no_loopback(host):
+    assert others_reach(host)
+    assert not any(map(others_reach, ("127.0.0.1", "127.0.0.2", "localhost", "::1")))

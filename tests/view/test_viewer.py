@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import socket
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,6 +25,8 @@ from scipy.spatial import cKDTree
 from ..conftest import ground_and_wall
 
 pytest.importorskip("viser", reason="the extra view is not installed")
+
+from viser import ClientHandle
 
 from bench.viewing.client import Glb, PlainClient, is_mesh
 
@@ -47,6 +51,31 @@ def client(viewer):
         client.wait_for(lambda message: message.kind == "GlbMessage")
         client.wait_for(lambda m: m.kind == "SetCameraLookAtMessage" and not m.message["initial"])
         yield client
+
+
+def test_connections_that_ended_leave_nothing(viewer):
+    def held():
+        return sum(type(thing) is ClientHandle for thing in gc.get_objects())
+
+    gc.disable()  # which would free some by chance
+    try:
+        for _ in range(6):
+            with PlainClient(viewer.host, viewer.port) as client:
+                client.wait_for(lambda message: message.kind == "GlbMessage")
+        until_s = time.monotonic() + 20
+        while held() > 2 and time.monotonic() < until_s:
+            time.sleep(0.1)
+        assert held() <= 2, held()  # the last ones may still be in use while others are freed
+    finally:
+        gc.enable()
+
+
+def test_a_host_that_others_reach_is_said(sharp_map):
+    with (
+        pytest.warns(RuntimeWarning, match=r"0\.0\.0\.0"),
+        Viewer(sharp_map, None, voxel_size=0.4, host="0.0.0.0", port=0, progress=False),
+    ):
+        pass
 
 
 def mesh_of(message):

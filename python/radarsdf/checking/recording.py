@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import (
+    MAX_TIME_S,
     check_scan_shapes,
     check_values_of_scans,
     one_for_each_scan,
@@ -54,10 +55,12 @@ class Recording:
         scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(one_for_each_scan(points, "points"))]
         check_scan_shapes(scans)
         T_world_sensor = pose_matrices(poses, len(scans))
-        times = None if times_s is None else real_array(times_s, "times_s")
+        times = None if times_s is None else real_array(times_s, "times_s").copy()
         if times is not None and times.shape != (len(scans),):
             msg = f"times_s must have shape ({len(scans)},), not {times.shape}"
             raise ValueError(msg)
+        if times is not None:
+            times[np.abs(times) > MAX_TIME_S] = np.nan  # they are none
         values = [
             None if given is None else _values_of(given, scans, name)
             for given, name in ((intensities, "intensities"), (doppler_mps, "doppler_mps"))

@@ -12,7 +12,6 @@ from os import PathLike
 from typing import Any, Protocol
 
 from safetensors import SafetensorError
-from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from radarsdf import _core
@@ -20,7 +19,7 @@ from radarsdf.checks import path_of
 from radarsdf.config.fit_config import FitConfig, flat_settings, settings_of_results
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
-from radarsdf.io.tensors import open_tensors
+from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.returns.rays import Rays
 
 FORMAT = "radarsdf.checkpoint"
@@ -89,7 +88,7 @@ class Checkpoint:
         started_s = time.monotonic()
         metadata = {"format": FORMAT, "identity": json.dumps(self._identity)}
         try:
-            write_whole(self._path, to_bytes({k: v.contiguous() for k, v in state.items()}, metadata))
+            write_whole(self._path, tensor_bytes(state, metadata))
         except OSError as error:
             warnings.warn(f"no checkpoint: {error}", RuntimeWarning, stacklevel=2)
         now_s = time.monotonic()
@@ -108,18 +107,14 @@ class Checkpoint:
         expected = training.state()
         try:
             with open_tensors(self._path) as file:
-                if (names := set(file.keys())) != set(expected):
+                if (names := set(file.names)) != set(expected):
                     msg = f"{sorted(names ^ set(expected))!s:.100} are too few or too many"
                     raise ValueError(msg)
-                for name, tensor in expected.items():
-                    shape = tuple(file.get_slice(name).get_shape())
-                    if shape != tuple(
-                        tensor.shape
-                    ):  # checked before the tensor is read, since a damaged one can have any size
-                        msg = f"{name} has shape {shape} instead of {tuple(tensor.shape)}"
-                        raise ValueError(msg)
-                state = {name: file.get_tensor(name).clone() for name in expected}
+                state = {name: file.array(name).clone() for name in expected}
             for name, value in state.items():
+                if value.shape != expected[name].shape:
+                    msg = f"{name} has shape {tuple(value.shape)} instead of {tuple(expected[name].shape)}"
+                    raise ValueError(msg)
                 if value.dtype != expected[name].dtype or not value.isfinite().all():
                     msg = f"{name} holds something other than finite {expected[name].dtype}"
                     raise ValueError(msg)
@@ -134,7 +129,7 @@ class Checkpoint:
         identity: Any = None
         try:
             with open_tensors(self._path) as file:
-                metadata = file.metadata() or {}
+                metadata = file.metadata
             if metadata.get("format") == FORMAT:
                 identity = json.loads(metadata["identity"])
         except (SafetensorError, KeyError, ValueError, RecursionError):

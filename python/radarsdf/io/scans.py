@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import one_for_each_scan
+from radarsdf.checks import MISSING_POSES, one_for_each_scan
 from radarsdf.io.imu import Imu
 
 _LOG = logging.getLogger("radarsdf.io")
@@ -204,10 +204,9 @@ class Scans:
     @property
     def poses(self) -> NDArray[np.float64]:
         """(F, 4, 4) T_world_sensor, m."""
+        self._read_once()
         if self._poses is None:
-            for _ in self._read():  # which keeps the poses in its end
-                pass
-        assert self._poses is not None
+            raise ValueError(MISSING_POSES)
         return self._poses
 
     @property
@@ -231,7 +230,7 @@ class Scans:
     @property
     def times_s(self) -> NDArray[np.float64] | None:
         """(F,) when the scans were taken, s. None if that is not known."""
-        _ = self.poses
+        self._read_once()
         return self._times_s
 
     @property
@@ -315,6 +314,12 @@ class Scans:
             raise ValueError(msg)
         self._poses = np.stack(poses)
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
+
+    def _read_once(self) -> None:
+        """Reads the files, if there are any and nobody did: poses and times are kept."""
+        if self._poses is None and self._source is not None:
+            for _ in self._read():
+                pass
 
     def _load(self) -> None:
         """Reads all scans, and keeps them."""

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -14,12 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import (
     check_pose,
-    check_poses,
     instance,
     not_negative,
     path_of,
     positions,
-    real_array,
     whole_number,
 )
 from radarsdf.config.fit_config import FitConfig
@@ -191,6 +189,7 @@ class LiveMap:
         scan = checked_scan(points, intensities, doppler_mps, self._state.config.returns)
         given = None if pose is None else check_pose(pose, "pose").copy()
         time_s = None if time is None else finite_time(time)
+        instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         if given is None and time_s is None:
             msg = "a scan needs a pose, or a time"
             raise ValueError(msg)
@@ -257,12 +256,13 @@ class LiveMap:
 
         Readers see the map before, or with all scans moved. Returns and raises as :meth:`remove`.
         """
-        ids = list(poses)
-        given = [real_array(pose, "pose") for pose in poses.values()]
-        checked = check_poses(given, len(given)) if given else np.zeros((0, 4, 4))
+        checked = {
+            scan_id: check_pose(pose, f"the pose of scan {scan_id!r:.50}")
+            for scan_id, pose in instance(poses, Mapping, "poses").items()  # type: ignore[type-abstract]
+        }
         with self._lock:
             change, moved = self._state.change(), []
-            for scan_id, pose in zip(ids, checked, strict=True):
+            for scan_id, pose in checked.items():
                 scan = self._state.log.get(scan_id)
                 if (pose == scan.pose).all():
                     continue

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import instance
 from radarsdf.io.npz import arrays_of, write_arrays
 
 ScanId = Hashable
@@ -106,6 +107,7 @@ class ScanLog:
 
     def get(self, scan_id: ScanId) -> LoggedScan:
         """A scan. Raises a KeyError if there is none of this id, SealedScan if it was let go."""
+        instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         if scan_id in self._sealed:
             msg = f"scan {scan_id!r} cannot be moved or taken out: it was let go to keep to max_bytes; give the map a folder to keep scans in"
             raise SealedScan(msg)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import check_values_of_scan, number, real_array
+from radarsdf.checks import MAX_TIME_S, check_values_of_scan, number, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.live.scan_log import LoggedScan, ScanId, compact
@@ -63,8 +63,8 @@ def checked_scan(
 def finite_time(time: float) -> float:
     """When a scan was taken, s. Raises a ValueError if it is no time."""
     time_s = number(time, "time")
-    if not np.isfinite(time_s):
-        msg = f"time must be finite, not {time_s}"
+    if not abs(time_s) <= MAX_TIME_S:
+        msg = f"time must be finite and within {MAX_TIME_S:g} s, not {time_s:g}"
         raise ValueError(msg)
     return time_s
 

@@ -9,18 +9,39 @@ import json
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from radarsdf.checks import check_poses
+from radarsdf.checks import MAX_POSITION_M, check_poses, check_values_of_scan, positions
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.live.scan_log import FIELDS, LoggedScan, ScanId
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.settings import by_name, settings
 
 _FORMAT = 1
+_Coordinate = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+_Count = Annotated[int, Field(ge=0, le=2**62)]
+
+
+@settings
+class State:
+    """What a file has besides arrays."""
+
+    format: Literal[1]
+    config: dict[str, Any]
+    origin: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] | None
+    noise: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=3, max_length=3)]
+    noise_of: _Count
+    next_id: _Count
+    with_intensities: bool | None
+    max_bytes: Annotated[int, Field(ge=1, le=2**63 - 1)] | None
+    sealed: list[int | str]
+    ids: list[int | str]
+    held: list[list[Literal["points", "intensities", "doppler_mps", "standing"]]]
 
 
 @dataclass(frozen=True)
@@ -94,7 +115,7 @@ def load_state(path: str | PathLike[str]) -> Stored:
     arrays = arrays_of(Path(path), names)
     try:
         return _state_of(arrays)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
         msg = f"{path} is not the state of a live map of this version, or it is damaged: {error}"
         raise ValueError(msg) from error
 
@@ -110,31 +131,39 @@ def checked_sums(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
-    described = json.loads(arrays["described"].tobytes())
-    if described["format"] != _FORMAT:
-        msg = f"format {described['format']!r:.20}"
-        raise ValueError(msg)
+    state = State(**by_name(json.loads(arrays["described"].tobytes()), "state"))
     sums = checked_sums(arrays)
-    ids, held, counts = described["ids"], described["held"], arrays["counts"].tolist()
+    check_arrays(arrays, {"counts": (np.int64, len(state.held))})
+    ids: list[ScanId] = [*state.ids]
+    held: list[list[str]] = [[*names] for names in state.held]
+    counts = arrays["counts"].tolist()
+    all_ids = {*ids, *state.sealed}
+    if len(all_ids) < len(ids) + len(state.sealed) or state.next_id in all_ids or min(counts, default=1) < 1:
+        msg = "ids are there twice, or a scan is empty"
+        raise ValueError(msg)
     poses = check_poses(arrays["poses"], len(ids)) if ids else np.zeros((0, 4, 4))
     columns = {name: _parts(arrays, name, held, counts) for name in FIELDS}
     scans = {
         scan_id: LoggedScan(poses[i].copy(), *(columns[name][i] for name in FIELDS))
         for i, scan_id in enumerate(ids)
     }
-    if any(scan.points is None or scan.points.shape[1:] != (3,) for scan in scans.values()):
-        msg = "a scan has no points"
-        raise ValueError(msg)
-    origin = described["origin"]
+    for i, scan in enumerate(scans.values()):
+        positions(scan.points, f"points of scan {i}")
+        for name in FIELDS[1:]:
+            if (value := getattr(scan, name)) is not None:
+                check_values_of_scan(value, scan.points, name, i)
+        if state.origin is None or state.with_intensities != (scan.intensities is not None):
+            msg = "the origin is missing, or only some scans have intensities"
+            raise ValueError(msg)
     return Stored(
-        config=FitConfig.from_dict(described["config"]),
-        origin=None if origin is None else np.array(origin, np.float64),
-        noise=SensorNoise(*map(float, described["noise"])),
-        noise_of=int(described["noise_of"]),
-        next_id=int(described["next_id"]),
-        with_intensities=described["with_intensities"],
-        max_bytes=described["max_bytes"],
-        sealed=described["sealed"],
+        config=FitConfig.from_dict(state.config),
+        origin=None if state.origin is None else np.array(state.origin, np.float64),
+        noise=SensorNoise(*state.noise),
+        noise_of=state.noise_of,
+        next_id=state.next_id,
+        with_intensities=state.with_intensities,
+        max_bytes=state.max_bytes,
+        sealed=[*state.sealed],
         scans=scans,
         **sums,
     )
@@ -147,8 +176,8 @@ def _parts(arrays: dict[str, NDArray[Any]], name: str, held: list[list[str]], co
         return [None] * len(held)
     lengths = [count for count, own in zip(counts, has, strict=True) if own]
     whole, single = arrays[name], arrays[f"{name}_single"]
-    if sum(lengths) != len(whole):
-        msg = f"{name} are of another number"
+    if sum(lengths) != len(whole) or whole.dtype.kind != ("b" if name == "standing" else "f"):
+        msg = f"{name} are of another number or type"
         raise ValueError(msg)
     parts = iter(zip(np.split(whole, np.cumsum(lengths)[:-1]), single, strict=True))
     found: list[Any] = []

@@ -22,7 +22,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
-from radarsdf.io.tensors import open_tensors
+from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.contents import MapContents
 from radarsdf.map.fit_report import checked_report
 from radarsdf.returns.echoes import Echoes
@@ -81,7 +81,7 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
         "units": _UNITS,
         "description": json.dumps(description),
     }
-    write_whole(path, to_bytes(tensors, metadata))
+    write_whole(path, tensor_bytes(tensors, metadata))
 
 
 def file_bytes(contents: MapContents) -> int:
@@ -192,10 +192,10 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
     check_regular_file(path)
     try:
         with open_tensors(path) as file:
-            metadata = file.metadata() or {}
+            metadata = file.metadata
             _check_format(metadata, path)
             # Copied, because the tensors are views of the file, which may be changed or removed.
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a mapping
+            tensors = {name: file.array(name).clone() for name in file.names}
         return _build(tensors, json.loads(metadata["description"]))
     except (OSError, _OtherFileError):
         raise
@@ -218,8 +218,8 @@ def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
     """
     try:
         with open_tensors(path, "np") as file:
-            keys: NDArray[Any] = file.get_tensor("leaf_keys")
-    except SafetensorError as error:
+            keys: NDArray[Any] = file.array("leaf_keys")
+    except (SafetensorError, ValueError) as error:
         raise _damaged(path) from error
     if keys.dtype != np.int64 or keys.ndim != 1 or not (np.diff(keys, prepend=-1) > 0).all():
         raise _damaged(path)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import real_array
+from radarsdf.checks import MAX_TIME_S, real_array
 from radarsdf.io.scans import Scans, filled
 from radarsdf.poses.by_doppler import NOT_USED, NoVelocityError, SensorVelocities
 from radarsdf.poses.rigid import Floats
@@ -76,7 +76,7 @@ def _checked_times(times: ArrayLike, num_scans: int) -> Floats:
     if times_s.shape != (num_scans,):
         msg = f"times must be one for each of {num_scans} scans, not {times_s.shape}"
         raise ValueError(msg)
-    if not np.isfinite(times_s).all() or (np.diff(times_s) < 0).any():
-        msg = "times must be finite, and ascend from scan to scan"
+    if not (np.abs(times_s) <= MAX_TIME_S).all() or (np.diff(times_s) < 0).any():
+        msg = f"times must be finite, within {MAX_TIME_S:g} s, and ascend from scan to scan"
         raise ValueError(msg)
     return times_s

@@ -197,7 +197,7 @@ def followed(drive: Drive, config: FitConfig, num_threads: int) -> tuple[Drive, 
         tracker = Tracker(cell_m, config.returns, num_threads)
         found = _Pass.of(drive, tracker)
         tracked = found.tracked
-        if i == 0 and tracked[-1].piece > 0 and drive.turns_slowly:
+        if i == 0 and drive.turns_slowly and tracked[-1].piece > 0:
             # Its returns agree nowhere. The next passes search less far.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             drive = dataclasses.replace(drive, turns=Habits(usual, usual, True))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import instance, real_array
+from radarsdf.checks import MAX_TIME_S, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
@@ -35,6 +35,7 @@ LEAST_TOLD = 0.5
 # Likewise of its rotation. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
 # which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_TOLD_TURN = 1 / WINDOW
+_MAX_RATE_RAD_S = 1e4  # more than any gyroscope measures, even in degrees
 
 
 class NotToldError(ValueError):
@@ -254,11 +255,15 @@ def _checked_rates(
     rates: Floats = real_array(angular_velocity, "angular_velocity")
     at_s: Floats = real_array(at, "angular_velocity_times")
     at_s = at_s if at is checked.times_s else at_s - checked.begin_s
-    if rates.ndim != 2 or rates.shape[1] != 3 or at_s.shape != (len(rates),):
-        msg = f"angular_velocity must have shape (G, 3), and one time for each rate, not {rates.shape} and {at_s.shape}"
+    if rates.ndim != 2 or rates.shape[1] != 3 or at_s.shape != (len(rates),) or len(rates) == 0:
+        msg = f"angular_velocity must have shape (G, 3), G > 0, and one time for each rate, not {rates.shape} and {at_s.shape}"
         raise ValueError(msg)
-    if not (np.isfinite(rates).all() and np.isfinite(at_s).all()) or (np.diff(at_s) < 0).any():
-        msg = "angular_velocity and its times must be finite, and the times ascend"
+    within = (np.abs(rates) <= _MAX_RATE_RAD_S).all() and (np.abs(at_s) <= MAX_TIME_S).all()
+    if not within or (np.diff(at_s) < 0).any():
+        msg = (
+            f"angular_velocity must be finite and within {_MAX_RATE_RAD_S:g} rad/s, its times finite, within {MAX_TIME_S:g} s, "
+            "and ascending"
+        )
         raise ValueError(msg)
     times_s = checked.times_s
     assert times_s is not None

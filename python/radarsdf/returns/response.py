@@ -54,6 +54,7 @@ class Response:
     """(48, 96) by range and elevation, of what the first of them leaves."""
 
     @classmethod
+    @np.errstate(under="ignore")  # of lobes and kernels far from their middle
     def of(
         cls,
         values: Float32,
@@ -78,6 +79,7 @@ class Response:
                 coefficients[kind] = _regression(np.concatenate([rays[own], of_incidence], axis=1), y[own])
         return cls(coefficients, table.astype(np.float32))
 
+    @np.errstate(under="ignore")
     def at(
         self, directions: Float32, ranges_m: Float32, incidence_rad: Float32, kinds: NDArray[np.int8]
     ) -> Float32:

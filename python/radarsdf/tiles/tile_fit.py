@@ -133,4 +133,4 @@ def report_of(root: Path, tile: TilePlan) -> dict[str, Any]:
 
 def _report(path: Path) -> Any:
     with open_tensors(path, "np") as file:
-        return json.loads((file.metadata() or {})["description"])["report"]
+        return json.loads(file.metadata["description"])["report"]

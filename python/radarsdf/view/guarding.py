@@ -45,6 +45,12 @@ def why_refused(hosts: Sequence[str], origins: Sequence[str], listening: str) ->
     return None
 
 
+def others_reach(host: str) -> bool:
+    """Whether other machines reach a server that listens on this host, however it is written."""
+    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    return not all(ipaddress.ip_address(address[4][0]).is_loopback for address in found)
+
+
 def _pages_of(host: str) -> tuple[str, str]:
     return f"http://{host}", f"https://{host}"
 

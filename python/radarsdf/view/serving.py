@@ -6,19 +6,21 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import io
 import os
 import socket
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from typing import Any
 
 from radarsdf.checks import whole_number
 from radarsdf.extras import require
-from radarsdf.view.guarding import MAX_MESSAGE_BYTES, bounded, why_refused
+from radarsdf.view.guarding import MAX_MESSAGE_BYTES, bounded, others_reach, why_refused
 
 _PORTS_TRIED = 100
 _TITLE = "radarsdf"
@@ -81,10 +83,16 @@ def start_server(host: str, port: int) -> Any:
     require_viser()
     import viser  # noqa: PLC0415
 
+    if others_reach(host):
+        msg = f"--host {host}: whoever can reach this address of the machine can see and operate the page"
+        warnings.warn(msg, RuntimeWarning, stacklevel=2)
     controls: dict[str, Mapping[str, Any]] = {}
     with _silence(), _guarded(host, port, controls):
         server: Any = viser.ViserServer(host, port, _TITLE, verbose=False)
     controls["all"] = server.gui._gui_input_handle_from_uuid
+    # viser's objects of a connection refer to each other, and to all that was sent. Python's collector would leave them
+    # until there are many: 1 MB a connection, with a mesh of 1 MB.
+    server.on_client_disconnect(lambda _: gc.collect())
     # A page asks for it by a message, which others can send too: a tunnel through a third party.
     server.request_share_url = lambda *_, **__: None
     server.gui.configure_theme(show_logo=False, show_share_button=False)
