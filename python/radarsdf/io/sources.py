@@ -133,9 +133,6 @@ def posed(
             columns = _read(raw, notes)
             if columns is None:
                 continue
-            if not columns or len(next(iter(columns.values()))) == 0:
-                notes.count(_NO_RETURNS, 1)
-                continue
             if raw.topic not in fields_of:
                 fields = _fields_of(columns, raw, raw_scans, request)
                 if fields is None:
@@ -169,12 +166,16 @@ def posed(
 
 
 def _read(raw: RawScan, notes: Notes) -> Columns | None:
-    """The columns of a scan; None, and counted, if it is damaged."""
+    """The columns of a scan; None, and counted, if it is damaged or empty."""
     try:
-        return raw.read()
+        columns = raw.read()
     except ValueError as error:
         notes.count(_UNREADABLE, 1, str(error))
         return None
+    if not columns or len(next(iter(columns.values()))) == 0:
+        notes.count(_NO_RETURNS, 1)
+        return None
+    return columns
 
 
 def _fields_of(

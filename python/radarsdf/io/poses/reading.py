@@ -141,7 +141,7 @@ def poses_of(
     if matrices.ndim != 3:
         msg = f"poses must be (F, 4, 4) T_world_sensor, or a file of poses, not an array {matrices.shape}"
         raise ValueError(msg)
-    return usable_poses(matrices, "the given array", notes)
+    return poses_or_nan(matrices, "the given array", notes)
 
 
 def read_poses(
@@ -187,7 +187,7 @@ def read_poses(
     """
     check_regular_file(path)
     if path.suffix.lower() == ".npy":
-        return usable_poses(np.array(array_in(path)), str(path), notes)
+        return poses_or_nan(np.array(array_in(path)), str(path), notes)
     heads, rows = _rows_of(path)
     width = Counter(len(words) for _, words in rows).most_common(1)[0][0]
     heads = [head for head in heads if len(head) == width]
@@ -204,7 +204,7 @@ def read_poses(
     if width == _KITTI_COLUMNS:
         return _kitti(table, path, notes, lines, calibration)
     if width == _MATRIX_COLUMNS or (width == 4 and len(table) % 4 == 0):
-        return usable_poses(table.reshape(-1, 4, 4), str(path), notes, lines[:: 16 // width])
+        return poses_or_nan(table.reshape(-1, 4, 4), str(path), notes, lines[:: 16 // width])
     msg = (
         f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four in blocks "
         "of four lines; or name the columns in the first line, such as time,x,y,z,qw,qx,qy,qz"
@@ -295,7 +295,7 @@ def _named(
     elif "time" in columns:
         poses[:, 0] = table[:, columns["time"]] * TIME_UNITS.get(without_unit(head[columns["time"]])[1], 1.0)
     else:
-        return usable_poses(_matrices(poses), str(path), notes, lines)
+        return poses_or_nan(_matrices(poses), str(path), notes, lines)
     return _stamped(poses, path, notes, lines)
 
 
@@ -305,7 +305,7 @@ def _kitti(
     """Poses of rows (F, 12), turned from the camera to the sensor if there is a calibration."""
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3] = table.reshape(-1, 3, 4)
-    checked = usable_poses(poses, str(path), notes, lines)
+    checked = poses_or_nan(poses, str(path), notes, lines)
     for file in calibration:
         if file.is_file() and (T_camera_sensor := read_calibration(file)) is not None:
             notes.add(
@@ -358,7 +358,7 @@ def _stamped(table: NDArray[np.float64], path: Path, notes: Notes, lines: list[i
     return trajectory_of(table[:, 0], table[:, 1:4], table[:, 4:], str(path))
 
 
-def usable_poses(
+def poses_or_nan(
     poses: NDArray[Any], name: str, notes: Notes, lines: Sequence[int] | None = None
 ) -> NDArray[np.float64]:
     """Poses (F, 4, 4) in the order of scans. Those that are not finite or rigid are NaN, and named: their scans have none.
