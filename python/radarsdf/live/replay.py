@@ -71,7 +71,7 @@ def replay(
                 scans.poses[i] if with_poses else None,
                 None if scans.intensities is None else scans.intensities[i],
                 doppler_mps=None if scans.doppler_mps is None else scans.doppler_mps[i],
-                time=float(times_s[i]),
+                time_s=float(times_s[i]),
                 scan_id=i,
             )
         except Lost:
@@ -80,6 +80,8 @@ def replay(
         done.seconds.append(time.perf_counter() - started)
         done.rows.append(i)
         done.poses.append(found.pose)
+        for before in found.moved:
+            done.poses[done.rows.index(before)] = live.pose(before)
         if on_scan is not None:
             on_scan(done)
     return done
