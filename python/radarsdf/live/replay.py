@@ -80,8 +80,8 @@ def replay(
         done.seconds.append(time.perf_counter() - started)
         done.rows.append(i)
         done.poses.append(found.pose)
-        for before in found.moved:
-            done.poses[done.rows.index(before)] = live.pose(before)
+        for k in (k for k, row in enumerate(done.rows) if row in found.moved):
+            done.poses[k] = live.pose(done.rows[k])
         if on_scan is not None:
             on_scan(done)
     return done

@@ -129,9 +129,8 @@ def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
     columns = {name: _parts(arrays, name, held, counts) for name in FIELDS}
     times_s = np.asarray(arrays.get("times_s", np.full(len(ids), np.nan)), np.float64)
     scans = {
-        scan_id: LoggedScan(
-            poses[i].copy(),
-            *(columns[name][i] for name in FIELDS),
+        scan_id: dataclasses.replace(
+            LoggedScan(poses[i].copy(), *(columns[name][i] for name in FIELDS)),
             time_s=float(times_s[i]) if np.isfinite(times_s[i]) else None,
         )
         for i, scan_id in enumerate(ids)
