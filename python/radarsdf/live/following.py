@@ -28,6 +28,9 @@ _STEPS = 100  # of the motion so far, that habits are learnt from
 _START = 8  # scans of a start, of which all are placed again once 2, 4 and 8 are there
 _HABITS = 2  # steps before a start that make it none: how the sensor moves is known
 _CLEAR = 5.0  # standard errors by which more returns agree if the Doppler has the other sign
+_CHANCE = (
+    0.25  # share of the returns of a sparse radar that agree at a wrong pose, at most about: 0.13 to 0.27
+)
 _MOVES = 5.0  # standard deviations of a velocity that is not zero
 _TOLD_STEPS = 10  # over which it is asked whether returns alone tell how the sensor moves
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # covariance of a step between given poses, about
@@ -253,12 +256,14 @@ class Follower:
         counts = np.array([len(scan) for scan in drive.scans[1:]])
         returns = max(int(counts.sum()), 1)
 
-        def share(tracked: list[Tracked]) -> float:
-            return float(np.dot(np.nan_to_num([found.agreeing for found in tracked[1:]]), counts) / returns)
+        def share(tracked: list[Tracked], lost: float = 0.0) -> float:
+            agreeing = np.nan_to_num([found.agreeing for found in tracked[1:]], nan=lost)
+            return float(np.dot(agreeing, counts) / returns)
 
         ahead, back = by(1), by(-1)
-        a, b = share(ahead), share(back)
-        if abs(a - b) > _CLEAR * np.sqrt((a * (1 - a) + b * (1 - b)) / returns):
+        a, b = share(ahead, _CHANCE), share(back, _CHANCE)
+        clear = abs(a - b) > _CLEAR * np.sqrt((a * (1 - a) + b * (1 - b)) / returns)
+        if clear and max(a, b) > _CHANCE:
             return (1, ahead) if a > b else (-1, back)
         return 0, max(ahead, back, by(0), key=share)
 

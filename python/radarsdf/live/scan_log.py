@@ -197,8 +197,8 @@ def _read(found: _OnDisk) -> LoggedScan:
     if not {"pose", "points"} <= set(arrays):
         msg = f"{found.path} is not a scan of this map"
         raise ValueError(msg)
-    scan = LoggedScan(found.pose, arrays["points"], *(arrays.get(name) for name in FIELDS[1:]))
-    return replace(scan, time_s=found.time_s)
+    columns: list[Any] = [arrays.get(name) for name in FIELDS[1:]]
+    return LoggedScan(found.pose, arrays["points"], *columns, found.time_s)
 
 
 def compact(points: NDArray[np.float64]) -> NDArray[Any]:
