@@ -198,7 +198,7 @@ def _read(found: _OnDisk) -> LoggedScan:
         msg = f"{found.path} is not a scan of this map"
         raise ValueError(msg)
     columns: list[Any] = [arrays.get(name) for name in FIELDS[1:]]
-    return LoggedScan(found.pose, arrays["points"], *columns, found.time_s)
+    return replace(LoggedScan(found.pose, arrays["points"], *columns), time_s=found.time_s)
 
 
 def compact(points: NDArray[np.float64]) -> NDArray[Any]:
