@@ -41,7 +41,7 @@ def test_scans_that_come_too_fast_are_dropped():
     class Slow:
         def integrate(self, *_given, **_named):
             time.sleep(0.03)
-            return type("Done", (), {"pose": np.eye(4)})
+            return type("Done", (), {"pose": np.eye(4), "moved": ()})
 
     scans = Scans(SCENE.points, SCENE.poses, None)
     done = replay(Slow(), scans, rate=10.0)  # a scan each 10 ms

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import threading
 
 import numpy as np
@@ -172,15 +174,15 @@ def test_sizes_are_not_read_while_a_scan_is_added(size, monkeypatch):
     """The core changes its tables without Python's lock: what it says of them meanwhile can be anything."""
     live, found, during = map_of(range(3)), [], []
     reader = threading.Thread(target=lambda: found.append(size(live)))
-    apply = live._state.apply
+    apply = live._state._apply
 
-    def slowly(change):
+    def slowly(come, gone):
         reader.start()
         reader.join(0.2)
         during.extend(found)
-        return apply(change)
+        return apply(come, gone)
 
-    monkeypatch.setattr(live._state, "apply", slowly)
+    monkeypatch.setattr(live._state, "_apply", slowly)
     live.integrate(SCENE.points[3], SCENE.poses[3], SCENE.intensities[3])
     reader.join()
     assert (during, found) == ([], [size(live)])
@@ -241,11 +243,11 @@ def test_scans_move_together_or_not_at_all():
 def test_old_scans_go_to_the_disk_or_are_sealed(tmp_path):
     needed = map_of(range(8)).num_bytes
     spilled = map_of(range(8), max_bytes=needed - 60_000, folder=tmp_path / "scans")
-    files = list((tmp_path / "scans").iterdir())
+    files = list((tmp_path / "scans").glob("scan-*.npz"))
     assert 0 < len(files) < 8
     assert spilled.num_bytes <= needed - 60_000
     spilled.remove(0)
-    assert len(list((tmp_path / "scans").iterdir())) == len(files) - 1
+    assert len(list((tmp_path / "scans").glob("scan-*.npz"))) == len(files) - 1
     assert state(spilled) == state(map_of(range(1, 8)))
     sealed = map_of(range(8), max_bytes=needed - 60_000)
     assert sealed.sealed_scans == len(files)
@@ -255,6 +257,46 @@ def test_old_scans_go_to_the_disk_or_are_sealed(tmp_path):
         sealed.finish()
     assert state(sealed) == state(map_of(range(8)))
     assert len(sealed.map().mesh(0.2).faces) > 100
+
+
+def test_a_full_disk_leaves_the_map_as_it_was(tmp_path, monkeypatch):
+    needed = map_of(range(7)).num_bytes
+    live = map_of(range(6), max_bytes=needed - 60_000, folder=tmp_path / "scans")
+    before, ids, poses = state(live), live.scan_ids, [live.pose(i) for i in range(6)]
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        for module in ("scan_log", "shelf"):
+            patched.setattr(f"radarsdf.live.{module}.write_arrays", full)
+        for _ in range(3):
+            with pytest.raises(OSError, match="No space"):
+                live.integrate(SCENE.points[6], SCENE.poses[6], SCENE.intensities[6])
+        with pytest.raises(OSError, match="No space"):
+            live.move_all({0: SCENE.poses[1], 1: SCENE.poses[0]})
+    assert (state(live), live.scan_ids) == (before, ids)
+    assert all((live.pose(i) == pose).all() for i, pose in enumerate(poses))
+    assert live.integrate(SCENE.points[6], SCENE.poses[6], SCENE.intensities[6]).scan_id == 6
+    with live._state.whole():
+        assert state(live) == state(map_of(range(7)))
+
+
+def test_a_folder_belongs_to_one_map(tmp_path):
+    folder = tmp_path / "scans"
+    live = map_of(range(8), max_bytes=map_of(range(8)).num_bytes - 60_000, folder=folder)
+    with pytest.raises(BlockingIOError, match=rf"scans is being used by process {os.getpid()}"):
+        LiveMap(folder=folder)
+    live.remove(0)
+    assert state(live) == state(map_of(range(1, 8)))
+    del live
+    assert len(LiveMap(folder=folder)) == 0  # files of before are written over
+    (folder / "notes.txt").touch()
+    with pytest.raises(ValueError, match="other files"):
+        LiveMap(folder=folder)
+    (tmp_path / "scan-000000001.npz").touch()  # of somebody else: no map has used this folder
+    with pytest.raises(ValueError, match="other files"):
+        LiveMap(folder=tmp_path)
 
 
 def test_what_is_far_away_is_forgotten():

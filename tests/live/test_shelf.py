@@ -75,6 +75,7 @@ def test_a_state_has_what_is_put_away(tmp_path):
     whole = state(live)
     live.clear_outside(FAR[6][:3, 3], 60.0)
     live.save(tmp_path / "live.npz")
+    del live
     # As after a process was killed: the folder still has files, of which the state knows nothing.
     loaded = LiveMap.load(tmp_path / "live.npz", folder=tmp_path / "kept")
     assert state(loaded) == whole

@@ -4,15 +4,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import operator
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.live.scan_log import LoggedScan
-from radarsdf.poses.by_doppler import LEAST_MPS, SensorVelocities, doppler_sign, upright
-from radarsdf.poses.drive import Drive, rates_of
+from radarsdf.live.scan_log import LoggedScan, ScanId, ScanLog
+from radarsdf.poses.by_doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
+from radarsdf.poses.drive import Drive, followed, rates_of
 from radarsdf.poses.odometry import LEAST_TOLD
 from radarsdf.poses.rates import Rate
 from radarsdf.poses.rigid import Floats, rotation_vector
@@ -21,8 +26,14 @@ from radarsdf.returns.doppler import SensorVelocity, sensor_velocities
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 
 _STEPS = 100  # of the motion so far, that habits are learnt from
-_SIGN_FROM, _SIGN_UNTIL = 3, 30  # scans, after which the sign of the Doppler is looked for
-_TOLD_STEPS = 10  # over which it is asked whether returns alone tell the way
+_START = 8  # scans of a start, of which all are placed again once 2, 4 and 8 are there
+_HABITS = 2  # steps before a start that make it none: how the sensor moves is known
+_CLEAR = 5.0  # standard errors by which more returns agree if the Doppler has the other sign
+_CHANCE = (
+    0.25  # share of the returns of a sparse radar that agree at a wrong pose, at most about: 0.13 to 0.27
+)
+_MOVES = 5.0  # standard deviations of a velocity that is not zero
+_TOLD_STEPS = 10  # over which it is asked whether returns alone tell how the sensor moves
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # covariance of a step between given poses, about
 
 
@@ -34,143 +45,254 @@ class Lost(ValueError):
 class Step:
     """A scan, and where it was found."""
 
-    scan: Floats
-    """(N, 3) of the returns that stand still, sensor frame, m."""
-    time_s: float
+    scan_id: ScanId
+    logged: LoggedScan
+    """With its time. Where the map has it now, `found` says."""
     velocity: SensorVelocity | None
     found: Tracked
+    given: bool = True
+    """Whether the pose was given, so that it is not found anew."""
+    sign: int = 0
+    """Of the Doppler, as it was known then: -1 if it is positive as the sensor comes nearer, 0 if that is not known."""
+
+    @property
+    def time_s(self) -> float:
+        """When it was taken."""
+        assert self.logged.time_s is not None
+        return self.logged.time_s
+
+    @property
+    def scan(self) -> Floats:
+        """(N, 3) of the returns that stand still, sensor frame, m."""
+        points, static = self.logged.points, self.logged.standing
+        return np.ascontiguousarray(points if static is None else points[static], np.float64)
+
+    @property
+    def measured(self) -> bool:
+        """Whether its Doppler gives a velocity."""
+        return self.velocity is not None and self.velocity.found
+
+    @cached_property
+    def moves(self) -> bool:
+        """Whether its Doppler does not show that the sensor stands."""
+        if self.velocity is None or not self.velocity.found:
+            return True
+        v, covariance = self.velocity.velocity_mps, self.velocity.covariance + LEAST_MPS**2 * np.eye(3)
+        return float(np.einsum("i,i->", v, np.linalg.solve(covariance, v))) > _MOVES**2
 
 
 @dataclass
 class Follower:
-    """Follows the sensor. :meth:`seek` changes nothing, so that a scan which is refused leaves no trace."""
+    """Follows the sensor. The map owns the poses: they are asked for before each scan. A scan that is refused leaves no trace."""
 
     config: FitConfig
     num_threads: int
-    _tracker: Tracker = field(init=False)
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
-    _rates: deque[tuple[Rate | None, Rate | None]] = field(default_factory=lambda: deque(maxlen=_STEPS))
-    _given: deque[tuple[LoggedScan, float]] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    _speeds: deque[Floats] = field(default_factory=lambda: deque(maxlen=WINDOW))  # of the last scans, m/s
-    _sign: int = 0  # of the Doppler. 0: not known yet, so that it is not used
+    _rates: deque[tuple[Rate, Rate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
+    _given: deque[tuple[ScanId, LoggedScan]] = field(default_factory=lambda: deque(maxlen=WINDOW))
 
     def __post_init__(self) -> None:
-        size_m = LEAVES_PER_SURFEL * self.config.leaf_size_m
-        self._tracker = Tracker(size_m, self.config.returns, self.num_threads)
+        self._begin([])
 
-    def seek(self, logged: LoggedScan, time_s: float) -> Step:
-        """Where a scan is. Raises a ValueError if it is late, Lost if it is nowhere near. The pose of `logged` does not count."""
-        for before, at_s in self._given:
-            self._place(before, at_s)
-        self._given.clear()
-        scan, velocity = _standing(logged), self._velocity(logged)
+    def seek(self, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
+        """Where a scan is, whose own pose does not count: the last of the steps. Those before it are scans to be placed again.
+
+        Raises a ValueError if it is late, Lost if it is nowhere near.
+        """
+        self._ask(log)
+        new = Step(scan_id, logged, self._velocity(logged), begun(np.eye(4)), given=False)
         if not self._steps:
-            return Step(scan, time_s, velocity, begun(np.eye(4)))
+            if len(log):
+                msg = "the map has scans, but none with a time to go on from: give the pose of the scan, and its time"
+                raise Lost(msg)
+            return [new]
         last = self._steps[-1]
-        if not time_s > last.time_s:
-            msg = f"a scan without a pose must be later than the one before it: {time_s:.6f} s is not after {last.time_s:.6f} s"
+        if not new.time_s > last.time_s:
+            msg = f"a scan without a pose must be later than the one before it: {new.time_s:.6f} s is not after {last.time_s:.6f} s"
             raise ValueError(msg)
-        drive = self._drive([*list(self._steps)[-2:], Step(scan, time_s, velocity, last.found)])
-        turn, move = self._rates[-1] if self._rates else (None, None)
-        found = self._tracker.seek(scan, drive.expected(len(drive.times_s) - 1, turn, move))
-        if found.piece != last.found.piece:
-            msg = f"the scan at {time_s:.6f} s agrees with the last ones nowhere near: give its pose"
+        sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
+        found = self._start(log, new, sign) or [self._next(new, sign)]
+        if any(step.found.piece for step in found):
+            msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near: give its pose"
             raise Lost(msg)
-        told = [step.found.told[0] for step in self._steps][-_TOLD_STEPS:]
-        if drive.velocities is None and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
+        told = [step.found.told[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
+        by_doppler = new.measured and (found[-1].sign != 0 or not new.moves)
+        if not by_doppler and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
             missing = "their Doppler (doppler_mps), or poses"
             if logged.doppler_mps is not None:
-                why = "the last two scans agree on no velocity" if self._sign else "its sign is not known yet"
-                missing = f"poses. The Doppler is not used: {why}"
+                why = (
+                    "its sign is not known yet" if new.measured else "the last two scans agree on no velocity"
+                )
+                missing = f"poses. {NOT_USED}: {why}"
             msg = f"the returns alone do not tell how the sensor moves: give {missing}"
             raise Lost(msg)
-        return Step(scan, time_s, velocity, found)
+        return found
 
-    def keep(self, logged: LoggedScan, time_s: float | None, step: Step | None) -> None:
-        """The scan was there: the next one is looked for from it. `step` None: its pose was given."""
-        if step is not None:
-            self._take(step, logged)
-        elif time_s is not None:  # only looked at once a scan comes without its pose
-            self._given.append((logged, time_s))
+    def keep(self, found: list[Step]) -> None:
+        """The scans that :meth:`seek` found are in the map: the next one is looked for from them."""
+        if len(found) == 1:
+            self._add(found[0])
+        else:
+            again = {step.scan_id for step in found}
+            self._begin([*(step for step in self._steps if step.scan_id not in again), *found])
 
-    def _take(self, step: Step, logged: LoggedScan) -> None:
-        if logged.doppler_mps is not None:
-            self._speeds.append(logged.doppler_mps)
+    def place(self, scan_id: ScanId, logged: LoggedScan) -> None:
+        """A scan came with its pose. It is only looked at once one comes without."""
+        if logged.time_s is not None:
+            self._given.append((scan_id, logged))
+
+    def _ask(self, log: ScanLog) -> None:
+        """Takes the poses of the map, if scans were moved or taken out."""
+        steps = {step.scan_id: now for step in self._steps if (now := _now(step, log)) is not None}
+        if len(steps) < len(self._steps) or not all(map(operator.is_, steps.values(), self._steps)):
+            self._begin(list(steps.values()))
+        for scan_id, logged in self._given:
+            step = Step(
+                scan_id, logged, self._velocity(logged), Tracked(logged.pose, _GIVEN, 1.0, 0, np.zeros(3))
+            )
+            now = _now(step, log)
+            if now is not None and not (self._steps and now.time_s <= self._steps[-1].time_s):
+                self._add(now)
+        self._given.clear()
+
+    def _begin(self, steps: Sequence[Step]) -> None:
+        """As if only these scans had come."""
+        size_m = LEAVES_PER_SURFEL * self.config.leaf_size_m
+        self._tracker = Tracker(size_m, self.config.returns, self.num_threads)
+        self._steps.clear()
+        self._rates.clear()
+        for i, step in enumerate(steps):
+            self._add(step, planes=i >= len(steps) - WINDOW)
+
+    def _add(self, step: Step, *, planes: bool = True) -> None:
         if self._steps:
-            before = self._steps[-1]
-            duration_s = step.time_s - before.time_s
-            known = duration_s > 0 and step.found.piece == before.found.piece
-            rates = rates_of(before.found.pose, step.found, duration_s) if known else (None, None)
-            self._rates.append(rates)
-        self._tracker.keep(step.scan, step.found)
+            before, found = self._steps[-1], step.found
+            turn = rotation_vector(before.found.pose[:3, :3].T @ found.pose[:3, :3], found.turn)
+            step = dataclasses.replace(step, found=dataclasses.replace(found, turn=turn))
+            self._rates.append(rates_of(before.found.pose, step.found, step.time_s - before.time_s))
         self._steps.append(step)
-        if self._sign == 0 and _SIGN_FROM <= len(self._steps) <= _SIGN_UNTIL:
-            self._sign = self._found_sign()
-
-    def _place(self, logged: LoggedScan, time_s: float) -> None:
-        """A scan came with its pose."""
-        pose, piece, turn = logged.pose, 0, np.zeros(3)
-        if self._steps:
-            last = self._steps[-1]
-            if not time_s > last.time_s:
-                return
-            piece, turn = last.found.piece, rotation_vector(last.found.pose[:3, :3].T @ pose[:3, :3])
-        found = Tracked(pose, _GIVEN, 1.0, piece, turn)
-        self._take(Step(_standing(logged), time_s, self._velocity(logged), found), logged)
+        if planes:
+            self._tracker.keep(step.scan, step.found)
 
     def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
         """By the Doppler of a scan. None: it has none."""
         if logged.doppler_mps is None:
             return None
-        return sensor_velocities([logged.points], [logged.doppler_mps], self._speeds)[0]
+        others = [step.logged.doppler_mps for step in list(self._steps)[-WINDOW:]]
+        return sensor_velocities(
+            [logged.points], [logged.doppler_mps], [speeds for speeds in others if speeds is not None]
+        )[0]
 
-    def _drive(self, steps: list[Step]) -> Drive:
-        """Of the last scans, with the habits so far."""
-        times_s = np.array([step.time_s for step in steps])
-        usual = Drive([], times_s, None, None)
-        durations_s = np.array(
-            [b.time_s - a.time_s for a, b in zip(self._steps, list(self._steps)[1:], strict=False)]
-        )[-len(self._rates) :]
+    def _next(self, new: Step, sign: int) -> Step:
+        """A scan, from the one before it."""
+        steps = [*list(self._steps)[-2:], new]
+        durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
+        usual = Drive([], np.zeros(0), None, None)
         turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
-        return Drive(
+        drive = Drive(
             [step.scan for step in steps],
-            times_s,
-            self._velocities(steps, self._sign) if self._sign else None,
+            np.array([step.time_s for step in steps]),
+            self._velocities(steps, sign),
             None,
             usual.turns.learnt(turns, durations_s),
             usual.moves.learnt(moves, durations_s),
         )
+        turn, move = self._rates[-1] if self._rates else (None, None)
+        found = self._tracker.seek(drive.scans[-1], drive.expected(len(steps) - 1, turn, move))
+        return dataclasses.replace(new, found=found, sign=sign)
 
     def _velocities(self, steps: list[Step], sign: int) -> SensorVelocities | None:
-        """By their Doppler. None: one of the last two tells none."""
-        if any(step.velocity is None or not step.velocity.found for step in steps[-2:]):
+        """By their Doppler. None: one of the last two has none."""
+        if not all(step.measured for step in steps[-2:]):
             return None
         mean, covariance = np.zeros((len(steps), 3)), np.tile(np.eye(3), (len(steps), 1, 1))
         for i, step in enumerate(steps):
             if step.velocity is not None and step.velocity.found:
-                mean[i] = sign * step.velocity.velocity_mps
+                mean[i] = step.velocity.velocity_mps
                 covariance[i] = step.velocity.covariance + LEAST_MPS**2 * np.eye(3)
         mean, covariance, _ = upright(mean, covariance)
-        known = [step for step in self._steps if step.velocity is not None and step.velocity.found]
+        known = [step for step in [*self._steps, steps[-1]] if step.measured]
         speeds = np.array([step.velocity.velocity_mps for step in known if step.velocity is not None])
-        duration_s = max(known[-1].time_s - known[0].time_s, 1e-9) if known else 1.0
-        changes = np.square(np.diff(speeds, axis=0)).sum(axis=0) if len(known) > 1 else np.ones(3)
+        change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (known[-1].time_s - known[0].time_s)
         static = [np.ones(len(step.scan), bool) for step in steps]
         found = np.ones(len(steps), bool)
-        return SensorVelocities(mean, covariance, changes / duration_s + LEAST_MPS**2, static, found)
+        return _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
 
-    def _found_sign(self) -> int:
-        """-1 if the radar's Doppler is positive as the sensor comes nearer, 1 if it is negative; 0 if that is not clear."""
-        steps = list(self._steps)
-        velocities = self._velocities(steps, 1)
-        if velocities is None:
-            return 0
-        scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
-        if doppler_sign(scans, velocities, times_s) < 0:
-            return -1
-        return 1 if doppler_sign(scans, velocities.turned, times_s) < 0 else 0
+    def _start(self, log: ScanLog, new: Step, sign: int) -> list[Step] | None:
+        """The first scans anew, as odometry finds them, once more are there. None: the next scan follows from those before."""
+        steps = [*self._steps, new]
+        fixed = [i for i, step in enumerate(steps) if step.given or log.entry(step.scan_id) is None][:-1]
+        first = max(fixed, default=0)
+        moving = [i for i in range(first, len(steps)) if steps[i].moves]
+        first = max([first, len(steps) - _START, *(i - 1 for i in moving[:1])])
+        count, sign_open = len(moving), sign == 0 and new.measured
+        due = count & (count - 1) == 0 and (sign_open or (first < _HABITS and count <= _START))
+        due = due or (sign_open and count <= _START / 2)
+        if not new.moves or not due:
+            return None
+        sign, tracked = self._followed(steps[first:], sign)
+        if first >= _HABITS and first == len(steps) - 2:  # it only needed the sign
+            return [self._next(new, sign)]
+        frame = steps[first].found.pose
+        both = np.kron(np.eye(2), frame[:3, :3])
+        return [
+            dataclasses.replace(
+                step,
+                found=dataclasses.replace(
+                    found, pose=frame @ found.pose, covariance=both @ found.covariance @ both.T
+                ),
+                sign=sign,
+            )
+            for step, found in zip(steps[first + 1 :], tracked[1:], strict=True)
+        ]
+
+    def _followed(self, steps: list[Step], sign: int) -> tuple[int, list[Tracked]]:
+        """The sign of the Doppler, 0 if it is not clear, and scans where odometry finds them, in the frame of the first."""
+        drive = Drive([step.scan for step in steps], np.array([step.time_s for step in steps]), None, None)
+        points = [step.logged.points for step in steps]
+        speeds = [step.logged.doppler_mps for step in steps if step.logged.doppler_mps is not None]
+        velocities = None
+        if len(speeds) == len(steps):
+            with contextlib.suppress(NoVelocityError):
+                velocities = SensorVelocities.of(points, speeds, drive.times_s)
+
+        def by(sign: int) -> list[Tracked]:
+            signed = None if velocities is None else _signed(velocities, sign)
+            return followed(dataclasses.replace(drive, velocities=signed), self.config, self.num_threads)[1]
+
+        if sign or velocities is None:
+            return sign, by(sign)
+        counts = np.array([len(scan) for scan in drive.scans[1:]])
+        returns = max(int(counts.sum()), 1)
+
+        def share(tracked: list[Tracked], lost: float = 0.0) -> float:
+            agreeing = np.nan_to_num([found.agreeing for found in tracked[1:]], nan=lost)
+            return float(np.dot(agreeing, counts) / returns)
+
+        ahead, back = by(1), by(-1)
+        a, b = share(ahead, _CHANCE), share(back, _CHANCE)
+        clear = abs(a - b) > _CLEAR * np.sqrt((a * (1 - a) + b * (1 - b)) / returns)
+        if clear and max(a, b) > _CHANCE:
+            return (1, ahead) if a > b else (-1, back)
+        return 0, max(ahead, back, by(0), key=share)
 
 
-def _standing(logged: LoggedScan) -> Floats:
-    points = logged.points if logged.standing is None else logged.points[logged.standing]
-    return np.ascontiguousarray(points, np.float64)
+def _now(step: Step, log: ScanLog) -> Step | None:
+    """A scan as it is in the map. None: it was taken out. One that was let go cannot have changed."""
+    entry = log.entry(step.scan_id)
+    if entry is None:
+        return step if step.scan_id in log else None
+    if entry.pose is step.found.pose:
+        return step
+    if entry.time_s != step.logged.time_s:
+        return None  # another scan of this id
+    found = dataclasses.replace(step.found, pose=entry.pose, covariance=_GIVEN)
+    return dataclasses.replace(step, found=found, given=True)
+
+
+def _signed(velocities: SensorVelocities, sign: int) -> SensorVelocities:
+    """For Doppler of this sign. 0: it may be either, so that the mean is no motion, and the speed its deviation."""
+    mean, covariance = velocities.mean_mps, velocities.covariance
+    if sign == 0:
+        covariance = covariance + mean[:, :, None] * mean[:, None, :]
+    return dataclasses.replace(velocities, mean_mps=sign * mean, covariance=covariance)

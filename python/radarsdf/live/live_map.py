@@ -4,7 +4,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import os
 import threading
+import weakref
 from collections.abc import Hashable, Mapping
 from os import PathLike
 from typing import TYPE_CHECKING
@@ -26,7 +29,7 @@ from radarsdf.live.learning import finished, known_now
 from radarsdf.live.rows import Keys
 from radarsdf.live.scan_log import ScanId, ScanLog
 from radarsdf.live.scans import Integrated, checked_scan, finite_time
-from radarsdf.live.shelf import Shelf
+from radarsdf.live.shelf import Shelf, locked_folder
 from radarsdf.live.state import GrowingState
 from radarsdf.live.storage import load_state, save_state
 from radarsdf.returns.evidence import Looks
@@ -42,7 +45,9 @@ class LiveMap:
     """A map that grows scan by scan. Scans can be moved, and taken out again, without a trace.
 
     What a scan adds are integers that depend on the scan, its pose and the settings alone. So a map that a scan was taken
-    out of has the bits of one that never saw it, in any order. All methods may be called from any thread; those that
+    out of has the bits of one that never saw it. They do not depend on the order of scans either, except for what is found
+    from single returns: the noise of the sensor, if it is not given, intensities, what :meth:`finish` trains, and the order
+    of scans in files. All methods may be called from any thread; those that
     change the map wait for each other, and readers see it before a change or after it.
 
     Parameters
@@ -57,13 +62,16 @@ class LiveMap:
         Memory that the map may take, bytes. Beyond it, the oldest scans are let go: they stay in the map, but can no
         longer be moved or taken out. None: all are kept.
     folder : path-like, optional
-        An empty or new folder, to which scans are written instead of being let go, and regions of the map far away by
-        :meth:`clear_outside`, or beyond `max_bytes`, instead of being forgotten.
+        An empty or new folder, or one that a map has used before, to which scans are written instead of being let go, and
+        regions of the map far away by :meth:`clear_outside`, or beyond `max_bytes`, instead of being forgotten. It is locked as
+        long as the map lives.
 
     Raises
     ------
     ValueError
-        If a setting is out of range, or several scans are to be accumulated.
+        If a setting is out of range, several scans are to be accumulated, or `folder` holds other files.
+    OSError
+        If `folder` cannot be written, or another map uses it.
 
     Examples
     --------
@@ -93,7 +101,7 @@ class LiveMap:
             raise ValueError(msg)
         place = None if folder is None else path_of(folder, "folder")
         if place is not None:
-            place.mkdir(exist_ok=True)
+            weakref.finalize(self, os.close, locked_folder(place))
         self._state = GrowingState(
             config,
             None if origin is None else positions([np.asarray(origin)], "origin")[0],
@@ -154,7 +162,7 @@ class LiveMap:
         intensities: ArrayLike | None = None,
         *,
         doppler_mps: ArrayLike | None = None,
-        time: float | None = None,
+        time_s: float | None = None,
         scan_id: ScanId | None = None,
     ) -> Integrated:
         """Adds a scan.
@@ -173,8 +181,8 @@ class LiveMap:
             Sensor units. All scans have them, or none has.
         doppler_mps : (N,) array_like, optional
             Speed along the ray, m/s, folded or not; NaN where it was not measured. Returns that move are left out.
-        time : float, optional
-            When the scan was taken, s. Only scans without a pose need it.
+        time_s : float, optional
+            When the scan was taken, s. Only scans without a pose need it, and those before them, to go on from.
         scan_id : hashable, optional
             By which the scan is known. By default a number that counts on.
 
@@ -188,9 +196,9 @@ class LiveMap:
         """
         scan = checked_scan(points, intensities, doppler_mps, self._state.config.returns)
         given = None if pose is None else check_pose(pose, "pose").copy()
-        time_s = None if time is None else finite_time(time)
+        scan = dataclasses.replace(scan, time_s=None if time_s is None else finite_time(time_s))
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
-        if given is None and time_s is None:
+        if given is None and scan.time_s is None:
             msg = "a scan needs a pose, or a time"
             raise ValueError(msg)
         with self._lock:
@@ -203,27 +211,24 @@ class LiveMap:
             if self._state.with_intensities not in (None, with_intensities):
                 msg = "either all scans have intensities, or none has"
                 raise ValueError(msg)
-            step = None
-            if given is None:
-                assert time_s is not None
-                step = self._follower.seek(scan, time_s)
-                given = step.found.pose
-            scan = scan.at(given)
-            origin = self._state.origin
-            if origin is None:
+            steps = self._follower.seek(self._state.log, scan_id, scan) if given is None else []
+            come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
+            scan = come[scan_id] if given is None else scan.at(given)
+            again = [step.scan_id for step in steps[:-1]]
+            origin = None
+            if self._state.origin is None:
                 lattice = self._state.config.lattice
                 origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
-            change = self._state.change()
-            self._state.collect(change, scan, 1, origin)
-            blocks = self._state.apply(change)
-            self._state.origin, self._state.with_intensities = origin, with_intensities
-            self._state.log.put(scan_id, scan)
-            self._follower.keep(scan, time_s, step)
+            blocks = self._state.exchange(come | {scan_id: scan}, again, origin)
+            self._state.with_intensities = with_intensities
+            if given is None:
+                self._follower.keep(steps)
+            else:
+                self._follower.place(scan_id, scan)
             if isinstance(scan_id, int):
                 self._state.next_id = max(self._state.next_id, scan_id + 1)
-            self._state.bound()
         movers = 0 if scan.standing is None else int((~scan.standing).sum())
-        return Integrated(scan_id, scan.pose.copy(), blocks, movers)
+        return Integrated(scan_id, scan.pose.copy(), blocks, movers, tuple(again))
 
     def remove(self, scan_id: ScanId) -> Keys:
         """Takes a scan out. The map then has the bits of one that never saw it.
@@ -241,11 +246,7 @@ class LiveMap:
             If it was let go to bound the memory.
         """
         with self._lock:
-            change = self._state.change()
-            self._state.collect(change, self._state.log.get(scan_id), -1)
-            blocks = self._state.apply(change)
-            self._state.log.drop(scan_id)
-            return blocks
+            return self._state.exchange({}, [scan_id])
 
     def move(self, scan_id: ScanId, pose: ArrayLike) -> Keys:
         """Moves a scan to another `pose` (4, 4). Returns and raises as :meth:`remove`."""
@@ -261,19 +262,13 @@ class LiveMap:
             for scan_id, pose in instance(poses, Mapping, "poses").items()  # type: ignore[type-abstract]
         }
         with self._lock:
-            change, moved = self._state.change(), []
-            for scan_id, pose in checked.items():
-                scan = self._state.log.get(scan_id)
-                if (pose == scan.pose).all():
-                    continue
-                moved.append((scan_id, scan.at(pose)))
-                self._state.collect(change, scan, -1)
-                self._state.collect(change, moved[-1][1], 1)
-            blocks = self._state.apply(change)
-            for scan_id, scan in moved:
-                self._state.log.put(scan_id, scan)
-            self._state.bound()
-            return blocks
+            scans = {scan_id: self._state.log.get(scan_id) for scan_id in checked}
+            moved = {
+                scan_id: scan.at(checked[scan_id])
+                for scan_id, scan in scans.items()
+                if (checked[scan_id] != scan.pose).any()
+            }
+            return self._state.exchange(moved, moved)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
         """Forgets the map beyond a ball. Scans that reach beyond it can then be neither moved nor taken out.
@@ -332,6 +327,8 @@ class LiveMap:
         stored = load_state(path)
         live = cls(stored.config, origin=stored.origin, max_bytes=stored.max_bytes, folder=folder)
         live._state.restore(stored)
+        for scan_id, scan in stored.scans.items():
+            live._follower.place(scan_id, scan)
         return live
 
     def mesh(

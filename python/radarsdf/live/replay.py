@@ -71,7 +71,7 @@ def replay(
                 scans.poses[i] if with_poses else None,
                 None if scans.intensities is None else scans.intensities[i],
                 doppler_mps=None if scans.doppler_mps is None else scans.doppler_mps[i],
-                time=float(times_s[i]),
+                time_s=float(times_s[i]),
                 scan_id=i,
             )
         except Lost:
@@ -80,6 +80,8 @@ def replay(
         done.seconds.append(time.perf_counter() - started)
         done.rows.append(i)
         done.poses.append(found.pose)
+        for k in (k for k, row in enumerate(done.rows) if row in found.moved):
+            done.poses[k] = live.pose(done.rows[k])
         if on_scan is not None:
             on_scan(done)
     return done

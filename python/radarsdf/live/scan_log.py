@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Hashable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ class LoggedScan:
     """(N,) along the ray."""
     standing: NDArray[np.bool_] | None
     """(N,) the returns that the map has. None: all."""
+    time_s: float | None = None
+    """When it was taken."""
 
     @property
     def num_bytes(self) -> int:
@@ -66,6 +69,7 @@ class _OnDisk:
     pose: NDArray[np.float64]
     path: Path
     reach_m: float
+    time_s: float | None
 
 
 class ScanLog:
@@ -105,6 +109,10 @@ class ScanLog:
         """(4, 4) of a scan that can be taken out."""
         return self._scans[scan_id].pose
 
+    def entry(self, scan_id: ScanId) -> LoggedScan | _OnDisk | None:
+        """What has the pose and the time of a scan. None: it cannot be taken out."""
+        return self._scans.get(scan_id)
+
     def get(self, scan_id: ScanId) -> LoggedScan:
         """A scan. Raises a KeyError if there is none of this id, SealedScan if it was let go."""
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
@@ -137,7 +145,8 @@ class ScanLog:
         """What it takes of the memory and of the disk."""
         there = self._scans.get(scan_id)
         if isinstance(there, _OnDisk):
-            there.path.unlink(missing_ok=True)
+            with suppress(OSError):  # a file that stays harms nothing
+                there.path.unlink()
             self.num_bytes -= _BYTES_ON_DISK
         elif there is not None:
             del self._in_memory[scan_id]
@@ -160,7 +169,7 @@ class ScanLog:
         write_arrays(path, _arrays(scan))
         self._written += 1
         self._forget(scan_id)
-        self._scans[scan_id] = _OnDisk(scan.pose, path, scan.reach_m)
+        self._scans[scan_id] = _OnDisk(scan.pose, path, scan.reach_m, scan.time_s)
         self.num_bytes += _BYTES_ON_DISK
 
     def seal_beyond(self, centre: NDArray[np.float64], radius_m: float) -> None:
@@ -190,7 +199,8 @@ def _read(found: _OnDisk) -> LoggedScan:
     if not {"pose", "points"} <= set(arrays):
         msg = f"{found.path} is not a scan of this map"
         raise ValueError(msg)
-    return LoggedScan(found.pose, arrays["points"], *(arrays.get(name) for name in FIELDS[1:]))
+    columns: list[Any] = [arrays.get(name) for name in FIELDS[1:]]
+    return replace(LoggedScan(found.pose, arrays["points"], *columns), time_s=found.time_s)
 
 
 def compact(points: NDArray[np.float64]) -> NDArray[Any]:

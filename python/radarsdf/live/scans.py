@@ -33,6 +33,9 @@ class Integrated:
     """(B,) keys of the blocks of 8 × 8 × 8 leaf cells whose returns changed, ascending."""
     movers: int
     """Number of its returns that were left out, because they move."""
+    moved: tuple[ScanId, ...] = ()
+    """Scans without poses that came before and were placed again, since only now it is clear how the sensor moves. Where they
+    are, :meth:`LiveMap.pose` says."""
 
 
 def checked_scan(
@@ -60,13 +63,13 @@ def checked_scan(
     )
 
 
-def finite_time(time: float) -> float:
+def finite_time(time_s: float) -> float:
     """When a scan was taken, s. Raises a ValueError if it is no time."""
-    time_s = number(time, "time")
-    if not abs(time_s) <= MAX_TIME_S:
-        msg = f"time must be finite and within {MAX_TIME_S:g} s, not {time_s:g}"
+    found = number(time_s, "time_s")
+    if not abs(found) <= MAX_TIME_S:
+        msg = f"time_s must be finite and within {MAX_TIME_S:g} s, not {found:g}"
         raise ValueError(msg)
-    return time_s
+    return found
 
 
 def rays_of(scan: LoggedScan, config: FitConfig, origin: NDArray[np.float64] | None) -> Rays:

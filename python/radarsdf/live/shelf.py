@@ -4,16 +4,33 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from radarsdf._core import GrowingSums
+from radarsdf.io.locking import take_lock
 from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.live.regions import REGION_BITS, regions_of
 from radarsdf.live.rows import Keys
 from radarsdf.live.storage import CELL_COLUMNS, checked_sums
 from radarsdf.returns.evidence import BLOCK_BITS
+
+_LOCK = "live.lock"  # also the mark of a folder that a map has used
+
+
+def locked_folder(folder: Path) -> int:
+    """Makes a folder that one map uses, and locks it until the descriptor is closed. Files of a map of before are written over.
+
+    Raises a ValueError if it holds anything else, an OSError if another map uses it.
+    """
+    folder.mkdir(exist_ok=True)
+    ours = (_LOCK, "*scan-*.npz*", "*region-*.npz*") if (folder / _LOCK).is_file() else ()
+    if not all(any(path.match(name) for name in ours) for path in folder.iterdir()):
+        msg = f"{folder} holds other files: give an empty or new folder"
+        raise ValueError(msg)
+    return take_lock(folder / _LOCK, "used")
 
 
 class Shelf:
@@ -65,7 +82,8 @@ class Shelf:
         joined = {name: np.concatenate([arrays[name] for arrays in read]) for name in CELL_COLUMNS}
         sums.insert(*joined.values())
         for region in found:
-            self._paths.pop(region).unlink(missing_ok=True)
+            with suppress(OSError):  # a file that stays harms nothing
+                self._paths.pop(region).unlink()
         return np.union1d(joined["look_keys"], joined["keys"] >> BLOCK_BITS)
 
     def touched(self, blocks: Keys) -> Keys:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -15,7 +15,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.learning import noise_of, quick_of
 from radarsdf.live.regions import REGION_CELLS, cubes_of, regions_of
 from radarsdf.live.rows import Keys
-from radarsdf.live.scan_log import LoggedScan, ScanLog
+from radarsdf.live.scan_log import LoggedScan, ScanId, ScanLog
 from radarsdf.live.scans import rays_of
 from radarsdf.live.shelf import Shelf
 from radarsdf.live.storage import Stored
@@ -79,19 +79,46 @@ class GrowingState:
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
-    def change(self) -> SumsChange:
-        """No change yet."""
-        return SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
+    def exchange(
+        self,
+        come: dict[ScanId, LoggedScan],
+        gone: Iterable[ScanId],
+        origin: NDArray[np.float64] | None = None,
+    ) -> Keys:
+        """Takes scans out and puts others in, also of the same ids: all of it, or nothing if an error is raised.
 
-    def collect(
-        self, change: SumsChange, scan: LoggedScan, sign: int, origin: NDArray[np.float64] | None = None
-    ) -> None:
-        """A scan comes (1) or goes (-1), once the change is applied. `origin`: of a map that has none yet."""
-        rays = rays_of(scan, self.config, self.origin if origin is None else origin)
-        change.collect(rays.points, rays.directions, rays.ranges_m, sign)
+        `origin`: of a map that has none yet. Gives the keys of the blocks whose returns changed.
+        """
+        left = {scan_id: self.log.get(scan_id) for scan_id in gone}
+        before, self.origin = self.origin, self.origin if origin is None else origin
+        done = False
+        try:
+            blocks = self._apply(come.values(), left.values())
+            done = True
+            for scan_id in left.keys() - come.keys():
+                self.log.drop(scan_id)
+            for scan_id, scan in come.items():
+                self.log.put(scan_id, scan)
+            if come:
+                self.bound()
+        except BaseException:  # the disk is full, say
+            if done:
+                self._apply(left.values(), come.values())
+                for scan_id in come.keys() - left.keys():
+                    self.log.drop(scan_id)
+                for scan_id, scan in left.items():
+                    self.log.put(scan_id, scan)
+            self.origin = before
+            raise
+        return blocks
 
-    def apply(self, change: SumsChange) -> Keys:
-        """Makes a change. Gives the keys of the blocks whose returns changed. An error leaves all as it was."""
+    def _apply(self, come: Iterable[LoggedScan], gone: Iterable[LoggedScan]) -> Keys:
+        """Changes the sums, or leaves all as it was. Gives the keys of the blocks whose returns changed."""
+        change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
+        for scans, sign in ((gone, -1), (come, 1)):
+            for scan in scans:
+                rays = rays_of(scan, self.config, self.origin)
+                change.collect(rays.points, rays.directions, rays.ranges_m, sign)
         if self._shelf is not None:
             blocks = change.block_keys()
             self._bring_back(self._shelf.touched(blocks))

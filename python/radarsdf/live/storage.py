@@ -98,6 +98,7 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
     scans = list(stored.scans.values())
     arrays: dict[str, NDArray[Any]] = {name: getattr(stored, name) for name in CELL_COLUMNS}
     arrays["poses"] = np.stack([scan.pose for scan in scans]) if scans else np.zeros((0, 4, 4))
+    arrays["times_s"] = np.array([np.nan if scan.time_s is None else scan.time_s for scan in scans])
     arrays["counts"] = np.array([len(scan.points) for scan in scans], np.int64)
     for name in FIELDS:
         held = [array for array in (getattr(scan, name) for scan in scans) if array is not None]
@@ -111,7 +112,15 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
 
 def load_state(path: str | PathLike[str]) -> Stored:
     """The state that :func:`save_state` wrote. Raises a ValueError if the file is none, or damaged."""
-    names = ("described", "poses", "counts", *CELL_COLUMNS, *FIELDS, *(f"{name}_single" for name in FIELDS))
+    names = (
+        "described",
+        "poses",
+        "times_s",
+        "counts",
+        *CELL_COLUMNS,
+        *FIELDS,
+        *(f"{name}_single" for name in FIELDS),
+    )
     arrays = arrays_of(Path(path), names)
     try:
         return _state_of(arrays)
@@ -143,8 +152,12 @@ def _state_of(arrays: dict[str, NDArray[Any]]) -> Stored:
         raise ValueError(msg)
     poses = check_poses(arrays["poses"], len(ids)) if ids else np.zeros((0, 4, 4))
     columns = {name: _parts(arrays, name, held, counts) for name in FIELDS}
+    times_s = np.asarray(arrays.get("times_s", np.full(len(ids), np.nan)), np.float64)
     scans = {
-        scan_id: LoggedScan(poses[i].copy(), *(columns[name][i] for name in FIELDS))
+        scan_id: dataclasses.replace(
+            LoggedScan(poses[i].copy(), *(columns[name][i] for name in FIELDS)),
+            time_s=float(times_s[i]) if np.isfinite(times_s[i]) else None,
+        )
         for i, scan_id in enumerate(ids)
     }
     for i, scan in enumerate(scans.values()):

@@ -179,7 +179,8 @@ def _squared_differences(given: Floats, found: Floats) -> Floats:
     increments = np.concatenate(
         [placed[:, :3, 3] - given[:, :3, 3], Rotation.from_matrix(turns).as_rotvec()], axis=1
     )
-    return np.einsum("fi,fj->fij", increments, increments)
+    squares: Floats = np.einsum("fi,fj->fij", increments, increments)
+    return squares
 
 
 def _kept(given: Floats, returns: int, why: str, begin: float) -> RefinedPoses:

@@ -123,15 +123,16 @@ class Rays:
 def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
     """Mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor itself, and no padding.
 
-    Drivers fill a cloud of fixed size with one point: a row that is repeated at once, many times, measures nothing.
+    Drivers fill a cloud of fixed size with one point: a row that is repeated at once, many times, among others.
     """
     returns: NDArray[np.bool_] = (np.abs(scan) <= MAX_POSITION_M).all(axis=1) & scan.any(axis=1)
     again = scan[1:, 0] == scan[:-1, 0]
     if np.count_nonzero(again) >= _PADDING:
         again &= (scan[1:] == scan[:-1]).all(axis=1)
         points, counts = np.unique(scan[1:][again], axis=0, return_counts=True)
-        if np.count_nonzero(counts >= _PADDING) == 1:
-            returns &= (scan != points[np.argmax(counts)]).any(axis=1)
+        others = (scan != points[np.argmax(counts)]).any(axis=1)
+        if np.count_nonzero(counts >= _PADDING) == 1 and (returns & others).any():
+            returns &= others
     return returns
 
 
