@@ -112,18 +112,16 @@ class Follower:
             raise ValueError(msg)
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
+        by_doppler = new.measured and (found[-1].sign != 0 or not new.moves)
+        missing = "its pose" if by_doppler else "its pose, or its Doppler (doppler_mps)"
+        if logged.doppler_mps is not None and not by_doppler:
+            why = "its sign is not known yet" if new.measured else "the last two scans agree on no velocity"
+            missing = f"its pose. {NOT_USED}: {why}"
         if any(step.found.piece for step in found):
-            msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near: give its pose"
+            msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near, or in several places: give {missing}"
             raise Lost(msg)
         told = [step.found.told[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
-        by_doppler = new.measured and (found[-1].sign != 0 or not new.moves)
         if not by_doppler and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
-            missing = "their Doppler (doppler_mps), or poses"
-            if logged.doppler_mps is not None:
-                why = (
-                    "its sign is not known yet" if new.measured else "the last two scans agree on no velocity"
-                )
-                missing = f"poses. {NOT_USED}: {why}"
             msg = f"the returns alone do not tell how the sensor moves: give {missing}"
             raise Lost(msg)
         return found

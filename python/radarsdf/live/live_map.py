@@ -258,7 +258,7 @@ class LiveMap:
         Readers see the map before, or with all scans moved. Returns and raises as :meth:`remove`.
         """
         checked = {
-            scan_id: check_pose(pose, f"the pose of scan {scan_id!r:.50}")
+            scan_id: check_pose(pose, f"the pose of scan {scan_id!r:.50}").copy()
             for scan_id, pose in instance(poses, Mapping, "poses").items()  # type: ignore[type-abstract]
         }
         with self._lock:

@@ -130,9 +130,9 @@ def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
     if np.count_nonzero(again) >= _PADDING:
         again &= (scan[1:] == scan[:-1]).all(axis=1)
         points, counts = np.unique(scan[1:][again], axis=0, return_counts=True)
-        others = (scan != points[np.argmax(counts)]).any(axis=1)
-        if np.count_nonzero(counts >= _PADDING) == 1 and (returns & others).any():
-            returns &= others
+        if np.count_nonzero(counts >= _PADDING) == 1:
+            others = returns & (scan != points[np.argmax(counts)]).any(axis=1)
+            returns = others if others.any() else returns
     return returns
 
 
