@@ -81,21 +81,19 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     """
     if min(len(placed.faces) for placed in (before, after)) < CELLS_OF_SURFACE:
         return unaligned()
-    surface = _Surface.of(after)
-    tree = cKDTree(before.vertices)
+    surface, target = _Surface.of(after), _Target(before, cKDTree(before.vertices))
 
     def far(pose: Floats) -> Floats:
         """(N,) logarithms of the distances between the surfaces, about equal where they lie on each other."""
-        there = after.at(pose).to_common(surface.points)
-        distance_m, _ = before.distance(there)
-        distance_m = np.where(np.isfinite(distance_m), distance_m, tree.query(there)[0])
+        near_m, _, distance_m = target.nearest(turned(surface.points, pose[:3, :3]) + pose[:3, 3])
+        distance_m = np.where(near_m <= target.reach_m, distance_m, near_m)
         found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
         return found
 
-    as_given, (pose, covariance) = far(np.eye(4)), _determined(before, surface, np.eye(4))
+    as_given, (pose, covariance) = far(np.eye(4)), _determined(target, surface, np.eye(4))
     left = far(pose)
     searched = _searched(before, surface)
-    other, of_other = _determined(before, surface, searched)
+    other, of_other = _determined(target, surface, searched)
     if Verdict.by_groups(left - far(other), surface.patches).improved:
         pose, covariance, left = other, of_other, far(other)
     offset = surface.offset(pose)
@@ -133,11 +131,14 @@ class _Surface:
         rng = np.random.default_rng(0)
         _, areas = across_triangles(placed.vertices, placed.faces)
         chosen = rng.choice(len(areas), min(len(areas), _MOST_POINTS), p=areas / areas.sum())
-        corners = placed.vertices[placed.faces[chosen]]
-        points = np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), len(chosen)), corners)
+        corners, shares = placed.faces[chosen], rng.dirichlet(np.ones(3), len(chosen))
+        points, normals = (
+            np.einsum("nk,nki->ni", shares, values[corners]) for values in (placed.vertices, placed.normals)
+        )
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+        sigma_m = np.einsum("nk,nk->n", shares, placed.sigma_m[corners])
         patches = np.unique(np.floor(points / _PATCH_M), axis=0, return_inverse=True)[1].ravel()
-        _, normals = placed.distance(points)
-        return cls(points, normals, placed.radar_map.uncertainty(points), patches, points.mean(axis=0))
+        return cls(points, normals, sigma_m, patches, points.mean(axis=0))
 
     @property
     def radius_m(self) -> float:
@@ -154,6 +155,25 @@ class _Surface:
         found = moved(np.eye(4)[None], offset[None])[0]
         found[:3, 3] += self.centre - np.einsum("ij,j->i", found[:3, :3], self.centre)
         return found
+
+
+@dataclass(frozen=True)
+class _Target:
+    """The earlier surface as planes at its vertices."""
+
+    placed: PlacedMap
+    tree: cKDTree
+
+    @property
+    def reach_m(self) -> float:
+        """From farther away, a point is on another surface, m."""
+        return REACH_CELLS * self.placed.leaf_m
+
+    def nearest(self, points: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+        """Of points (N, 3): (N,) distances of the nearest vertices, m, their rows, and (N,) distances from their planes, m."""
+        near_m, rows = self.tree.query(points)
+        away = points - self.placed.vertices[rows]
+        return near_m, rows, np.einsum("ni,ni->n", away, self.placed.normals[rows])
 
 
 def _searched(before: PlacedMap, surface: _Surface) -> Floats:
@@ -176,24 +196,23 @@ def _searched(before: PlacedMap, surface: _Surface) -> Floats:
     return surface.pose(offsets[((offsets / _APART) ** 2).sum(axis=1).argmin()])
 
 
-def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats]:
+def _determined(target: _Target, surface: _Surface, start: Floats) -> tuple[Floats, Floats]:
     """The pose that the surfaces lead to, and its covariance. Along what they do not determine, it stays as given."""
     information = np.diag(_APART**-2.0)
-    pose, covariance = _settled(before, surface, start, information)
+    pose, covariance = _settled(target, surface, start, information)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
     variances, axes = np.linalg.eigh(covariance * np.outer(lever_m, lever_m))
-    offset = surface.offset(pose) * lever_m
-    along = np.einsum("ij,i->j", axes, offset)
-    unsure = variances > np.minimum((_UNSURE_CELLS * before.leaf_m) ** 2, along**2 / chi2.isf(_BY_CHANCE, 1))
-    if unsure.any():
-        fixed = axes[:, unsure] * lever_m[:, None]
-        offset -= np.einsum("ij,j->i", axes[:, unsure], along[unsure])
+    unsure = axes[:, variances > (_UNSURE_CELLS * target.placed.leaf_m) ** 2]
+    if unsure.size:
+        offset = surface.offset(pose) * lever_m
+        offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
+        fixed = unsure * lever_m[:, None]
         information += _FIXED * np.einsum("ik,jk->ij", fixed, fixed)
-        pose, _ = _settled(before, surface, surface.pose(offset / lever_m), information)
+        pose, _ = _settled(target, surface, surface.pose(offset / lever_m), information)
     return pose, covariance
 
 
-def _settled(before: PlacedMap, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
+def _settled(target: _Target, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
     """By Gauss and Newton's method; and the covariance. What changed counts as little as it is probable that it did not.
 
     Normals of both maps have errors, which are independent: products of normals of different maps tell along which axes surfaces determine the
@@ -203,9 +222,10 @@ def _settled(before: PlacedMap, surface: _Surface, pose: Floats, prior: Floats) 
     for _ in range(_ITERATIONS):
         there, own = turned(surface.points, pose[:3, :3]) + pose[:3, 3], turned(surface.normals, pose[:3, :3])
         offset = surface.offset(pose)
-        distance_m, normals = before.distance(there)
-        sigma_m = np.hypot(surface.sigma_m, before.radar_map.uncertainty(there))
-        known = np.isfinite(distance_m) & np.isfinite(sigma_m)
+        near_m, rows, distance_m = target.nearest(there)
+        normals = target.placed.normals[rows]
+        sigma_m = np.hypot(surface.sigma_m, target.placed.sigma_m[rows])
+        known = (near_m <= target.reach_m) & np.isfinite(sigma_m)
         known &= np.einsum("ni,ni->n", normals, own) >= PARALLEL
         if known.sum() < CELLS_OF_SURFACE:
             break
@@ -214,10 +234,10 @@ def _settled(before: PlacedMap, surface: _Surface, pose: Floats, prior: Floats) 
             sigma_m[known],
             there[known] - surface.centre - offset[:3],
         )
-        odds = odds_of_differences(distance_m, sigma_m, REACH_CELLS * before.leaf_m)
+        odds = odds_of_differences(distance_m, sigma_m, target.reach_m)
         weights = (1 - posterior(odds, share_of_changes(odds))) / sigma_m**2
-        rows, of_own = _jacobian(arms, normals[known]), _jacobian(arms, own[known])
-        slope = np.einsum("ni,n,nj->ij", of_own, weights, rows)
+        of_target, of_own = _jacobian(arms, normals[known]), _jacobian(arms, own[known])
+        slope = np.einsum("ni,n,nj->ij", of_own, weights, of_target)
         parts = np.stack(
             [np.bincount(surface.patches[known], column * weights * distance_m) for column in of_own.T]
         )
