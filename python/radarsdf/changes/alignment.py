@@ -90,12 +90,12 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
         return found
 
-    as_given, (pose, covariance) = far(np.eye(4)), _determined(target, surface, np.eye(4))
+    as_given, (pose, covariance, unsure) = far(np.eye(4)), _determined(target, surface, np.eye(4))
     left = far(pose)
-    searched = _searched(before, surface)
-    other, of_other = _determined(target, surface, searched)
-    if Verdict.by_groups(left - far(other), surface.patches).improved:
-        pose, covariance, left = other, of_other, far(other)
+    other = _determined(target, surface, _searched(before, surface))
+    if Verdict.by_groups(left - far(other[0]), surface.patches).improved:
+        pose, covariance, unsure = other
+        left = far(pose)
     offset = surface.offset(pose)
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
     by_chance = np.sqrt(chi2.isf(_BY_CHANCE, len(offset)))
@@ -107,6 +107,8 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         words = f"The frames were taken as they are: surfaces do not show that they are apart ({figures})."
         return Alignment(np.eye(4), covariance, surface.centre, False, words)
     words = f"The later map was moved so that its surface lies on the earlier one ({figures})."
+    if unsure.size:
+        words += f" Along {unsure.shape[1]} of 6 axes, surfaces do not determine it: there it stays as given."
     return Alignment(pose, covariance, surface.centre + offset[:3], True, words)
 
 
@@ -196,20 +198,23 @@ def _searched(before: PlacedMap, surface: _Surface) -> Floats:
     return surface.pose(offsets[((offsets / _APART) ** 2).sum(axis=1).argmin()])
 
 
-def _determined(target: _Target, surface: _Surface, start: Floats) -> tuple[Floats, Floats]:
-    """The pose that the surfaces lead to, and its covariance. Along what they do not determine, it stays as given."""
+def _determined(target: _Target, surface: _Surface, start: Floats) -> tuple[Floats, Floats, Floats]:
+    """The pose that the surfaces lead to, its covariance, and axes (6, K) that they do not determine: there it stays as given."""
     information = np.diag(_APART**-2.0)
     pose, covariance = _settled(target, surface, start, information)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
     variances, axes = np.linalg.eigh(covariance * np.outer(lever_m, lever_m))
-    unsure = axes[:, variances > (_UNSURE_CELLS * target.placed.leaf_m) ** 2]
+    most = (_UNSURE_CELLS * target.placed.leaf_m) ** 2
+    unsure = axes[:, variances > most]
     if unsure.size:
         offset = surface.offset(pose) * lever_m
         offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
         fixed = unsure * lever_m[:, None]
         information += _FIXED * np.einsum("ik,jk->ij", fixed, fixed)
         pose, _ = _settled(target, surface, surface.pose(offset / lever_m), information)
-    return pose, covariance
+    # Errors of normals would make larger ones errors of all surfaces.
+    covariance = np.einsum("ik,k,jk->ij", axes, np.minimum(variances, most), axes)
+    return pose, covariance / np.outer(lever_m, lever_m), unsure
 
 
 def _settled(target: _Target, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
