@@ -92,14 +92,14 @@ class PlacedMap:
     def told(self, x: Floats, facing: Floats | None = None) -> Told:
         """All that the map tells of places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
         own = self.to_own(x)
-        evidence = self.radar_map.evidence_at(torch.from_numpy(np.ascontiguousarray(own)))
+        evidence, sigma_m, confidence = self.radar_map.surface_at(torch.from_numpy(np.ascontiguousarray(own)))
         distance_m, normals = self.distance(x)
         behind = x - _BEHIND_CELLS * self.leaf_m * np.nan_to_num(normals if facing is None else facing)
         return Told(
             distance_m,
             normals,
-            self.radar_map.uncertainty(own),
-            self.radar_map.confidence(own),
+            sigma_m.double().numpy(),
+            confidence.double().numpy(),
             evidence.detections.numpy().astype(np.float64),
             self._passes(self.to_own(behind)),
         )
