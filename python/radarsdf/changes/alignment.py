@@ -57,7 +57,7 @@ class Alignment:
     centre: Floats
     """(3,) world of the earlier map, m."""
     improved: bool
-    """Whether surfaces that took no part are nearer to each other then, by more than chance gives one of a thousand."""
+    """Whether the surfaces show that the frames are apart, at a significance level of 0.001."""
     words: str
     """The verdict in one sentence."""
 
