@@ -154,7 +154,7 @@ class _Surface:
 
     def pose(self, offset: Floats) -> Floats:
         """The inverse of :meth:`offset`."""
-        found = moved(np.eye(4)[None], offset[None])[0]
+        found: Floats = moved(np.eye(4)[None], offset[None])[0]
         found[:3, 3] += self.centre - np.einsum("ij,j->i", found[:3, :3], self.centre)
         return found
 
