@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch  # noqa: F401 - before the core
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
