@@ -4,13 +4,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import radarsdf
 import trimesh
+from radarsdf.changes.alignment import align
 from radarsdf.changes.changes import APPEARED, GONE, UNSEEN
+from radarsdf.changes.placed import PlacedMap
 from radarsdf.changes.probability import _passed, share_of_changes
 from radarsdf.cli import main
 from radarsdf.poses.rigid import transform
@@ -18,7 +21,7 @@ from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
 from ..conftest import draw_small
-from .conftest import drives_past
+from .conftest import QUICK, drives_past
 
 TAKEN, PUT = np.array([2.5, 2.5, 0.5]), np.array([2.5, -3.0, 0.5])
 
@@ -89,6 +92,45 @@ def test_maps_of_different_frames_are_aligned_first(drives, maps):
     x = np.append(PUT, 1)
     # The wall tells nothing along itself.
     assert np.abs(found.T_before_after @ apart @ x - x)[[0, 2]].max() < 0.1
+
+
+@pytest.fixture(scope="module")
+def wall_alone(maps):
+    """Two maps of a wall and the ground, the later one without what faces along the wall."""
+    before, after = (PlacedMap.of(radar_map) for radar_map in maps[:2])
+    along = np.abs(after.normals[after.faces, 1]).max(axis=1)
+    return before, replace(after, faces=after.faces[along < 0.15])
+
+
+@pytest.mark.parametrize(
+    "shift_m",
+    [(0.1, 0, 0), (-0.3, 0, 0), (0, 0, 0.1), (0.3, 0.15, 0.03), (1, 0, 0), (-0.7, 0.5, 0.1)],
+    ids=str,
+)
+def test_a_wall_is_aligned_along_its_normal_and_left_along_itself(wall_alone, shift_m):
+    before, after = wall_alone
+    found = align(before, replace(after, vertices=after.vertices + shift_m))
+    assert found.improved
+    moved_m = found.T_before_after[:3, 3] + (found.T_before_after[:3, :3] - np.eye(3)) @ found.centre
+    np.testing.assert_allclose(moved_m, [-shift_m[0], 0, -shift_m[2]], atol=0.05)
+
+
+@pytest.mark.parametrize("shift_m", [(0, 0, 0), (0, 0.3, 0)], ids=str)
+def test_frames_are_kept_that_surfaces_do_not_show_to_be_apart(wall_alone, shift_m):
+    before, after = wall_alone
+    found = align(before, replace(after, vertices=after.vertices + shift_m))
+    assert not found.improved
+    np.testing.assert_array_equal(found.T_before_after, np.eye(4))
+
+
+@pytest.mark.parametrize("align_frames", [True, False])
+def test_a_map_without_a_surface_is_refused_by_name(maps, align_frames):
+    two = [np.array([[5.0, 0, 0], [5.0, 0.3, 0.1]])]
+    with pytest.raises(ValueError, match="after has no surface"):
+        radarsdf.compare(maps[0], two, [np.eye(4)], align_frames=align_frames)
+    empty = radarsdf.fit(two, [np.eye(4)], config=QUICK)
+    with pytest.raises(ValueError, match="before has no surface"):
+        radarsdf.compare(empty, maps[0], align_frames=align_frames)
 
 
 @pytest.mark.parametrize(

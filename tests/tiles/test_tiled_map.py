@@ -11,6 +11,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import TiledMap
+from radarsdf.map.gridding import plane_at
 
 from .conftest import CONFIG, TILE_M
 
@@ -141,3 +142,18 @@ def test_echoes_of_tiles_are_those_of_one_map(drive, tmp_path):
         means = [getattr(e, name) @ w for e, w in zip((found, expected), weights, strict=True)]
         np.testing.assert_allclose(*means, rtol=0.005)
     assert abs(found.sigma / expected.sigma - 1) < 0.03
+
+
+def test_planes_take_one_pass_over_the_tiles(city, monkeypatch):
+    x = np.asarray(city.mesh(0.2).vertices, np.float64)
+    distance_m, gradient = city.sdf(x), city.gradient(x)
+    passes = []
+    shares = type(city).known_shares
+    monkeypatch.setattr(
+        type(city), "known_shares", lambda *args, **options: passes.append(1) or shares(*args, **options)
+    )
+    found_m, normals = plane_at(city, x)
+    assert len(passes) == 1
+    length = np.linalg.norm(gradient, axis=1)
+    np.testing.assert_allclose(found_m, distance_m / np.maximum(length, 1), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(normals, gradient / length[:, None], rtol=1e-6, atol=1e-12)

@@ -7,25 +7,44 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch  # noqa: F401 - before the core
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.stats import chi2
 
+from radarsdf._core import LocalPlanes
 from radarsdf.changes.placed import Floats, PlacedMap
-from radarsdf.changes.probability import REACH_CELLS, odds_of_differences, posterior, share_of_changes
-from radarsdf.map.map import Map
+from radarsdf.changes.probability import (
+    PARALLEL,
+    REACH_CELLS,
+    odds_of_differences,
+    posterior,
+    share_of_changes,
+)
+from radarsdf.map.threshold import across_triangles
 from radarsdf.poses.expected import ExpectedStep
 from radarsdf.poses.rates import Rate
-from radarsdf.poses.rigid import moved, skew
-from radarsdf.poses.tracking import Tracker
+from radarsdf.poses.rigid import moved, rotation_vector, skew
+from radarsdf.poses.tracking import thinned
 from radarsdf.poses.verdict import Verdict
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 
-_SEARCHED_M, _SEARCHED_RAD = 3.0, 0.15  # standard deviations of what a search covers
+# Standard deviations of how far frames are apart before maps are compared: translation, m, and rotation vector, rad.
+_APART = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.15])
 _ITERATIONS = 15
-_MOST_VERTICES = 20_000  # that are looked at, evenly spread
-_PATCH_M = 4.0  # vertices of a patch have errors in common: patches judge, as scans do of poses
-_LEAST_M = 1e-3
+_MOST_POINTS = 10_000  # of the later surface
+_PATCH_M = 4.0  # edge of a patch, whose errors are correlated
+_BY_CHANCE = 1e-3  # significance level
+_UNSURE_CELLS = (
+    0.5  # standard error, in leaf cells, from which on an axis is not determined: fields reach two cells
+)
+_FIXED = 1e8  # information of what stays as given, 1/m²
+_ALIKE_CELLS = 0.25  # surfaces that are nearer lie on each other
+_SEARCH_CELLS = 8.0  # edge of the cells of a search, in leaf cells
+_SEARCHED = 500  # points of a search
+_FOLLOWED = 200  # best poses of a search
+_ERRORS = 3.0  # standard errors by which poses that agree about as well differ at most
 
 
 @dataclass(frozen=True)
@@ -39,7 +58,7 @@ class Alignment:
     centre: Floats
     """(3,) world of the earlier map, m."""
     improved: bool
-    """Whether surfaces that took no part are nearer to each other then, by more than chance gives one of a thousand."""
+    """Whether the surfaces show that the frames are apart, at a significance level of 0.001."""
     words: str
     """The verdict in one sentence."""
 
@@ -56,92 +75,188 @@ def unaligned() -> Alignment:
 
 
 def align(before: PlacedMap, after: PlacedMap) -> Alignment:
-    """Move the later map so that its surface lies on that of the earlier one, if that is an improvement.
+    """Move the later map so that its surface lies on that of the earlier one, if that is more than chance explains.
 
-    Half of its vertices say where, the others judge. It begins where the frames are, and where a search by planes finds most
-    agreement within some metres.
+    It begins where the frames are, and where a search by planes finds significantly more agreement. The verdict is about the
+    offset over its standard errors: surfaces that lie along it become no nearer, however far it is.
     """
-    target, vertices = (placed.to_common(placed.vertices) for placed in (before, after))
-    if min(len(target), len(vertices)) < CELLS_OF_SURFACE:
+    if min(len(placed.faces) for placed in (before, after)) < CELLS_OF_SURFACE:
         return unaligned()
-    vertices = vertices[:: max(1, len(vertices) // _MOST_VERTICES)]
-    judge = np.arange(len(vertices)) % 2 == 1
-    used, sigma_m = vertices[~judge], after.radar_map.uncertainty(vertices[~judge])
-    patches = np.unique(np.floor(vertices / _PATCH_M).astype(np.int64), axis=0, return_inverse=True)[1]
-    centre = vertices.mean(axis=0)
-    tree = cKDTree(target)
+    surface, target = _Surface.of(after), _Target(before, cKDTree(before.vertices))
 
-    def far_m(pose: Floats) -> Floats:
-        """(N,) distances of the vertices that judge, m."""
-        there = after.at(pose).to_common(vertices[judge])
-        nearest_m, _ = tree.query(there)
-        distance_m, _ = before.distance(there)
-        found: Floats = np.where(np.isfinite(distance_m), np.abs(distance_m), nearest_m)
-        return np.maximum(found, _LEAST_M)
+    def far(pose: Floats) -> Floats:
+        """(N,) logarithms of the distances between the surfaces, about equal where they lie on each other."""
+        near_m, _, distance_m = target.nearest(turned(surface.points, pose[:3, :3]) + pose[:3, 3])
+        distance_m = np.where(near_m <= target.reach_m, distance_m, near_m)
+        found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
+        return found
 
-    starts = [np.eye(4), *_searched(target, vertices, before.radar_map)]
-    found = [_settled(before, used, sigma_m, centre, start) for start in starts]
-    as_given_m = far_m(np.eye(4))
-    gains = [np.log(as_given_m / far_m(pose)) for pose, _ in found]
-    best = int(np.argmax([gain.mean() for gain in gains]))
-    verdict = Verdict.by_groups(gains[best], patches.reshape(-1)[judge])
-    pose, covariance = found[best]
-    there = after.at(pose)
-    moved_m = float(np.sqrt(((there.to_common(vertices) - vertices) ** 2).sum(1).mean()))
-    figures = f"{verdict.gain:+.1%} of their distance, by chance less than {verdict.needed:.1%}"
-    if not verdict.improved:
-        words = f"The frames were taken as they are: moved onto each other, the surfaces are not nearer ({figures})."
-        return Alignment(np.eye(4), covariance, centre, False, words)
-    words = f"The later map was moved by {moved_m:.3f} m, root mean square: its surface is nearer then ({figures})."
-    return Alignment(pose, covariance, there.to_common(centre[None])[0], True, words)
+    as_given, (pose, covariance, unsure) = far(np.eye(4)), _determined(target, surface, np.eye(4))
+    left = far(pose)
+    other = _determined(target, surface, _searched(before, surface))
+    if Verdict.by_groups(left - far(other[0]), surface.patches).improved:
+        pose, covariance, unsure = other
+        left = far(pose)
+    offset = surface.offset(pose)
+    sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
+    by_chance = np.sqrt(chi2.isf(_BY_CHANCE, len(offset)))
+    moved_m = np.sqrt(((after.at(pose).to_common(surface.points) - surface.points) ** 2).sum(1).mean())
+    figures = (
+        f"{moved_m:.3f} m, root mean square, {sigmas:.1f} standard errors, by chance up to {by_chance:.1f}"
+    )
+    if sigmas <= by_chance or left.mean() >= as_given.mean():
+        words = f"The frames were taken as they are: surfaces do not show that they are apart ({figures})."
+        return Alignment(np.eye(4), covariance, surface.centre, False, words)
+    words = f"The later map was moved so that its surface lies on the earlier one ({figures})."
+    if unsure.size:
+        words += f" Along {unsure.shape[1]} of 6 axes, surfaces do not determine it: there it stays as given."
+    return Alignment(pose, covariance, surface.centre + offset[:3], True, words)
 
 
-def _searched(target: Floats, vertices: Floats, before: Map) -> list[Floats]:
-    """The pose at which the vertices agree best with the planes of the target, of those within some metres; none if unclear."""
-    centre = target.mean(axis=0)
-    tracker = Tracker(LEAVES_PER_SURFEL * before.config.leaf_size_m, before.config.returns)
+@dataclass(frozen=True)
+class _Surface:
+    """Points of the later surface, in the frame that is given."""
+
+    points: Floats
+    """(N, 3) m."""
+    normals: Floats
+    """(N, 3)"""
+    sigma_m: Floats
+    """(N,) standard errors, m."""
+    patches: NDArray[np.int64]
+    """(N,) number of the patch of each."""
+    centre: Floats
+    """(3,) m."""
+
+    @classmethod
+    def of(cls, placed: PlacedMap) -> _Surface:
+        """Points on triangles: vertices are in the lattice of cells, and would be aligned with that of the other map."""
+        rng = np.random.default_rng(0)
+        _, areas = across_triangles(placed.vertices, placed.faces)
+        chosen = rng.choice(len(areas), min(len(areas), _MOST_POINTS), p=areas / areas.sum())
+        corners, shares = placed.faces[chosen], rng.dirichlet(np.ones(3), len(chosen))
+        points, normals = (
+            np.einsum("nk,nki->ni", shares, values[corners]) for values in (placed.vertices, placed.normals)
+        )
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
+        sigma_m = np.einsum("nk,nk->n", shares, placed.sigma_m[corners])
+        patches = np.unique(np.floor(points / _PATCH_M), axis=0, return_inverse=True)[1].ravel()
+        return cls(points, normals, sigma_m, patches, points.mean(axis=0))
+
+    @property
+    def radius_m(self) -> float:
+        """Root mean square distance from the centre, m."""
+        return float(np.sqrt(((self.points - self.centre) ** 2).sum(axis=1).mean()))
+
+    def offset(self, pose: Floats) -> Floats:
+        """(6,) by how far a pose (4, 4) moves the centre, m, and its rotation vector, rad."""
+        shift = np.einsum("ij,j->i", pose[:3, :3], self.centre) + pose[:3, 3] - self.centre
+        return np.concatenate([shift, rotation_vector(pose[:3, :3])])
+
+    def pose(self, offset: Floats) -> Floats:
+        """The inverse of :meth:`offset`."""
+        found: Floats = moved(np.eye(4)[None], offset[None])[0]
+        found[:3, 3] += self.centre - np.einsum("ij,j->i", found[:3, :3], self.centre)
+        return found
+
+
+@dataclass(frozen=True)
+class _Target:
+    """The earlier surface as planes at its vertices."""
+
+    placed: PlacedMap
+    tree: cKDTree
+
+    @property
+    def reach_m(self) -> float:
+        """From farther away, a point is on another surface, m."""
+        return REACH_CELLS * self.placed.leaf_m
+
+    def nearest(self, points: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+        """Of points (N, 3): (N,) distances of the nearest vertices, m, their rows, and (N,) distances from their planes, m."""
+        near_m, rows = self.tree.query(points)
+        away = points - self.placed.vertices[rows]
+        return near_m, rows, np.einsum("ni,ni->n", away, self.placed.normals[rows])
+
+
+def _searched(before: PlacedMap, surface: _Surface) -> Floats:
+    """The nearest of the poses at which points agree about as well with planes of the earlier surface as anywhere."""
+    cell_m, radius_m = _SEARCH_CELLS * before.leaf_m, surface.radius_m
+    planes = LocalPlanes(cell_m)
+    planes.add(np.ascontiguousarray(before.vertices - surface.centre))
+    points = thinned(surface.points - surface.centre, _SEARCHED)
+    variances = np.diag(_APART**2)
     wide = ExpectedStep(
-        Rate(np.zeros(3), np.diag([0.02, 0.02, _SEARCHED_RAD]) ** 2),
-        np.zeros(3), np.zeros(3), np.diag([_SEARCHED_M, _SEARCHED_M, 0.5]) ** 2, 1.0,
-    )  # fmt: skip
-    tracker.follow(np.ascontiguousarray(target - centre), None)
-    sought = tracker.seek(np.ascontiguousarray(vertices - centre), wide)
-    if np.isnan(sought.agreeing):  # it agrees nowhere
-        return []
-    pose = sought.pose.copy()
-    pose[:3, 3] += centre - np.einsum("ij,j->i", pose[:3, :3], centre)
-    return [pose]
+        Rate(np.zeros(3), variances[3:, 3:]), np.zeros(3), np.zeros(3), variances[:3, :3], 1.0
+    )
+    turns, poses = wide.candidates(0.5 * cell_m, radius_m)
+    width = 0.25 * cell_m
+    scores = planes.scores(points, poses, [width**2, *[(width / radius_m) ** 2] * 2])
+    best = np.argsort(-scores.mean(axis=1))[:_FOLLOWED]
+    losses = scores[best[0]] - scores[best]
+    alike = best[losses.mean(axis=1) <= _ERRORS * losses.std(axis=1) / np.sqrt(len(points))]
+    offsets = np.concatenate([poses[alike, :3, 3], turns[alike]], axis=1)
+    return surface.pose(offsets[((offsets / _APART) ** 2).sum(axis=1).argmin()])
 
 
-def _settled(
-    before: PlacedMap, vertices: Floats, sigma_m: Floats, centre: Floats, pose: Floats
-) -> tuple[Floats, Floats]:
-    """By Gauss and Newton's method; and the covariance. What changed counts as little as it is probable that it did not."""
-    information = np.eye(6)
+def _determined(target: _Target, surface: _Surface, start: Floats) -> tuple[Floats, Floats, Floats]:
+    """The pose that the surfaces lead to, its covariance, and axes (6, K) that they do not determine: there it stays as given."""
+    information = np.diag(_APART**-2.0)
+    pose, covariance = _settled(target, surface, start, information)
+    lever_m = np.repeat([1.0, surface.radius_m], 3)
+    variances, axes = np.linalg.eigh(covariance * np.outer(lever_m, lever_m))
+    most = (_UNSURE_CELLS * target.placed.leaf_m) ** 2
+    unsure = axes[:, variances > most]
+    if unsure.size:
+        offset = surface.offset(pose) * lever_m
+        offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
+        fixed = unsure * lever_m[:, None]
+        information += _FIXED * np.einsum("ik,jk->ij", fixed, fixed)
+        pose, _ = _settled(target, surface, surface.pose(offset / lever_m), information)
+    # Errors of normals would make larger ones errors of all surfaces.
+    covariance = np.einsum("ik,k,jk->ij", axes, np.minimum(variances, most), axes)
+    return pose, covariance / np.outer(lever_m, lever_m), unsure
+
+
+def _settled(target: _Target, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
+    """By Gauss and Newton's method; and the covariance. What changed counts as little as it is probable that it did not.
+
+    Normals of both maps have errors, which are independent: products of normals of different maps tell along which axes surfaces determine the
+    pose (instrumental variables). Errors are correlated in a patch, so its sums say how certain the equations are (Hansen 1982).
+    """
+    covariance = np.linalg.inv(prior)
     for _ in range(_ITERATIONS):
-        there = turned(vertices, pose[:3, :3]) + pose[:3, 3]
-        middle = np.einsum("ij,j->i", pose[:3, :3], centre) + pose[:3, 3]
-        distance_m, normals = before.distance(there)
-        sigma = np.hypot(sigma_m, before.radar_map.uncertainty(there))
-        known = np.isfinite(distance_m) & np.isfinite(sigma)
+        there, own = turned(surface.points, pose[:3, :3]) + pose[:3, 3], turned(surface.normals, pose[:3, :3])
+        offset = surface.offset(pose)
+        near_m, rows, distance_m = target.nearest(there)
+        normals = target.placed.normals[rows]
+        sigma_m = np.hypot(surface.sigma_m, target.placed.sigma_m[rows])
+        known = (near_m <= target.reach_m) & np.isfinite(sigma_m)
+        known &= np.einsum("ni,ni->n", normals, own) >= PARALLEL
         if known.sum() < CELLS_OF_SURFACE:
             break
-        odds = odds_of_differences(distance_m[known], sigma[known], REACH_CELLS * before.leaf_m)
-        weights = (1 - posterior(odds, share_of_changes(odds))) / sigma[known] ** 2
-        rows = _jacobian(there[known] - middle, normals[known])
-        information = np.einsum("ni,n,nj->ij", rows, weights, rows) / CELLS_OF_SURFACE
-        gradient = np.einsum("ni,n,n->i", rows, weights, distance_m[known]) / CELLS_OF_SURFACE
-        # What surfaces do not tell, along a corridor say, stays as it is.
-        step = -np.linalg.solve(information + np.eye(6), gradient)
-        shifted = pose.copy()
-        shifted[:3, 3] = middle
-        shifted = moved(shifted[None], step[None])[0]
-        shifted[:3, 3] -= np.einsum("ij,j->i", shifted[:3, :3], centre)
-        pose = shifted
-        if np.einsum("i,ij,j->", step, information, step) < 0.01:
+        distance_m, sigma_m, arms = (
+            distance_m[known],
+            sigma_m[known],
+            there[known] - surface.centre - offset[:3],
+        )
+        odds = odds_of_differences(distance_m, sigma_m, target.reach_m)
+        weights = (1 - posterior(odds, share_of_changes(odds))) / sigma_m**2
+        of_target, of_own = _jacobian(arms, normals[known]), _jacobian(arms, own[known])
+        slope = np.einsum("ni,n,nj->ij", of_own, weights, of_target)
+        parts = np.stack(
+            [np.bincount(surface.patches[known], column * weights * distance_m) for column in of_own.T]
+        )
+        scatter = np.einsum("ip,jp->ij", parts, parts)
+        scatter += CELLS_OF_SURFACE * np.einsum("ni,n,nj->ij", of_own, weights, of_own) + np.eye(6)
+        weighted = np.linalg.solve(scatter, slope).T
+        covariance = np.linalg.inv(np.einsum("ij,jk->ik", weighted, slope) + prior)
+        gradient = np.einsum("ij,j->i", weighted, parts.sum(axis=1)) + np.einsum("ij,j->i", prior, offset)
+        step = -np.einsum("ij,j->i", covariance, gradient)
+        pose = surface.pose(offset + step)
+        if np.einsum("i,i->", step, -gradient) < 0.01:
             break
-    covariance = np.asarray(np.linalg.inv(information + np.eye(6)), np.float64)
-    return pose, covariance
+    return pose, np.asarray(covariance, np.float64)
 
 
 def _jacobian(from_centre: Floats, normals: Floats) -> Floats:

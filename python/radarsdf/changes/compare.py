@@ -76,8 +76,9 @@ def compare(
     poses, intensities
         Of new scans, as :func:`fit` takes them.
     align_frames : bool
-        Whether the later map may be moved as a whole. It is if its surface is then nearer to the earlier one, by more than
-        chance gives one of a thousand; frames may be some metres and some degrees apart.
+        Whether the later map may be moved as a whole. It is if its surface shows that the frames are apart, at a significance
+        level of 0.001; they may be some metres and some degrees apart. Along axes that surfaces do not determine, such as
+        along a single wall, the frame stays as given.
     box : (2, 3) array_like, optional
         Lower and upper corner, world of the earlier map, m: nothing outside is returned.
 
@@ -89,7 +90,7 @@ def compare(
     Raises
     ------
     ValueError
-        If a map does not keep what rays passed, for wrong arguments, or if the maps do not fit together: they saw no surface
+        If a map does not keep what rays passed or has no surface, for wrong arguments, or if the maps do not fit together: they saw no surface
         in common, or of the level or of the steep surfaces that they have in common, more would have changed than agrees.
     TypeError
         If `before` is no map.
@@ -112,6 +113,10 @@ def compare(
     check_passages(after, "after")
     corners = None if box is None else check_box(box)
     earlier, later = PlacedMap.of(before), PlacedMap.of(after)
+    for name, placed in (("before", earlier), ("after", later)):
+        if len(placed.faces) == 0:
+            msg = f"{name} has no surface: its mesh has 0 triangles. Fit it with more scans of the place"
+            raise ValueError(msg)
     alignment = align(earlier, later) if align_frames else unaligned()
     later = later.at(alignment.T_before_after)
     sides = (

@@ -53,13 +53,19 @@ class PlacedMap:
     """(V, 3) of the mesh that the map keeps by default, in leaf cells; world of the map, m."""
     faces: NDArray[np.int32]
     """(F, 3) rows of vertices."""
+    normals: Floats
+    """(V, 3) of the mesh, towards free space."""
+    sigma_m: Floats
+    """(V,) standard errors of the vertices, m."""
 
     @classmethod
     def of(cls, radar_map: Map) -> PlacedMap:
         """A map whose world is the common frame."""
         mesh = radar_map.mesh(radar_map.config.leaf_size_m, progress=False)
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
-        return cls(radar_map, np.eye(4), vertices, faces)
+        normals = np.asarray(mesh.vertex_normals, np.float64)
+        sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
+        return cls(radar_map, np.eye(4), vertices, faces, normals, sigma_m)
 
     def at(self, T_common_map: Floats) -> PlacedMap:
         """The map in another place (4, 4)."""
@@ -86,14 +92,14 @@ class PlacedMap:
     def told(self, x: Floats, facing: Floats | None = None) -> Told:
         """All that the map tells of places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
         own = self.to_own(x)
-        evidence = self.radar_map.evidence_at(torch.from_numpy(np.ascontiguousarray(own)))
+        evidence, sigma_m, confidence = self.radar_map.surface_at(torch.from_numpy(np.ascontiguousarray(own)))
         distance_m, normals = self.distance(x)
         behind = x - _BEHIND_CELLS * self.leaf_m * np.nan_to_num(normals if facing is None else facing)
         return Told(
             distance_m,
             normals,
-            self.radar_map.uncertainty(own),
-            self.radar_map.confidence(own),
+            sigma_m.double().numpy(),
+            confidence.double().numpy(),
             evidence.detections.numpy().astype(np.float64),
             self._passes(self.to_own(behind)),
         )

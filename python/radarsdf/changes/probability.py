@@ -25,7 +25,8 @@ _ROUNDS, _SETTLED = 50, 1e-4  # of the share
 # Returns of a scan in cells side by side have causes in common: so many of them count once. Chosen on facade, hall and
 # forest of seed 31.
 _CELLS_PER_SCAN = 2.0
-_PARALLEL = np.cos(np.pi / 4)  # a surface that moved is still about parallel
+PARALLEL = np.cos(np.pi / 4)
+"""Least cosine between normals of surfaces that are about parallel: one that moved still is."""
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 _MOST_DISTANCES = 5_000  # that tell both, evenly spread
@@ -109,7 +110,7 @@ class Beside:
     @property
     def parallel(self) -> NDArray[np.bool_]:
         """(N,) whether the other map's surface is about parallel."""
-        mask: NDArray[np.bool_] = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= _PARALLEL
+        mask: NDArray[np.bool_] = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
         return mask
 
     def agree(self, errors: Errors, sigmas: float) -> NDArray[np.bool_]:

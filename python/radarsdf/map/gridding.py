@@ -94,9 +94,9 @@ def plane_at(radar_map: Map, x: NDArray[np.float64]) -> tuple[NDArray[np.float64
 
     Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
     """
-    gradient = np.asarray(radar_map.gradient(x), np.float64)
+    sdf, gradient = (values.double().numpy() for values in radar_map.plane_at(torch.from_numpy(x)))
     length = np.linalg.norm(gradient, axis=1)
-    return radar_map.sdf(x) / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
+    return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
 
 
 def make_grid(

@@ -58,17 +58,26 @@ class MapParts(ABC):
     def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
         """:meth:`Map.gradient` there, (N, 3)."""
 
+    def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3) in the world, m."""
+        return self._sdf(world, False), self._gradient(world, False)
+
     @abstractmethod
     def _observed(self, world: Tensor) -> Tensor:
         """:meth:`Map.observed` there, (N,) bool."""
 
+    def surface_at(self, world: Tensor) -> tuple[queries.EvidenceAt, Tensor, Tensor]:
+        """:meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3) in the world, m."""
+        evidence, contents = self.evidence_at(world), self._contents_of_any
+        return evidence, queries.uncertainty(contents, evidence), queries.confidence(contents, evidence)
+
     def _uncertainty(self, world: Tensor) -> Tensor:
         """:meth:`Map.uncertainty` there, (N,)."""
-        return queries.uncertainty(self._contents_of_any, self.evidence_at(world))
+        return self.surface_at(world)[1]
 
     def _confidence(self, world: Tensor) -> Tensor:
         """:meth:`Map.confidence` there, (N,)."""
-        return queries.confidence(self._contents_of_any, self.evidence_at(world))
+        return self.surface_at(world)[2]
 
     @abstractmethod
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:

@@ -195,11 +195,11 @@ class TileBlend:
         cells = cells + self.plan.origin_cells(asking)
         owners = cells[:, :2] // self.plan.tile_cells
         found = np.ones(len(cells), bool)
-        left = np.ones(len(cells), bool)
-        while left.any():
-            owner = tuple(owners[left.argmax()].tolist())
-            rows = (owners == owner).all(axis=1)
-            left &= ~rows
+        left = np.arange(len(cells))
+        while len(left):
+            owner = tuple(owners[left[0]].tolist())
+            of_owner = (owners[left, 0] == owner[0]) & (owners[left, 1] == owner[1])
+            rows, left = left[of_owner], left[~of_owner]
             if self.has(owner):
                 found[rows] = holds(self.contents_of(owner), cells[rows] - self.plan.origin_cells(owner))
         return found

@@ -32,7 +32,8 @@ def holds(contents: MapContents, cells: _Cells) -> NDArray[np.bool_]:
     """(M,) whether a tile observed these leaf cells (M, 3), from its origin."""
     size_m = contents.field.cells.table.leaf_size_m
     centres = (cells + 0.5).astype(np.float32) * np.float32(size_m)
-    return queries.occupied(contents, torch.from_numpy(centres)).numpy()
+    # The core looks them up on all threads: queries would start threads of their own.
+    return contents.field.cells.occupied(torch.from_numpy(centres)).numpy()
 
 
 def knowledge(

@@ -76,6 +76,12 @@ class TiledMap(TileBlend, Map):
         return torch.from_numpy(averages(shares, len(positions), distance)[:, 0])
 
     def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
+        return self._plane_at(world, extrapolate)[1]
+
+    def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
+        return self._plane_at(world, False)
+
+    def _plane_at(self, world: Tensor, extrapolate: bool) -> tuple[Tensor, Tensor]:
         positions = _contiguous(world)
         count = len(positions)
         # Of the quotient of two sums, of w f and of w: the weights change with the position, too.
@@ -91,7 +97,7 @@ class TiledMap(TileBlend, Map):
         with np.errstate(invalid="ignore", divide="ignore"):
             means = sums / totals[:, None]
             found = means[:, 1:] + (distances - means[:, :1] * slopes) / totals[:, None]
-        return torch.from_numpy(found)
+        return torch.from_numpy(means[:, 0]), torch.from_numpy(found)
 
     def _observed(self, world: Tensor) -> Tensor:
         return torch.from_numpy(self.seen(_contiguous(world)))
