@@ -62,7 +62,9 @@ def _refined(part: Recording, config: FitConfig) -> tuple[FloatArray, RefinedPos
     times_s, doppler_mps = part.ascending_times_s, None
     if part.doppler_mps is not None and times_s is not None:
         doppler_mps = [speeds[::every] for speeds in part.doppler_mps]
-    return part.poses, refine_poses(points, part.poses, doppler_mps=doppler_mps, times=times_s, config=config)
+    return part.poses, refine_poses(
+        points, part.poses, doppler_mps=doppler_mps, times=times_s, config=config, progress=False
+    )
 
 
 def _drift(given: FloatArray, found: FloatArray) -> tuple[float, float]:

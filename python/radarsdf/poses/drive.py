@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from tqdm import tqdm
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.by_doppler import DopplerMotion, SensorVelocities
@@ -19,6 +20,7 @@ from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rates import Habits, Rate
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector
 from radarsdf.poses.tracking import Tracked, Tracker
+from radarsdf.progress import hides_bar
 
 # What a drive begins with. Its own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
 # scans were lost, up to 9 degrees.
@@ -188,12 +190,14 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rat
     return Rate(now.turn / duration_s, of_turn), Rate(way / duration_s, of_way)
 
 
-def followed(drive: Drive, config: FitConfig, num_threads: int) -> tuple[Drive, list[Tracked]]:
+def followed(
+    drive: Drive, config: FitConfig, num_threads: int, progress: bool | None = False
+) -> tuple[Drive, list[Tracked]]:
     """The drive with its habits, and its scans where the last pass found them."""
     gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
     cell_m = plane_cell_m(drive.scans, config.leaf_size_m)
     tracked: list[Tracked] = []
-    for i in range(_PASSES):
+    for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
         tracker = Tracker(cell_m, config.returns, num_threads)
         found = _Pass.of(drive, tracker)
         tracked = found.tracked

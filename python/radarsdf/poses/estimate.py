@@ -8,12 +8,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from tqdm import tqdm
 
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.groups import Groups
 from radarsdf.poses.motion import Motion
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, moved
+from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import SensorNoise
 
 # Of scans in short windows, the drift is small beside a cell. So each window may be twice as long as the one before.
@@ -55,10 +57,12 @@ class PosesEstimate:
         config: ReturnsConfig,
         num_threads: int,
         first_window: int = _FIRST_WINDOW,
+        progress: bool | None = False,
     ) -> PosesEstimate:
         """From `given` (F, 4, 4) and what was measured, by Gauss and Newton's method, with planes drawn anew in each round."""
         poses, noise, rounds, motions = given, None, 0, list(motions)
-        for grid in plan_of(len(given), cell_m, first_window):
+        plan = list(plan_of(len(given), cell_m, first_window))
+        for grid in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
             # The noise is estimated every other round: with the poses, it changes slowly.
             planes, noise = common_planes(
                 returns, poses, grid, None if rounds % 2 == 0 else noise, config, num_threads

@@ -78,6 +78,7 @@ def odometry(
     angular_velocity_times: ArrayLike | None = None,
     imu: Imu | None = None,
     config: FitConfig | None = None,
+    progress: bool | None = None,
 ) -> Odometry:
     """Finds the poses of scans from the radar alone.
 
@@ -104,6 +105,8 @@ def odometry(
         also tells which way is up.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
+    progress : bool, optional
+        Whether to show a progress bar. Default: only in a terminal.
 
     Returns
     -------
@@ -152,11 +155,11 @@ def odometry(
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
         try:
-            drive, tracked = followed(drive, config, workers.num_threads)
+            drive, tracked = followed(drive, config, workers.num_threads, progress)
         except UnknownAxesError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
-            drive, tracked = followed(drive, config, workers.num_threads)
+            drive, tracked = followed(drive, config, workers.num_threads, progress)
         notes = [*checked.notes, *inertial.notes]
         told = _checked_told(tracked, drive, notes)
         poses, covariance = _together(drive, tracked, config, workers.num_threads)

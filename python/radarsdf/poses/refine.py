@@ -60,6 +60,7 @@ def refine_poses(
     sigma_m: float | None = None,
     sigma_rad: float | None = None,
     config: FitConfig | None = None,
+    progress: bool | None = None,
 ) -> RefinedPoses:
     """Refines the poses of scans, so that their returns lie on common surfaces.
 
@@ -83,6 +84,8 @@ def refine_poses(
         Standard deviations of each component of a step's translation, m, and rotation, rad. By default found from the data.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
+    progress : bool, optional
+        Whether to show a progress bar. Default: only in a terminal.
 
     Returns
     -------
@@ -146,7 +149,7 @@ def refine_poses(
     with Workers(config.num_threads) as workers:
         held = held_out(len(returns), config.seed)
         used = returns.select(~held)
-        found = PosesEstimate.of(used, given, motions, cell_m, limits, workers.num_threads)
+        found = PosesEstimate.of(used, given, motions, cell_m, limits, workers.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
     steps_given = found.motions[0]
     report = {

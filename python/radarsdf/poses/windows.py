@@ -85,7 +85,7 @@ def refine_in_windows(
     joined = JoinedPoses()
     for window, whole in _read(scans, None, "refine", progress):
         with _named(window):
-            answer = refine_poses(whole, config=config)
+            answer = refine_poses(whole, config=config, progress=False)
         joined.add(window.begin, answer.poses, answer.covariance)
         given.append(whole.poses[window.common :])
         answers.append(answer)
@@ -132,7 +132,7 @@ def find_in_windows(
     for window, whole in _read(scans, imu, "find poses", progress):
         try:
             with _named(window):
-                found = odometry(whole, config=config)
+                found = odometry(whole, config=config, progress=False)
         except NotToldError as why:
             refused = refused or why
             notes.append([f"There are no poses of the {window.words}: {why}"])
