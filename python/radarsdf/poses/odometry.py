@@ -21,8 +21,8 @@ from radarsdf.poses.by_doppler import NOT_USED, doppler_sign
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.drive import LATERAL_MPS2, Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
-from radarsdf.poses.gyroscope import Gyroscope, UnknownAxesError
-from radarsdf.poses.inertial import Inertial, levelled
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
+from radarsdf.poses.inertial import Inertial, implausible_rates, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
@@ -137,13 +137,17 @@ def odometry(
     if checked.times_s is None:
         msg = "times are missing: when each scan was taken, s"
         raise ValueError(msg)
+    checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
     if velocities is not None:
         sign = doppler_sign(checked.scans, velocities, times_s)
         velocities = velocities.turned if sign < 0 else velocities
     if angular_velocity is not None:
         at = times_s if angular_velocity_times is None else angular_velocity_times
-        inertial = Inertial(Gyroscope.of(*_checked_rates(angular_velocity, at, checked), times_s))
+        rates, at_s = _checked_rates(angular_velocity, at, checked)
+        inertial = Inertial(Gyroscope.of(rates, at_s, times_s))
+        if (why := implausible_rates(rates, velocities)) is not None:
+            inertial = inertial.without(why)
     else:
         used = points.imu if imu is None and isinstance(points, Scans) else imu
         inertial = Inertial.of(used, velocities, times_s, checked.begin_s)
@@ -153,7 +157,7 @@ def odometry(
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
         try:
             drive, tracked = followed(drive, config, workers.num_threads)
-        except UnknownAxesError as why:
+        except UnusableGyroscopeError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
             drive, tracked = followed(drive, config, workers.num_threads)
