@@ -57,6 +57,18 @@ def test_speeds_in_other_units_are_left_out(drive, motion):
     assert "m/s: it may be in" in found.report["notes"][0]
 
 
+@pytest.mark.parametrize("factor", [0.5, 1.5])
+def test_speeds_that_contradict_the_returns_are_left_out(drive, motion, factor):
+    found = radarsdf.odometry(
+        drive.points, times=motion.times_s, doppler_mps=[factor * speeds for speeds in motion.doppler_mps]
+    )
+    assert not found.report["doppler"]
+    (note,) = found.report["notes"]
+    ratio = float(note.split(" times as far")[0].split()[-1])
+    assert ratio == pytest.approx(1 / factor, rel=0.05)
+    assert position_error_m(radarsdf.poses.rigid.aligned(found.poses, drive.poses), drive.poses) < 0.1
+
+
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [

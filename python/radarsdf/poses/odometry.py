@@ -19,7 +19,7 @@ from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import NOT_USED, doppler_sign
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.drive import LATERAL_MPS2, Drive, followed
+from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, doppler_contradicted, followed
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.inertial import Inertial, implausible_rates, levelled
@@ -29,10 +29,7 @@ from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
 from radarsdf.returns.rays import within_ranges
 from radarsdf.threads import Workers
 
-# Of a step's variance, that the returns must take away where nothing else measures the way. Below a half, the motion before
-# says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
-LEAST_TOLD = 0.5
-# Likewise of its rotation. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
+# Of the variance of a step's rotation, that the returns must take away. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
 # which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_TOLD_TURN = 1 / WINDOW
 _MAX_RATE_RAD_S = 1e4  # more than any gyroscope measures, even in degrees
@@ -155,13 +152,18 @@ def odometry(
     with Workers(config.num_threads) as workers:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
+        notes = [*checked.notes]
+        if (why := velocities and doppler_contradicted(drive, config, workers.num_threads)) is not None:
+            notes.append(f"{NOT_USED}: {why}.")
+            velocities = None
+            drive = dataclasses.replace(drive, velocities=None)
         try:
             drive, tracked = followed(drive, config, workers.num_threads)
         except UnusableGyroscopeError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
             drive, tracked = followed(drive, config, workers.num_threads)
-        notes = [*checked.notes, *inertial.notes]
+        notes += inertial.notes
         told = _checked_told(tracked, drive, notes)
         poses, covariance = _together(drive, tracked, config, workers.num_threads)
         if inertial.alignment is not None:
