@@ -104,6 +104,15 @@ def test_the_sign_and_the_folds_of_the_doppler_do_not_matter(drive, motion):
     assert errors(turned.poses, true)[0] < 0.005 * length_m(true)
 
 
+def test_returns_without_doppler_stay_in_the_scans(drive, motion):
+    """Nine of ten speeds were not measured: such returns contradict no velocity."""
+    rng = np.random.default_rng(0)
+    speeds = [np.where(rng.random(len(v)) < 0.9, np.nan, v) for v in motion.doppler_mps[:20]]
+    found = radarsdf.odometry(drive.points[:20], doppler_mps=speeds, times=motion.times_s[:20])
+    assert found.report["movers"] < 0.05 * sum(map(len, drive.points[:20]))
+    assert errors(found.poses, drive.poses[:20])[0] < 0.005 * length_m(drive.poses[:20])
+
+
 def test_a_gap_is_bridged(drive, motion):
     rows = np.r_[0:15, 21:36]
     points, true = only(drive, rows)

@@ -77,8 +77,8 @@ class SensorVelocities:
             np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3),
         )
         static = [
-            velocity.static if velocity.found else np.ones(len(scan), bool)
-            for velocity, scan in zip(each, scans, strict=True)
+            velocity.static | np.isnan(speeds) if velocity.found else np.ones(len(scan), bool)
+            for velocity, scan, speeds in zip(each, scans, doppler_mps, strict=True)
         ]
         at = times_s[found]
         durations = np.diff(at)
@@ -97,6 +97,11 @@ class SensorVelocities:
         return SensorVelocities(
             self.mean_mps[rows], self.covariance[rows], self.change, self.static[rows], self.found[rows]
         )
+
+    @property
+    def usual_mps(self) -> float:
+        """Median of the speeds."""
+        return float(np.median(np.linalg.norm(self.mean_mps, axis=1)))
 
     @property
     def turned(self) -> SensorVelocities:

@@ -9,6 +9,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
@@ -20,9 +21,21 @@ FIRST_BIAS_RAD_S = 0.02
 _FIRST_NOISE_RAD = 0.003
 # How sure it must be how a gyroscope sits on the radar.
 _LEAST_TURNS = 20
+_LEAST_STEPS = 4  # fewer turns contradict nothing
 _UNRELATED = 60  # shifts between two courses of turns that have nothing to do with each other, to see what chance explains
 _BY_CHANCE = 1e-3
+_HOW = "the drive does not show the axes of the IMU in the frame of the radar"
 _KNOWN_RAD = 0.1  # standard deviation
+_MOST_BIAS_RAD_S = 0.35  # zero-rate offset of the cheapest gyroscopes: 20 degrees a second
+# Mean squared deviation of a turn from the rates, per step, and as a multiple of that from a constant rate, from which on rates
+# contradict the returns. Simulated drives of 9 kinds: 0.02 to 0.63 times; in wrong units, signs or axes 1.3 times and more.
+_CONTRADICTED, _CONTRADICTED_SHARE = 12.0, 1.2
+_MISTAKES = {
+    "deg/s, not rad/s": np.degrees(1.0),
+    "mrad/s, not rad/s": 1e3,
+    "of the opposite sign": -1.0,
+}
+"""Factors by which rates may be wrong."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +87,14 @@ class Gyroscope:
         return Rate(self.turns[i] - self.bias.mean * duration_s, covariance)
 
     def learnt(self, turns: Floats, covariance: Floats) -> Gyroscope:
-        """With the bias and the noise that rotations (F - 1, 3) show, with their covariance (F - 1, 3, 3). NaN: unknown."""
+        """With the bias and the noise that rotations (F - 1, 3) show, with their covariance (F - 1, 3, 3). NaN: unknown.
+
+        Raises an :class:`UnusableGyroscopeError` if they contradict the rates.
+        """
         known = np.isfinite(turns).all(axis=1) & (self.durations_s > 0)
         if known.sum() < 2:
             return self
+        self._check(turns[known], covariance[known], known)
         duration_s = self.durations_s[known, None, None]
         off = (self.turns - turns)[known]
         # Weighted least squares, with what was known of the bias.
@@ -94,8 +111,49 @@ class Gyroscope:
         noise = np.maximum(squares / self._spans[known, None], 0.0).mean()
         return dataclasses.replace(self, bias=bias, noise_rad2=float(max(noise, 1e-10)))
 
+    def _check(self, turns: Floats, covariance: Floats, known: NDArray[np.bool_]) -> None:
+        """Raises an UnusableGyroscopeError if these turns (K, 3) of the steps that are `known` contradict the rates."""
+        durations_s = self.durations_s[known]
+        noise = self.noise_rad2 * self._spans[known, None, None] * np.eye(3)
+        weights = np.linalg.inv(covariance + noise)
+        information = np.einsum("fij,f->ij", weights, durations_s**2)
 
-class UnknownAxesError(ValueError):
+        def fit(measured: Floats) -> tuple[float, Floats]:
+            """Mean square of the deviations, but for a constant bias, and the bias (3,)."""
+            off = measured - turns
+            bias: Floats = np.linalg.solve(information, np.einsum("fij,fj,f->i", weights, off, durations_s))
+            left = off - bias * durations_s[:, None]
+            return float(np.einsum("fi,fij,fj->f", left, weights, left).mean()), bias
+
+        measured = self.turns[known]
+        (square, bias), constant = fit(measured), fit(0 * measured)[0]
+        rate = float(np.linalg.norm(bias))
+        contradicted = len(turns) > _LEAST_STEPS and square > max(
+            _CONTRADICTED, _CONTRADICTED_SHARE * constant
+        )
+        # Turns that the returns hardly show all have the error of what was expected.
+        unknown = float(np.sqrt(np.median(np.einsum("fii->f", covariance) / durations_s**2)))
+        if not contradicted and rate < _MOST_BIAS_RAD_S + 3 * unknown:
+            return
+        squares = {name: fit(measured / factor)[0] for name, factor in _MISTAKES.items()}
+        best = min(squares, key=squares.__getitem__)
+        likely = (
+            f"they seem to be {best}"
+            if squares[best] < min(square, constant) / 2
+            else "are they in the axes of the radar, and of this drive?"
+        )
+        msg = (
+            f"its rates differ from the turns that the returns show by {np.sqrt(square / 3):.1f} standard deviations and a bias "
+            f"of {rate:.2f} rad/s, a constant rate by {np.sqrt(constant / 3):.1f}: {likely}"
+        )
+        raise UnusableGyroscopeError(msg)
+
+
+class UnusableGyroscopeError(ValueError):
+    """The rates of a gyroscope cannot be those of a drive."""
+
+
+class UnknownAxesError(UnusableGyroscopeError):
     """The turns of a drive do not tell how a gyroscope sits on the radar."""
 
 
@@ -107,7 +165,7 @@ class UnalignedGyroscope(Gyroscope):
         """In the axes of the radar, as :meth:`Gyroscope.learnt`. Raises :class:`UnknownAxesError`."""
         known = np.isfinite(turns).all(axis=1) & (self.durations_s > 0)
         if known.sum() < _LEAST_TURNS:
-            msg = "too few turns are known"
+            msg = f"{_HOW}: too few turns are known"
             raise UnknownAxesError(msg)
         weights = 3 / (np.einsum("fii->f", covariance[known]) + 3 * self.noise_rad2 * self._spans[known])
         measured, found, spans = self.turns[known], turns[known], self.durations_s[known]
@@ -118,7 +176,7 @@ class UnalignedGyroscope(Gyroscope):
         logs = np.log([_wahba(np.roll(measured, k, axis=0), found, spans, weights)[2] for k in away])
         needed = float(student.ppf(1 - _BY_CHANCE, len(logs) - 1)) * logs.std(ddof=1)
         if sigma_rad > _KNOWN_RAD or logs.mean() - np.log(cost) < needed:
-            msg = f"their deviation would be {np.degrees(sigma_rad):.1f} degrees, or chance explains the turns as well"
+            msg = f"{_HOW}: their deviation would be {np.degrees(sigma_rad):.1f} degrees, or chance explains the turns as well. Give R_sensor_imu"
             raise UnknownAxesError(msg)
         in_radar = Gyroscope(
             np.einsum("ij,fj->fi", R, self.turns), self.durations_s, self.bias, self.noise_rad2

@@ -17,6 +17,9 @@ from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope
 from radarsdf.poses.imu_alignment import ImuAlignment
 from radarsdf.poses.rigid import Floats, covariance_in
 
+# Half of the time, nothing that a radar is mounted on turns faster, or is accelerated more: a turn a second, three times gravity.
+_MOST_RAD_S, _MOST_MPS2 = 6.0, 30.0
+
 
 @dataclass(frozen=True)
 class Inertial:
@@ -35,6 +38,8 @@ class Inertial:
         """Of scans at `times_s` (F,) after `begin_s`, in the clock of the IMU."""
         if imu is None:
             return cls(None)
+        if (why := implausible_rates(imu.angular_velocity, velocities)) is not None:
+            return cls(None).without(why)
         imu = dataclasses.replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             note = "The IMU is not used: it measured before or after all scans. Are both times of one clock?"
@@ -47,9 +52,9 @@ class Inertial:
         rates = imu.angular_velocity if R is None else np.einsum("ij,gj->gi", R, imu.angular_velocity)
         return cls((UnalignedGyroscope if R is None else Gyroscope).of(rates, imu.times_s, times_s))
 
-    def without(self, why: Exception) -> Inertial:
+    def without(self, why: object) -> Inertial:
         """Not used, and why."""
-        note = f"The IMU is not used: the drive does not tell how it sits on the radar ({why}). Give R_sensor_imu."
+        note = f"The gyroscope is not used: {why}."
         return Inertial(None, notes=(*self.notes, note))
 
     @property
@@ -60,6 +65,16 @@ class Inertial:
         names = ("R_sensor_imu", "sigma_rad", "late_s", "lever_m")
         values = ((name, getattr(self.alignment, name)) for name in names)
         return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values}
+
+
+def implausible_rates(angular_velocity: Floats, velocities: SensorVelocities | None) -> str | None:
+    """Why rates (G, 3) cannot be in rad/s. None: they can."""
+    rate = float(np.median(np.linalg.norm(angular_velocity, axis=1)))
+    speed_mps = 0.0 if velocities is None else velocities.usual_mps
+    if rate <= _MOST_RAD_S and rate * speed_mps <= _MOST_MPS2:
+        return None
+    across = f", {rate * speed_mps:.0f} m/s² across the trajectory at {speed_mps:.1f} m/s" * (speed_mps > 0)
+    return f"the median of its rates is {rate:.3g} rad/s{across}. They may be in deg/s: give rad/s"
 
 
 def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:

@@ -19,20 +19,17 @@ from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import NOT_USED, doppler_sign
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.drive import LATERAL_MPS2, Drive, followed
+from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, doppler_contradicted, followed
 from radarsdf.poses.estimate import PosesEstimate
-from radarsdf.poses.gyroscope import Gyroscope, UnknownAxesError
-from radarsdf.poses.inertial import Inertial, levelled
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
+from radarsdf.poses.inertial import Inertial, implausible_rates, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
 from radarsdf.returns.rays import within_ranges
 from radarsdf.threads import Workers
 
-# Of a step's variance, that the returns must take away where nothing else measures the way. Below a half, the motion before
-# says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
-LEAST_TOLD = 0.5
-# Likewise of its rotation. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
+# Of the variance of a step's rotation, that the returns must take away. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
 # which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_TOLD_TURN = 1 / WINDOW
 _MAX_RATE_RAD_S = 1e4  # more than any gyroscope measures, even in degrees
@@ -140,13 +137,17 @@ def odometry(
     if checked.times_s is None:
         msg = "times are missing: when each scan was taken, s"
         raise ValueError(msg)
+    checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
     if velocities is not None:
         sign = doppler_sign(checked.scans, velocities, times_s)
         velocities = velocities.turned if sign < 0 else velocities
     if angular_velocity is not None:
         at = times_s if angular_velocity_times is None else angular_velocity_times
-        inertial = Inertial(Gyroscope.of(*_checked_rates(angular_velocity, at, checked), times_s))
+        rates, at_s = _checked_rates(angular_velocity, at, checked)
+        inertial = Inertial(Gyroscope.of(rates, at_s, times_s))
+        if (why := implausible_rates(rates, velocities)) is not None:
+            inertial = inertial.without(why)
     else:
         used = points.imu if imu is None and isinstance(points, Scans) else imu
         inertial = Inertial.of(used, velocities, times_s, checked.begin_s)
@@ -154,13 +155,18 @@ def odometry(
     with Workers(config.num_threads) as workers:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
+        notes = [*checked.notes]
+        if (why := velocities and doppler_contradicted(drive, config, workers.num_threads)) is not None:
+            notes.append(f"{NOT_USED}: {why}.")
+            velocities = None
+            drive = dataclasses.replace(drive, velocities=None)
         try:
             drive, tracked = followed(drive, config, workers.num_threads, progress)
-        except UnknownAxesError as why:
+        except UnusableGyroscopeError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
             drive, tracked = followed(drive, config, workers.num_threads, progress)
-        notes = [*checked.notes, *inertial.notes]
+        notes += inertial.notes
         told = _checked_told(tracked, drive, notes)
         poses, covariance = _together(drive, tracked, config, workers.num_threads)
         if inertial.alignment is not None:

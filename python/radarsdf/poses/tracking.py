@@ -26,6 +26,8 @@ _CELLS = (4.0, 2.0)  # edges of cells, in those of a map's surfels
 _ITERATIONS, _SETTLED = 8, 0.03  # of Gauss and Newton's method, in each cell size; in standard deviations
 _MOST_RETURNS = 2000  # of a scan that are held against planes, evenly spread
 _SEARCHED = 250  # likewise, of a search
+_MOST_RADII = 10.0  # median ranges: deviation of an expected translation, up to which a search may meet the scans before
+_MOST_RECKONED_M = 1e4  # likewise, up to which a new piece begins where dead reckoning leads
 _FOLLOWED = 12  # best poses of a search
 _ELSEWHERE = 500  # poses that tell what agrees by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
@@ -95,7 +97,11 @@ class Tracker:
         if expected is None or self.last is None:
             return begun(np.eye(4))
         # Where a drive was lost, what was mapped before and after cannot be joined.
-        return self._sought(scan, expected) or begun(self.last.pose @ expected.pose(), self.last.piece + 1)
+        if (found := self._sought(scan, expected)) is not None:
+            return found
+        # Nor where dead reckoning leads after a day.
+        reckoned = expected.spread_m(0.0) <= _MOST_RECKONED_M
+        return begun(self.last.pose @ expected.pose() if reckoned else self.last.pose, self.last.piece + 1)
 
     def keep(self, scan: Floats, found: Tracked) -> None:
         """The scan was there. The next ones are held against its planes, too."""
@@ -133,6 +139,8 @@ class Tracker:
         capture_m = 0.5 * _CELLS[0] * self.cell_size_m
         if expected.spread_m(radius_m) <= capture_m:
             return self._fitted(scan, expected, expected.turn.mean)
+        if expected.spread_m(0.0) > _MOST_RADII * radius_m:
+            return None  # where the scans so far are seen, if at all, is not among a search's few poses
         return self._searched(scan, expected, capture_m, radius_m)
 
     def _as_expected(self, expected: ExpectedStep) -> Tracked:

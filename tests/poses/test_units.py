@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Times, ranges, speeds and rates in wrong units, signs and axes are named, and long gaps end a segment."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
+from radarsdf.simulate import measured_motion
+
+from .drift import first, position_error_m
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return first(radarsdf.simulate.hugin, 24, seed=61, frames=30)
+
+
+@pytest.fixture(scope="module")
+def motion(drive):
+    return measured_motion(drive)
+
+
+@pytest.mark.parametrize(
+    ("factor", "named"),
+    [(1e3, r"100 s .*\bms\b"), (1e9, r"1e\+08 s .*\bns\b"), (1 / 60, "0.00167 s .*minutes")],
+)
+@pytest.mark.parametrize("with_doppler", [True, False])
+def test_times_in_other_units_are_refused_at_once(drive, motion, factor, named, with_doppler):
+    begin_s = time.perf_counter()
+    speeds = motion.doppler_mps if with_doppler else None
+    with pytest.raises(ValueError, match=f"times .*{named}"):
+        radarsdf.odometry(drive.points, times=motion.times_s * factor, doppler_mps=speeds)
+    assert time.perf_counter() - begin_s < 1
+
+
+@pytest.mark.parametrize("factor", [1e2, 1e3])
+def test_ranges_in_other_units_are_refused_at_once(drive, motion, factor):
+    points = [factor * scan for scan in drive.points]
+    begin_s = time.perf_counter()
+    with pytest.raises(ValueError, match=r"median range of .*mm"):
+        radarsdf.refine_poses(points, drive.poses)
+    with pytest.raises(ValueError, match=r"median range of .*mm"):
+        radarsdf.odometry(points, times=motion.times_s)
+    assert time.perf_counter() - begin_s < 1
+
+
+def test_speeds_in_other_units_are_left_out(drive, motion):
+    found = radarsdf.odometry(
+        drive.points, times=motion.times_s, doppler_mps=[100 * speeds for speeds in motion.doppler_mps]
+    )
+    assert not found.report["doppler"]
+    assert "m/s: it may be in" in found.report["notes"][0]
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.5])
+def test_speeds_that_contradict_the_returns_are_left_out(drive, motion, factor):
+    found = radarsdf.odometry(
+        drive.points, times=motion.times_s, doppler_mps=[factor * speeds for speeds in motion.doppler_mps]
+    )
+    assert not found.report["doppler"]
+    (note,) = found.report["notes"]
+    ratio = float(note.split(" times as far")[0].split()[-1])
+    assert ratio == pytest.approx(1 / factor, rel=0.05)
+    assert position_error_m(radarsdf.poses.rigid.aligned(found.poses, drive.poses), drive.poses) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (np.degrees, "deg/s"),
+        (lambda rates: 1e3 * rates, "rad/s"),
+        (lambda rates: -rates, "opposite sign"),
+        (lambda rates: rates[:, [2, 0, 1]], "axes"),
+    ],
+)
+def test_a_gyroscope_that_contradicts_the_returns_is_left_out(drive, motion, wrong, named):
+    given = {"times": motion.times_s, "doppler_mps": motion.doppler_mps}
+    found = radarsdf.odometry(drive.points, **given, angular_velocity=wrong(motion.angular_velocity))
+    assert not found.report["gyroscope"]
+    (note,) = found.report["notes"]
+    assert "The gyroscope is not used" in note
+    assert named in note
+    np.testing.assert_array_equal(found.poses, radarsdf.odometry(drive.points, **given).poses)
+
+
+@pytest.mark.parametrize(("bias_rad_s", "named"), [(0.02, None), (1.0, "bias of 1.0")])
+def test_a_bias_that_no_gyroscope_has_is_named(bias_rad_s, named):
+    rng = np.random.default_rng(0)
+    turns = 0.02 * rng.standard_normal((40, 3))
+    rates = Gyroscope.of(np.zeros((41, 3)), np.arange(41) / 10, np.arange(41) / 10)
+    covariance = np.tile(1e-6 * np.eye(3), (40, 1, 1))
+    measured = type(rates)(turns + [0, 0, bias_rad_s / 10], rates.durations_s, rates.bias, rates.noise_rad2)
+    if named is None:
+        assert measured.learnt(turns, covariance).bias.mean[2] == pytest.approx(bias_rad_s, rel=0.1)
+        return
+    with pytest.raises(UnusableGyroscopeError, match=named):
+        measured.learnt(turns, covariance)
+
+
+@pytest.mark.parametrize("with_doppler", [True, False])
+def test_after_a_day_a_new_segment_begins(drive, motion, with_doppler):
+    times_s = motion.times_s + 86400.0 * (np.arange(24) >= 12)
+    speeds = motion.doppler_mps if with_doppler else None
+    found = radarsdf.odometry(drive.points, times=times_s, doppler_mps=speeds)
+    assert found.pieces.tolist() == [0] * 12 + [1] * 12
+    for rows in (slice(0, 12), slice(12, 24)):
+        aligned = radarsdf.poses.rigid.aligned(found.poses[rows], drive.poses[rows])
+        assert position_error_m(aligned, drive.poses[rows]) < 0.1
