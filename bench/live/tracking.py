@@ -55,7 +55,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 radarsdf.odometry(
                     scans.points,
                     doppler_mps=doppler,
-                    times=motion.times_s,
+                    times_s=motion.times_s,
                     config=FitConfig(num_threads=options.threads),
                 )
             cpu_ms, wall_ms = 1e3 * np.array(took).T

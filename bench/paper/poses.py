@@ -77,7 +77,7 @@ def _measured(scene: Scene) -> list[tuple[str, dict[str, Any]]]:
     """What refinement is given besides returns, and how the rows are then named: nothing, and what was recorded."""
     if scene.doppler_mps is None or scene.times_s is None:
         return [("", {})]
-    return [("", {}), (", Doppler", {"doppler_mps": scene.doppler_mps, "times": scene.times_s})]
+    return [("", {}), (", Doppler", {"doppler_mps": scene.doppler_mps, "times_s": scene.times_s})]
 
 
 def _odometry_rows(scene: Scene, seed: int, options: Options) -> Iterable[Row]:
@@ -99,7 +99,7 @@ def _odometry_rows(scene: Scene, seed: int, options: Options) -> Iterable[Row]:
             found = radarsdf.odometry(
                 scene.points,
                 doppler_mps=None if name == "returns alone" else doppler,
-                times=times_s,
+                times_s=times_s,
                 angular_velocity=gyroscope,
             )
         except ValueError as error:

@@ -93,7 +93,7 @@ def _ours(drive: Drive, *, doppler: bool, gyroscope: bool) -> str:
     try:
         found = radarsdf.odometry(
             drive.points,
-            times=drive.times_s,
+            times_s=drive.times_s,
             doppler_mps=drive.doppler_mps if doppler else None,
             angular_velocity=drive.rates if gyroscope else None,
         )

@@ -127,7 +127,7 @@ def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, num
         raise ValueError(msg)
 
 
-MISSING_POSES = "poses are missing: T_world_sensor (4, 4) of each scan; radarsdf.odometry(points, doppler_mps=..., times=...) finds them"
+MISSING_POSES = "poses are missing: T_world_sensor (4, 4) of each scan; radarsdf.odometry(points, doppler_mps=..., times_s=...) finds them"
 """What is said where poses are None."""
 
 

@@ -57,7 +57,7 @@ def test_a_drive_that_begins_fast_is_placed_as_by_odometry(seed):
     assert moved[3] == (1, 2)
     assert moved[7] == (1, 2, 3, 4, 5, 6)
     batch = radarsdf.odometry(
-        scans.points, doppler_mps=motion.doppler_mps, times=motion.times_s, config=SETTINGS
+        scans.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s, config=SETTINGS
     )
     assert rms_m(live, batch.poses) < 0.3
 

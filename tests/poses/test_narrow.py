@@ -75,7 +75,7 @@ def test_radars_on_a_motorway_find_their_poses(name):
             np.split(data[f"{name}_{what}"], borders) for what in ("points", "doppler_mps")
         )
         times_s, true = data["times_s"], data[f"{name}_poses"]
-    found = radarsdf.odometry(points, doppler_mps=doppler_mps, times=times_s)
+    found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
     assert found.report["pieces"] == 1
     assert found.report["length_m"] == pytest.approx(98, abs=1)
     assert end_error_m(found, true) < 1.0
@@ -87,7 +87,7 @@ def test_radars_on_a_motorway_find_their_poses(name):
 def test_errors_of_a_narrow_radar_are_in_its_covariance(rate_rad_s):
     """Its returns say nothing of how it turns, so that a bend is known as well as assumed: 0.15 rad/s are two deviations."""
     points, doppler_mps, times_s, true = road(1, rate_rad_s)
-    found = radarsdf.odometry(points, doppler_mps=doppler_mps, times=times_s)
+    found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
     assert found.report["pieces"] == 1
     assert np.abs(deviations(found, true)).max() < 4
     if rate_rad_s == 0:
@@ -97,7 +97,7 @@ def test_errors_of_a_narrow_radar_are_in_its_covariance(rate_rad_s):
 def test_a_radar_without_elevation_is_assumed_to_climb_little():
     points, doppler_mps, times_s, true = road(2, elevation_deg=0.0)
     assert all((scan[:, 2] == 0).all() for scan in points)
-    found = radarsdf.odometry(points, doppler_mps=doppler_mps, times=times_s)
+    found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
     assert "40 of 40 scans" in found.report["notes"][0]
     assert end_error_m(found, true) < 0.5
     assert np.abs(deviations(found, true)[:, :2]).max() < 4
@@ -117,13 +117,13 @@ def test_an_open_direction_has_a_large_covariance(elevation_deg, least_sigma_mps
 def test_a_refusal_names_what_is_missing():
     points, doppler_mps, times_s, _ = road(4, speed_mps=10.0)
     with pytest.raises(ValueError, match="how the sensor turned") as refused:
-        radarsdf.odometry(points, doppler_mps=doppler_mps, times=times_s)
+        radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
     assert "Give its angular_velocity" in str(refused.value)
     assert "Doppler" not in str(refused.value)
     rng = np.random.default_rng(5)
     doppler_mps = [rng.uniform(-20, 20, len(scan)) for scan in points]
     doppler_mps[3][:35] = np.nan
     with pytest.raises(ValueError, match="how the sensor moved") as refused:
-        radarsdf.odometry(points, doppler_mps=doppler_mps, times=times_s)
+        radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
     assert "Give their Doppler" not in str(refused.value)
     assert "0 of 40 scans agree on a velocity of the sensor; 1 have fewer than 10" in str(refused.value)

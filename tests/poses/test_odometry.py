@@ -35,7 +35,7 @@ def motion(drive):
 
 @pytest.fixture(scope="module")
 def found(drive, motion):
-    return radarsdf.odometry(drive.points, doppler_mps=motion.doppler_mps, times=motion.times_s)
+    return radarsdf.odometry(drive.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
 
 
 def length_m(poses):
@@ -85,7 +85,7 @@ def test_a_gyroscope_turns_and_its_bias_is_found(drive, motion, found):
     with_it = radarsdf.odometry(
         drive.points,
         doppler_mps=motion.doppler_mps,
-        times=motion.times_s,
+        times_s=motion.times_s,
         angular_velocity=motion.angular_velocity,
     )
     assert errors(with_it.poses, drive.poses)[1] < errors(found.poses, drive.poses)[1]
@@ -98,7 +98,7 @@ def test_the_sign_and_the_folds_of_the_doppler_do_not_matter(drive, motion):
     assert max(np.abs(speeds).max() for speeds in folded.doppler_mps) <= 3.0 + 1e-6
     points, true = only(drive, range(30))
     turned = radarsdf.odometry(
-        points, doppler_mps=[-speeds for speeds in folded.doppler_mps[:30]], times=motion.times_s[:30]
+        points, doppler_mps=[-speeds for speeds in folded.doppler_mps[:30]], times_s=motion.times_s[:30]
     )
     assert turned.report["doppler_sign"] == -1
     assert errors(turned.poses, true)[0] < 0.005 * length_m(true)
@@ -108,7 +108,7 @@ def test_returns_without_doppler_stay_in_the_scans(drive, motion):
     """Nine of ten speeds were not measured: such returns contradict no velocity."""
     rng = np.random.default_rng(0)
     speeds = [np.where(rng.random(len(v)) < 0.9, np.nan, v) for v in motion.doppler_mps[:20]]
-    found = radarsdf.odometry(drive.points[:20], doppler_mps=speeds, times=motion.times_s[:20])
+    found = radarsdf.odometry(drive.points[:20], doppler_mps=speeds, times_s=motion.times_s[:20])
     assert found.report["movers"] < 0.05 * sum(map(len, drive.points[:20]))
     assert errors(found.poses, drive.poses[:20])[0] < 0.005 * length_m(drive.poses[:20])
 
@@ -117,7 +117,7 @@ def test_a_gap_is_bridged(drive, motion):
     rows = np.r_[0:15, 21:36]
     points, true = only(drive, rows)
     found = radarsdf.odometry(
-        points, doppler_mps=[motion.doppler_mps[i] for i in rows], times=motion.times_s[rows]
+        points, doppler_mps=[motion.doppler_mps[i] for i in rows], times_s=motion.times_s[rows]
     )
     assert found.report["pieces"] == 1
     assert errors(found.poses, true)[0] < 0.005 * length_m(true)
@@ -129,7 +129,7 @@ def test_a_drive_that_goes_on_elsewhere_is_in_two_pieces(drive):
     found = radarsdf.odometry(
         drive.points[:16] + other.points,
         doppler_mps=motions[0].doppler_mps[:16] + motions[1].doppler_mps,
-        times=np.r_[motions[0].times_s[:16], motions[1].times_s + 60],
+        times_s=np.r_[motions[0].times_s[:16], motions[1].times_s + 60],
     )
     assert found.pieces.tolist() == [0] * 16 + [1] * 10
     assert np.flatnonzero(np.isnan(found.agreeing)).tolist() == [0, 16]
@@ -140,7 +140,7 @@ def test_a_drive_that_goes_on_elsewhere_is_in_two_pieces(drive):
 
 def test_scans_alone_are_enough_where_they_tell(drive, motion):
     points, true = only(drive, range(36))
-    found = radarsdf.odometry(points, times=motion.times_s[:36])
+    found = radarsdf.odometry(points, times_s=motion.times_s[:36])
     assert not found.report["doppler"]
     assert errors(found.poses, true)[0] < 0.01 * length_m(true)
 
@@ -148,9 +148,9 @@ def test_scans_alone_are_enough_where_they_tell(drive, motion):
 def test_a_wall_alone_is_refused():
     wall = first(radarsdf.simulate.wall, 20, seed=5, frames=40)
     with pytest.raises(ValueError, match="returns alone do not tell"):
-        radarsdf.odometry(wall.points, times=np.arange(20) / 10)
+        radarsdf.odometry(wall.points, times_s=np.arange(20) / 10)
     motion = measured_motion(wall)
-    found = radarsdf.odometry(wall.points, times=motion.times_s, doppler_mps=motion.doppler_mps)
+    found = radarsdf.odometry(wall.points, times_s=motion.times_s, doppler_mps=motion.doppler_mps)
     assert errors(found.poses, wall.poses)[0] < 0.05
 
 
@@ -158,9 +158,9 @@ def test_hardly_any_returns_of_a_turning_sensor_are_refused(drive, motion):
     few = [scan[:: max(1, len(scan) // 20)] for scan in drive.points]
     speeds = [v[:: max(1, len(v) // 20)] for v in motion.doppler_mps]
     with pytest.raises(ValueError, match="how the sensor turned"):
-        radarsdf.odometry(few, doppler_mps=speeds, times=motion.times_s)
+        radarsdf.odometry(few, doppler_mps=speeds, times_s=motion.times_s)
     found = radarsdf.odometry(
-        few, doppler_mps=speeds, times=motion.times_s, angular_velocity=motion.angular_velocity
+        few, doppler_mps=speeds, times_s=motion.times_s, angular_velocity=motion.angular_velocity
     )
     assert found.report["length_m"] == pytest.approx(length_m(drive.poses), rel=0.05)
 
@@ -170,7 +170,7 @@ def test_the_bits_do_not_depend_on_threads(drive, motion):
         radarsdf.odometry(
             drive.points[:16],
             doppler_mps=motion.doppler_mps[:16],
-            times=motion.times_s[:16],
+            times_s=motion.times_s[:16],
             config=FitConfig(num_threads=threads),
         )
         for threads in (1, 3)
@@ -183,7 +183,9 @@ def test_scans_have_their_own_times_and_doppler(drive, motion):
     scans = Scans(
         drive.points[:8], drive.poses[:8], doppler_mps=motion.doppler_mps[:8], times_s=motion.times_s[:8]
     )
-    given = radarsdf.odometry(drive.points[:8], doppler_mps=motion.doppler_mps[:8], times=motion.times_s[:8])
+    given = radarsdf.odometry(
+        drive.points[:8], doppler_mps=motion.doppler_mps[:8], times_s=motion.times_s[:8]
+    )
     np.testing.assert_array_equal(radarsdf.odometry(scans).poses, given.poses)
 
 
@@ -193,7 +195,7 @@ def test_hardly_any_returns_have_poses_as_well(counts):
     scans = [rng.normal(0, 3, (n, 3)) for n in counts]
     speeds = [rng.normal(0, 1, n) for n in counts]
     try:
-        found = radarsdf.odometry(scans, doppler_mps=speeds, times=np.arange(len(counts)))
+        found = radarsdf.odometry(scans, doppler_mps=speeds, times_s=np.arange(len(counts)))
     except ValueError as error:
         assert "returns alone do not tell" in str(error)  # noqa: PT017 - where the Doppler tells no velocity
     else:
@@ -204,7 +206,7 @@ def test_hardly_any_returns_have_poses_as_well(counts):
 def test_refined_poses_with_doppler_are_better(drive, motion):
     given = drifted(drive.poses[:40], 0.05, 0.004, 1)
     plain, by_doppler = (
-        radarsdf.refine_poses(drive.points[:40], given, times=motion.times_s[:40], doppler_mps=speeds)
+        radarsdf.refine_poses(drive.points[:40], given, times_s=motion.times_s[:40], doppler_mps=speeds)
         for speeds in (None, [-speeds for speeds in motion.doppler_mps[:40]])
     )
     assert by_doppler.improved
@@ -216,7 +218,7 @@ def test_doppler_that_tells_no_velocity_is_said(drive):
     rng = np.random.default_rng(0)
     noise = [rng.uniform(-20, 20, len(scan)) for scan in drive.points[:6]]
     found = radarsdf.refine_poses(
-        drive.points[:6], drive.poses[:6], times=np.arange(6) / 10, doppler_mps=noise
+        drive.points[:6], drive.poses[:6], times_s=np.arange(6) / 10, doppler_mps=noise
     )
     assert "The Doppler is not used" in found.report["notes"][0]
 
@@ -229,34 +231,34 @@ def test_wrong_arguments_are_refused(drive, motion):
     with pytest.raises(ValueError, match="Doppler needs times"):
         radarsdf.odometry(points, doppler_mps=speeds)
     with pytest.raises(ValueError, match="doppler_mps"):
-        radarsdf.odometry(points, doppler_mps=speeds[:3], times=times)
+        radarsdf.odometry(points, doppler_mps=speeds[:3], times_s=times)
     with pytest.raises(ValueError, match="shape"):
-        radarsdf.odometry(points, doppler_mps=speeds, times=times, angular_velocity=rates[:3])
+        radarsdf.odometry(points, doppler_mps=speeds, times_s=times, angular_velocity=rates[:3])
     with pytest.raises(ValueError, match="ascend"):
         radarsdf.odometry(
             points,
             doppler_mps=speeds,
-            times=times,
+            times_s=times,
             angular_velocity=rates,
-            angular_velocity_times=times[::-1],
+            angular_velocity_times_s=times[::-1],
         )
     with pytest.raises(ValueError, match="one clock"):
         radarsdf.odometry(
             points,
             doppler_mps=speeds,
-            times=times,
+            times_s=times,
             angular_velocity=rates,
-            angular_velocity_times=times + 1e9,
+            angular_velocity_times_s=times + 1e9,
         )
     none = np.zeros(0)
     for wrong, name in (
-        ({"times": times * 1e300}, "times"),
+        ({"times_s": times * 1e300}, "times_s"),
         ({"angular_velocity": rates + 1e300}, "angular_velocity"),
-        ({"angular_velocity": rates[:0], "angular_velocity_times": none}, "angular_velocity"),
-        ({"angular_velocity": rates, "angular_velocity_times": times * 1e300}, "angular_velocity"),
+        ({"angular_velocity": rates[:0], "angular_velocity_times_s": none}, "angular_velocity"),
+        ({"angular_velocity": rates, "angular_velocity_times_s": times * 1e300}, "angular_velocity"),
     ):
         with pytest.raises(ValueError, match=f"^{name} "):
-            radarsdf.odometry(points, **{"doppler_mps": speeds, "times": times} | wrong)
+            radarsdf.odometry(points, **{"doppler_mps": speeds, "times_s": times} | wrong)
 
 
 def test_scans_without_poses(drive, motion):

@@ -160,12 +160,12 @@ def test_scans_have_their_own_poses_and_times(street):
     scans = Scans(street.points, given, times_s=np.arange(24.0))
     np.testing.assert_array_equal(
         radarsdf.refine_poses(scans).poses,
-        radarsdf.refine_poses(street.points, given, times=np.arange(24.0)).poses,
+        radarsdf.refine_poses(street.points, given, times_s=np.arange(24.0)).poses,
     )
 
 
 def test_two_scans_may_have_one_time(street):
-    found = radarsdf.refine_poses(street.points[:3], street.poses[:3], times=[0.0, 1, 1])
+    found = radarsdf.refine_poses(street.points[:3], street.poses[:3], times_s=[0.0, 1, 1])
     assert np.isfinite(found.poses).all()
 
 
@@ -179,9 +179,9 @@ def test_wrong_arguments_are_refused(street):
     with pytest.raises(ValueError, match="poses are missing"):
         radarsdf.refine_poses(points)
     with pytest.raises(ValueError, match="times must be one"):
-        radarsdf.refine_poses(points, poses, times=[0.0])
+        radarsdf.refine_poses(points, poses, times_s=[0.0])
     with pytest.raises(ValueError, match="ascend"):
-        radarsdf.refine_poses(points, poses, times=[0.0, 2, 1])
+        radarsdf.refine_poses(points, poses, times_s=[0.0, 2, 1])
     with pytest.raises(ValueError, match="sigma_m"):
         radarsdf.refine_poses(points, poses, sigma_m=-1)
 
@@ -191,10 +191,10 @@ def test_scans_that_cannot_be_used_are_left_out():
     motion = radarsdf.simulate.measured_motion(scans)
     points, speeds, poses = list(scans.points), list(motion.doppler_mps), scans.poses.copy()
     points[2], speeds[2], poses[5] = points[2][:0], speeds[2][:0], np.nan
-    refined = radarsdf.refine_poses(points, poses, doppler_mps=speeds, times=motion.times_s)
+    refined = radarsdf.refine_poses(points, poses, doppler_mps=speeds, times_s=motion.times_s)
     assert np.linalg.norm(refined.poses[5, :3, 3] - scans.poses[5, :3, 3]) < 0.5
     assert [note.count("scan 2") + 2 * note.count("scan 5") for note in refined.report["notes"]] == [1, 2]
-    found = radarsdf.odometry(points, doppler_mps=speeds, times=motion.times_s)
+    found = radarsdf.odometry(points, doppler_mps=speeds, times_s=motion.times_s)
     assert np.isfinite(found.poses).all()
     assert "1 scans without returns (the first is scan 2)" in found.report["notes"][0]
 
@@ -204,7 +204,7 @@ def test_zeros_for_doppler_do_not_draw_true_poses_together(share):
     drive = radarsdf.simulate.hugin(seed=8, frames=30)
     motion, rng = radarsdf.simulate.measured_motion(drive), np.random.default_rng(0)
     speeds = [np.where(rng.random(len(v)) < share, 0.0, v) for v in motion.doppler_mps]
-    found = radarsdf.refine_poses(drive.points, drive.poses, doppler_mps=speeds, times=motion.times_s)
+    found = radarsdf.refine_poses(drive.points, drive.poses, doppler_mps=speeds, times_s=motion.times_s)
     np.testing.assert_array_equal(found.poses, drive.poses)
     assert f"{share:.0%}" in found.report["notes"][0]
 
@@ -212,7 +212,7 @@ def test_zeros_for_doppler_do_not_draw_true_poses_together(share):
 def test_doppler_that_contradicts_the_given_poses_is_left_out(street):
     motion = radarsdf.simulate.measured_motion(street)
     speeds = [0.2 * v for v in motion.doppler_mps]
-    found = radarsdf.refine_poses(street.points, street.poses, doppler_mps=speeds, times=motion.times_s)
+    found = radarsdf.refine_poses(street.points, street.poses, doppler_mps=speeds, times_s=motion.times_s)
     np.testing.assert_array_equal(found.poses, street.poses)
     assert "contradicts 64%" in found.report["notes"][0]
 

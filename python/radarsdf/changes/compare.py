@@ -57,6 +57,7 @@ def compare(
     *,
     align_frames: bool = True,
     box: ArrayLike | None = None,
+    progress: bool | None = None,
 ) -> Changes:
     """What appeared, what is gone, what moved its surface and what was repainted between two maps.
 
@@ -81,6 +82,8 @@ def compare(
         along a single wall, the frame stays as given.
     box : (2, 3) array_like, optional
         Lower and upper corner, world of the earlier map, m: nothing outside is returned.
+    progress : bool, optional
+        Whether to show the progress of a fit of new scans. Default: only in a terminal.
 
     Returns
     -------
@@ -105,7 +108,7 @@ def compare(
         msg = f"before must be a map, not {type(before).__name__}"
         raise TypeError(msg)
     if not isinstance(after, Map):
-        after = fit(after, poses, intensities, config=_quick(before.config), progress=False)
+        after = fit(after, poses, intensities, config=_quick(before.config), progress=progress)
     elif poses is not None or intensities is not None:
         msg = "poses and intensities belong to new scans: a map has its own"
         raise ValueError(msg)

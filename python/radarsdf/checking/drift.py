@@ -63,7 +63,7 @@ def _refined(part: Recording, config: FitConfig) -> tuple[FloatArray, RefinedPos
     if part.doppler_mps is not None and times_s is not None:
         doppler_mps = [speeds[::every] for speeds in part.doppler_mps]
     return part.poses, refine_poses(
-        points, part.poses, doppler_mps=doppler_mps, times=times_s, config=config, progress=False
+        points, part.poses, doppler_mps=doppler_mps, times_s=times_s, config=config, progress=False
     )
 
 

@@ -122,11 +122,11 @@ def _check_speeds(doppler_mps: Sequence[Floats]) -> None:
 
 def _checked_times(times: ArrayLike, num_scans: int) -> Floats:
     """(F,) s."""
-    times_s: Floats = real_array(times, "times")
+    times_s: Floats = real_array(times, "times_s")
     if times_s.shape != (num_scans,):
-        msg = f"times must be one for each of {num_scans} scans, not {times_s.shape}"
+        msg = f"times_s must be one for each of {num_scans} scans, not {times_s.shape}"
         raise ValueError(msg)
     if not (np.abs(times_s) <= MAX_TIME_S).all() or (np.diff(times_s) < 0).any():
-        msg = f"times must be finite, within {MAX_TIME_S:g} s, and ascend from scan to scan"
+        msg = f"times_s must be finite, within {MAX_TIME_S:g} s, and ascend from scan to scan"
         raise ValueError(msg)
     return times_s

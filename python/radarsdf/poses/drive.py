@@ -18,7 +18,7 @@ from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rates import Habits, Rate
-from radarsdf.poses.rigid import Floats, rotation, rotation_vector, steps
+from radarsdf.poses.rigid import Floats, rotation, rotation_vector
 from radarsdf.poses.tracking import Tracked, Tracker
 from radarsdf.progress import hides_bar
 
@@ -30,12 +30,6 @@ _PASSES = 3
 # Of a step's variance, that the returns must take away where nothing else measures the way. Below a half, the motion before
 # says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
 LEAST_TOLD = 0.5
-_ASKED, _LEAST_ASKED = 13, 8  # scans whose returns may contradict the Doppler
-# Share of the returns, and standard errors, by which more agree at other speeds. Measured on seven kinds of simulated drives: at most
-# 0.005 more where the Doppler is right, 0.05 to 0.21 where it is half or one and a half of that.
-_LEAST_AGREEING, _ERRORS = 0.03, 4.0
-_OTHER_SPEEDS = (0.6, 1.7)  # times the given ones, and
-_OPEN = 1.0  # deviation, in cells a scan: so far returns lead without a search
 _NO_CHANCE = 3.0  # standard deviations
 LATERAL_MPS2 = 2.0
 """Deviation of the acceleration across the trajectory: what moves fast turns slowly. Vehicles on roads: about 1; drones and hands: 2."""
@@ -197,46 +191,6 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rat
         for matrix, rows in ((half, slice(0, 3)), (back, slice(3, 6)))
     )
     return Rate(now.turn / duration_s, of_turn), Rate(way / duration_s, of_way)
-
-
-def doppler_contradicted(drive: Drive, config: FitConfig, num_threads: int) -> str | None:
-    """Why the velocities are not those of the first scans: more of their returns agree at other speeds. None: they may be."""
-    assert drive.velocities is not None
-    rows = slice(0, _ASKED)
-    given, times_s = drive.velocities.select(rows), drive.times_s[rows]
-    if len(times_s) < _LEAST_ASKED:
-        return None
-    cell_m = plane_cell_m(drive.scans, config.leaf_size_m)
-    open_mps = _OPEN * cell_m / max(float(np.median(np.diff(times_s))), 1e-9)
-
-    def followed_at(velocities: SensorVelocities) -> tuple[Floats, float, float]:
-        """(F - 1,) shares of returns that agree, what they reveal of a step's translation, and its usual length, m."""
-        tried = dataclasses.replace(
-            drive, scans=drive.scans[rows], times_s=times_s, velocities=velocities, gyroscope=None
-        )
-        tracked = _Pass.of(tried, Tracker(cell_m, config.returns, num_threads)).tracked
-        lengths_m = np.linalg.norm(steps(np.stack([found.pose for found in tracked]))[:, :3, 3], axis=1)
-        agreeing = np.nan_to_num([found.agreeing for found in tracked[1:]])
-        told = float(np.median([found.told[0] for found in tracked[1:]]))
-        return agreeing, told, float(np.median(lengths_m))
-
-    before, _, length_m = followed_at(given)
-    for scale in _OTHER_SPEEDS:
-        agreeing, told, other_m = followed_at(
-            dataclasses.replace(
-                given,
-                mean_mps=scale * given.mean_mps,
-                covariance=given.covariance + open_mps**2 * np.eye(3),
-            )
-        )
-        gains = agreeing - before
-        needed = max(_LEAST_AGREEING, _ERRORS * float(gains.std(ddof=1)) / np.sqrt(len(gains)))
-        if told >= LEAST_TOLD and gains.mean() > needed:
-            return (
-                f"{agreeing.mean():.0%} instead of {before.mean():.0%} of the returns of the first {len(times_s)} scans agree if the sensor "
-                f"moves {other_m / max(length_m, 1e-9):.2f} times as far. Check the units of Doppler and times"
-            )
-    return None
 
 
 def followed(

@@ -19,7 +19,7 @@ from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 from radarsdf.poses.by_doppler import NOT_USED, doppler_sign
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, doppler_contradicted, followed
+from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.inertial import Inertial, implausible_rates, levelled
@@ -70,9 +70,9 @@ def odometry(
     points: Iterable[ArrayLike] | Scans,
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
-    times: ArrayLike | None = None,
+    times_s: ArrayLike | None = None,
     angular_velocity: ArrayLike | None = None,
-    angular_velocity_times: ArrayLike | None = None,
+    angular_velocity_times_s: ArrayLike | None = None,
     imu: Imu | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
@@ -90,12 +90,12 @@ def odometry(
         where none are given here.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured.
-    times : (F,) array_like
+    times_s : (F,) array_like
         Of the scans, s.
     angular_velocity : (G, 3) array_like, optional
         Of a gyroscope, rad/s, in the axes of the radar.
-    angular_velocity_times : (G,) array_like, optional
-        When it was measured, s, in the clock of `times`. Default: at the times of the scans.
+    angular_velocity_times_s : (G,) array_like, optional
+        When it was measured, s, in the clock of `times_s`. Default: at the times of the scans.
     imu : Imu, optional
         An IMU in axes of its own, in place of `angular_velocity`; of Scans, theirs. How it sits on the radar and what time is
         between their clocks is found, from its accelerometer and the Doppler, or from turns that the returns tell; the accelerometer
@@ -127,15 +127,15 @@ def odometry(
     >>> import radarsdf
     >>> scans = radarsdf.simulate.wall(frames=6)
     >>> motion = radarsdf.simulate.measured_motion(scans)
-    >>> found = radarsdf.odometry(scans.points, doppler_mps=motion.doppler_mps, times=motion.times_s)
+    >>> found = radarsdf.odometry(scans.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
     >>> found.poses.shape, found.report["pieces"]
     ((6, 4, 4), 1)
     """
     begin = time.perf_counter()
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
-    checked = CheckedScans.of(points, doppler_mps, times)
+    checked = CheckedScans.of(points, doppler_mps, times_s)
     if checked.times_s is None:
-        msg = "times are missing: when each scan was taken, s"
+        msg = "times_s are missing: when each scan was taken, s"
         raise ValueError(msg)
     checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
@@ -143,7 +143,7 @@ def odometry(
         sign = doppler_sign(checked.scans, velocities, times_s)
         velocities = velocities.turned if sign < 0 else velocities
     if angular_velocity is not None:
-        at = times_s if angular_velocity_times is None else angular_velocity_times
+        at = times_s if angular_velocity_times_s is None else angular_velocity_times_s
         rates, at_s = _checked_rates(angular_velocity, at, checked)
         inertial = Inertial(Gyroscope.of(rates, at_s, times_s))
         if (why := implausible_rates(rates, velocities)) is not None:
@@ -156,10 +156,6 @@ def odometry(
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
         notes = [*checked.notes]
-        if (why := velocities and doppler_contradicted(drive, config, workers.num_threads)) is not None:
-            notes.append(f"{NOT_USED}: {why}.")
-            velocities = None
-            drive = dataclasses.replace(drive, velocities=None)
         try:
             drive, tracked = followed(drive, config, workers.num_threads, progress)
         except UnusableGyroscopeError as why:
@@ -262,7 +258,7 @@ def _checked_rates(
 ) -> tuple[Floats, Floats]:
     """Rates (G, 3) and their times (G,) from the first scan on."""
     rates: Floats = real_array(angular_velocity, "angular_velocity")
-    at_s: Floats = real_array(at, "angular_velocity_times")
+    at_s: Floats = real_array(at, "angular_velocity_times_s")
     at_s = at_s if at is checked.times_s else at_s - checked.begin_s
     if rates.ndim != 2 or rates.shape[1] != 3 or at_s.shape != (len(rates),) or len(rates) == 0:
         msg = f"angular_velocity must have shape (G, 3), G > 0, and one time for each rate, not {rates.shape} and {at_s.shape}"

@@ -56,7 +56,7 @@ def refine_poses(
     poses: ArrayLike | None = None,
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
-    times: ArrayLike | None = None,
+    times_s: ArrayLike | None = None,
     sigma_m: float | None = None,
     sigma_rad: float | None = None,
     config: FitConfig | None = None,
@@ -77,8 +77,8 @@ def refine_poses(
         (F, 4, 4) T_world_sensor, m, one for each scan.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured. It measures the
-        velocity of the sensor, and what moves is left out. It needs `times`.
-    times : (F,) array_like, optional
+        velocity of the sensor, and what moves is left out. It needs `times_s`.
+    times_s : (F,) array_like, optional
         Of the scans, s. After a gap, a step has larger errors. By default all steps are alike.
     sigma_m, sigma_rad : float, optional
         Standard deviations of each component of a step's translation, m, and rotation, rad. By default found from the data.
@@ -116,7 +116,7 @@ def refine_poses(
         poses = points.poses
     if poses is None:
         raise ValueError(MISSING_POSES)
-    checked = CheckedScans.of(points, doppler_mps, times)
+    checked = CheckedScans.of(points, doppler_mps, times_s)
     scans, times_s, velocities = checked.scans, checked.times_s, checked.velocities
     given, rigid = usable_poses(poses, len(scans))
     notes = [*checked.notes]

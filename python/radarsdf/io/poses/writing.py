@@ -25,16 +25,16 @@ def check_pose_suffix(path: str | PathLike[str]) -> None:
         raise ValueError(msg)
 
 
-def check_pose_times(path: str | PathLike[str], times: ArrayLike | None) -> None:
+def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
     """Raises a ValueError if :func:`write_poses` would refuse to write without times."""
-    if times is None and path_of(path, "path").suffix.lower() == ".tum":
+    if times_s is None and path_of(path, "path").suffix.lower() == ".tum":
         msg = (
             f"{path} needs times, when each pose was taken, s, and there are none: .kitti and .npy do without"
         )
         raise ValueError(msg)
 
 
-def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | None = None) -> None:
+def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike | None = None) -> None:
     """Writes a trajectory, whole or not at all.
 
     Parameters
@@ -44,7 +44,7 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | 
         first three rows of each matrix; ``.npy``, the array (F, 4, 4). evo reads the first two.
     poses : (F, 4, 4) array_like
         T_world_sensor, m.
-    times : (F,) array_like, optional
+    times_s : (F,) array_like, optional
         s. ``.tum`` needs them; the others have no place for them.
 
     Raises
@@ -64,7 +64,7 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | 
     12.500000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 1.000000000
     """
     check_pose_suffix(path)
-    check_pose_times(path, times)
+    check_pose_times(path, times_s)
     suffix = path_of(path, "path").suffix.lower()
     matrices = check_poses(poses)
     text = io.BytesIO()
@@ -73,9 +73,9 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times: ArrayLike | 
     elif suffix == ".kitti":
         np.savetxt(text, matrices[:, :3].reshape(-1, 12), "%.12g")
     else:
-        times_s = real_array(times, "times")
+        times_s = real_array(times_s, "times_s")
         if times_s.shape != (len(matrices),) or not np.isfinite(times_s).all():
-            msg = f"times must be one finite number for each of {len(matrices)} poses, not {times_s.shape}"
+            msg = f"times_s must be one finite number for each of {len(matrices)} poses, not {times_s.shape}"
             raise ValueError(msg)
         quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
         np.savetxt(text, np.column_stack([times_s, matrices[:, :3, 3], quaternions]), "%.9f")
