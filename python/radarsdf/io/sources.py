@@ -20,9 +20,10 @@ from radarsdf.io.clouds.pcd import read_viewpoint
 from radarsdf.io.clouds.raw_binary import KITTI, bin_layout
 from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, names_of, read_columns
 from radarsdf.io.poses.reading import POSE_FILES, ScanPoses, StampedPoses
-from radarsdf.io.poses.trajectory import MAX_GAP_S, TIME_UNITS, Trajectory, in_seconds
+from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory
 from radarsdf.io.scans import Notes, Scan, Scans
-from radarsdf.io.text import number_rows, without_unit
+from radarsdf.io.text import number_rows
+from radarsdf.io.units import SCALES, in_seconds, without_unit
 
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
 """Names of files with a time, s, for each scan, one a line."""
@@ -304,7 +305,7 @@ def _listed_times(path: Path, count: int, notes: Notes) -> list[float]:
     if len(times) != count:
         msg = f"{path} has {len(times)} times for {count} scans"
         raise ValueError(msg)
-    seconds: list[float] = in_seconds(times, path, notes).tolist()
+    seconds: list[float] = in_seconds(times, path.name, notes).tolist()
     if len(set(seconds)) < count:
         notes.add(f"{path.name} has the same time for several scans")
     return seconds
@@ -415,8 +416,8 @@ def _split(
         notes.add(f"{path.name}: {len(table[key]) - len(rows)} rows left out: their {key} is not a number")
     order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
     if time is not None and table[time].dtype.kind in "iuf":
-        scale = TIME_UNITS.get(without_unit(time)[1], 1.0)
-        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path, notes).tolist()
+        scale = SCALES.get(without_unit(time)[1], 1.0)
+        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
     if (
         isinstance(poses, np.ndarray)
         and len(poses) > len(values)

@@ -28,10 +28,6 @@ _COMMENT = re.compile("(" + "|".join(COMMENTS) + ").*")
 _DECIMAL_COMMA = r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?"
 _IN_CELL = re.compile(rf"(?:^|;)[ \t]*{_DECIMAL_COMMA}(?=[ \t]*(?:;|$))", re.MULTILINE)
 
-_UNIT = re.compile(
-    r"[\s_]+(m|cm|mm|km|s|ms|us|ns|rad|mrad|radians?|deg|degrees?|mps|kmh|kph|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
-)
-
 
 def read_text(path: Path) -> str:
     """The text of a file, with a line feed after each line.
@@ -87,14 +83,6 @@ def words_of(line: str) -> list[str]:
     separator = next((sign for sign in (",", ";", "\t") if sign in line), None)
     line = line if separator else re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
     return [word.strip().strip('"') for word in line.split(separator)]
-
-
-def without_unit(name: str) -> tuple[str, str]:
-    """The name of a column in lower case without its unit, and the unit: of ``azimuth_deg``, ``x [m]``, ``time(ns)``."""
-    found = _UNIT.search(name.strip().lower())
-    if found is None or not found.start():
-        return name.strip().lower(), ""
-    return name.strip().lower()[: found.start()], found[1] if found[1] is not None else found[2].strip()
 
 
 def text_rows(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]:

@@ -13,6 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from radarsdf.extras import require
 from radarsdf.io.bags.messages import read_message
 from radarsdf.io.files import check_regular_file, in_utf8
@@ -146,6 +149,18 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
         notes.add(f"messages left out: {count} of {numbers[topic]}; the first: {first[topic]}")
 
 
+def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes | None) -> bool:
+    """Whether record times stand for the header stamps of `what`: as wanted, or where these are zero or stand still."""
+    if wanted is not None:
+        return wanted == "record"
+    if stamps.any() and (len(stamps) == 1 or (stamps != stamps[0]).any()):
+        return False
+    if notes is not None:
+        why = "stand still" if stamps.any() else "are zero"
+        notes.add(f"the header stamps of {what} {why}: the record time is used instead")
+    return True
+
+
 def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic in names and _encoding(c) in ("cdr", "ros1")]
@@ -210,10 +225,12 @@ def _damaged(path: Path, error: Exception) -> ValueError:
     if isinstance(error, MemoryError):  # rosbags reads as many bytes as a damaged size says
         why = "a size in it is larger than the memory"
     why = _QUOTED.sub(r"\1", why).rstrip(".")
-    way_out = ""
+    remedy = ""
     if path.suffix.lower() == _ROS1_SUFFIX and "index" in why.lower():
-        way_out = f"; if its recording was cut off, rosbag reindex {path.name} may mend it"
+        remedy = f"; if its recording was cut off, rosbag reindex {path.name} may repair it"
     elif "end magic" in why:
         files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        way_out = f"; if its recording was cut off, mcap recover {files[0].name} may mend it" if files else ""
-    return ValueError(f"{path} is not a whole bag: {why}{way_out}")
+        remedy = (
+            f"; if its recording was cut off, mcap recover {files[0].name} may repair it" if files else ""
+        )
+    return ValueError(f"{path} is not a whole bag: {why}{remedy}")

@@ -8,14 +8,13 @@ import re
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property, reduce
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from radarsdf.io.bags.files import read_messages, topics_of, topics_with
+from radarsdf.io.bags.files import by_record, read_messages, topics_of, topics_with
 from radarsdf.io.bags.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage
 from radarsdf.io.poses.reading import (
     FIND_POSES,
@@ -23,9 +22,8 @@ from radarsdf.io.poses.reading import (
     ScanPoses,
     StampedPoses,
     TransformChain,
-    trajectory_of,
 )
-from radarsdf.io.poses.trajectory import Trajectory
+from radarsdf.io.poses.trajectory import Trajectory, are_poses, pose_matrices_of, trajectory_of
 from radarsdf.io.scans import Notes
 from radarsdf.io.sources import Request
 
@@ -34,7 +32,6 @@ FindPoses = Callable[[str], ScanPoses | None]
 
 _STATIC = "static"  # in the name of a topic whose transforms hold for all times: /tf_static
 _SAME = 1e-9  # a transform that changes by no more is constant, though it is published again and again
-_MIN_QUATERNION, _MAX_QUATERNION = 0.49, 1.01  # largest of the four numbers of a unit quaternion
 _NOT_MEASURED = re.compile(
     r"goal|set_?point|way_?point|initial_?pose|desired|(^|[/_.-])(plans?|planned|planner|target|cmd)(?![a-z])",
     re.IGNORECASE,
@@ -53,62 +50,49 @@ class _Track:
 
     parent: str
     child: str = ""
-    stamps_s: array[float] = field(default_factory=lambda: array("d"))
-    recorded_s: array[float] = field(default_factory=lambda: array("d"))
-    values: array[float] = field(default_factory=lambda: array("d"))
     static: bool = False
+    numbers: array[float] = field(default_factory=lambda: array("d"))
+    """Of each pose: stamp, record time, x, y, z, qx, qy, qz, qw."""
 
     def add(self, pose: PoseMessage, recorded_s: float) -> None:
-        self.stamps_s.append(pose.header.stamp_s)
-        self.recorded_s.append(recorded_s)
-        self.values.extend(pose.values)
+        self.numbers.extend((pose.header.stamp_s, recorded_s, *pose.values))
 
-    def usable(self) -> NDArray[np.bool_]:
-        """Mask (P,) of poses that are finite, with a unit quaternion."""
-        table = np.frombuffer(self.values, np.float64).reshape(-1, 7)
-        largest = np.abs(table[:, 3:]).max(axis=1)  # not the length, whose square overflows
-        unit = (largest >= _MIN_QUATERNION) & (largest <= _MAX_QUATERNION)
-        mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
-        return mask
-
+    @cached_property
     def table(self) -> NDArray[np.float64]:
-        """(P, 7) x, y, z, qx, qy, qz, qw of those that are usable."""
-        return np.frombuffer(self.values, np.float64).reshape(-1, 7)[self.usable()]
+        """(P, 9) all poses."""
+        return np.array(self.numbers).reshape(-1, 9)
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """Mask (P,) of those that are poses."""
+        return are_poses(self.table[:, 2:])
+
+    @cached_property
+    def constant(self) -> bool:
+        poses = self.table[self.usable, 2:]
+        return self.static or bool((np.abs(poses - poses[0]) <= _SAME).all())
+
+    @cached_property
+    def matrix(self) -> NDArray[np.float64]:
+        """(4, 4) of a constant transform."""
+        matrix: NDArray[np.float64] = pose_matrices_of(self.table[self.usable, 2:][-1:])[0]
+        return matrix
 
     def extent(self, max_gap_s: float) -> tuple[float, int]:
         """The time in which there are poses, to 0.1 s, and their number."""
-        gaps_s = np.diff(np.frombuffer(self.recorded_s, np.float64))
-        return round(float(gaps_s[gaps_s <= max_gap_s].sum()), 1), len(self.recorded_s)
-
-    def is_constant(self) -> bool:
-        table = self.table()
-        return self.static or bool((np.abs(table - table[0]) <= _SAME).all())
-
-    def matrix(self) -> NDArray[np.float64]:
-        """(4, 4) of a constant transform."""
-        row = self.table()[-1]
-        pose = np.eye(4)
-        pose[:3, 3] = row[:3]
-        pose[:3, :3] = Rotation.from_quat(row[3:]).as_matrix()
-        return pose
+        gaps_s = np.diff(self.table[:, 1])
+        return round(float(gaps_s[gaps_s <= max_gap_s].sum()), 1), len(self.table)
 
     def trajectory(self, name: str, request: Request, notes: Notes | None = None) -> Trajectory:
-        usable, stamps = self.usable(), np.frombuffer(self.stamps_s, np.float64)
+        table, usable = self.table, self.usable
         if notes is not None and not usable.all():
+            first = int(np.argmin(usable))
             notes.add(
                 f"poses of {name} left out: {(~usable).sum()} of {len(usable)} are not finite, or have no unit quaternion; "
-                f"the first, pose {np.argmin(usable)}, was recorded at {self.recorded_s[int(np.argmin(usable))]:.3f} s"
+                f"the first, pose {first}, was recorded at {table[first, 1]:.3f} s"
             )
-        if (
-            request.stamps == "record"
-            or not stamps.any()
-            or (len(stamps) > 1 and (stamps == stamps[0]).all())
-        ):
-            if notes is not None and request.stamps is None:
-                notes.add(f"the stamps of {name} are zero or stand still: the record time is used instead")
-            stamps = np.frombuffer(self.recorded_s, np.float64)
-        table = self.table()
-        return trajectory_of(stamps[usable], table[:, :3], table[:, 3:], name)
+        clock = int(by_record(table[:, 0], name, request.stamps, notes))
+        return trajectory_of(table[usable][:, [clock, *range(2, 9)]], name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +102,7 @@ class _Candidate:
     agrees: bool
     """Whether its frames are connected with that of the scans."""
     names_child: bool
-    """Whether it says whose poses it has."""
+    """Whether it names the frame whose poses it has."""
     poses: StampedPoses
     interval_s: float
 
@@ -317,7 +301,7 @@ def _base(track: _Track, name: str, tree: dict[str, _Track], sensor: str, notes:
     base = track.child
     if not base and sensor in tree:
         chain = _ancestors(tree, sensor)
-        rigid = [tree[frame].is_constant() and tree[frame].parent != track.parent for frame in chain[:-1]]
+        rigid = [tree[frame].constant and tree[frame].parent != track.parent for frame in chain[:-1]]
         base = chain[rigid.index(False) if False in rigid else len(rigid)]
         if base != sensor:
             notes.add(f"{name} names no child frame: its poses are taken as those of {base}")
@@ -352,7 +336,7 @@ def _tracks_and_tree(
             tracks[name].add(pose, message.recorded_s)
     choices: dict[str, list[_Track]] = {}
     for child, parents in edges.items():
-        usable = [track for track in parents.values() if track.usable().any()]
+        usable = [track for track in parents.values() if track.usable.any()]
         if usable:
             choices[child] = sorted(usable, key=lambda track: track.extent(request.max_gap_s), reverse=True)
     tree = {child: options[0] for child, options in choices.items()}
@@ -363,7 +347,7 @@ def _tracks_and_tree(
             tree[child] = track
             if _moves(tree, child, request.world_frame):
                 break
-        listed = ", ".join(f"{track.parent} ({len(track.stamps_s)} transforms)" for track in options)
+        listed = ", ".join(f"{track.parent} ({len(track.table)} transforms)" for track in options)
         request.notes.add(f"{child} has several parents in TF, {listed}: {tree[child].parent} is used")
     return by_topic, tree
 
@@ -375,7 +359,7 @@ def _moves(tree: dict[str, _Track], frame: str, world: str | None) -> bool:
     except ValueError:
         return False
     above = world is None or world.lstrip("/") in chain
-    return above and not all(tree[child].is_constant() for child in chain[:-1])
+    return above and not all(tree[child].constant for child in chain[:-1])
 
 
 def _ancestors(tree: dict[str, _Track], frame: str) -> list[str]:
@@ -393,7 +377,7 @@ def _ancestors(tree: dict[str, _Track], frame: str) -> list[str]:
 def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: bool = False) -> FindPoses:
     """Poses of the frames below the world."""
     notes = None if quiet else request.notes
-    moving = [child for child, track in tree.items() if not track.is_constant()]
+    moving = [child for child, track in tree.items() if not track.constant]
     base = sensor
     if request.extrinsic is not None or sensor not in tree:
         # The frame that moves and has no other moving frame below it.
@@ -428,8 +412,8 @@ def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: b
             return None
         chain = chain[: chain.index(world) + 1]
         links = [
-            tree[child].matrix()
-            if tree[child].is_constant()
+            tree[child].matrix
+            if tree[child].constant
             else tree[child].trajectory(f"TF from {tree[child].parent} to {child}", request, notes)
             for child in reversed(chain[:-1])
         ]
@@ -455,7 +439,7 @@ def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: b
 
 def _world(tree: dict[str, _Track], chain: list[str], request: Request) -> str:
     """The root; but the frame below it where that is corrected rarely, and its own poses are dense."""
-    moving = [frame for frame in chain[:-1] if not tree[frame].is_constant()]
+    moving = [frame for frame in chain[:-1] if not tree[frame].constant]
     intervals_s = [_interval_s(tree[frame].trajectory(frame, request)) for frame in moving]
     if len(moving) > 1 and intervals_s[-1] > max(_SLOW_S, _SLOWER * min(intervals_s)):
         return moving[-1]
@@ -473,16 +457,10 @@ def _fixed(tree: dict[str, _Track], base: str, sensor: str) -> NDArray[np.float6
     common = next((frame for frame in up_sensor if frame in up_base), None)
     if common is None:
         return None
-    down = up_sensor[: up_sensor.index(common)]
-    up = up_base[: up_base.index(common)]
-    if not all(tree[frame].is_constant() for frame in (*down, *up)):
-        return None
-    return np.linalg.inv(_product(tree, up)) @ _product(tree, down)
-
-
-def _product(tree: dict[str, _Track], upwards: list[str]) -> NDArray[np.float64]:
-    """T_top_frame of constant transforms, from the lowest frame upwards."""
-    pose = np.eye(4)
-    for frame in upwards:
-        pose = tree[frame].matrix() @ pose
-    return pose
+    T_common = []
+    for frames in (up_base[: up_base.index(common)], up_sensor[: up_sensor.index(common)]):
+        if not all(tree[frame].constant for frame in frames):
+            return None
+        T_common.append(reduce(np.matmul, (tree[frame].matrix for frame in reversed(frames)), np.eye(4)))
+    T_base_sensor: NDArray[np.float64] = np.linalg.inv(T_common[0]) @ T_common[1]
+    return T_base_sensor

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.bags.files import Topic, bags_in, is_bag, read_messages, topics_of, topics_with
+from radarsdf.io.bags.files import Topic, bags_in, by_record, is_bag, read_messages, topics_of, topics_with
 from radarsdf.io.bags.imu import imu_in_bags, imu_topic
 from radarsdf.io.bags.messages import CLOUD_TYPES, PACKETS, POINT_A_MESSAGE, CloudMessage
 from radarsdf.io.bags.poses import FindPoses, attached, poses_in_bags, transforms_of
@@ -68,10 +68,15 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.header.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
-    by_record = {topic.name: _by_record(peeked[topic.name], topic, request) for topic in scan_topics}
+    by_recording = {
+        name: by_record(
+            np.array([cloud.header.stamp_s for cloud in clouds]), name, request.stamps, request.notes
+        )
+        for name, clouds in peeked.items()
+    }
 
     def raw_scans() -> Iterator[RawScan]:
-        streams = [_raw_scans(paths, topic, by_record[topic.name], request) for topic in scan_topics]
+        streams = [_raw_scans(paths, topic, by_recording[topic.name], request) for topic in scan_topics]
         merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
         return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
 
@@ -90,7 +95,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     def imu() -> Imu | None:
         if of_imu is None:
             return None
-        return imu_in_bags(paths, of_imu, frames[0], by_record[scan_topics[0].name], request)
+        return imu_in_bags(paths, of_imu, frames[0], by_recording[scan_topics[0].name], request)
 
     truth = request.truth or (lambda: None)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
@@ -200,32 +205,18 @@ def _peek(paths: list[Path], topic: Topic, request: Request) -> list[CloudMessag
     return peeked
 
 
-def _by_record(peeked: list[CloudMessage], topic: Topic, request: Request) -> bool:
-    """Whether the times of scans are when they were recorded: as wanted, or where stamps are zero or stand still."""
-    if request.stamps is not None:
-        return request.stamps == "record"
-    stamps = [cloud.header.stamp_s for cloud in peeked]
-    if not any(stamps):
-        request.notes.add(f"the header stamps of {topic.name} are zero: the record time is used instead")
-        return True
-    if len(stamps) > 1 and len(set(stamps)) == 1:
-        request.notes.add(f"the header stamps of {topic.name} stand still: the record time is used instead")
-        return True
-    return False
-
-
-def _raw_scans(paths: list[Path], topic: Topic, by_record: bool, request: Request) -> Iterator[RawScan]:
+def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
     if topic.message_type == POINT_A_MESSAGE:
-        yield from _grouped(paths, topic, by_record, request)
+        yield from _grouped(paths, topic, recorded, request)
         return
     for message in read_messages(paths, {topic.name}, request.notes):
         cloud: CloudMessage = message.content
-        time_s = message.recorded_s if by_record else cloud.header.stamp_s
+        time_s = message.recorded_s if recorded else cloud.header.stamp_s
         name = f"{message.bag}: message {message.number} of {topic.name}"
         yield RawScan(cloud.columns, time_s, name, cloud.header.frame, topic.name, message.number)
 
 
-def _grouped(paths: list[Path], topic: Topic, by_record: bool, request: Request) -> Iterator[RawScan]:
+def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
     """Scans of messages of one point each. A scan begins where the number of the point does not grow, or after a pause."""
     points: list[CloudMessage] = []
     last, last_s, start_s, number = -1, 0.0, 0.0, 0
@@ -236,7 +227,7 @@ def _grouped(paths: list[Path], topic: Topic, by_record: bool, request: Request)
             yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}", topic)
             points, number = [], number + 1
         if not points:
-            start_s = message.recorded_s if by_record else cloud.header.stamp_s
+            start_s = message.recorded_s if recorded else cloud.header.stamp_s
         points.append(cloud)
         last, last_s = point_id, message.recorded_s
     if points:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.scans import Notes
-from radarsdf.io.text import without_unit
+from radarsdf.io.units import SCALES, are_degrees, without_unit
 
 ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
          "sigma_range", "sigma_azimuth", "sigma_elevation")  # fmt: skip
@@ -22,13 +22,6 @@ ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
 _SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
-
-
-_SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "mrad": 1e-3, "kmh": 1 / 3.6, "kph": 1 / 3.6, "km/h": 1 / 3.6,
-           "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180}  # fmt: skip
-"""Units in names of fields, in m, rad or m/s."""
-_BEYOND = 1.05  # angles that exceed a limit by rounding
-_STEPS, _ENOUGH = 4, 30  # parts of a degree, and angles that lie in such steps not by chance
 
 
 @dataclass(frozen=True)
@@ -189,7 +182,7 @@ class Fields:
         names = [self.names[role] for role in units]
         angles = [np.stack([cloud[name] for name in names]) for cloud in clouds if set(names) <= set(cloud)]
         azimuth, elevation = np.concatenate([np.zeros((2, 0)), *angles], axis=1).astype(np.float64)
-        in_degrees = named.startswith("deg") if named else _are_degrees(azimuth, elevation)
+        in_degrees = are_degrees(azimuth, elevation, named)
         by = (
             f"as {'azimuth' if units['azimuth'] else 'elevation'} is by its name"
             if named
@@ -274,7 +267,7 @@ class Fields:
         unit = _plain(self.names[role])[1]
         if not unit and self.in_degrees and role.endswith(("azimuth", "elevation")):
             unit = "deg"
-        scale = _SCALES.get(unit)
+        scale = SCALES.get(unit)
         values = columns[self.names[role]]
         return values if scale is None else values * np.float64(scale)
 
@@ -309,21 +302,6 @@ def _plain(name: str) -> tuple[str, str]:
 def _squeezed(name: str) -> str:
     """A name without what separates its words: AzimuthAngle, azimuth_angle and Azimuth Angle are one."""
     return re.sub(r"[\W_]+", "", name)
-
-
-def _are_degrees(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> bool:
-    """Whether angles (N,) are in degrees: beyond what rad can be, or in steps that only degrees have."""
-    finite = np.isfinite(azimuth) & np.isfinite(elevation)
-    if not finite.any():
-        return False
-    azimuth, elevation = azimuth[finite], elevation[finite]
-    largest, highest = (np.quantile(np.abs(angles), 0.99) / np.pi for angles in (azimuth, elevation))
-    if highest > _BEYOND / 2 or largest > 2 * _BEYOND:
-        return True
-    if largest > _BEYOND:  # rad from 0 to a whole turn have no other sign
-        return bool(azimuth.min() < 0)
-    steps = azimuth * _STEPS
-    return bool(len(steps) >= _ENOUGH and steps.any() and (steps == np.round(steps)).all())
 
 
 def _roles(dialect: Dialect) -> dict[str, str]:

@@ -21,8 +21,8 @@ from radarsdf.io.bags.files import bags_in
 from radarsdf.io.bags.reading import read_bags
 from radarsdf.io.datasets.folders import BASE_T_RADAR, base_T_radar
 from radarsdf.io.datasets.snail_radar import SnailRadar, is_snail_radar
-from radarsdf.io.poses.reading import poses_of, read_calibration, trajectory_of
-from radarsdf.io.poses.trajectory import read_table
+from radarsdf.io.poses.reading import poses_of, read_calibration
+from radarsdf.io.poses.trajectory import pose_matrices_of, read_table, trajectory_of
 from radarsdf.io.scans import Scans
 from radarsdf.io.sources import Request, natural, scans_of_files
 from radarsdf.io.text import read_text
@@ -123,7 +123,7 @@ class ColoRadar:
                 msg = f"{folder}: groundtruth has {len(stamps)} times for {len(table)} poses"
                 raise ValueError(msg)
             poses = trajectory_of(
-                stamps, table[:, :3], table[:, 3:], str(folder / "groundtruth" / "groundtruth_poses.txt")
+                np.column_stack([stamps, table]), f"{folder / 'groundtruth'}", request.notes
             )
         T_base_sensor = request.extrinsic
         if T_base_sensor is None:
@@ -315,9 +315,7 @@ def _translation_and_quaternion(path: Path) -> NDArray[np.float64]:
         if [len(row) for row in rows] != [3, 4]:
             msg = "it has not one line x y z and one line qx qy qz qw"
             raise ValueError(msg)
-        track = trajectory_of([0.0, 1.0], [rows[0]] * 2, [rows[1]] * 2, str(path))
+        return check_pose(pose_matrices_of(np.array([[*rows[0], *rows[1]]]))[0], "it")
     except ValueError as error:
         msg = f"{path} is not a transform: {error}"
         raise ValueError(msg) from error
-    transform: NDArray[np.float64] = track.poses(np.zeros(1), 1.0)[0]
-    return transform

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,12 +20,9 @@ from radarsdf.io.text import number_rows
 MAX_GAP_S = 0.5
 """Longest time between two poses over which poses are interpolated, by default."""
 
-_UNITS = ((1e17, "ns", 1e-9), (1e14, "µs", 1e-6), (1e11, "ms", 1e-3))  # from so much on, since 1970
-TIME_UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-"""Units of times in names of columns, s."""
-
-MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
+_MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
 _ROUNDED_S = 1e-3
+_LISTED = 5  # poses that a note names
 _NEARLY_SAME = 1 - 1e-9  # cosine of half an angle so small that its sine and itself are equal to rounding
 
 
@@ -155,53 +153,68 @@ def _matrix(quaternion: NDArray[np.float64]) -> list[list[float]]:
     ]
 
 
-def in_seconds(times: NDArray[np.float64], path: Path, notes: Notes) -> NDArray[np.float64]:
-    """Times (N,) of a file, s. They may be in ms, µs or ns since 1970, which is noted.
+def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mask (P,) of the rows (P, 7) x y z qx qy qz qw that are finite and have a unit quaternion."""
+    with np.errstate(over="ignore", invalid="ignore"):  # of damaged numbers
+        unit = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= _MAX_NORM_ERROR
+    mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
+    return mask
+
+
+def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, 4, 4) of rows (P, 7) x y z qx qy qz qw; NaN where a row is no pose."""
+    good = are_poses(table)
+    poses = np.full((len(table), 4, 4), np.nan)
+    poses[good] = np.eye(4)
+    poses[good, :3, 3] = table[good, :3]
+    if good.any():
+        poses[good, :3, :3] = Rotation.from_quat(table[good, 3:]).as_matrix()
+    return poses
+
+
+def trajectory_of(
+    table: NDArray[np.float64], name: str, notes: Notes | None = None, lines: Sequence[int] | None = None
+) -> Trajectory:
+    """The trajectory in rows (P, 8) of time, position and quaternion, in any order, from these lines of a file.
+
+    Of several poses at one time, the first counts. `notes` take what was left out.
 
     Raises
     ------
     ValueError
-        If a time is not finite, or times are of different units.
+        If there are fewer than two poses, or half of the quaternions have another length.
     """
-    if not np.isfinite(times).all():
-        msg = f"{path} holds a time that is not finite"
-        raise ValueError(msg)
-    units = {
-        next((unit for unit in _UNITS if abs(time) >= unit[0]), None) for time in times[times != 0].tolist()
-    }
-    if len(units) > 1:
-        msg = f"{path} holds times of different units, such as s and ns"
-        raise ValueError(msg)
-    (unit,) = units or {None}
-    if unit is None:
-        return times
-    notes.add(f"times of {path.name} are taken as {unit[1]} since 1970")
-    return times * unit[2]
+    bad = ~(are_poses(table[:, 1:]) & np.isfinite(table[:, 0]))
+    missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
+    rows = np.flatnonzero(~bad)
+    times_s, first = np.unique(table[rows, 0], return_index=True)
+    back, again = np.zeros_like(bad), ~bad
+    back[rows[1:]] = np.diff(table[rows, 0]) < 0
+    again[rows[first]] = False
+    remarks = [
+        f"{name}: {mask.sum()} of {len(table)} poses {what}: {listed(mask, lines)}"
+        for mask, what in (
+            (bad, "left out, which are not finite or not unit quaternions"),
+            (back, "are not in the order of their times, and sorted"),
+            (again, "left out, whose times repeat"),
+        )
+        if mask.any()
+    ]
+    if len(times_s) < 2 or 2 * (bad & ~missing).sum() >= (~missing).sum():
+        msg = f"{name} holds {len(times_s)} poses at different times; at least two poses are needed"
+        raise ValueError("; ".join([msg, *remarks]))
+    if notes is not None:
+        for remark in remarks:
+            notes.add(remark)
+    table = table[rows[first]]
+    return Trajectory(times_s, table[:, 1:4], Rotation.from_quat(table[:, 4:]), name)
 
 
-def read_trajectory(path: Path) -> Trajectory:
-    """Reads a trajectory in the TUM format: lines of ``time x y z qx qy qz qw``, s and m, and comments after ``#``.
-
-    Raises
-    ------
-    ValueError
-        If the file has another format or fewer than two poses, or if times do not ascend or quaternions do not have
-        unit length.
-    OSError
-        If the file cannot be read.
-    """
-    return trajectory_of_table(read_table(path, 8), path)
-
-
-def trajectory_of_table(table: NDArray[np.float64], path: Path) -> Trajectory:
-    """The trajectory in the rows (P, 8) of a TUM file; see :func:`read_trajectory`."""
-    if len(table) < 2 or not (np.diff(table[:, 0]) > 0).all():
-        msg = f"{path} must hold at least two poses, in the order of their times"
-        raise ValueError(msg)
-    if (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > MAX_NORM_ERROR).any():
-        msg = f"{path}: the last four columns are not unit quaternions qx qy qz qw"
-        raise ValueError(msg)
-    return Trajectory(table[:, 0], table[:, 1:4], Rotation.from_quat(table[:, 4:]), str(path))
+def listed(mask: NDArray[np.bool_], lines: Sequence[int] | None) -> str:
+    """The first poses of a mask (P,), by the lines of their file or else by number."""
+    rows = np.flatnonzero(mask)
+    named = [str(row if lines is None else lines[row]) for row in rows[:_LISTED]]
+    return f"{'pose' if lines is None else 'line'} {', '.join(named)}{', …' if len(rows) > _LISTED else ''}"
 
 
 def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
