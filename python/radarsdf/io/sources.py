@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.clouds.fields import Fields
+from radarsdf.io.clouds.fields import Fields, names_of, plain_name
 from radarsdf.io.clouds.pcd import read_viewpoint
 from radarsdf.io.clouds.raw_binary import KITTI, bin_layout
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, names_of, read_columns
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_columns
 from radarsdf.io.poses.reading import POSE_FILES, ScanPoses, StampedPoses
 from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory
 from radarsdf.io.scans import Notes, Scan, Scans
@@ -33,9 +33,6 @@ SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD
 
 NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 """What a note says of such returns, after their number."""
-
-VIEWPOINTS = "poses: VIEWPOINT of the PCD files"
-"""What a note says of them."""
 
 WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
 """What it says of such scans."""
@@ -152,9 +149,7 @@ def posed(
             if len(cloud.points) == 0:
                 notes.count(_NO_RETURNS, 1)
                 continue
-            yield Scan(
-                cloud.points, T_world_sensor, cloud.intensities, cloud.doppler_mps, raw.time_s, cloud.sigma
-            )
+            yield cloud.scan(T_world_sensor, raw.time_s)
         if taken or first_s is None or matched is None or isinstance(matched.poses, np.ndarray):
             return
         msg = (
@@ -366,11 +361,8 @@ def scans_of_files(
     """
     tables: list[Columns] | None = None
     columns: Any = request.columns
-    suffixes = {path.suffix.lower() for path in files}
-    if ".bin" in suffixes:
+    if any(path.suffix.lower() == ".bin" for path in files):
         columns = bin_columns(files, columns, request.notes)
-    if ".pcd" in suffixes:
-        note_viewpoint(files[0], request.notes)
     if len(files) == 1:
         tables, times_s, poses = _split(files[0], columns, times_s, poses, request.notes)
     count = len(files) if tables is None else len(tables)
@@ -400,7 +392,7 @@ def _split(
         table = read_columns(path, columns)
     except ValueError:  # which is said when the scan is read
         return None, times_s, poses
-    plain = {without_unit(name.lower().removeprefix("scalar_"))[0]: name for name in reversed(table)}
+    plain = {plain_name(name)[0]: name for name in reversed(table)}
     number = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
     time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
     one_pose = isinstance(poses, np.ndarray) and len(poses) == 1
@@ -444,15 +436,8 @@ def bin_columns(files: list[Path], columns: Any, notes: Notes) -> Any:
     return layout
 
 
-def note_viewpoint(path: Path, notes: Notes) -> None:
-    """Says that the ``VIEWPOINT`` of scans is where they were taken, which poses say, too: it is not applied twice."""
-    with contextlib.suppress(ValueError):
-        if (read_viewpoint(path) != np.eye(4)).any() and VIEWPOINTS not in notes.lines:
-            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")
-
-
 def viewpoint_poses(files: list[Path], notes: Notes) -> NDArray[np.float64] | None:
-    """T_world_sensor (F, 4, 4) of the ``VIEWPOINT`` of PCD files, if they tell where the scans were taken."""
+    """T_world_sensor (F, 4, 4) of the ``VIEWPOINT`` of PCD files, if it is where each scan was taken."""
     if {path.suffix.lower() for path in files} != {".pcd"}:
         return None
     poses = np.full((len(files), 4, 4), np.nan)
@@ -462,5 +447,12 @@ def viewpoint_poses(files: list[Path], notes: Notes) -> NDArray[np.float64] | No
     known = poses[np.isfinite(poses).all(axis=(1, 2))]
     if not len(known) or (known == (np.eye(4) if len(files) == 1 else known[0])).all():
         return None
-    notes.add(VIEWPOINTS)
+    notes.add("poses: VIEWPOINT of the PCD files")
     return poses
+
+
+def note_viewpoint(path: Path, notes: Notes) -> None:
+    """Notes that the ``VIEWPOINT`` of a scan is not applied where poses are given: it would place the scan twice."""
+    with contextlib.suppress(ValueError):
+        if path.suffix.lower() == ".pcd" and (read_viewpoint(path) != np.eye(4)).any():
+            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")

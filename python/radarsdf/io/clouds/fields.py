@@ -5,14 +5,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.scans import Notes
+from radarsdf.io.scans import Notes, Scan
 from radarsdf.io.units import SCALES, are_degrees, without_unit
 
 ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
@@ -29,38 +29,33 @@ class Dialect:
     """How one kind of sensor or data set names its fields. Case does not matter."""
 
     name: str
-    position: tuple[str, str, str]
-    """x, y and z, m, or range, azimuth and elevation, m and rad."""
-    doppler: str | None
-    intensity: str | None
+    doppler: str
+    intensity: str
     sigma: tuple[str, str, str] | None = None
     """Standard deviations of range, azimuth and elevation."""
     sigma_in_degrees: bool = False
     polar: bool = False
+    """Whether positions are range, azimuth and elevation, m and rad, not x, y and z."""
     note: str = ""
     """What a user must know of the numbers, one sentence."""
 
 
 DIALECTS = (
-    Dialect("Sensrad Hugin", _XYZ, "doppler", "power"),
+    Dialect("Sensrad Hugin", "doppler", "power"),
+    Dialect("Oculii Eagle", "doppler", "power", ("rangeaccu", "aziaccu", "eleaccu"), sigma_in_degrees=True),
+    Dialect("Oculii, NTU4DRadLM", "doppler", "power"),  # a sensor_msgs/PointCloud with channels
+    Dialect("ARS548, nebula", "range_rate", "rcs", ("range_std", "azimuth_std", "elevation_std")),
     Dialect(
-        "Oculii Eagle", _XYZ, "doppler", "power", ("rangeaccu", "aziaccu", "eleaccu"), sigma_in_degrees=True
-    ),
-    Dialect("Oculii, NTU4DRadLM", _XYZ, "doppler", "power"),  # a sensor_msgs/PointCloud with channels
-    Dialect("ARS548, nebula", _XYZ, "range_rate", "rcs", ("range_std", "azimuth_std", "elevation_std")),
-    Dialect(
-        "ARS548, SNAIL-Radar", _XYZ, "doppler", "intensity", ("range_std", "azimuth_std", "elevation_std"),
+        "ARS548, SNAIL-Radar", "doppler", "intensity", ("range_std", "azimuth_std", "elevation_std"),
         note="the intensities of ARS548 clouds with these fields are RCS + 128",
     ),
-    Dialect(
-        "ARS548, HKUST RIO", _POLAR, "velocity", "rcs", ("rangestd", "azimuthstd", "elevationstd"), polar=True
-    ),
-    Dialect("smartmicro", _XYZ, "radial_speed", "power"),
-    Dialect("TI ti_mmwave", _XYZ, "velocity", "intensity"),  # of ti_mmwave_rospkg/RadarScan too
-    Dialect("TI reve", _XYZ, "v_doppler_mps", "snr_db"),
-    Dialect("radar_msgs/RadarScan", _POLAR, "doppler_velocity", "amplitude", polar=True),
-    Dialect("View-of-Delft", _XYZ, "v_r", "rcs"),
-    Dialect("TJ4DRadSet", _XYZ, "v_r", "power"),
+    Dialect("ARS548, HKUST RIO", "velocity", "rcs", ("rangestd", "azimuthstd", "elevationstd"), polar=True),
+    Dialect("smartmicro", "radial_speed", "power"),
+    Dialect("TI ti_mmwave", "velocity", "intensity"),  # of ti_mmwave_rospkg/RadarScan too
+    Dialect("TI reve", "v_doppler_mps", "snr_db"),
+    Dialect("radar_msgs/RadarScan", "doppler_velocity", "amplitude", polar=True),
+    Dialect("View-of-Delft", "v_r", "rcs"),
+    Dialect("TJ4DRadSet", "v_r", "power"),
 )  # fmt: skip
 """The twelve dialects. A cloud is read by the one of which it has the most fields, all of them."""
 
@@ -89,6 +84,21 @@ COLUMNS: dict[int, tuple[str, ...]] = {
 """Names of columns without names, by their number."""
 
 
+def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
+    """Names of `width` columns that have none in their file."""
+    if columns is not None and not isinstance(columns, int):
+        if len(columns) != width:
+            msg = f"there are {width} columns, but {len(columns)} names"
+            raise ValueError(msg)
+        return list(columns)
+    if width in COLUMNS:
+        return list(COLUMNS[width])
+    if width < 3:
+        msg = f"there are {width} columns; points have three or more"
+        raise ValueError(msg)
+    return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
+
+
 @dataclass(frozen=True)
 class Cloud:
     """The returns of one scan of a file, by what they mean."""
@@ -100,6 +110,25 @@ class Cloud:
     sigma: NDArray[np.float32] | None
     dropped: int
     """Returns that were left out, since a coordinate or the intensity was not finite."""
+
+    @classmethod
+    def of_finite(
+        cls, points: NDArray[Any], intensities: NDArray[Any] | None, *others: NDArray[Any] | None
+    ) -> Cloud:
+        """The returns whose coordinates and intensity are finite, with their Doppler and deviations."""
+        arrays = (points, intensities, *others)
+        # All at once first: that is usual, and row by row takes twenty times as long.
+        if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
+            return cls(*arrays, dropped=0)
+        finite = np.isfinite(points).all(axis=1)
+        if intensities is not None:
+            finite &= np.isfinite(intensities)
+        kept = (None if array is None else array[finite] for array in arrays)
+        return cls(*kept, dropped=int((~finite).sum()))
+
+    def scan(self, T_world_sensor: NDArray[np.float64], time_s: float | None) -> Scan:
+        """These returns with the pose and the time of the scan."""
+        return Scan(self.points, T_world_sensor, self.intensities, self.doppler_mps, time_s, self.sigma)
 
 
 @dataclass(frozen=True)
@@ -133,8 +162,8 @@ class Fields:
         ValueError
             If a role or a field does not exist, or there are no positions.
         """
-        lower = {name.lower(): name for name in reversed(names)}
-        lower = {_plain(name)[0]: name for name in reversed(names)} | lower
+        lower = {plain_name(name)[0]: name for name in reversed(names)}
+        lower |= {name.lower(): name for name in reversed(names)}
         squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
         dialect = _dialect(lower)
@@ -173,21 +202,15 @@ class Fields:
 
     def judged(self, clouds: Iterable[Mapping[str, NDArray[Any]]], notes: Notes) -> Fields:
         """These fields with the unit of their angles: of their names, or else by the numbers in some clouds."""
-        if not self.polar:
-            return self
-        units = {role: _plain(self.names[role])[1] for role in ("azimuth", "elevation")}
-        named = next((unit for unit in units.values() if unit), "")
-        if all(units.values()):
+        units = {role: plain_name(self.names[role])[1] for role in _POLAR[1:] if role in self.names}
+        if not self.polar or all(units.values()):
             return self
         names = [self.names[role] for role in units]
         angles = [np.stack([cloud[name] for name in names]) for cloud in clouds if set(names) <= set(cloud)]
         azimuth, elevation = np.concatenate([np.zeros((2, 0)), *angles], axis=1).astype(np.float64)
-        in_degrees = are_degrees(azimuth, elevation, named)
-        by = (
-            f"as {'azimuth' if units['azimuth'] else 'elevation'} is by its name"
-            if named
-            else "by their numbers"
-        )
+        named = next((role for role, unit in units.items() if unit), None)
+        in_degrees = are_degrees(azimuth, elevation, units[named] if named else "")
+        by = f"as {named} is by its name" if named else "by their numbers"
         if in_degrees or (self.dialect is None and not named):
             notes.add(
                 f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
@@ -199,7 +222,7 @@ class Fields:
         """Says what to know of the numbers, and which of these fields are passed over, unless a user has chosen some."""
         if self.dialect is not None and self.dialect.note:
             notes.add(self.dialect.note)
-        if "intensity" in self.names and _plain(self.names["intensity"])[1] == "linear":
+        if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
             notes.add(
                 f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
             )
@@ -224,38 +247,23 @@ class Fields:
             if columns[name].dtype.kind not in "biuf":
                 msg = f"{what}: the field {name} holds no numbers"
                 raise ValueError(msg)
-        points = self._positions(columns)
         with np.errstate(over="ignore"):  # too large a number becomes infinite, and is dropped
-            intensities = self._column(columns, "intensity")
-            doppler = self._column(columns, "doppler")
-            sigma = self._sigma(columns)
-        # All at once first: that is usual, and row by row takes twenty times as long.
-        if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
-            return Cloud(points, intensities, doppler, sigma, 0)
-        finite = np.isfinite(points).all(axis=1)
-        if intensities is not None:
-            finite &= np.isfinite(intensities)
-        return Cloud(
-            points[finite],
-            None if intensities is None else intensities[finite],
-            None if doppler is None else doppler[finite],
-            None if sigma is None else sigma[finite],
-            int((~finite).sum()),
-        )
+            others = (
+                self._column(columns, "intensity"),
+                self._column(columns, "doppler"),
+                self._sigma(columns),
+            )
+        return Cloud.of_finite(self._positions(columns), *others)
 
     def check_no_more(self, others: Fields, what: str, first: str) -> None:
         """Raises a ValueError if the cloud `what` has a role that these fields, of the cloud `first`, leave out."""
-        more = [
-            role
-            for role in ("intensity", "doppler", *_SIGMA)
-            if role in others.names and role not in self.names
-        ]
-        if more:
-            msg = (
-                f"{what} has the field {others.names[more[0]]} for {more[0]}, which {first} lacks: leave it out of all scans "
-                f"by fields={{{more[0]!r}: None}}"
-            )
-            raise ValueError(msg)
+        for role in ("intensity", "doppler", *_SIGMA):
+            if role in others.names and role not in self.names:
+                msg = (
+                    f"{what} has the field {others.names[role]} for {role}, which {first} lacks: leave it out of all scans "
+                    f"by fields={{{role!r}: None}}"
+                )
+                raise ValueError(msg)
 
     def _column(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[np.float32] | None:
         if role not in self.names:
@@ -264,7 +272,7 @@ class Fields:
 
     def _values(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[Any]:
         """A column in m, rad or m/s, where its name has another unit, or angles are in degrees."""
-        unit = _plain(self.names[role])[1]
+        unit = plain_name(self.names[role])[1]
         if not unit and self.in_degrees and role.endswith(("azimuth", "elevation")):
             unit = "deg"
         scale = SCALES.get(unit)
@@ -294,7 +302,7 @@ class Fields:
         return sigma
 
 
-def _plain(name: str) -> tuple[str, str]:
+def plain_name(name: str) -> tuple[str, str]:
     """A name in lower case as radars give it, and its unit: without the prefix of CloudCompare."""
     return without_unit(name.lower().removeprefix("scalar_"))
 
@@ -306,14 +314,9 @@ def _squeezed(name: str) -> str:
 
 def _roles(dialect: Dialect) -> dict[str, str]:
     """Field by role."""
-    roles = dict(zip(_POLAR if dialect.polar else _XYZ, dialect.position, strict=True))
-    if dialect.doppler is not None:
-        roles["doppler"] = dialect.doppler
-    if dialect.intensity is not None:
-        roles["intensity"] = dialect.intensity
-    if dialect.sigma is not None:
-        roles |= dict(zip(_SIGMA, dialect.sigma, strict=True))
-    return roles
+    position = _POLAR if dialect.polar else _XYZ
+    roles = {role: role for role in position} | {"doppler": dialect.doppler, "intensity": dialect.intensity}
+    return roles | dict(zip(_SIGMA, dialect.sigma or (), strict=False))
 
 
 def _dialect(lower: Mapping[str, str]) -> Dialect | None:

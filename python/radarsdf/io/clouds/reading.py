@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
 from radarsdf.interrupts import whole_import
-from radarsdf.io.clouds.fields import COLUMNS, Fields
+from radarsdf.io.clouds.fields import Fields, names_of
 from radarsdf.io.clouds.las import read_las
 from radarsdf.io.clouds.pcd import read_pcd, read_viewpoint
 from radarsdf.io.clouds.raw_binary import read_bin
@@ -119,25 +119,6 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     return points if origin is None else points + origin
 
 
-def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
-    """Names of `width` columns that have none in their file."""
-    if columns is not None and not isinstance(columns, int):
-        if len(columns) != width:
-            msg = f"there are {width} columns, but {len(columns)} names"
-            raise ValueError(msg)
-        return list(columns)
-    if width in COLUMNS:
-        return list(COLUMNS[width])
-    if width < 3:
-        msg = f"there are {width} columns; points have three or more"
-        raise ValueError(msg)
-    return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
-
-
-def _bin(path: Path, columns: int | Sequence[str] | None) -> Columns:
-    return read_bin(path, columns, names_of)
-
-
 def _npy(path: Path, columns: int | Sequence[str] | None) -> Columns:
     # A memory map: a header that claims more than the file holds is refused before anything is allocated.
     array = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -223,7 +204,7 @@ _NAMED: dict[str, Callable[[Path], Columns]] = {
 """Readers of formats that name their columns."""
 
 _NAMELESS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
-    ".bin": _bin,
+    ".bin": read_bin,
     ".npy": _npy,
     **dict.fromkeys(TEXT_SUFFIXES, _text),
 }
