@@ -23,7 +23,7 @@ from radarsdf.io.poses.reading import POSE_FILES, ScanPoses, StampedPoses
 from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory
 from radarsdf.io.scans import Notes, Scan, Scans
 from radarsdf.io.text import number_rows
-from radarsdf.io.units import SCALES, in_seconds, without_unit
+from radarsdf.io.units import SCALES, in_seconds, unit_since_1970, without_unit
 
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
 """Names of files with a time, s, for each scan, one a line."""
@@ -55,8 +55,6 @@ _NOT_SCANS = {
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply beside the scans is their ground truth
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
-_UNITS = ((17, 1e-9), (14, 1e-6), (11, 1e-3))  # more digits than this: the unit of a time without a point, s
-
 
 Truth = Callable[[], NDArray[np.float64] | None]
 """Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
@@ -112,20 +110,20 @@ def posed(
 
     def source() -> Iterator[Scan]:
         fields_of: dict[str, tuple[Fields, RawScan, list[str]]] = {}
-        first_s: float | None = None
-        taken = 0
-        matched: ScanPoses | None = None
+        taken, missed = 0, None
         for before, raw in enumerate(raw_scans()):
             own = poses(raw.frame) if callable(poses) else poses
             if own is None:
                 notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}", 1)
                 continue
-            matched = own
             T_world_sensor = own.of(before if raw.number is None else raw.number, raw.time_s)
             if T_world_sensor is None:
-                first_s = raw.time_s if first_s is None else first_s
                 if not isinstance(own.poses, np.ndarray):  # else it was named when the poses were read
                     notes.count(WITHOUT_POSES.format(gap_s=own.max_gap_s), 1)
+                    missed = (
+                        missed
+                        or f"the first scan is at {raw.time_s:.3f} s, the poses are from {own.poses.span()}"
+                    )
                 continue
             taken += 1
             columns = _read(raw, notes)
@@ -150,13 +148,9 @@ def posed(
                 notes.count(_NO_RETURNS, 1)
                 continue
             yield cloud.scan(T_world_sensor, raw.time_s)
-        if taken or first_s is None or matched is None or isinstance(matched.poses, np.ndarray):
-            return
-        msg = (
-            f"{notes.about}: no scan has a pose: the first scan is at {first_s:.3f} s, the poses are from {matched.poses.span()}, "
-            f"and a gap between poses may be {matched.max_gap_s} s: are both of one clock?"
-        )
-        raise ValueError(msg)
+        if missed and not taken:
+            msg = f"{notes.about}: no scan has a pose: {missed}, and a gap between poses may be {request.max_gap_s} s: are both of one clock?"
+            raise ValueError(msg)
 
     return source
 
@@ -287,8 +281,7 @@ def _time_of(stem: str) -> float | None:
         return None
     if "." in found[1]:
         return float(found[1])
-    unit = next((unit for digits, unit in _UNITS if len(found[1]) > digits), 1.0)
-    return int(found[1]) * unit
+    return int(found[1]) * unit_since_1970(int(found[1]))[1]
 
 
 def _listed_times(path: Path, count: int, notes: Notes) -> list[float]:
@@ -313,13 +306,7 @@ def scan_poses(
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
 ) -> tuple[ScanPoses, Sequence[float] | None]:
-    """Which pose each of `count` scans has, and the times of the scans as far as they are then known.
-
-    Raises
-    ------
-    ValueError
-        If poses in order are not as many as the scans, or scans without time stamps meet poses that have them.
-    """
+    """Which pose each of `count` scans has, and the times of the scans as far as they are then known."""
     T = np.eye(4) if T_base_sensor is None else T_base_sensor
     if isinstance(poses, np.ndarray):
         if len(poses) != count:
@@ -352,13 +339,7 @@ def scans_of_files(
     request: Request,
     truth: Truth = lambda: None,
 ) -> Scans:
-    """Scans of one file each, with poses; `truth` is that beside them, if the request has none.
-
-    Raises
-    ------
-    ValueError
-        As :func:`scan_poses`.
-    """
+    """Scans of one file each, with poses; `truth` is that beside them, if the request has none."""
     tables: list[Columns] | None = None
     columns: Any = request.columns
     if any(path.suffix.lower() == ".bin" for path in files):

@@ -34,11 +34,6 @@ def read_text(path: Path) -> str:
 
     It is in UTF-8, or in another encoding of Unicode that a byte order mark names, which is left out. What does not
     decode, such as a comment in Latin-1, becomes replacement characters. Lines may end as those of any system.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
     """
     data = path.read_bytes()
     encoding = next((encoding for mark, encoding in _MARKS if data.startswith(mark)), "utf-8")
@@ -46,13 +41,7 @@ def read_text(path: Path) -> str:
 
 
 def with_points(text: str) -> str:
-    """The same numbers with decimal points, if there are decimal commas: then semicolons separate numbers.
-
-    Raises
-    ------
-    ValueError
-        If there are decimal commas, and numbers are separated by spaces: it could be twice as many numbers.
-    """
+    """The same numbers with decimal points, if there are decimal commas: then semicolons separate numbers."""
     bare = map(without_comment, text.split("\n"))
     rows = list(itertools.islice(filter(None, bare), 2))  # a line of names, and one of numbers
     if any(";" in row for row in rows):
@@ -90,13 +79,6 @@ def text_rows(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]
 
     Names are above the rows: comments after ``#``, ``//`` or ``%``, or a line without a number. Words of a row are
     separated by commas, semicolons or white space. Other comments and blank lines are left out.
-
-    Raises
-    ------
-    ValueError
-        If the numbers have decimal commas between spaces.
-    OSError
-        If the file cannot be read.
     """
     heads: list[list[str]] = []
     rows: list[tuple[int, list[str]]] = []
@@ -115,15 +97,7 @@ def text_rows(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]
 
 
 def number_rows(path: Path) -> list[list[str]]:
-    """The rows of a text file of numbers, without names above them; see :func:`text_rows`.
-
-    Raises
-    ------
-    ValueError
-        If a row has a word that is no number, or another number of words than the first.
-    OSError
-        If the file cannot be read.
-    """
+    """The rows of a text file of numbers, without names above them; see :func:`text_rows`."""
     _, rows = text_rows(path)
     for number, words in rows:
         if not are_numbers(words):

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect
 from typing import Any
 
 import numpy as np
@@ -34,22 +35,21 @@ def without_unit(name: str) -> tuple[str, str]:
     return name[: found.start()], found[1] if found[1] is not None else found[2].strip()
 
 
-def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[np.float64]:
-    """Times (N,) of the file `name`, s. They may be in ms, µs or ns since 1970, which is noted.
+def unit_since_1970(time: float) -> tuple[str, float]:
+    """The unit of a time since 1970 and its length, s."""
+    return _SINCE_1970[bisect(_LIMITS, abs(time))]
 
-    Raises
-    ------
-    ValueError
-        If a time is not finite, or times are of different units.
-    """
+
+def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[np.float64]:
+    """Times (N,) of the file `name`, s. They may be in ms, µs or ns since 1970, which is noted."""
     if not np.isfinite(times).all():
         msg = f"{name} holds a time that is not finite"
         raise ValueError(msg)
-    units = np.unique(np.digitize(np.abs(times[times != 0]), _LIMITS))
+    units = {unit_since_1970(time) for time in times[times != 0].tolist()}
     if len(units) > 1:
         msg = f"{name} holds times of different units, such as s and ns"
         raise ValueError(msg)
-    unit, scale = _SINCE_1970[int(units.sum())]
+    ((unit, scale),) = units or {_SINCE_1970[0]}
     if unit != "s":
         notes.add(f"times of {name} are taken as {unit} since 1970")
     return times * scale

@@ -70,13 +70,7 @@ def bags_in(folder: Path) -> list[Path]:
 
 
 def topics_of(paths: list[Path]) -> dict[str, Topic]:
-    """The topics of bags, by name.
-
-    Raises
-    ------
-    ValueError, OSError, ImportError
-        If a bag cannot be read.
-    """
+    """The topics of bags, by name."""
     topics: dict[str, Topic] = {}
     with ExitStack() as stack:
         for path in paths:
@@ -109,26 +103,14 @@ def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, T
 
 
 def messages_of(paths: list[Path], names: set[str]) -> Generator[Message, None, None]:
-    """The messages of some topics of bags, in the order in which they were recorded, one after another.
-
-    Raises
-    ------
-    ValueError, OSError, ImportError
-        If a bag cannot be read.
-    """
+    """The messages of some topics of bags, in the order in which they were recorded, one after another."""
     with ExitStack() as stack:
         streams = [stack.enter_context(closing(_stream(path, names))) for path in paths]
         yield from heapq.merge(*streams, key=lambda message: message.recorded_s)
 
 
 def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
-    """The same with their content. Those that are damaged are left out, and noted in the end.
-
-    Raises
-    ------
-    ValueError, OSError, ImportError
-        As :func:`messages_of`.
-    """
+    """The same with their content. Those that are damaged are left out, and noted in the end."""
     numbers: Counter[str] = Counter()
     damaged: Counter[str] = Counter()
     first: dict[str, str] = {}

@@ -19,13 +19,7 @@ __all__ = ["imu_in_bags", "imu_topic"]
 
 
 def imu_topic(topics: dict[str, Topic], request: Request) -> Topic | None:
-    """The topic of the IMU: the wanted one, or the only one. None: there is none, or none is named of several.
-
-    Raises
-    ------
-    ValueError
-        If the wanted one is no topic of an IMU.
-    """
+    """The topic of the IMU: the wanted one, or the only one. None: there is none, or none is named of several."""
     fitting = topics_with([IMU], topics)
     listed = ", ".join(sorted(fitting))
     if request.imu_topic is not None:
@@ -35,7 +29,7 @@ def imu_topic(topics: dict[str, Topic], request: Request) -> Topic | None:
         return fitting[request.imu_topic]
     if len(fitting) > 1:
         request.notes.add(
-            f"there are several topics of IMUs, of which none is used: name one by imu_topic, of {listed}"
+            f"there are several topics of IMUs, of which none is used: say by imu_topic which, of {listed}"
         )
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 

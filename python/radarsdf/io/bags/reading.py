@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -68,12 +68,10 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.header.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
-    by_recording = {
-        name: by_record(
-            np.array([cloud.header.stamp_s for cloud in clouds]), name, request.stamps, request.notes
-        )
-        for name, clouds in peeked.items()
-    }
+    by_recording = {}
+    for name, clouds in peeked.items():
+        stamps = np.array([cloud.header.stamp_s for cloud in clouds])
+        by_recording[name] = by_record(stamps, name, request.stamps, request.notes)
 
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, by_recording[topic.name], request) for topic in scan_topics]
@@ -85,7 +83,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
 
     poses = request.poses
     find: Any
-    if poses is None or _is_bag_of_poses(poses):
+    if poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses))):
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name), scan_times_s)
     else:
@@ -122,48 +120,39 @@ def _given(
     return attached(poses, frames[0], cache(lambda: transforms_of(paths, request)), request)
 
 
-def _is_bag_of_poses(poses: Any) -> bool:
-    return isinstance(poses, (str, PathLike)) and is_bag(Path(poses))
-
-
 def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) -> list[Topic]:
-    """The topics of the scans: the wanted ones, or the only one that can be meant. Says which others there are."""
-    where = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+    """The topics of the scans: the wanted ones, or the only one that can be meant. The others are noted."""
+    about = request.notes.about
     fitting = topics_with(CLOUD_TYPES, topics)
     for wanted in request.topic:
-        if wanted in fitting:
-            continue
-        if wanted in topics:
-            msg = f"{where}: {wanted} has messages {topics[wanted].message_type}, or none; scans are {', '.join(CLOUD_TYPES)}"
-        else:
+        if wanted not in topics:
             msg = (
-                f"{where} has no topic {wanted}: topics with points are {_listed(fitting.values()) or 'none'}"
+                f"{about} has no topic {wanted}: topics with points are {_listed(fitting.values()) or 'none'}"
             )
-        raise ValueError(msg)
+            raise ValueError(msg)
+        if wanted not in fitting:
+            kind = topics[wanted].message_type
+            msg = f"{about}: {wanted} has messages {kind}, or none; scans are {', '.join(CLOUD_TYPES)}"
+            raise ValueError(msg)
     if request.topic:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
-    unread = [t for t in topics.values() if t.count and t.name not in fitting and _may_have_points(t)]
     if not fitting:
-        msg = f"{where} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {_listed(topics.values()) or 'no topics'}"
+        msg = f"{about} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {_listed(topics.values()) or 'no topics'}"
         raise ValueError(msg)
-    decoded = [t for t in fitting.values() if t.message_type != PACKETS]
-    chosen: list[Topic] = []
-    for fits in (
-        lambda _: True,
-        lambda t: t.name in KNOWN_TOPICS,
-        _is_radar,
-        lambda t: _has_doppler(paths, t),
-    ):
-        chosen = [t for t in decoded or fitting.values() if fits(t)]
+    decoded = [t for t in fitting.values() if t.message_type != PACKETS] or list(fitting.values())
+    has_doppler = partial(_has_doppler, paths)
+    for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar, has_doppler):
+        chosen = [t for t in decoded if fits(t)]
         if len(chosen) == 1:
             break
     else:
-        msg = f"{where} has several topics with points: say by topic which is the radar's, one or several of {_listed(fitting.values())}"
+        msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {_listed(fitting.values())}"
         raise ValueError(msg)
+    unread = [t for t in topics.values() if t.count and t.name not in fitting and _may_have_points(t)]
     radars = [t for t in unread if _is_radar(t)]
-    if radars and not _is_radar(chosen[0]) and not _has_doppler(paths, chosen[0]):
+    if radars and not _is_radar(chosen[0]) and not has_doppler(chosen[0]):
         msg = (
-            f"{where}: messages of the radar cannot be read, {_listed(radars)}. The only points are those of {_listed(chosen)}, whose "
+            f"{about}: messages of the radar cannot be read, {_listed(radars)}. The only points are those of {_listed(chosen)}, whose "
             f"name and fields are not a radar's: give topic {chosen[0].name} to map them"
         )
         raise ValueError(msg)

@@ -146,21 +146,9 @@ class Fields:
     def of(
         cls, names: list[str], overrides: Mapping[str, Any] | None = None, what: str = "the cloud"
     ) -> Fields:
-        """The roles of the fields with these names.
+        """The roles of the fields with these names, of the cloud `what`.
 
-        Parameters
-        ----------
-        names : list of str
-            The fields of a cloud.
-        overrides : mapping, optional
-            Field by role; None leaves a role out. A number means a column. Other roles are found by the table.
-        what : str
-            The file, for errors.
-
-        Raises
-        ------
-        ValueError
-            If a role or a field does not exist, or there are no positions.
+        `overrides` are fields by role, or numbers of columns; None leaves a role out.
         """
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
@@ -233,13 +221,7 @@ class Fields:
             )
 
     def read(self, columns: Mapping[str, NDArray[Any]], what: str) -> Cloud:
-        """The cloud in these columns, (N,) each, without returns that are not finite.
-
-        Raises
-        ------
-        ValueError
-            If a field is missing that other scans have, or does not hold numbers.
-        """
+        """The cloud in these columns, (N,) each, without returns that are not finite."""
         for name in self.names.values():
             if name not in columns:
                 msg = f"{what} lacks the field {name}, which other scans have: it has {', '.join(columns)}"

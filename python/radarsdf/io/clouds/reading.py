@@ -46,22 +46,8 @@ Columns = dict[str, NDArray[Any]]
 def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Columns:
     """The columns of a file of points, (N,) each, by name.
 
-    Parameters
-    ----------
-    path : Path
-        A file of `CLOUD_SUFFIXES`.
-    columns : int or sequence of str, optional
-        Of files without names: how many numbers a point has, or their names. Of a ``.bin`` file, its content decides by
-        default.
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged, or of another kind.
-    OSError
-        If it cannot be read.
-    ImportError
-        If it takes a library that is not installed.
+    `columns` are those of files without names: how many numbers a point has, or their names. By default the content of
+    a ``.bin`` file decides.
     """
     check_regular_file(path)
     suffix = path.suffix.lower()

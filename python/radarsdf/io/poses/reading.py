@@ -115,13 +115,7 @@ class ScanPoses:
 
 
 def extrinsic_of(extrinsic: Any) -> NDArray[np.float64] | None:
-    """`extrinsic` as a checked T_base_sensor (4, 4), or None.
-
-    Raises
-    ------
-    ValueError
-        If it is not a rigid transform.
-    """
+    """`extrinsic` as a checked T_base_sensor (4, 4), or None."""
     return None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor")
 
 
@@ -216,15 +210,7 @@ def read_poses(
 
 
 def read_calibration(path: Path) -> NDArray[np.float64] | None:
-    """``Tr``, or ``Tr_velo_to_cam``, of a KITTI calibration, as T_camera_sensor (4, 4); None if the file has neither.
-
-    Raises
-    ------
-    ValueError
-        If it does not hold twelve numbers, or they are no rigid transform.
-    OSError
-        If the file cannot be read.
-    """
+    """``Tr``, or ``Tr_velo_to_cam``, of a KITTI calibration, as T_camera_sensor (4, 4); None if the file has neither."""
     check_regular_file(path)
     try:
         lines = [line.partition(":") for line in read_text(path).splitlines()]
@@ -290,13 +276,7 @@ def _stamped(table: NDArray[np.float64], path: Path, notes: Notes, lines: list[i
 def poses_or_nan(
     poses: NDArray[Any], name: str, notes: Notes, lines: Sequence[int] | None = None
 ) -> NDArray[np.float64]:
-    """Poses (F, 4, 4) in the order of scans. Those that are not finite or rigid are NaN, and named: their scans have none.
-
-    Raises
-    ------
-    ValueError
-        If no pose is rigid, or half of those that are finite are not.
-    """
+    """Poses (F, 4, 4) in the order of scans. Those that are not finite or rigid are NaN, and named: their scans have none."""
     if poses.ndim != 3 or poses.dtype.kind not in "iuf":
         msg = f"{name} must hold poses (F, 4, 4), not {poses.dtype} {poses.shape}"
         raise ValueError(msg)

@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,6 @@ MAX_GAP_S = 0.5
 _MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
 _ROUNDED_S = 1e-3
 _LISTED = 5  # poses that a note names
-_NEARLY_SAME = 1 - 1e-9  # cosine of half an angle so small that its sine and itself are equal to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +49,6 @@ class Trajectory:
         """Poses T_world_base (N, 4, 4) at the times (N,), s.
 
         Between two poses, the position is interpolated linearly and the rotation spherically (slerp).
-
-        Raises
-        ------
-        ValueError
-            If a time is not covered, or the poses before and after it are more than `max_gap_s` apart.
         """
         rotations, positions = self._at(times_s, max_gap_s)
         poses = np.tile(np.eye(4), (len(times_s), 1, 1))
@@ -65,45 +57,28 @@ class Trajectory:
         return poses
 
     def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
-        """Pose T_world_base (4, 4) at one time, s. None where `poses` would raise. Fast for one time of many poses.
+        """Pose T_world_base (4, 4) at one time, s. None where `poses` would raise.
 
-        A millisecond before the first pose or after the last one, or beside one in a longer gap, is at that pose: times in
-        files are rounded.
+        A millisecond before the first pose or after the last one, or next to one in a longer gap, is at that pose: times
+        in files are rounded.
         """
-        nearest_s = min(max(time_s, self.times_s[0]), self.times_s[-1])
-        time_s = nearest_s if abs(nearest_s - time_s) <= _ROUNDED_S else time_s
-        if not self.times_s[0] <= time_s <= self.times_s[-1]:
-            return None
-        after = int(np.searchsorted(self.times_s, time_s))
-        before = after if self.times_s[after] == time_s else after - 1
-        gap_s = self.times_s[after] - self.times_s[before]
-        if gap_s > max_gap_s:
-            nearest = before if time_s - self.times_s[before] < self.times_s[after] - time_s else after
-            if abs(self.times_s[nearest] - time_s) > _ROUNDED_S:
+        after = int(np.clip(np.searchsorted(self.times_s, time_s), 1, len(self.times_s) - 1))
+        both = slice(after - 1, after + 1)
+        first_s, last_s = self.times_s[both]
+        share = (time_s - first_s) / (last_s - first_s)
+        if not 0 <= share <= 1 or last_s - first_s > max_gap_s:
+            share = float(share > 0.5)
+            if not abs(time_s - (last_s if share else first_s)) <= _ROUNDED_S:
                 return None
-            before = after = nearest
-        share = 0.0 if before == after else (time_s - self.times_s[before]) / gap_s
         pose = np.eye(4)
-        pose[:3, :3] = _matrix(_slerp(self._quaternions[before], self._quaternions[after], share))
-        pose[:3, 3] = (1 - share) * self.positions[before] + share * self.positions[after]
+        pose[:3, :3] = Slerp([0, 1], self.rotations[both])(share).as_matrix()
+        pose[:3, 3] = (1 - share) * self.positions[after - 1] + share * self.positions[after]
         return pose
-
-    @cached_property
-    def _quaternions(self) -> NDArray[np.float64]:
-        """(P, 4) qx, qy, qz, qw of `rotations`."""
-        quaternions: NDArray[np.float64] = self.rotations.as_quat()
-        return quaternions
 
     def move(
         self, points: NDArray[np.float64], times_s: NDArray[np.float64], max_gap_s: float
     ) -> NDArray[np.float64]:
-        """Points (N, 3) in the world frame, m, of points (N, 3) in the moving frame, each with its own time (N,), s.
-
-        Raises
-        ------
-        ValueError
-            As `poses`.
-        """
+        """Points (N, 3) in the world frame, m, of points (N, 3) in the moving frame, each with its own time (N,), s."""
         if len(points) == 0:
             return points
         rotations, positions = self._at(times_s, max_gap_s)
@@ -127,30 +102,6 @@ class Trajectory:
             raise ValueError(msg)
         positions = [np.interp(times_s, self.times_s, self.positions[:, axis]) for axis in range(3)]
         return Slerp(self.times_s, self.rotations)(times_s), np.stack(positions, axis=1)
-
-
-def _slerp(first: NDArray[np.float64], last: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """The unit quaternion (4,) between two, on the shorter way. SciPy's takes ten times as long for one."""
-    cosine = float(first @ last)
-    if cosine < 0:
-        last, cosine = -last, -cosine
-    if cosine > _NEARLY_SAME:
-        mixed = (1 - share) * first + share * last
-    else:
-        angle = math.acos(cosine)
-        mixed = (math.sin((1 - share) * angle) * first + math.sin(share * angle) * last) / math.sin(angle)
-    unit: NDArray[np.float64] = mixed / math.sqrt(mixed @ mixed)
-    return unit
-
-
-def _matrix(quaternion: NDArray[np.float64]) -> list[list[float]]:
-    """The rotation matrix (3, 3) of a unit quaternion."""
-    x, y, z, w = quaternion.tolist()
-    return [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
 
 
 def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -178,11 +129,6 @@ def trajectory_of(
     """The trajectory in rows (P, 8) of time, position and quaternion, in any order, from these lines of a file.
 
     Of several poses at one time, the first counts. `notes` take what was left out.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two poses, or half of the quaternions have another length.
     """
     bad = ~(are_poses(table[:, 1:]) & np.isfinite(table[:, 0]))
     missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
@@ -218,15 +164,7 @@ def listed(mask: NDArray[np.bool_], lines: Sequence[int] | None) -> str:
 
 
 def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
-    """Reads a text file of finite numbers, (R, columns) float64, with comments after ``#``; None: of any poses.
-
-    Raises
-    ------
-    ValueError
-        If the file holds anything else.
-    OSError
-        If the file cannot be read.
-    """
+    """Reads a text file of finite numbers, (R, columns) float64, with comments after ``#``; None: of any poses."""
     wanted = "poses" if columns is None else f"{columns} columns of numbers"
     try:
         table = np.array(number_rows(path), np.float64)
