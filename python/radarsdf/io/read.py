@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import path_of, positions, positive
+from radarsdf.checks import check_pose, path_of, positions, positive
 from radarsdf.io.bags.reading import bags_in, is_bag, read_bags
 from radarsdf.io.clouds.fields import Cloud
 from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
@@ -28,7 +28,6 @@ from radarsdf.io.poses.reading import (
     NoPoses,
     ScanPoses,
     StampedPoses,
-    extrinsic_of,
     poses_of,
 )
 from radarsdf.io.poses.trajectory import MAX_GAP_S
@@ -149,7 +148,7 @@ def read(
         raise ValueError(msg)
     request = Request(
         poses=poses,
-        extrinsic=extrinsic_of(extrinsic),
+        extrinsic=None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor"),
         topic=(topic,) if isinstance(topic, str) else tuple(topic or ()),
         pose_topic=pose_topic,
         imu_topic=imu_topic,
@@ -303,12 +302,7 @@ def _truth(ground_truth: Any) -> Truth | None:
 
 
 def _check_exists(path: Path) -> None:
-    """Raises an OSError in plain words: many readers would say less."""
-    try:
-        path.stat()
-    except FileNotFoundError as error:
+    """Raises an error that names the path: many readers would not."""
+    if not path.exists():
         msg = f"{path} does not exist"
-        raise FileNotFoundError(msg) from error
-    except NotADirectoryError as error:
-        msg = f"{path} does not exist: a part of it is a file, not a folder"
-        raise FileNotFoundError(msg) from error
+        raise FileNotFoundError(msg)

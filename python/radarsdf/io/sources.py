@@ -339,7 +339,7 @@ def scans_of_files(
     request: Request,
     truth: Truth = lambda: None,
 ) -> Scans:
-    """Scans of one file each, with poses; `truth` is that beside them, if the request has none."""
+    """Scans of one file each, with poses; `truth` is that of the folder, if the request has none."""
     tables: list[Columns] | None = None
     columns: Any = request.columns
     if any(path.suffix.lower() == ".bin" for path in files):

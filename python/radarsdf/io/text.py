@@ -67,9 +67,14 @@ def check_header(words: list[str]) -> None:
         raise ValueError(msg)
 
 
+def separator_of(line: str) -> str | None:
+    """What separates the words of a line; None: white space."""
+    return next((sign for sign in (";", ",", "\t") if sign in line), None)
+
+
 def words_of(line: str) -> list[str]:
     """The words of a line, separated by commas, semicolons, tabs or else white space."""
-    separator = next((sign for sign in (",", ";", "\t") if sign in line), None)
+    separator = separator_of(line)
     line = line if separator else re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
     return [word.strip().strip('"') for word in line.split(separator)]
 

@@ -78,10 +78,9 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
             for connection in reader.connections:
                 if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
                     raise _damaged(path, ValueError("a topic has no name or no type"))
-                before = topics[connection.topic].count if connection.topic in topics else 0
-                topics[connection.topic] = Topic(
-                    connection.topic, _type_of(connection), before + connection.msgcount
-                )
+                name = connection.topic
+                count = connection.msgcount + (topics[name].count if name in topics else 0)
+                topics[name] = Topic(name, _type_of(connection), count)
     return topics
 
 
@@ -102,33 +101,26 @@ def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, T
     return {name: topic for name, topic in topics.items() if topic.message_type in types and topic.count}
 
 
-def messages_of(paths: list[Path], names: set[str]) -> Generator[Message, None, None]:
-    """The messages of some topics of bags, in the order in which they were recorded, one after another."""
+def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
+    """The messages of some topics of bags, in the order of their recording; damaged ones are left out, and noted in the end."""
+    numbers: Counter[str] = Counter()
+    damaged: dict[str, list[str]] = {}
     with ExitStack() as stack:
         streams = [stack.enter_context(closing(_stream(path, names))) for path in paths]
-        yield from heapq.merge(*streams, key=lambda message: message.recorded_s)
-
-
-def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
-    """The same with their content. Those that are damaged are left out, and noted in the end."""
-    numbers: Counter[str] = Counter()
-    damaged: Counter[str] = Counter()
-    first: dict[str, str] = {}
-    for message in messages_of(paths, names):
-        numbers[message.topic] += 1
-        try:
-            content = read_message(message.raw, message.message_type, message.cdr)
-        except ValueError as error:
-            damaged[message.topic] += 1
-            first.setdefault(
-                message.topic,
-                f"{message.bag}: message {numbers[message.topic] - 1} of {message.topic}, at {message.recorded_s:.3f} s, "
-                f"is not a whole {message.message_type}: {error}",
-            )
-            continue
-        yield replace(message, content=content, number=numbers[message.topic] - 1)
-    for topic, count in damaged.items():
-        notes.add(f"messages left out: {count} of {numbers[topic]}; the first: {first[topic]}")
+        for message in heapq.merge(*streams, key=lambda message: message.recorded_s):
+            topic, number = message.topic, numbers[message.topic]
+            numbers[topic] += 1
+            try:
+                content = read_message(message.raw, message.message_type, message.cdr)
+            except ValueError as error:
+                damaged.setdefault(topic, []).append(
+                    f"{message.bag}: message {number} of {topic}, at {message.recorded_s:.3f} s, is not a whole "
+                    f"{message.message_type}: {error}"
+                )
+                continue
+            yield replace(message, content=content, number=number)
+    for topic, texts in damaged.items():
+        notes.add(f"messages left out: {len(texts)} of {numbers[topic]}; the first: {texts[0]}")
 
 
 def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes | None) -> bool:

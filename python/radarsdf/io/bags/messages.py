@@ -322,7 +322,7 @@ _CLOUDS = {
     "ars548_messages/msg/DetectionList": _ars548_list,
     PACKETS: _nebula_packets,
 }
-_POSES = {
+_POSES: dict[str, Callable[[_Cursor], Any]] = {
     "nav_msgs/msg/Odometry": partial(_pose, child=True, behind=36 + 6 + 36),  # covariance, twist, covariance
     "geometry_msgs/msg/PoseStamped": _pose,
     "geometry_msgs/msg/PoseWithCovarianceStamped": partial(_pose, behind=36),
@@ -337,7 +337,7 @@ TRANSFORM_TYPES = tuple(_TRANSFORMS)
 
 
 def read_message(raw: bytes | memoryview, message_type: str, cdr: bool) -> Any:
-    """What a message says: a `CloudMessage`, a list of `PoseMessage` or an `ImuMessage`, by its type."""
+    """The content of a message: a `CloudMessage`, a list of `PoseMessage` or an `ImuMessage`, by its type."""
     try:
         cursor = _Cursor(raw, cdr)
         message = _LAYOUTS[message_type](cursor)

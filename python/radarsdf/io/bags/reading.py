@@ -42,14 +42,12 @@ KNOWN_TOPICS = {
 
 _RADAR = re.compile(r"radar|ars_?\d{3}|srr_?\d{3}|oculii|mmwave", re.IGNORECASE)
 _POINTS = re.compile(_RADAR.pattern + "|lidar|cloud|points|detection|target|packets", re.IGNORECASE)
-_STATUS = re.compile(
-    "status|info|config|diagnos|imu|odom|twist|velocity|speed|rate|accel|steer|direction", re.IGNORECASE
+_NO_POINTS = re.compile(
+    r"^(((std|sensor|nav|geometry|visualization|diagnostic|lifecycle|tf2)_msgs|tf|rcl_interfaces|dynamic_reconfigure|bond)/[^ ]+$)"
+    "|status|info|config|diagnos|imu|odom|twist|velocity|speed|rate|accel|steer|direction",
+    re.IGNORECASE,
 )
-"""In the names of types without points."""
-_STANDARD = re.compile(
-    r"((std|sensor|nav|geometry|visualization|diagnostic|lifecycle|tf2)_msgs|tf|rcl_interfaces|dynamic_reconfigure|bond)/[^ ]+$"
-)
-"""Types of packages whose other messages are no scans."""
+"""Types of messages that are no scans: of packages without others, or by their names."""
 _PAUSE_S = 0.02  # the points of a scan are sent at once; scans are 30 ms apart or more
 _PEEKED_SCANS, _PEEKED_POINTS = 10, 400  # messages that are looked at for the clock: several scans
 
@@ -171,9 +169,8 @@ def _is_radar(topic: Topic) -> bool:
 
 def _may_have_points(topic: Topic) -> bool:
     """Whether messages of a type that cannot be read are probably scans."""
-    kind = topic.message_type
-    named = _POINTS.search(f"{topic.name} {kind}") and not _STATUS.search(kind)
-    return bool(named) and not _STANDARD.match(kind)
+    named = _POINTS.search(f"{topic.name} {topic.message_type}")
+    return named is not None and not _NO_POINTS.search(topic.message_type)
 
 
 def _has_doppler(paths: list[Path], topic: Topic) -> bool:

@@ -60,18 +60,18 @@ DIALECTS = (
 """The twelve dialects. A cloud is read by the one of which it has the most fields, all of them."""
 
 _ALIASES: dict[str, tuple[str, ...]] = {
-    # For clouds of no dialect: the first name that a cloud has. Existing files of ours come first.
-    "intensity": ("power", "intensity", "rcs", "snr", "snr_db", "amplitude", "reflectivity", "reflectance", "magnitude",
-                  "rssi", "signal_power", "signal_strength"),
-    "doppler": ("doppler", "velocity", "doppler_velocity", "v_doppler_mps", "radial_speed", "radial_velocity",
-                "range_rate", "v_r", "vr", "speed", "rdot", "r_dot", "v_radial", "vrad", "v_rad", "vel_r", "vel",
-                "radial_vel", "velocity_radial", "doppler_speed", "v_doppler", "rangerate", "relative_velocity"),
-    "range": ("range", "distance", "r", "rng", "dist", "radius", "slant_range"),
-    "azimuth": ("azimuth", "azimuth_angle", "az", "azi", "azim", "angle_azimuth"),
-    "elevation": ("elevation", "elevation_angle", "el", "ele", "elev", "angle_elevation"),
-    "sigma_range": ("sigma_range", "range_std", "rangestd"),
-    "sigma_azimuth": ("sigma_azimuth", "azimuth_std", "azimuthstd"),
-    "sigma_elevation": ("sigma_elevation", "elevation_std", "elevationstd"),
+    # For clouds of no dialect: the first name that a cloud has, without what separates words. Files of ours come first.
+    "intensity": ("power", "intensity", "rcs", "snr", "snrdb", "amplitude", "reflectivity", "reflectance", "magnitude",
+                  "rssi", "signalpower", "signalstrength"),
+    "doppler": ("doppler", "velocity", "dopplervelocity", "vdopplermps", "radialspeed", "radialvelocity", "rangerate",
+                "vr", "speed", "rdot", "vradial", "vrad", "velr", "vel", "radialvel", "velocityradial",
+                "dopplerspeed", "vdoppler", "relativevelocity"),
+    "range": ("range", "distance", "r", "rng", "dist", "radius", "slantrange"),
+    "azimuth": ("azimuth", "azimuthangle", "az", "azi", "azim", "angleazimuth"),
+    "elevation": ("elevation", "elevationangle", "el", "ele", "elev", "angleelevation"),
+    "sigma_range": ("sigmarange", "rangestd"),
+    "sigma_azimuth": ("sigmaazimuth", "azimuthstd"),
+    "sigma_elevation": ("sigmaelevation", "elevationstd"),
 }  # fmt: skip
 
 COLUMNS: dict[int, tuple[str, ...]] = {
@@ -112,19 +112,16 @@ class Cloud:
     """Returns that were left out, since a coordinate or the intensity was not finite."""
 
     @classmethod
-    def of_finite(
-        cls, points: NDArray[Any], intensities: NDArray[Any] | None, *others: NDArray[Any] | None
-    ) -> Cloud:
+    def of_finite(cls, points: NDArray[Any], intensities: Any, doppler_mps: Any, sigma: Any) -> Cloud:
         """The returns whose coordinates and intensity are finite, with their Doppler and deviations."""
-        arrays = (points, intensities, *others)
         # All at once first: that is usual, and row by row takes twenty times as long.
         if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
-            return cls(*arrays, dropped=0)
+            return cls(points, intensities, doppler_mps, sigma, 0)
         finite = np.isfinite(points).all(axis=1)
         if intensities is not None:
             finite &= np.isfinite(intensities)
-        kept = (None if array is None else array[finite] for array in arrays)
-        return cls(*kept, dropped=int((~finite).sum()))
+        kept = [None if array is None else array[finite] for array in (intensities, doppler_mps, sigma)]
+        return cls(points[finite], kept[0], kept[1], kept[2], int((~finite).sum()))
 
     def scan(self, T_world_sensor: NDArray[np.float64], time_s: float | None) -> Scan:
         """These returns with the pose and the time of the scan."""
@@ -152,15 +149,14 @@ class Fields:
         """
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
-        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
+        # AzimuthAngle, azimuth_angle and Azimuth Angle are one name.
+        squeezed = {re.sub(r"[\W_]+", "", name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
         dialect = _dialect(lower)
         if dialect is not None:
             found = {role: lower[name] for role, name in _roles(dialect).items()}
         for role, aliases in ({axis: (axis,) for axis in _XYZ} | _ALIASES).items():
-            name = next(
-                (squeezed[_squeezed(alias)] for alias in aliases if _squeezed(alias) in squeezed), None
-            )
+            name = next((squeezed[alias] for alias in aliases if alias in squeezed), None)
             if role not in found and name is not None and name not in found.values():
                 found[role] = name
         for role, field in (overrides or {}).items():
@@ -207,7 +203,7 @@ class Fields:
         return replace(self, in_degrees=in_degrees)
 
     def note_use(self, names: Iterable[str], notes: Notes, *, chosen: bool) -> None:
-        """Says what to know of the numbers, and which of these fields are passed over, unless a user has chosen some."""
+        """Notes what to know of the numbers, and which fields are not used, unless a user has chosen some."""
         if self.dialect is not None and self.dialect.note:
             notes.add(self.dialect.note)
         if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
@@ -230,12 +226,9 @@ class Fields:
                 msg = f"{what}: the field {name} holds no numbers"
                 raise ValueError(msg)
         with np.errstate(over="ignore"):  # too large a number becomes infinite, and is dropped
-            others = (
-                self._column(columns, "intensity"),
-                self._column(columns, "doppler"),
-                self._sigma(columns),
-            )
-        return Cloud.of_finite(self._positions(columns), *others)
+            intensities, doppler_mps = (self._column(columns, role) for role in ("intensity", "doppler"))
+            sigma = self._sigma(columns)
+        return Cloud.of_finite(self._positions(columns), intensities, doppler_mps, sigma)
 
     def check_no_more(self, others: Fields, what: str, first: str) -> None:
         """Raises a ValueError if the cloud `what` has a role that these fields, of the cloud `first`, leave out."""
@@ -287,11 +280,6 @@ class Fields:
 def plain_name(name: str) -> tuple[str, str]:
     """A name in lower case as radars give it, and its unit: without the prefix of CloudCompare."""
     return without_unit(name.lower().removeprefix("scalar_"))
-
-
-def _squeezed(name: str) -> str:
-    """A name without what separates its words: AzimuthAngle, azimuth_angle and Azimuth Angle are one."""
-    return re.sub(r"[\W_]+", "", name)
 
 
 def _roles(dialect: Dialect) -> dict[str, str]:

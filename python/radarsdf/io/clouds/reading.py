@@ -30,6 +30,7 @@ from radarsdf.io.text import (
     check_header,
     numbers_of,
     read_text,
+    separator_of,
     text_rows,
     with_points,
     without_comment,
@@ -38,7 +39,6 @@ from radarsdf.io.text import (
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
 _PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
-_SEPARATORS = (";", ",", "\t", None)  # None: any white space
 
 Columns = dict[str, NDArray[Any]]
 
@@ -58,9 +58,7 @@ def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Colu
         return _NAMED[suffix](path) if suffix in _NAMED else _NAMELESS[suffix](path, columns)
     except (ImportError, MemoryError):
         raise
-    except (
-        BaseException
-    ) as error:  # libraries raise exceptions of many kinds for damaged files, OSError among them
+    except BaseException as error:  # libraries raise many kinds for damaged files, OSError among them
         if isinstance(error, OSError) and error.filename is not None:
             raise
         if not isinstance(error, Exception) and type(error).__name__ != _PANIC:
@@ -80,8 +78,8 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        (M, 3) float64, frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places them; the world's, if :func:`radarsdf.io.write_cloud` wrote an origin beside
-        it. Points that are not finite are left out.
+        (M, 3) float64, frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places them; the world's, if
+        :func:`radarsdf.io.write_cloud` wrote an origin next to it. Points that are not finite are left out.
 
     Raises
     ------
@@ -127,10 +125,7 @@ def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
     if not first:
         return {name: np.zeros(0) for name in names_of(3, None)}
     first = without_comment(first.lstrip("/#% "))  # names may be after a comment sign
-    separator = next(s for s in _SEPARATORS if s is None or s in first)
-    words = (
-        words_of(first) if separator is None else [word.strip().strip('"') for word in first.split(separator)]
-    )
+    separator, words = separator_of(first), words_of(first)
     header = not are_numbers(words)
     if header:
         check_header(words)
@@ -194,7 +189,7 @@ _NAMELESS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
     ".npy": _npy,
     **dict.fromkeys(TEXT_SUFFIXES, _text),
 }
-"""Readers of formats that may not, and are told the names."""
+"""Readers of formats that may not."""
 
 CLOUD_SUFFIXES = (*_NAMED, *_NAMELESS)
 """What :func:`read_columns` reads."""

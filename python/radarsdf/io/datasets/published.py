@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sized
 from pathlib import Path
 from typing import Protocol
 
@@ -87,9 +88,7 @@ class MscRad4R:
         stamps = read_table(folder / "3_RADAR" / "timestamp_radar.txt", 3)
         files = sorted((folder / "3_RADAR" / "PCD").glob("*.pcd"), key=natural)
         times_s = [float(seconds + 1e-9 * nanoseconds) for _, seconds, nanoseconds in stamps]
-        if len(times_s) != len(files):
-            msg = f"{folder}: timestamp_radar.txt has {len(times_s)} lines for {len(files)} scans"
-            raise ValueError(msg)
+        _check_count(times_s, files, folder / "3_RADAR" / "timestamp_radar.txt")
         return _of_files(files, times_s, request.extrinsic, request)
 
 
@@ -112,16 +111,12 @@ class ColoRadar:
         clouds = folder / "single_chip" / "pointclouds"
         files = sorted((clouds / "data").glob("radar_pointcloud_*.bin"), key=natural)
         times_s = read_table(clouds / "timestamps.txt", 1)[:, 0].tolist()
-        if len(times_s) != len(files):
-            msg = f"{clouds}: timestamps.txt has {len(times_s)} lines for {len(files)} scans"
-            raise ValueError(msg)
+        _check_count(times_s, files, clouds / "timestamps.txt")
         poses = request.poses
         if poses is None:
             stamps = read_table(folder / "groundtruth" / "timestamps.txt", 1)[:, 0]
             table = read_table(folder / "groundtruth" / "groundtruth_poses.txt", 7)
-            if len(stamps) != len(table):
-                msg = f"{folder}: groundtruth has {len(stamps)} times for {len(table)} poses"
-                raise ValueError(msg)
+            _check_count(stamps, table, folder / "groundtruth" / "timestamps.txt")
             poses = trajectory_of(
                 np.column_stack([stamps, table]), f"{folder / 'groundtruth'}", request.notes
             )
@@ -296,6 +291,12 @@ def _of_files(
         msg = "the folder of the scans is empty"
         raise ValueError(msg)
     return scans_of_files(files, times_s, poses_of(request.poses, request.notes), T_base_sensor, request)
+
+
+def _check_count(times: Sized, wanted: Sized, path: Path) -> None:
+    if len(times) != len(wanted):
+        msg = f"{path} has {len(times)} lines for {len(wanted)} scans or poses"
+        raise ValueError(msg)
 
 
 def _say_without_extrinsic(name: str, poses: str, request: Request) -> None:

@@ -114,11 +114,6 @@ class ScanPoses:
         return T_world_sensor
 
 
-def extrinsic_of(extrinsic: Any) -> NDArray[np.float64] | None:
-    """`extrinsic` as a checked T_base_sensor (4, 4), or None."""
-    return None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor")
-
-
 def poses_of(
     poses: Any, notes: Notes, calibration: Sequence[Path] = ()
 ) -> StampedPoses | NDArray[np.float64]:
