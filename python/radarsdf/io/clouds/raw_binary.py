@@ -102,8 +102,10 @@ def _tables(paths: list[Path], dtype: str, widths: Sequence[int]) -> dict[int, N
             numbers = [np.fromfile(path, dtype, _MAX_NUMBERS // width * width) for path in whole]
             with np.errstate(invalid="ignore"):  # bytes of another type
                 table = np.concatenate(numbers).reshape(-1, width).astype(np.float64)
-            if _are_returns(table):  # logarithms, so that no column has all of the variance
-                tables[width] = np.nan_to_num(np.sign(table) * np.log1p(np.abs(table)), posinf=0, neginf=0)
+            if _are_returns(table):
+                table = table[np.isfinite(table).all(axis=1)]
+                # Logarithms, so that no column has all of the variance.
+                tables[width] = np.sign(table) * np.log1p(np.abs(table))
     return tables
 
 
@@ -121,13 +123,13 @@ def _are_returns(table: NDArray[np.float64]) -> bool:
 def _variance(table: NDArray[np.float64]) -> float:
     """Within columns, unbiased."""
     rest = table.size - table.shape[1]
-    return float(table.var(axis=0).sum()) * len(table) / rest if rest else np.inf
+    return float(table.var(axis=0).sum()) * len(table) / rest if rest > 0 else np.inf
 
 
 def _chance(table: NDArray[np.float64], width: int = 1) -> float:
     """The probability that columns explain so much more than those of a smaller `width`, or than a single one."""
     more, rest = table.shape[1] - width, table.size - table.shape[1]
-    if more == 0 or rest == 0 or table.shape[1] % width:
+    if more == 0 or rest <= 0 or table.shape[1] % width:
         return 1.0
     within = table.var(axis=0).sum() * len(table)
     total = table.reshape(-1, width).var(axis=0).sum() * table.size / width
