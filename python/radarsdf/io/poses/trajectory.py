@@ -73,7 +73,8 @@ class Trajectory:
             if not abs(time_s - (last_s if share else first_s)) <= _ROUNDED_S:
                 return None
         pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_quat(_slerp(*self.rotations[both].as_quat(), share)).as_matrix()
+        first, last = self.rotations[both].as_quat()
+        pose[:3, :3] = Rotation.from_quat(_slerp(first, last, share)).as_matrix()
         pose[:3, 3] = (1 - share) * self.positions[after - 1] + share * self.positions[after]
         return pose
 
