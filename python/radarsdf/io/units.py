@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from radarsdf.io.scans import Notes
 
-SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "km/h": 1 / 3.6,
-          "kmh": 1 / 3.6, "mrad": 1e-3, **dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180)}  # fmt: skip
+SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "mrad": 1e-3,
+          **dict.fromkeys(("km/h", "kmh", "kph"), 1 / 3.6),
+          **dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180)}  # fmt: skip
 """Units in names of columns, in m, s, m/s or rad."""
 
 _UNIT = re.compile(
-    r"[\s_]+(m|cm|mm|km|s|ms|us|ns|rad|mrad|radians?|deg|degrees?|mps|kmh|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
+    r"[\s_]+(m|cm|mm|km|s|ms|us|ns|rad|mrad|radians?|deg|degrees?|mps|kmh|kph|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
 )
 _SINCE_1970 = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
 _LIMITS = (1e11, 1e14, 1e17)  # of the absolute times since 1970, from one of these units to the next
