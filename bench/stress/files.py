@@ -22,7 +22,7 @@ from radarsdf.io import read
 from radarsdf.io.ground_truth import read_ground_truth
 from radarsdf.io.meshes import read_mesh
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.trajectory import read_trajectory
+from radarsdf.io.poses.trajectory import read_table, trajectory_of
 from tqdm import tqdm
 
 from bench.paper.report import markdown
@@ -63,7 +63,7 @@ def _scans(path: Path) -> None:
 
 
 def _trajectory(path: Path) -> None:
-    trajectory = read_trajectory(path)
+    trajectory = trajectory_of(read_table(path, 8), str(path))
     assert len(trajectory.times_s) == len(trajectory.positions) == len(trajectory.rotations) >= 2
 
 
@@ -102,7 +102,7 @@ READERS = {
     "eval: mesh": Reader(_mesh, "mesh.ply", samples.meshes),
     "load": Reader(_load, "map.safetensors", samples.maps, samples.hostile_map),
     "read_scans": Reader(_scans, "scans.npz", samples.scans, samples.hostile_scans),
-    "read_trajectory": Reader(_trajectory, "poses.txt", samples.trajectories),
+    "trajectory_of": Reader(_trajectory, "poses.txt", samples.trajectories),
     "folder: scan": Reader(_folder, "radar/100.0.pcd", samples.clouds),
     "folder: poses": Reader(_folder, "poses.txt", samples.trajectories),
     "folder: mounting": Reader(_folder, "base_T_radar.txt", samples.transforms),

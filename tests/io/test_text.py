@@ -11,7 +11,7 @@ from radarsdf.config import toml
 from radarsdf.io import read
 from radarsdf.io.clouds.reading import read_columns
 from radarsdf.io.poses.reading import read_calibration, read_poses
-from radarsdf.io.poses.trajectory import read_trajectory
+from radarsdf.io.poses.trajectory import read_table, trajectory_of
 from radarsdf.io.scans import Notes
 from radarsdf.io.text import number_rows
 
@@ -45,7 +45,10 @@ def test_the_same_numbers_in_all_layouts(tmp_path, layout, encoding):
     (tmp_path / "a.csv").write_bytes(LAYOUTS[layout](ROWS).encode(encoding))
     assert_array_equal(np.transpose(list(read_columns(tmp_path / "a.csv").values())), ROWS)
     (tmp_path / "poses.txt").write_bytes(LAYOUTS[layout](TUM).encode(encoding))
-    for trajectory in (read_poses(tmp_path / "poses.txt", Notes()), read_trajectory(tmp_path / "poses.txt")):
+    for trajectory in (
+        read_poses(tmp_path / "poses.txt", Notes()),
+        trajectory_of(read_table(tmp_path / "poses.txt"), ""),
+    ):
         assert_array_equal(trajectory.times_s, TUM[:, 0])
         assert_array_equal(trajectory.positions, TUM[:, 1:4])
 

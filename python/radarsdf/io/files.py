@@ -27,13 +27,6 @@ def check_regular_file(path: str | PathLike[str]) -> None:
     """Raises unless `path` is a regular file that can be read.
 
     Pipes and devices are refused: reading them could block forever, or never end.
-
-    Raises
-    ------
-    ValueError
-        If `path` is a pipe, a socket or a device.
-    OSError
-        If it is a folder, does not exist, or cannot be read.
     """
     if not Path(path).is_dir() and not stat.S_ISREG(Path(path).stat().st_mode):
         msg = f"{path} is not a regular file"
@@ -77,13 +70,6 @@ def check_outputs(
     """Raises unless each output can be written, and is neither an input nor another output. To be called before the work.
 
     A path that is None is ignored. Links are followed.
-
-    Raises
-    ------
-    ValueError
-        If an output is the same file as an input or another output, or exists and is no regular file.
-    OSError
-        If an output's folder does not exist or cannot be written to, or the output is a folder.
     """
     taken = {os.path.realpath(path): path for path in inputs if path is not None}
     for path in outputs:
@@ -117,13 +103,6 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
     ------
     file
         Open for writing, and empty. If the block raises, it is removed, and the old file is as before.
-
-    Raises
-    ------
-    ValueError
-        If `path` is a pipe, a socket or a device: it would be replaced by a file.
-    OSError
-        If the file cannot be written.
     """
     target = Path(os.path.realpath(path_of(path, "path")))
     mode = _check_target(target, path)

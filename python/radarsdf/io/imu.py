@@ -55,13 +55,7 @@ class Imu:
 
 
 def checked_rotation(R_sensor_imu: ArrayLike) -> FloatArray:
-    """`R_sensor_imu` as a rotation (3, 3); of a rigid transform (4, 4), its rotation.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
+    """`R_sensor_imu` as a rotation (3, 3); of a rigid transform (4, 4), its rotation."""
     matrix: FloatArray = real_array(R_sensor_imu, "R_sensor_imu")
     whole = np.eye(4)
     if matrix.shape not in ((3, 3), (4, 4)):

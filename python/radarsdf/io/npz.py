@@ -136,15 +136,7 @@ def _imu(arrays: dict[str, NDArray[Any]], path: str | PathLike[str]) -> Imu | No
 
 
 def array_in(path: Path) -> NDArray[Any]:
-    """The array of an ``.npy`` file, as a memory map: a header that claims more than the file holds is refused.
-
-    Raises
-    ------
-    ValueError
-        If it is no such file, or damaged.
-    OSError
-        If it cannot be read.
-    """
+    """The array of an ``.npy`` file, as a memory map: a header that claims more than the file holds is refused."""
     check_regular_file(path)
     try:
         array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -184,15 +176,7 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[
 def write_arrays(
     path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
 ) -> None:
-    """Writes the ``.npz`` that :func:`arrays_of` reads, whole or not at all.
-
-    Raises
-    ------
-    ValueError
-        If an array has Python's objects: they are pickled, and would not be read.
-    OSError
-        If the file cannot be written.
-    """
+    """Writes the ``.npz`` that :func:`arrays_of` reads, whole or not at all."""
     for name, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
             msg = f"{name} has objects of Python, which are not written"

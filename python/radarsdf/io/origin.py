@@ -45,15 +45,7 @@ def write_origin(path: str | PathLike[str], origin: NDArray[np.float64] | None) 
 
 
 def origin_of(path: str | PathLike[str]) -> NDArray[np.float64] | None:
-    """(3,) the origin of a file in a local frame, world, m. None if none is written beside it.
-
-    Raises
-    ------
-    ValueError
-        If what is written there is damaged.
-    OSError
-        If it cannot be read.
-    """
+    """(3,) the origin of a file in a local frame, world, m. None if none is written next to it."""
     beside = origin_path(path)
     if not beside.is_file():
         return None

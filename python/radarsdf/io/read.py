@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import path_of, positions, positive
+from radarsdf.checks import check_pose, path_of, positions, positive
 from radarsdf.io.bags.reading import bags_in, is_bag, read_bags
+from radarsdf.io.clouds.fields import Cloud
 from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
 from radarsdf.io.datasets import published
 from radarsdf.io.datasets.folders import base_T_radar, lidar_map
@@ -27,7 +28,6 @@ from radarsdf.io.poses.reading import (
     NoPoses,
     ScanPoses,
     StampedPoses,
-    extrinsic_of,
     poses_of,
 )
 from radarsdf.io.poses.trajectory import MAX_GAP_S
@@ -39,6 +39,7 @@ from radarsdf.io.sources import (
     Truth,
     cloud_files,
     in_order_of_time,
+    note_viewpoint,
     scan_poses,
     scans_of_files,
     viewpoint_poses,
@@ -147,7 +148,7 @@ def read(
         raise ValueError(msg)
     request = Request(
         poses=poses,
-        extrinsic=extrinsic_of(extrinsic),
+        extrinsic=None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor"),
         topic=(topic,) if isinstance(topic, str) else tuple(topic or ()),
         pose_topic=pose_topic,
         imu_topic=imu_topic,
@@ -234,6 +235,7 @@ def _files(files: list[Path], folder: Path, request: Request, truth: Truth = lam
         places = dict.fromkeys((Path(poses).parent, *places))
     calibrations = [place / name for place in places for name in _CALIBRATIONS]
     given = poses_of(poses, request.notes, calibrations)
+    note_viewpoint(files[0], request.notes)
     files, times_s, given = in_order_of_time(files, given, request.notes)
     T_base_sensor = request.extrinsic if request.extrinsic is not None else base_T_radar(folder)
     return scans_of_files(files, times_s, given, T_base_sensor, request, truth)
@@ -265,15 +267,10 @@ def _npz(path: Path, request: Request) -> Scans:
             if T_world_sensor is None:
                 request.notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s), 1)
                 continue
-            finite = np.isfinite(scan.points).all(axis=1)
-            if scan.intensities is not None:
-                finite &= np.isfinite(scan.intensities)
-            request.notes.count(NOT_FINITE, int((~finite).sum()))
-            if finite.any():
-                rows = slice(None) if finite.all() else finite
-                parts = (scan.intensities, scan.doppler_mps, scan.sigma)
-                values, doppler, sigma = (None if part is None else part[rows] for part in parts)
-                yield Scan(scan.points[rows], T_world_sensor, values, doppler, scan.time_s, sigma)
+            cloud = Cloud.of_finite(scan.points, scan.intensities, scan.doppler_mps, scan.sigma)
+            request.notes.count(NOT_FINITE, cloud.dropped)
+            if len(cloud.points):
+                yield cloud.scan(T_world_sensor, scan.time_s)
 
     imu = scans.imu
     if imu is not None and request.R_sensor_imu is not None:
@@ -305,12 +302,7 @@ def _truth(ground_truth: Any) -> Truth | None:
 
 
 def _check_exists(path: Path) -> None:
-    """Raises an OSError in plain words: many readers would say less."""
-    try:
-        path.stat()
-    except FileNotFoundError as error:
+    """Raises an error that names the path: many readers would not."""
+    if not path.exists():
         msg = f"{path} does not exist"
-        raise FileNotFoundError(msg) from error
-    except NotADirectoryError as error:
-        msg = f"{path} does not exist: a part of it is a file, not a folder"
-        raise FileNotFoundError(msg) from error
+        raise FileNotFoundError(msg)

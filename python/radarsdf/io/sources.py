@@ -15,14 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.clouds.fields import Fields
+from radarsdf.io.clouds.fields import Fields, names_of, plain_name
 from radarsdf.io.clouds.pcd import read_viewpoint
 from radarsdf.io.clouds.raw_binary import KITTI, bin_layout
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, names_of, read_columns
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, Columns, read_columns
 from radarsdf.io.poses.reading import POSE_FILES, ScanPoses, StampedPoses
-from radarsdf.io.poses.trajectory import MAX_GAP_S, TIME_UNITS, Trajectory, in_seconds
+from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory
 from radarsdf.io.scans import Notes, Scan, Scans
-from radarsdf.io.text import number_rows, without_unit
+from radarsdf.io.text import number_rows
+from radarsdf.io.units import SCALES, in_seconds, unit_since_1970, without_unit
 
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
 """Names of files with a time, s, for each scan, one a line."""
@@ -32,9 +33,6 @@ SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD
 
 NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 """What a note says of such returns, after their number."""
-
-VIEWPOINTS = "poses: VIEWPOINT of the PCD files"
-"""What a note says of them."""
 
 WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
 """What it says of such scans."""
@@ -57,8 +55,6 @@ _NOT_SCANS = {
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply beside the scans is their ground truth
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
-_UNITS = ((17, 1e-9), (14, 1e-6), (11, 1e-3))  # more digits than this: the unit of a time without a point, s
-
 
 Truth = Callable[[], NDArray[np.float64] | None]
 """Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
@@ -114,20 +110,20 @@ def posed(
 
     def source() -> Iterator[Scan]:
         fields_of: dict[str, tuple[Fields, RawScan, list[str]]] = {}
-        first_s: float | None = None
-        taken = 0
-        matched: ScanPoses | None = None
+        taken, missed = 0, None
         for before, raw in enumerate(raw_scans()):
             own = poses(raw.frame) if callable(poses) else poses
             if own is None:
                 notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}", 1)
                 continue
-            matched = own
             T_world_sensor = own.of(before if raw.number is None else raw.number, raw.time_s)
             if T_world_sensor is None:
-                first_s = raw.time_s if first_s is None else first_s
                 if not isinstance(own.poses, np.ndarray):  # else it was named when the poses were read
                     notes.count(WITHOUT_POSES.format(gap_s=own.max_gap_s), 1)
+                    missed = (
+                        missed
+                        or f"the first scan is at {raw.time_s:.3f} s, the poses are from {own.poses.span()}"
+                    )
                 continue
             taken += 1
             columns = _read(raw, notes)
@@ -151,16 +147,10 @@ def posed(
             if len(cloud.points) == 0:
                 notes.count(_NO_RETURNS, 1)
                 continue
-            yield Scan(
-                cloud.points, T_world_sensor, cloud.intensities, cloud.doppler_mps, raw.time_s, cloud.sigma
-            )
-        if taken or first_s is None or matched is None or isinstance(matched.poses, np.ndarray):
-            return
-        msg = (
-            f"{notes.about}: no scan has a pose: the first scan is at {first_s:.3f} s, the poses are from {matched.poses.span()}, "
-            f"and a gap between poses may be {matched.max_gap_s} s: are both of one clock?"
-        )
-        raise ValueError(msg)
+            yield cloud.scan(T_world_sensor, raw.time_s)
+        if missed and not taken:
+            msg = f"{notes.about}: no scan has a pose: {missed}, and a gap between poses may be {request.max_gap_s} s: are both of one clock?"
+            raise ValueError(msg)
 
     return source
 
@@ -291,8 +281,7 @@ def _time_of(stem: str) -> float | None:
         return None
     if "." in found[1]:
         return float(found[1])
-    unit = next((unit for digits, unit in _UNITS if len(found[1]) > digits), 1.0)
-    return int(found[1]) * unit
+    return int(found[1]) * unit_since_1970(int(found[1]))[1]
 
 
 def _listed_times(path: Path, count: int, notes: Notes) -> list[float]:
@@ -304,7 +293,7 @@ def _listed_times(path: Path, count: int, notes: Notes) -> list[float]:
     if len(times) != count:
         msg = f"{path} has {len(times)} times for {count} scans"
         raise ValueError(msg)
-    seconds: list[float] = in_seconds(times, path, notes).tolist()
+    seconds: list[float] = in_seconds(times, path.name, notes).tolist()
     if len(set(seconds)) < count:
         notes.add(f"{path.name} has the same time for several scans")
     return seconds
@@ -317,13 +306,7 @@ def scan_poses(
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
 ) -> tuple[ScanPoses, Sequence[float] | None]:
-    """Which pose each of `count` scans has, and the times of the scans as far as they are then known.
-
-    Raises
-    ------
-    ValueError
-        If poses in order are not as many as the scans, or scans without time stamps meet poses that have them.
-    """
+    """Which pose each of `count` scans has, and the times of the scans as far as they are then known."""
     T = np.eye(4) if T_base_sensor is None else T_base_sensor
     if isinstance(poses, np.ndarray):
         if len(poses) != count:
@@ -356,20 +339,11 @@ def scans_of_files(
     request: Request,
     truth: Truth = lambda: None,
 ) -> Scans:
-    """Scans of one file each, with poses; `truth` is that beside them, if the request has none.
-
-    Raises
-    ------
-    ValueError
-        As :func:`scan_poses`.
-    """
+    """Scans of one file each, with poses; `truth` is that of the folder, if the request has none."""
     tables: list[Columns] | None = None
     columns: Any = request.columns
-    suffixes = {path.suffix.lower() for path in files}
-    if ".bin" in suffixes:
+    if any(path.suffix.lower() == ".bin" for path in files):
         columns = bin_columns(files, columns, request.notes)
-    if ".pcd" in suffixes:
-        note_viewpoint(files[0], request.notes)
     if len(files) == 1:
         tables, times_s, poses = _split(files[0], columns, times_s, poses, request.notes)
     count = len(files) if tables is None else len(tables)
@@ -399,7 +373,7 @@ def _split(
         table = read_columns(path, columns)
     except ValueError:  # which is said when the scan is read
         return None, times_s, poses
-    plain = {without_unit(name.lower().removeprefix("scalar_"))[0]: name for name in reversed(table)}
+    plain = {plain_name(name)[0]: name for name in reversed(table)}
     number = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
     time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
     one_pose = isinstance(poses, np.ndarray) and len(poses) == 1
@@ -415,8 +389,8 @@ def _split(
         notes.add(f"{path.name}: {len(table[key]) - len(rows)} rows left out: their {key} is not a number")
     order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
     if time is not None and table[time].dtype.kind in "iuf":
-        scale = TIME_UNITS.get(without_unit(time)[1], 1.0)
-        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path, notes).tolist()
+        scale = SCALES.get(without_unit(time)[1], 1.0)
+        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
     if (
         isinstance(poses, np.ndarray)
         and len(poses) > len(values)
@@ -443,15 +417,8 @@ def bin_columns(files: list[Path], columns: Any, notes: Notes) -> Any:
     return layout
 
 
-def note_viewpoint(path: Path, notes: Notes) -> None:
-    """Says that the ``VIEWPOINT`` of scans is where they were taken, which poses say, too: it is not applied twice."""
-    with contextlib.suppress(ValueError):
-        if (read_viewpoint(path) != np.eye(4)).any() and VIEWPOINTS not in notes.lines:
-            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")
-
-
 def viewpoint_poses(files: list[Path], notes: Notes) -> NDArray[np.float64] | None:
-    """T_world_sensor (F, 4, 4) of the ``VIEWPOINT`` of PCD files, if they tell where the scans were taken."""
+    """T_world_sensor (F, 4, 4) of the ``VIEWPOINT`` of PCD files, if it is where each scan was taken."""
     if {path.suffix.lower() for path in files} != {".pcd"}:
         return None
     poses = np.full((len(files), 4, 4), np.nan)
@@ -461,5 +428,12 @@ def viewpoint_poses(files: list[Path], notes: Notes) -> NDArray[np.float64] | No
     known = poses[np.isfinite(poses).all(axis=(1, 2))]
     if not len(known) or (known == (np.eye(4) if len(files) == 1 else known[0])).all():
         return None
-    notes.add(VIEWPOINTS)
+    notes.add("poses: VIEWPOINT of the PCD files")
     return poses
+
+
+def note_viewpoint(path: Path, notes: Notes) -> None:
+    """Notes that the ``VIEWPOINT`` of a scan is not applied where poses are given: it would place the scan twice."""
+    with contextlib.suppress(ValueError):
+        if path.suffix.lower() == ".pcd" and (read_viewpoint(path) != np.eye(4)).any():
+            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")

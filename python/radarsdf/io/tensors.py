@@ -62,15 +62,6 @@ def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[T
     ------
     TensorFile
         Its arrays are of this `framework`, as ``safetensors.safe_open`` has it.
-
-    Raises
-    ------
-    SafetensorError
-        If it is no such file, or cut off.
-    ValueError
-        If its header is damaged.
-    OSError
-        If it cannot be read.
     """
     with in_utf8(path) as readable, safe_open(readable, framework=framework) as file:
         yield TensorFile(file)

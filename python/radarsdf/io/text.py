@@ -28,21 +28,12 @@ _COMMENT = re.compile("(" + "|".join(COMMENTS) + ").*")
 _DECIMAL_COMMA = r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?"
 _IN_CELL = re.compile(rf"(?:^|;)[ \t]*{_DECIMAL_COMMA}(?=[ \t]*(?:;|$))", re.MULTILINE)
 
-_UNIT = re.compile(
-    r"[\s_]+(m|cm|mm|km|s|ms|us|ns|rad|mrad|radians?|deg|degrees?|mps|kmh|kph|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
-)
-
 
 def read_text(path: Path) -> str:
     """The text of a file, with a line feed after each line.
 
     It is in UTF-8, or in another encoding of Unicode that a byte order mark names, which is left out. What does not
     decode, such as a comment in Latin-1, becomes replacement characters. Lines may end as those of any system.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
     """
     data = path.read_bytes()
     encoding = next((encoding for mark, encoding in _MARKS if data.startswith(mark)), "utf-8")
@@ -50,13 +41,7 @@ def read_text(path: Path) -> str:
 
 
 def with_points(text: str) -> str:
-    """The same numbers with decimal points, if there are decimal commas: then semicolons separate numbers.
-
-    Raises
-    ------
-    ValueError
-        If there are decimal commas, and numbers are separated by spaces: it could be twice as many numbers.
-    """
+    """The same numbers with decimal points, if there are decimal commas: then semicolons separate numbers."""
     bare = map(without_comment, text.split("\n"))
     rows = list(itertools.islice(filter(None, bare), 2))  # a line of names, and one of numbers
     if any(";" in row for row in rows):
@@ -82,19 +67,16 @@ def check_header(words: list[str]) -> None:
         raise ValueError(msg)
 
 
+def separator_of(line: str) -> str | None:
+    """What separates the words of a line; None: white space."""
+    return next((sign for sign in (";", ",", "\t") if sign in line), None)
+
+
 def words_of(line: str) -> list[str]:
     """The words of a line, separated by commas, semicolons, tabs or else white space."""
-    separator = next((sign for sign in (",", ";", "\t") if sign in line), None)
+    separator = separator_of(line)
     line = line if separator else re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
     return [word.strip().strip('"') for word in line.split(separator)]
-
-
-def without_unit(name: str) -> tuple[str, str]:
-    """The name of a column in lower case without its unit, and the unit: of ``azimuth_deg``, ``x [m]``, ``time(ns)``."""
-    found = _UNIT.search(name.strip().lower())
-    if found is None or not found.start():
-        return name.strip().lower(), ""
-    return name.strip().lower()[: found.start()], found[1] if found[1] is not None else found[2].strip()
 
 
 def text_rows(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]:
@@ -102,13 +84,6 @@ def text_rows(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]
 
     Names are above the rows: comments after ``#``, ``//`` or ``%``, or a line without a number. Words of a row are
     separated by commas, semicolons or white space. Other comments and blank lines are left out.
-
-    Raises
-    ------
-    ValueError
-        If the numbers have decimal commas between spaces.
-    OSError
-        If the file cannot be read.
     """
     heads: list[list[str]] = []
     rows: list[tuple[int, list[str]]] = []
@@ -127,15 +102,7 @@ def text_rows(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]
 
 
 def number_rows(path: Path) -> list[list[str]]:
-    """The rows of a text file of numbers, without names above them; see :func:`text_rows`.
-
-    Raises
-    ------
-    ValueError
-        If a row has a word that is no number, or another number of words than the first.
-    OSError
-        If the file cannot be read.
-    """
+    """The rows of a text file of numbers, without names above them; see :func:`text_rows`."""
     _, rows = text_rows(path)
     for number, words in rows:
         if not are_numbers(words):

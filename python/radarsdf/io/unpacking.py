@@ -30,13 +30,7 @@ def check_unpacked(unpacked: int, packed: int, what: str) -> None:
 
 
 def unpack(packed: bytes, decompressor: Callable[[], Any], what: str) -> bytes:
-    """Unpacks with decompressors such as `bz2.BZ2Decompressor`, one for each stream in the bytes.
-
-    Raises
-    ------
-    ValueError
-        If the bytes are cut off, or unpack to too many.
-    """
+    """Unpacks with decompressors such as `bz2.BZ2Decompressor`, one for each stream in the bytes."""
     parts: list[bytes] = []
     rest, total = packed, 0
     while rest:

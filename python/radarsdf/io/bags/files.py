@@ -13,6 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from radarsdf.extras import require
 from radarsdf.io.bags.messages import read_message
 from radarsdf.io.files import check_regular_file, in_utf8
@@ -67,13 +70,7 @@ def bags_in(folder: Path) -> list[Path]:
 
 
 def topics_of(paths: list[Path]) -> dict[str, Topic]:
-    """The topics of bags, by name.
-
-    Raises
-    ------
-    ValueError, OSError, ImportError
-        If a bag cannot be read.
-    """
+    """The topics of bags, by name."""
     topics: dict[str, Topic] = {}
     with ExitStack() as stack:
         for path in paths:
@@ -81,10 +78,9 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
             for connection in reader.connections:
                 if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
                     raise _damaged(path, ValueError("a topic has no name or no type"))
-                before = topics[connection.topic].count if connection.topic in topics else 0
-                topics[connection.topic] = Topic(
-                    connection.topic, _type_of(connection), before + connection.msgcount
-                )
+                name = connection.topic
+                count = connection.msgcount + (topics[name].count if name in topics else 0)
+                topics[name] = Topic(name, _type_of(connection), count)
     return topics
 
 
@@ -105,45 +101,38 @@ def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, T
     return {name: topic for name, topic in topics.items() if topic.message_type in types and topic.count}
 
 
-def messages_of(paths: list[Path], names: set[str]) -> Generator[Message, None, None]:
-    """The messages of some topics of bags, in the order in which they were recorded, one after another.
-
-    Raises
-    ------
-    ValueError, OSError, ImportError
-        If a bag cannot be read.
-    """
+def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
+    """The messages of some topics of bags, in the order of their recording; damaged ones are left out, and noted in the end."""
+    numbers: Counter[str] = Counter()
+    damaged: dict[str, list[str]] = {}
     with ExitStack() as stack:
         streams = [stack.enter_context(closing(_stream(path, names))) for path in paths]
-        yield from heapq.merge(*streams, key=lambda message: message.recorded_s)
+        for message in heapq.merge(*streams, key=lambda message: message.recorded_s):
+            topic, number = message.topic, numbers[message.topic]
+            numbers[topic] += 1
+            try:
+                content = read_message(message.raw, message.message_type, message.cdr)
+            except ValueError as error:
+                damaged.setdefault(topic, []).append(
+                    f"{message.bag}: message {number} of {topic}, at {message.recorded_s:.3f} s, is not a whole "
+                    f"{message.message_type}: {error}"
+                )
+                continue
+            yield replace(message, content=content, number=number)
+    for topic, texts in damaged.items():
+        notes.add(f"messages left out: {len(texts)} of {numbers[topic]}; the first: {texts[0]}")
 
 
-def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
-    """The same with their content. Those that are damaged are left out, and noted in the end.
-
-    Raises
-    ------
-    ValueError, OSError, ImportError
-        As :func:`messages_of`.
-    """
-    numbers: Counter[str] = Counter()
-    damaged: Counter[str] = Counter()
-    first: dict[str, str] = {}
-    for message in messages_of(paths, names):
-        numbers[message.topic] += 1
-        try:
-            content = read_message(message.raw, message.message_type, message.cdr)
-        except ValueError as error:
-            damaged[message.topic] += 1
-            first.setdefault(
-                message.topic,
-                f"{message.bag}: message {numbers[message.topic] - 1} of {message.topic}, at {message.recorded_s:.3f} s, "
-                f"is not a whole {message.message_type}: {error}",
-            )
-            continue
-        yield replace(message, content=content, number=numbers[message.topic] - 1)
-    for topic, count in damaged.items():
-        notes.add(f"messages left out: {count} of {numbers[topic]}; the first: {first[topic]}")
+def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes | None) -> bool:
+    """Whether record times stand for the header stamps of `what`: as wanted, or where these are zero or stand still."""
+    if wanted is not None:
+        return wanted == "record"
+    if stamps.any() and (len(stamps) == 1 or (stamps != stamps[0]).any()):
+        return False
+    if notes is not None:
+        why = "stand still" if stamps.any() else "are zero"
+        notes.add(f"the header stamps of {what} {why}: the record time is used instead")
+    return True
 
 
 def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
@@ -210,10 +199,12 @@ def _damaged(path: Path, error: Exception) -> ValueError:
     if isinstance(error, MemoryError):  # rosbags reads as many bytes as a damaged size says
         why = "a size in it is larger than the memory"
     why = _QUOTED.sub(r"\1", why).rstrip(".")
-    way_out = ""
+    remedy = ""
     if path.suffix.lower() == _ROS1_SUFFIX and "index" in why.lower():
-        way_out = f"; if its recording was cut off, rosbag reindex {path.name} may mend it"
+        remedy = f"; if its recording was cut off, rosbag reindex {path.name} may repair it"
     elif "end magic" in why:
         files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        way_out = f"; if its recording was cut off, mcap recover {files[0].name} may mend it" if files else ""
-    return ValueError(f"{path} is not a whole bag: {why}{way_out}")
+        remedy = (
+            f"; if its recording was cut off, mcap recover {files[0].name} may repair it" if files else ""
+        )
+    return ValueError(f"{path} is not a whole bag: {why}{remedy}")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from radarsdf.io.bags.files import Topic, read_messages, topics_with
+from radarsdf.io.bags.files import Topic, by_record, read_messages, topics_with
 from radarsdf.io.bags.messages import IMU, Header, ImuMessage
 from radarsdf.io.bags.poses import static_between
 from radarsdf.io.imu import Imu
@@ -19,13 +19,7 @@ __all__ = ["imu_in_bags", "imu_topic"]
 
 
 def imu_topic(topics: dict[str, Topic], request: Request) -> Topic | None:
-    """The topic of the IMU: the wanted one, or the only one. None: there is none, or nobody says which of several.
-
-    Raises
-    ------
-    ValueError
-        If the wanted one is no topic of an IMU.
-    """
+    """The topic of the IMU: the wanted one, or the only one. None: there is none, or none is named of several."""
     fitting = topics_with([IMU], topics)
     listed = ", ".join(sorted(fitting))
     if request.imu_topic is not None:
@@ -44,12 +38,12 @@ def imu_in_bags(
     paths: list[Path],
     topic: Topic,
     sensor_frame: str,
-    by_record: bool,
+    recorded_scans: bool,
     request: Request,
 ) -> Imu | None:
     """What the topic holds; None if it has no gyroscope.
 
-    `by_record`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
+    `recorded_scans`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
     from stamp to record, because messages of an IMU are recorded several at a time.
     """
     stamps_s, recorded_s, rates, forces = (array("d") for _ in range(4))
@@ -65,14 +59,9 @@ def imu_in_bags(
         rates.extend(measured.angular_velocity)
         forces.extend(measured.specific_force or (np.nan,) * 3)
     stamps, recorded = np.array(stamps_s), np.array(recorded_s)
-    moving = len(np.unique(stamps)) > 1
-    if not moving and not by_record:
-        request.notes.add(
-            f"the stamps of {topic.name} are zero or stand still: the record time is used instead"
-        )
-    times_s = recorded if not moving else stamps
-    if moving and by_record:
-        times_s = stamps + np.median(recorded - stamps)
+    times_s = recorded
+    if not by_record(stamps, topic.name, None, None if recorded_scans else request.notes):
+        times_s = stamps + np.median(recorded - stamps) if recorded_scans else stamps
     table = np.column_stack([np.array(rates).reshape(-1, 3), np.array(forces).reshape(-1, 3)])
     order = np.argsort(times_s, kind="stable")
     finite = order[np.isfinite(table[order, :3]).all(axis=1)]

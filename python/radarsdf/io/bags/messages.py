@@ -12,6 +12,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -280,35 +281,21 @@ def _ars548_columns(
     return columns | {n: returns[n] for n in ("rcs", "range_std", "azimuth_std", "elevation_std")}
 
 
-def _odometry(cursor: _Cursor) -> list[PoseMessage]:
-    header, child = cursor.header(), cursor.string().lstrip("/")
-    values = cursor.doubles(7)
-    cursor.doubles(36 + 6 + 36)  # covariance, twist, covariance
-    return [PoseMessage(header, child, values)]
-
-
-def _pose_stamped(cursor: _Cursor) -> list[PoseMessage]:
-    return [PoseMessage(cursor.header(), "", cursor.doubles(7))]
-
-
-def _pose_with_covariance(cursor: _Cursor) -> list[PoseMessage]:
-    pose = PoseMessage(cursor.header(), "", cursor.doubles(7))
-    cursor.doubles(36)
+def _pose(cursor: _Cursor, *, child: bool = False, behind: int = 0) -> list[PoseMessage]:
+    """One pose; whether the message names the child frame, and how many numbers are behind the pose."""
+    header = cursor.header()
+    pose = PoseMessage(header, cursor.string().lstrip("/") if child else "", cursor.doubles(7))
+    cursor.doubles(behind)
     return [pose]
 
 
 def _path(cursor: _Cursor) -> list[PoseMessage]:
     cursor.header()
-    return [PoseMessage(cursor.header(), "", cursor.doubles(7)) for _ in range(cursor.take("I"))]
-
-
-def _transform_stamped(cursor: _Cursor) -> list[PoseMessage]:
-    header, child = cursor.header(), cursor.string().lstrip("/")
-    return [PoseMessage(header, child, cursor.doubles(7))]
+    return [_pose(cursor)[0] for _ in range(cursor.take("I"))]
 
 
 def _transforms(cursor: _Cursor) -> list[PoseMessage]:
-    return [_transform_stamped(cursor)[0] for _ in range(cursor.take("I"))]
+    return [_pose(cursor, child=True)[0] for _ in range(cursor.take("I"))]
 
 
 def _imu(cursor: _Cursor) -> ImuMessage:
@@ -335,11 +322,11 @@ _CLOUDS = {
     "ars548_messages/msg/DetectionList": _ars548_list,
     PACKETS: _nebula_packets,
 }
-_POSES = {
-    "nav_msgs/msg/Odometry": _odometry,
-    "geometry_msgs/msg/PoseStamped": _pose_stamped,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_with_covariance,
-    "geometry_msgs/msg/TransformStamped": _transform_stamped,
+_POSES: dict[str, Callable[[_Cursor], Any]] = {
+    "nav_msgs/msg/Odometry": partial(_pose, child=True, behind=36 + 6 + 36),  # covariance, twist, covariance
+    "geometry_msgs/msg/PoseStamped": _pose,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": partial(_pose, behind=36),
+    "geometry_msgs/msg/TransformStamped": partial(_pose, child=True),
     PATH: _path,
 }
 _TRANSFORMS = {"tf2_msgs/msg/TFMessage": _transforms, "tf/msg/tfMessage": _transforms}
@@ -350,13 +337,7 @@ TRANSFORM_TYPES = tuple(_TRANSFORMS)
 
 
 def read_message(raw: bytes | memoryview, message_type: str, cdr: bool) -> Any:
-    """What a message says: a `CloudMessage`, a list of `PoseMessage` or an `ImuMessage`, by its type.
-
-    Raises
-    ------
-    ValueError
-        If its bytes do not have the layout of its type.
-    """
+    """The content of a message: a `CloudMessage`, a list of `PoseMessage` or an `ImuMessage`, by its type."""
     try:
         cursor = _Cursor(raw, cdr)
         message = _LAYOUTS[message_type](cursor)

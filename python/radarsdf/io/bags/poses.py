@@ -8,14 +8,13 @@ import re
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property, reduce
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from radarsdf.io.bags.files import read_messages, topics_of, topics_with
+from radarsdf.io.bags.files import by_record, read_messages, topics_of, topics_with
 from radarsdf.io.bags.messages import PATH, POSE_TYPES, TRANSFORM_TYPES, PoseMessage
 from radarsdf.io.poses.reading import (
     FIND_POSES,
@@ -23,9 +22,8 @@ from radarsdf.io.poses.reading import (
     ScanPoses,
     StampedPoses,
     TransformChain,
-    trajectory_of,
 )
-from radarsdf.io.poses.trajectory import Trajectory
+from radarsdf.io.poses.trajectory import Trajectory, are_poses, pose_matrices_of, trajectory_of
 from radarsdf.io.scans import Notes
 from radarsdf.io.sources import Request
 
@@ -34,7 +32,6 @@ FindPoses = Callable[[str], ScanPoses | None]
 
 _STATIC = "static"  # in the name of a topic whose transforms hold for all times: /tf_static
 _SAME = 1e-9  # a transform that changes by no more is constant, though it is published again and again
-_MIN_QUATERNION, _MAX_QUATERNION = 0.49, 1.01  # largest of the four numbers of a unit quaternion
 _NOT_MEASURED = re.compile(
     r"goal|set_?point|way_?point|initial_?pose|desired|(^|[/_.-])(plans?|planned|planner|target|cmd)(?![a-z])",
     re.IGNORECASE,
@@ -53,62 +50,49 @@ class _Track:
 
     parent: str
     child: str = ""
-    stamps_s: array[float] = field(default_factory=lambda: array("d"))
-    recorded_s: array[float] = field(default_factory=lambda: array("d"))
-    values: array[float] = field(default_factory=lambda: array("d"))
     static: bool = False
+    numbers: array[float] = field(default_factory=lambda: array("d"))
+    """Of each pose: stamp, record time, x, y, z, qx, qy, qz, qw."""
 
     def add(self, pose: PoseMessage, recorded_s: float) -> None:
-        self.stamps_s.append(pose.header.stamp_s)
-        self.recorded_s.append(recorded_s)
-        self.values.extend(pose.values)
+        self.numbers.extend((pose.header.stamp_s, recorded_s, *pose.values))
 
-    def usable(self) -> NDArray[np.bool_]:
-        """Mask (P,) of poses that are finite, with a unit quaternion."""
-        table = np.frombuffer(self.values, np.float64).reshape(-1, 7)
-        largest = np.abs(table[:, 3:]).max(axis=1)  # not the length, whose square overflows
-        unit = (largest >= _MIN_QUATERNION) & (largest <= _MAX_QUATERNION)
-        mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
-        return mask
-
+    @cached_property
     def table(self) -> NDArray[np.float64]:
-        """(P, 7) x, y, z, qx, qy, qz, qw of those that are usable."""
-        return np.frombuffer(self.values, np.float64).reshape(-1, 7)[self.usable()]
+        """(P, 9) all poses."""
+        return np.array(self.numbers).reshape(-1, 9)
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """Mask (P,) of those that are poses."""
+        return are_poses(self.table[:, 2:])
+
+    @cached_property
+    def constant(self) -> bool:
+        poses = self.table[self.usable, 2:]
+        return self.static or bool((np.abs(poses - poses[0]) <= _SAME).all())
+
+    @cached_property
+    def matrix(self) -> NDArray[np.float64]:
+        """(4, 4) of a constant transform."""
+        matrix: NDArray[np.float64] = pose_matrices_of(self.table[self.usable, 2:][-1:])[0]
+        return matrix
 
     def extent(self, max_gap_s: float) -> tuple[float, int]:
         """The time in which there are poses, to 0.1 s, and their number."""
-        gaps_s = np.diff(np.frombuffer(self.recorded_s, np.float64))
-        return round(float(gaps_s[gaps_s <= max_gap_s].sum()), 1), len(self.recorded_s)
-
-    def is_constant(self) -> bool:
-        table = self.table()
-        return self.static or bool((np.abs(table - table[0]) <= _SAME).all())
-
-    def matrix(self) -> NDArray[np.float64]:
-        """(4, 4) of a constant transform."""
-        row = self.table()[-1]
-        pose = np.eye(4)
-        pose[:3, 3] = row[:3]
-        pose[:3, :3] = Rotation.from_quat(row[3:]).as_matrix()
-        return pose
+        gaps_s = np.diff(self.table[:, 1])
+        return round(float(gaps_s[gaps_s <= max_gap_s].sum()), 1), len(self.table)
 
     def trajectory(self, name: str, request: Request, notes: Notes | None = None) -> Trajectory:
-        usable, stamps = self.usable(), np.frombuffer(self.stamps_s, np.float64)
+        table, usable = self.table, self.usable
         if notes is not None and not usable.all():
+            first = int(np.argmin(usable))
             notes.add(
                 f"poses of {name} left out: {(~usable).sum()} of {len(usable)} are not finite, or have no unit quaternion; "
-                f"the first, pose {np.argmin(usable)}, was recorded at {self.recorded_s[int(np.argmin(usable))]:.3f} s"
+                f"the first, pose {first}, was recorded at {table[first, 1]:.3f} s"
             )
-        if (
-            request.stamps == "record"
-            or not stamps.any()
-            or (len(stamps) > 1 and (stamps == stamps[0]).all())
-        ):
-            if notes is not None and request.stamps is None:
-                notes.add(f"the stamps of {name} are zero or stand still: the record time is used instead")
-            stamps = np.frombuffer(self.recorded_s, np.float64)
-        table = self.table()
-        return trajectory_of(stamps[usable], table[:, :3], table[:, 3:], name)
+        clock = int(by_record(table[:, 0], name, request.stamps, notes))
+        return trajectory_of(table[usable][:, [clock, *range(2, 9)]], name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +102,7 @@ class _Candidate:
     agrees: bool
     """Whether its frames are connected with that of the scans."""
     names_child: bool
-    """Whether it says whose poses it has."""
+    """Whether it names the frame whose poses it has."""
     poses: StampedPoses
     interval_s: float
 
@@ -130,59 +114,31 @@ def poses_in_bags(
     preferred: str | None,
     scan_times_s: Callable[[], NDArray[np.float64]],
 ) -> FindPoses:
-    """Poses by time in bags.
+    """Poses of each frame of scans, by time; `frames` are those of the first scans.
 
-    Parameters
-    ----------
-    paths : list of Path
-        The bags.
-    request : Request
-        What the user wants: `pose_topic`, `extrinsic`, `world_frame`, `stamps`. Its notes say what was chosen.
-    frames : list of str
-        The frames of the first scans, as their messages say.
-    preferred : str or None
-        The topic of poses that is taken before others, if it is there.
-    scan_times_s : callable
-        Reads the times of the scans, for a choice among several topics.
-
-    Returns
-    -------
-    callable
-        Gives the poses of a frame of scans.
-
-    Raises
-    ------
-    ValueError, OSError, ImportError
-        If there are no poses, or several topics that could be meant.
+    The topic `preferred` is taken before others; `scan_times_s` is called only for a choice among several.
     """
     notes = request.notes
     topics = topics_of(paths)
     transforms = set(topics_with(TRANSFORM_TYPES, topics))
     fitting = topics_with(POSE_TYPES, topics)
     wanted = request.pose_topic
-    of_tree = wanted is not None and (
-        wanted in transforms or (wanted.strip("/") == "tf" and bool(transforms))
-    )
+    of_tree = wanted in transforms or (wanted is not None and wanted.strip("/") == "tf" and bool(transforms))
     if wanted is not None and not of_tree and wanted not in fitting:
         listed = ", ".join(sorted([*fitting, *transforms]))
         msg = f"{paths[0]} has no poses in {wanted}: topics with poses are {listed or 'none'}"
         raise ValueError(msg)
-    passed_over = {
-        name: "a goal, a plan or the like, by its name" for name in fitting if _NOT_MEASURED.search(name)
-    }
-    names = {wanted} & set(fitting) if wanted is not None else set(fitting) - set(passed_over)
+    passed_over = {n: "a goal, a plan or the like, by its name" for n in fitting if _NOT_MEASURED.search(n)}
+    names = set(fitting) - set(passed_over) if wanted is None else {wanted} & set(fitting)
     tracks, tree = _tracks_and_tree(paths, names, transforms, request)
     sensor = next((frame for frame in frames if frame in tree), frames[0])
-    if of_tree:
-        return _of_tree(tree, sensor, request)
+    name = wanted
     if wanted is None:
         name = _chosen(tracks, tree, sensor, passed_over, preferred, scan_times_s, request)
         for other, why in sorted(passed_over.items()):
             notes.add(f"poses of {other} are passed over ({why}); pose_topic chooses them")
-        if name is None:
-            return _of_tree(tree, sensor, request)
-    else:
-        name = wanted
+    if of_tree or name is None:
+        return _of_tree(tree, sensor, request)
     track = tracks.get(name)
     if track is None:
         msg = f"{paths[0]}: {name} holds no poses"
@@ -224,6 +180,7 @@ def _chosen(
     request: Request,
 ) -> str | None:
     """The topic of the poses; None means TF. Says why others are passed over."""
+    about = request.notes.about
     candidates: dict[str, _Candidate] = {}
     for name, track in tracks.items():
         try:
@@ -236,13 +193,11 @@ def _chosen(
         if track.child and sensor in tree:
             agrees = agrees and _fixed(tree, track.child, sensor) is not None
         candidates[name] = _Candidate(agrees, bool(track.child), trajectory, _interval_s(trajectory))
-    about = request.notes.about
     try:
         of_tree = _of_tree(tree, sensor, request, quiet=True)(sensor) if tree else None
         if of_tree is not None and isinstance(of_tree.poses, TransformChain):
-            candidates[_TF] = _Candidate(
-                True, True, of_tree.poses, max(map(_interval_s, of_tree.poses.moving()))
-            )
+            interval_s = max(map(_interval_s, of_tree.poses.moving()))
+            candidates[_TF] = _Candidate(True, True, of_tree.poses, interval_s)
     except ValueError as error:
         if not candidates:
             msg = f"{error}{_listed(passed_over)}"
@@ -278,22 +233,20 @@ def _unfit(
     some = times_s[:: max(1, len(times_s) // _SAMPLES)].tolist()
     positions_m = {name: _positions_m(c.poses, some, max_gap_s) for name, c in candidates.items()}
     covered = {name: float(np.isfinite(xyz[:, 0]).mean()) for name, xyz in positions_m.items()}
-    best = max(covered.values())
+    half = max(covered.values()) / 2
+    connected = any(c.agrees and covered[name] > half for name, c in candidates.items())
     unfit: dict[str, str] = {}
-    if any(c.agrees and covered[name] > best / 2 for name, c in candidates.items()):
-        unfit = {
-            n: "its frames do not lead to that of the scans" for n, c in candidates.items() if not c.agrees
-        }
     for name, c in candidates.items():
-        if c.names_child or _TF not in candidates:
-            continue
-        both = np.isfinite(positions_m[name] + positions_m[_TF]).all(axis=1)
-        own_m, of_tree_m = (_length_m(positions_m[n][both]) for n in (name, _TF))
-        if abs(own_m - of_tree_m) > _SAME_LENGTH_M + _SAME_LENGTH * max(own_m, of_tree_m):
-            unfit.setdefault(name, f"it moved {own_m:.1f} m, the sensor {of_tree_m:.1f} m by TF")
-    best = max(share for name, share in covered.items() if name not in unfit)
+        if connected and not c.agrees:
+            unfit[name] = "its frames do not lead to that of the scans"
+        elif not c.names_child and _TF in candidates:
+            both = np.isfinite(positions_m[name] + positions_m[_TF]).all(axis=1)
+            own_m, of_tree_m = (_length_m(positions_m[n][both]) for n in (name, _TF))
+            if abs(own_m - of_tree_m) > _SAME_LENGTH_M + _SAME_LENGTH * max(own_m, of_tree_m):
+                unfit[name] = f"it moved {own_m:.1f} m, the sensor {of_tree_m:.1f} m by TF"
+    enough = _NEARLY_ALL * max(share for name, share in covered.items() if name not in unfit)
     unfit |= {
-        n: f"it covers {share:.0%} of the scans" for n, share in covered.items() if share < _NEARLY_ALL * best
+        name: f"it covers {share:.0%} of the scans" for name, share in covered.items() if share < enough
     }
     fastest_s = min(c.interval_s for name, c in candidates.items() if name not in unfit)
     for name, c in candidates.items():
@@ -317,11 +270,11 @@ def _base(track: _Track, name: str, tree: dict[str, _Track], sensor: str, notes:
     base = track.child
     if not base and sensor in tree:
         chain = _ancestors(tree, sensor)
-        rigid = [tree[frame].is_constant() and tree[frame].parent != track.parent for frame in chain[:-1]]
+        rigid = [tree[frame].constant and tree[frame].parent != track.parent for frame in chain[:-1]]
         base = chain[rigid.index(False) if False in rigid else len(rigid)]
         if base != sensor:
             notes.add(f"{name} names no child frame: its poses are taken as those of {base}")
-    if base and base == sensor and track.child:
+    if track.child and track.child == sensor:
         return sensor
     if base and base != sensor and _fixed(tree, base, sensor) is not None:
         notes.add(f"extrinsic: of the static transforms, {base} -> {sensor}")
@@ -350,21 +303,18 @@ def _tracks_and_tree(
                 tracks[name] = _Track(pose.header.frame, static=_STATIC in message.topic)
             tracks[name].child = pose.child
             tracks[name].add(pose, message.recorded_s)
-    choices: dict[str, list[_Track]] = {}
-    for child, parents in edges.items():
-        usable = [track for track in parents.values() if track.usable().any()]
-        if usable:
-            choices[child] = sorted(usable, key=lambda track: track.extent(request.max_gap_s), reverse=True)
-    tree = {child: options[0] for child, options in choices.items()}
+    choices = {child: [t for t in parents.values() if t.usable.any()] for child, parents in edges.items()}
+    for options in choices.values():
+        options.sort(key=lambda track: track.extent(request.max_gap_s), reverse=True)
+    tree = {child: options[0] for child, options in choices.items() if options}
     for child, options in choices.items():
-        if len(options) == 1:
-            continue
-        for track in (*options, options[0]):
-            tree[child] = track
-            if _moves(tree, child, request.world_frame):
-                break
-        listed = ", ".join(f"{track.parent} ({len(track.stamps_s)} transforms)" for track in options)
-        request.notes.add(f"{child} has several parents in TF, {listed}: {tree[child].parent} is used")
+        if len(options) > 1:
+            moving = (
+                track for track in options if _moves({**tree, child: track}, child, request.world_frame)
+            )
+            tree[child] = next(moving, options[0])
+            listed = ", ".join(f"{track.parent} ({len(track.table)} transforms)" for track in options)
+            request.notes.add(f"{child} has several parents in TF, {listed}: {tree[child].parent} is used")
     return by_topic, tree
 
 
@@ -375,7 +325,7 @@ def _moves(tree: dict[str, _Track], frame: str, world: str | None) -> bool:
     except ValueError:
         return False
     above = world is None or world.lstrip("/") in chain
-    return above and not all(tree[child].is_constant() for child in chain[:-1])
+    return above and not all(tree[child].constant for child in chain[:-1])
 
 
 def _ancestors(tree: dict[str, _Track], frame: str) -> list[str]:
@@ -393,28 +343,22 @@ def _ancestors(tree: dict[str, _Track], frame: str) -> list[str]:
 def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: bool = False) -> FindPoses:
     """Poses of the frames below the world."""
     notes = None if quiet else request.notes
-    moving = [child for child, track in tree.items() if not track.is_constant()]
+    moving = [child for child, track in tree.items() if not track.constant]
     base = sensor
     if request.extrinsic is not None or sensor not in tree:
         # The frame that moves and has no other moving frame below it.
-        above = {frame for child in moving for frame in _ancestors(tree, child)[1:]}
-        lowest = [child for child in moving if child not in above]
+        lowest = set(moving) - {frame for child in moving for frame in _ancestors(tree, child)[1:]}
         if request.extrinsic is None or len(lowest) != 1:
             msg = (
                 f"{request.notes.about}: the transforms do not lead to the frame of the scans, {sensor or '(unnamed)'}: they have "
                 f"{', '.join(sorted(tree)) or 'no frames'}; give extrinsic, the pose of the radar in the frame that moves"
             )
             raise (ValueError if moving else NoPoses)(msg)
-        base = lowest[0]
+        (base,) = lowest
     chain = _ancestors(tree, base)
-    if request.world_frame is None:
-        world = _world(tree, chain, request)
-        if notes is not None and world in tree:
-            notes.add(
-                f"TF above {world} is passed over: it changes rarely; world_frame chooses another world"
-            )
-    else:
-        world = request.world_frame.lstrip("/")
+    world = _world(tree, chain, request)
+    if notes is not None and request.world_frame is None and world in tree:
+        notes.add(f"TF above {world} is passed over: it changes rarely; world_frame chooses another world")
     if world not in chain:
         msg = f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}"
         raise ValueError(msg)
@@ -428,8 +372,8 @@ def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: b
             return None
         chain = chain[: chain.index(world) + 1]
         links = [
-            tree[child].matrix()
-            if tree[child].is_constant()
+            tree[child].matrix
+            if tree[child].constant
             else tree[child].trajectory(f"TF from {tree[child].parent} to {child}", request, notes)
             for child in reversed(chain[:-1])
         ]
@@ -454,8 +398,10 @@ def _of_tree(tree: dict[str, _Track], sensor: str, request: Request, *, quiet: b
 
 
 def _world(tree: dict[str, _Track], chain: list[str], request: Request) -> str:
-    """The root; but the frame below it where that is corrected rarely, and its own poses are dense."""
-    moving = [frame for frame in chain[:-1] if not tree[frame].is_constant()]
+    """The wanted one, or the root; but the frame below it where that is corrected rarely, and its own poses are dense."""
+    if request.world_frame is not None:
+        return request.world_frame.lstrip("/")
+    moving = [frame for frame in chain[:-1] if not tree[frame].constant]
     intervals_s = [_interval_s(tree[frame].trajectory(frame, request)) for frame in moving]
     if len(moving) > 1 and intervals_s[-1] > max(_SLOW_S, _SLOWER * min(intervals_s)):
         return moving[-1]
@@ -473,16 +419,10 @@ def _fixed(tree: dict[str, _Track], base: str, sensor: str) -> NDArray[np.float6
     common = next((frame for frame in up_sensor if frame in up_base), None)
     if common is None:
         return None
-    down = up_sensor[: up_sensor.index(common)]
-    up = up_base[: up_base.index(common)]
-    if not all(tree[frame].is_constant() for frame in (*down, *up)):
-        return None
-    return np.linalg.inv(_product(tree, up)) @ _product(tree, down)
-
-
-def _product(tree: dict[str, _Track], upwards: list[str]) -> NDArray[np.float64]:
-    """T_top_frame of constant transforms, from the lowest frame upwards."""
-    pose = np.eye(4)
-    for frame in upwards:
-        pose = tree[frame].matrix() @ pose
-    return pose
+    T_common = []
+    for frames in (up_base[: up_base.index(common)], up_sensor[: up_sensor.index(common)]):
+        if not all(tree[frame].constant for frame in frames):
+            return None
+        T_common.append(reduce(np.matmul, (tree[frame].matrix for frame in reversed(frames)), np.eye(4)))
+    T_base_sensor: NDArray[np.float64] = np.linalg.inv(T_common[0]) @ T_common[1]
+    return T_base_sensor

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.bags.files import Topic, bags_in, is_bag, read_messages, topics_of, topics_with
+from radarsdf.io.bags.files import Topic, bags_in, by_record, is_bag, read_messages, topics_of, topics_with
 from radarsdf.io.bags.imu import imu_in_bags, imu_topic
 from radarsdf.io.bags.messages import CLOUD_TYPES, PACKETS, POINT_A_MESSAGE, CloudMessage
 from radarsdf.io.bags.poses import FindPoses, attached, poses_in_bags, transforms_of
@@ -42,14 +42,12 @@ KNOWN_TOPICS = {
 
 _RADAR = re.compile(r"radar|ars_?\d{3}|srr_?\d{3}|oculii|mmwave", re.IGNORECASE)
 _POINTS = re.compile(_RADAR.pattern + "|lidar|cloud|points|detection|target|packets", re.IGNORECASE)
-_STATUS = re.compile(
-    "status|info|config|diagnos|imu|odom|twist|velocity|speed|rate|accel|steer|direction", re.IGNORECASE
+_NO_POINTS = re.compile(
+    r"^(((std|sensor|nav|geometry|visualization|diagnostic|lifecycle|tf2)_msgs|tf|rcl_interfaces|dynamic_reconfigure|bond)/[^ ]+$)"
+    "|status|info|config|diagnos|imu|odom|twist|velocity|speed|rate|accel|steer|direction",
+    re.IGNORECASE,
 )
-"""In the names of types without points."""
-_STANDARD = re.compile(
-    r"((std|sensor|nav|geometry|visualization|diagnostic|lifecycle|tf2)_msgs|tf|rcl_interfaces|dynamic_reconfigure|bond)/[^ ]+$"
-)
-"""Types of packages whose other messages are no scans."""
+"""Types of messages that are no scans: of packages without others, or by their names."""
 _PAUSE_S = 0.02  # the points of a scan are sent at once; scans are 30 ms apart or more
 _PEEKED_SCANS, _PEEKED_POINTS = 10, 400  # messages that are looked at for the clock: several scans
 
@@ -68,10 +66,13 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.header.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
-    by_record = {topic.name: _by_record(peeked[topic.name], topic, request) for topic in scan_topics}
+    by_recording = {}
+    for name, clouds in peeked.items():
+        stamps = np.array([cloud.header.stamp_s for cloud in clouds])
+        by_recording[name] = by_record(stamps, name, request.stamps, request.notes)
 
     def raw_scans() -> Iterator[RawScan]:
-        streams = [_raw_scans(paths, topic, by_record[topic.name], request) for topic in scan_topics]
+        streams = [_raw_scans(paths, topic, by_recording[topic.name], request) for topic in scan_topics]
         merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
         return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
 
@@ -80,7 +81,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
 
     poses = request.poses
     find: Any
-    if poses is None or _is_bag_of_poses(poses):
+    if poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses))):
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name), scan_times_s)
     else:
@@ -90,7 +91,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     def imu() -> Imu | None:
         if of_imu is None:
             return None
-        return imu_in_bags(paths, of_imu, frames[0], by_record[scan_topics[0].name], request)
+        return imu_in_bags(paths, of_imu, frames[0], by_recording[scan_topics[0].name], request)
 
     truth = request.truth or (lambda: None)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
@@ -117,48 +118,39 @@ def _given(
     return attached(poses, frames[0], cache(lambda: transforms_of(paths, request)), request)
 
 
-def _is_bag_of_poses(poses: Any) -> bool:
-    return isinstance(poses, (str, PathLike)) and is_bag(Path(poses))
-
-
 def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) -> list[Topic]:
-    """The topics of the scans: the wanted ones, or the only one that can be meant. Says which others there are."""
-    where = paths[0] if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+    """The topics of the scans: the wanted ones, or the only one that can be meant. The others are noted."""
+    about = request.notes.about
     fitting = topics_with(CLOUD_TYPES, topics)
     for wanted in request.topic:
-        if wanted in fitting:
-            continue
-        if wanted in topics:
-            msg = f"{where}: {wanted} has messages {topics[wanted].message_type}, or none; scans are {', '.join(CLOUD_TYPES)}"
-        else:
+        if wanted not in topics:
             msg = (
-                f"{where} has no topic {wanted}: topics with points are {_listed(fitting.values()) or 'none'}"
+                f"{about} has no topic {wanted}: topics with points are {_listed(fitting.values()) or 'none'}"
             )
-        raise ValueError(msg)
+            raise ValueError(msg)
+        if wanted not in fitting:
+            kind = topics[wanted].message_type
+            msg = f"{about}: {wanted} has messages {kind}, or none; scans are {', '.join(CLOUD_TYPES)}"
+            raise ValueError(msg)
     if request.topic:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
-    unread = [t for t in topics.values() if t.count and t.name not in fitting and _may_have_points(t)]
     if not fitting:
-        msg = f"{where} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {_listed(topics.values()) or 'no topics'}"
+        msg = f"{about} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {_listed(topics.values()) or 'no topics'}"
         raise ValueError(msg)
-    decoded = [t for t in fitting.values() if t.message_type != PACKETS]
-    chosen: list[Topic] = []
-    for fits in (
-        lambda _: True,
-        lambda t: t.name in KNOWN_TOPICS,
-        _is_radar,
-        lambda t: _has_doppler(paths, t),
-    ):
-        chosen = [t for t in decoded or fitting.values() if fits(t)]
+    decoded = [t for t in fitting.values() if t.message_type != PACKETS] or list(fitting.values())
+    has_doppler = partial(_has_doppler, paths)
+    for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar, has_doppler):
+        chosen = [t for t in decoded if fits(t)]
         if len(chosen) == 1:
             break
     else:
-        msg = f"{where} has several topics with points: say by topic which is the radar's, one or several of {_listed(fitting.values())}"
+        msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {_listed(fitting.values())}"
         raise ValueError(msg)
+    unread = [t for t in topics.values() if t.count and t.name not in fitting and _may_have_points(t)]
     radars = [t for t in unread if _is_radar(t)]
-    if radars and not _is_radar(chosen[0]) and not _has_doppler(paths, chosen[0]):
+    if radars and not _is_radar(chosen[0]) and not has_doppler(chosen[0]):
         msg = (
-            f"{where}: messages of the radar cannot be read, {_listed(radars)}. The only points are those of {_listed(chosen)}, whose "
+            f"{about}: messages of the radar cannot be read, {_listed(radars)}. The only points are those of {_listed(chosen)}, whose "
             f"name and fields are not a radar's: give topic {chosen[0].name} to map them"
         )
         raise ValueError(msg)
@@ -177,9 +169,8 @@ def _is_radar(topic: Topic) -> bool:
 
 def _may_have_points(topic: Topic) -> bool:
     """Whether messages of a type that cannot be read are probably scans."""
-    kind = topic.message_type
-    named = _POINTS.search(f"{topic.name} {kind}") and not _STATUS.search(kind)
-    return bool(named) and not _STANDARD.match(kind)
+    named = _POINTS.search(f"{topic.name} {topic.message_type}")
+    return named is not None and not _NO_POINTS.search(topic.message_type)
 
 
 def _has_doppler(paths: list[Path], topic: Topic) -> bool:
@@ -200,32 +191,18 @@ def _peek(paths: list[Path], topic: Topic, request: Request) -> list[CloudMessag
     return peeked
 
 
-def _by_record(peeked: list[CloudMessage], topic: Topic, request: Request) -> bool:
-    """Whether the times of scans are when they were recorded: as wanted, or where stamps are zero or stand still."""
-    if request.stamps is not None:
-        return request.stamps == "record"
-    stamps = [cloud.header.stamp_s for cloud in peeked]
-    if not any(stamps):
-        request.notes.add(f"the header stamps of {topic.name} are zero: the record time is used instead")
-        return True
-    if len(stamps) > 1 and len(set(stamps)) == 1:
-        request.notes.add(f"the header stamps of {topic.name} stand still: the record time is used instead")
-        return True
-    return False
-
-
-def _raw_scans(paths: list[Path], topic: Topic, by_record: bool, request: Request) -> Iterator[RawScan]:
+def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
     if topic.message_type == POINT_A_MESSAGE:
-        yield from _grouped(paths, topic, by_record, request)
+        yield from _grouped(paths, topic, recorded, request)
         return
     for message in read_messages(paths, {topic.name}, request.notes):
         cloud: CloudMessage = message.content
-        time_s = message.recorded_s if by_record else cloud.header.stamp_s
+        time_s = message.recorded_s if recorded else cloud.header.stamp_s
         name = f"{message.bag}: message {message.number} of {topic.name}"
         yield RawScan(cloud.columns, time_s, name, cloud.header.frame, topic.name, message.number)
 
 
-def _grouped(paths: list[Path], topic: Topic, by_record: bool, request: Request) -> Iterator[RawScan]:
+def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
     """Scans of messages of one point each. A scan begins where the number of the point does not grow, or after a pause."""
     points: list[CloudMessage] = []
     last, last_s, start_s, number = -1, 0.0, 0.0, 0
@@ -236,7 +213,7 @@ def _grouped(paths: list[Path], topic: Topic, by_record: bool, request: Request)
             yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}", topic)
             points, number = [], number + 1
         if not points:
-            start_s = message.recorded_s if by_record else cloud.header.stamp_s
+            start_s = message.recorded_s if recorded else cloud.header.stamp_s
         points.append(cloud)
         last, last_s = point_id, message.recorded_s
     if points:

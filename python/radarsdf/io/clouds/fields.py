@@ -5,15 +5,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.scans import Notes
-from radarsdf.io.text import without_unit
+from radarsdf.io.scans import Notes, Scan
+from radarsdf.io.units import SCALES, are_degrees, without_unit
 
 ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
          "sigma_range", "sigma_azimuth", "sigma_elevation")  # fmt: skip
@@ -24,66 +24,54 @@ _POLAR = ("range", "azimuth", "elevation")
 _SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
 
 
-_SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "mrad": 1e-3, "kmh": 1 / 3.6, "kph": 1 / 3.6, "km/h": 1 / 3.6,
-           "deg": np.pi / 180, "degree": np.pi / 180, "degrees": np.pi / 180, "°": np.pi / 180}  # fmt: skip
-"""Units in names of fields, in m, rad or m/s."""
-_BEYOND = 1.05  # angles that exceed a limit by rounding
-_STEPS, _ENOUGH = 4, 30  # parts of a degree, and angles that lie in such steps not by chance
-
-
 @dataclass(frozen=True)
 class Dialect:
     """How one kind of sensor or data set names its fields. Case does not matter."""
 
     name: str
-    position: tuple[str, str, str]
-    """x, y and z, m, or range, azimuth and elevation, m and rad."""
-    doppler: str | None
-    intensity: str | None
+    doppler: str
+    intensity: str
     sigma: tuple[str, str, str] | None = None
     """Standard deviations of range, azimuth and elevation."""
     sigma_in_degrees: bool = False
     polar: bool = False
+    """Whether positions are range, azimuth and elevation, m and rad, not x, y and z."""
     note: str = ""
     """What a user must know of the numbers, one sentence."""
 
 
 DIALECTS = (
-    Dialect("Sensrad Hugin", _XYZ, "doppler", "power"),
+    Dialect("Sensrad Hugin", "doppler", "power"),
+    Dialect("Oculii Eagle", "doppler", "power", ("rangeaccu", "aziaccu", "eleaccu"), sigma_in_degrees=True),
+    Dialect("Oculii, NTU4DRadLM", "doppler", "power"),  # a sensor_msgs/PointCloud with channels
+    Dialect("ARS548, nebula", "range_rate", "rcs", ("range_std", "azimuth_std", "elevation_std")),
     Dialect(
-        "Oculii Eagle", _XYZ, "doppler", "power", ("rangeaccu", "aziaccu", "eleaccu"), sigma_in_degrees=True
-    ),
-    Dialect("Oculii, NTU4DRadLM", _XYZ, "doppler", "power"),  # a sensor_msgs/PointCloud with channels
-    Dialect("ARS548, nebula", _XYZ, "range_rate", "rcs", ("range_std", "azimuth_std", "elevation_std")),
-    Dialect(
-        "ARS548, SNAIL-Radar", _XYZ, "doppler", "intensity", ("range_std", "azimuth_std", "elevation_std"),
+        "ARS548, SNAIL-Radar", "doppler", "intensity", ("range_std", "azimuth_std", "elevation_std"),
         note="the intensities of ARS548 clouds with these fields are RCS + 128",
     ),
-    Dialect(
-        "ARS548, HKUST RIO", _POLAR, "velocity", "rcs", ("rangestd", "azimuthstd", "elevationstd"), polar=True
-    ),
-    Dialect("smartmicro", _XYZ, "radial_speed", "power"),
-    Dialect("TI ti_mmwave", _XYZ, "velocity", "intensity"),  # of ti_mmwave_rospkg/RadarScan too
-    Dialect("TI reve", _XYZ, "v_doppler_mps", "snr_db"),
-    Dialect("radar_msgs/RadarScan", _POLAR, "doppler_velocity", "amplitude", polar=True),
-    Dialect("View-of-Delft", _XYZ, "v_r", "rcs"),
-    Dialect("TJ4DRadSet", _XYZ, "v_r", "power"),
+    Dialect("ARS548, HKUST RIO", "velocity", "rcs", ("rangestd", "azimuthstd", "elevationstd"), polar=True),
+    Dialect("smartmicro", "radial_speed", "power"),
+    Dialect("TI ti_mmwave", "velocity", "intensity"),  # of ti_mmwave_rospkg/RadarScan too
+    Dialect("TI reve", "v_doppler_mps", "snr_db"),
+    Dialect("radar_msgs/RadarScan", "doppler_velocity", "amplitude", polar=True),
+    Dialect("View-of-Delft", "v_r", "rcs"),
+    Dialect("TJ4DRadSet", "v_r", "power"),
 )  # fmt: skip
 """The twelve dialects. A cloud is read by the one of which it has the most fields, all of them."""
 
 _ALIASES: dict[str, tuple[str, ...]] = {
-    # For clouds of no dialect: the first name that a cloud has. Existing files of ours come first.
-    "intensity": ("power", "intensity", "rcs", "snr", "snr_db", "amplitude", "reflectivity", "reflectance", "magnitude",
-                  "rssi", "signal_power", "signal_strength"),
-    "doppler": ("doppler", "velocity", "doppler_velocity", "v_doppler_mps", "radial_speed", "radial_velocity",
-                "range_rate", "v_r", "vr", "speed", "rdot", "r_dot", "v_radial", "vrad", "v_rad", "vel_r", "vel",
-                "radial_vel", "velocity_radial", "doppler_speed", "v_doppler", "rangerate", "relative_velocity"),
-    "range": ("range", "distance", "r", "rng", "dist", "radius", "slant_range"),
-    "azimuth": ("azimuth", "azimuth_angle", "az", "azi", "azim", "angle_azimuth"),
-    "elevation": ("elevation", "elevation_angle", "el", "ele", "elev", "angle_elevation"),
-    "sigma_range": ("sigma_range", "range_std", "rangestd"),
-    "sigma_azimuth": ("sigma_azimuth", "azimuth_std", "azimuthstd"),
-    "sigma_elevation": ("sigma_elevation", "elevation_std", "elevationstd"),
+    # For clouds of no dialect: the first name that a cloud has, without what separates words. Files of ours come first.
+    "intensity": ("power", "intensity", "rcs", "snr", "snrdb", "amplitude", "reflectivity", "reflectance", "magnitude",
+                  "rssi", "signalpower", "signalstrength"),
+    "doppler": ("doppler", "velocity", "dopplervelocity", "vdopplermps", "radialspeed", "radialvelocity", "rangerate",
+                "vr", "speed", "rdot", "vradial", "vrad", "velr", "vel", "radialvel", "velocityradial",
+                "dopplerspeed", "vdoppler", "relativevelocity"),
+    "range": ("range", "distance", "r", "rng", "dist", "radius", "slantrange"),
+    "azimuth": ("azimuth", "azimuthangle", "az", "azi", "azim", "angleazimuth"),
+    "elevation": ("elevation", "elevationangle", "el", "ele", "elev", "angleelevation"),
+    "sigma_range": ("sigmarange", "rangestd"),
+    "sigma_azimuth": ("sigmaazimuth", "azimuthstd"),
+    "sigma_elevation": ("sigmaelevation", "elevationstd"),
 }  # fmt: skip
 
 COLUMNS: dict[int, tuple[str, ...]] = {
@@ -94,6 +82,21 @@ COLUMNS: dict[int, tuple[str, ...]] = {
     8: ("x", "y", "z", "v_r", "range", "power", "alpha", "beta"),  # TJ4DRadSet
 }
 """Names of columns without names, by their number."""
+
+
+def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
+    """Names of `width` columns that have none in their file."""
+    if columns is not None and not isinstance(columns, int):
+        if len(columns) != width:
+            msg = f"there are {width} columns, but {len(columns)} names"
+            raise ValueError(msg)
+        return list(columns)
+    if width in COLUMNS:
+        return list(COLUMNS[width])
+    if width < 3:
+        msg = f"there are {width} columns; points have three or more"
+        raise ValueError(msg)
+    return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,22 @@ class Cloud:
     sigma: NDArray[np.float32] | None
     dropped: int
     """Returns that were left out, since a coordinate or the intensity was not finite."""
+
+    @classmethod
+    def of_finite(cls, points: NDArray[Any], intensities: Any, doppler_mps: Any, sigma: Any) -> Cloud:
+        """The returns whose coordinates and intensity are finite, with their Doppler and deviations."""
+        # All at once first: that is usual, and row by row takes twenty times as long.
+        if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
+            return cls(points, intensities, doppler_mps, sigma, 0)
+        finite = np.isfinite(points).all(axis=1)
+        if intensities is not None:
+            finite &= np.isfinite(intensities)
+        kept = [None if array is None else array[finite] for array in (intensities, doppler_mps, sigma)]
+        return cls(points[finite], kept[0], kept[1], kept[2], int((~finite).sum()))
+
+    def scan(self, T_world_sensor: NDArray[np.float64], time_s: float | None) -> Scan:
+        """These returns with the pose and the time of the scan."""
+        return Scan(self.points, T_world_sensor, self.intensities, self.doppler_mps, time_s, self.sigma)
 
 
 @dataclass(frozen=True)
@@ -124,33 +143,20 @@ class Fields:
     def of(
         cls, names: list[str], overrides: Mapping[str, Any] | None = None, what: str = "the cloud"
     ) -> Fields:
-        """The roles of the fields with these names.
+        """The roles of the fields with these names, of the cloud `what`.
 
-        Parameters
-        ----------
-        names : list of str
-            The fields of a cloud.
-        overrides : mapping, optional
-            Field by role; None leaves a role out. A number means a column. Other roles are found by the table.
-        what : str
-            The file, for errors.
-
-        Raises
-        ------
-        ValueError
-            If a role or a field does not exist, or there are no positions.
+        `overrides` are fields by role, or numbers of columns; None leaves a role out.
         """
-        lower = {name.lower(): name for name in reversed(names)}
-        lower = {_plain(name)[0]: name for name in reversed(names)} | lower
-        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
+        lower = {plain_name(name)[0]: name for name in reversed(names)}
+        lower |= {name.lower(): name for name in reversed(names)}
+        # AzimuthAngle, azimuth_angle and Azimuth Angle are one name.
+        squeezed = {re.sub(r"[\W_]+", "", name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
         dialect = _dialect(lower)
         if dialect is not None:
             found = {role: lower[name] for role, name in _roles(dialect).items()}
         for role, aliases in ({axis: (axis,) for axis in _XYZ} | _ALIASES).items():
-            name = next(
-                (squeezed[_squeezed(alias)] for alias in aliases if _squeezed(alias) in squeezed), None
-            )
+            name = next((squeezed[alias] for alias in aliases if alias in squeezed), None)
             if role not in found and name is not None and name not in found.values():
                 found[role] = name
         for role, field in (overrides or {}).items():
@@ -180,21 +186,15 @@ class Fields:
 
     def judged(self, clouds: Iterable[Mapping[str, NDArray[Any]]], notes: Notes) -> Fields:
         """These fields with the unit of their angles: of their names, or else by the numbers in some clouds."""
-        if not self.polar:
-            return self
-        units = {role: _plain(self.names[role])[1] for role in ("azimuth", "elevation")}
-        named = next((unit for unit in units.values() if unit), "")
-        if all(units.values()):
+        units = {role: plain_name(self.names[role])[1] for role in _POLAR[1:] if role in self.names}
+        if not self.polar or all(units.values()):
             return self
         names = [self.names[role] for role in units]
         angles = [np.stack([cloud[name] for name in names]) for cloud in clouds if set(names) <= set(cloud)]
         azimuth, elevation = np.concatenate([np.zeros((2, 0)), *angles], axis=1).astype(np.float64)
-        in_degrees = named.startswith("deg") if named else _are_degrees(azimuth, elevation)
-        by = (
-            f"as {'azimuth' if units['azimuth'] else 'elevation'} is by its name"
-            if named
-            else "by their numbers"
-        )
+        named = next((role for role, unit in units.items() if unit), None)
+        in_degrees = are_degrees(azimuth, elevation, units[named] if named else "")
+        by = f"as {named} is by its name" if named else "by their numbers"
         if in_degrees or (self.dialect is None and not named):
             notes.add(
                 f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
@@ -203,10 +203,10 @@ class Fields:
         return replace(self, in_degrees=in_degrees)
 
     def note_use(self, names: Iterable[str], notes: Notes, *, chosen: bool) -> None:
-        """Says what to know of the numbers, and which of these fields are passed over, unless a user has chosen some."""
+        """Notes what to know of the numbers, and which fields are not used, unless a user has chosen some."""
         if self.dialect is not None and self.dialect.note:
             notes.add(self.dialect.note)
-        if "intensity" in self.names and _plain(self.names["intensity"])[1] == "linear":
+        if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
             notes.add(
                 f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
             )
@@ -217,13 +217,7 @@ class Fields:
             )
 
     def read(self, columns: Mapping[str, NDArray[Any]], what: str) -> Cloud:
-        """The cloud in these columns, (N,) each, without returns that are not finite.
-
-        Raises
-        ------
-        ValueError
-            If a field is missing that other scans have, or does not hold numbers.
-        """
+        """The cloud in these columns, (N,) each, without returns that are not finite."""
         for name in self.names.values():
             if name not in columns:
                 msg = f"{what} lacks the field {name}, which other scans have: it has {', '.join(columns)}"
@@ -231,38 +225,20 @@ class Fields:
             if columns[name].dtype.kind not in "biuf":
                 msg = f"{what}: the field {name} holds no numbers"
                 raise ValueError(msg)
-        points = self._positions(columns)
         with np.errstate(over="ignore"):  # too large a number becomes infinite, and is dropped
-            intensities = self._column(columns, "intensity")
-            doppler = self._column(columns, "doppler")
+            intensities, doppler_mps = (self._column(columns, role) for role in ("intensity", "doppler"))
             sigma = self._sigma(columns)
-        # All at once first: that is usual, and row by row takes twenty times as long.
-        if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
-            return Cloud(points, intensities, doppler, sigma, 0)
-        finite = np.isfinite(points).all(axis=1)
-        if intensities is not None:
-            finite &= np.isfinite(intensities)
-        return Cloud(
-            points[finite],
-            None if intensities is None else intensities[finite],
-            None if doppler is None else doppler[finite],
-            None if sigma is None else sigma[finite],
-            int((~finite).sum()),
-        )
+        return Cloud.of_finite(self._positions(columns), intensities, doppler_mps, sigma)
 
     def check_no_more(self, others: Fields, what: str, first: str) -> None:
         """Raises a ValueError if the cloud `what` has a role that these fields, of the cloud `first`, leave out."""
-        more = [
-            role
-            for role in ("intensity", "doppler", *_SIGMA)
-            if role in others.names and role not in self.names
-        ]
-        if more:
-            msg = (
-                f"{what} has the field {others.names[more[0]]} for {more[0]}, which {first} lacks: leave it out of all scans "
-                f"by fields={{{more[0]!r}: None}}"
-            )
-            raise ValueError(msg)
+        for role in ("intensity", "doppler", *_SIGMA):
+            if role in others.names and role not in self.names:
+                msg = (
+                    f"{what} has the field {others.names[role]} for {role}, which {first} lacks: leave it out of all scans "
+                    f"by fields={{{role!r}: None}}"
+                )
+                raise ValueError(msg)
 
     def _column(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[np.float32] | None:
         if role not in self.names:
@@ -271,10 +247,10 @@ class Fields:
 
     def _values(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[Any]:
         """A column in m, rad or m/s, where its name has another unit, or angles are in degrees."""
-        unit = _plain(self.names[role])[1]
+        unit = plain_name(self.names[role])[1]
         if not unit and self.in_degrees and role.endswith(("azimuth", "elevation")):
             unit = "deg"
-        scale = _SCALES.get(unit)
+        scale = SCALES.get(unit)
         values = columns[self.names[role]]
         return values if scale is None else values * np.float64(scale)
 
@@ -301,41 +277,16 @@ class Fields:
         return sigma
 
 
-def _plain(name: str) -> tuple[str, str]:
+def plain_name(name: str) -> tuple[str, str]:
     """A name in lower case as radars give it, and its unit: without the prefix of CloudCompare."""
     return without_unit(name.lower().removeprefix("scalar_"))
 
 
-def _squeezed(name: str) -> str:
-    """A name without what separates its words: AzimuthAngle, azimuth_angle and Azimuth Angle are one."""
-    return re.sub(r"[\W_]+", "", name)
-
-
-def _are_degrees(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> bool:
-    """Whether angles (N,) are in degrees: beyond what rad can be, or in steps that only degrees have."""
-    finite = np.isfinite(azimuth) & np.isfinite(elevation)
-    if not finite.any():
-        return False
-    azimuth, elevation = azimuth[finite], elevation[finite]
-    largest, highest = (np.quantile(np.abs(angles), 0.99) / np.pi for angles in (azimuth, elevation))
-    if highest > _BEYOND / 2 or largest > 2 * _BEYOND:
-        return True
-    if largest > _BEYOND:  # rad from 0 to a whole turn have no other sign
-        return bool(azimuth.min() < 0)
-    steps = azimuth * _STEPS
-    return bool(len(steps) >= _ENOUGH and steps.any() and (steps == np.round(steps)).all())
-
-
 def _roles(dialect: Dialect) -> dict[str, str]:
     """Field by role."""
-    roles = dict(zip(_POLAR if dialect.polar else _XYZ, dialect.position, strict=True))
-    if dialect.doppler is not None:
-        roles["doppler"] = dialect.doppler
-    if dialect.intensity is not None:
-        roles["intensity"] = dialect.intensity
-    if dialect.sigma is not None:
-        roles |= dict(zip(_SIGMA, dialect.sigma, strict=True))
-    return roles
+    position = _POLAR if dialect.polar else _XYZ
+    roles = {role: role for role in position} | {"doppler": dialect.doppler, "intensity": dialect.intensity}
+    return roles | dict(zip(_SIGMA, dialect.sigma or (), strict=False))
 
 
 def _dialect(lower: Mapping[str, str]) -> Dialect | None:

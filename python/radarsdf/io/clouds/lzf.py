@@ -8,13 +8,7 @@ _LITERALS = 32  # control bytes below this are followed by so many bytes, and on
 
 
 def unpack_lzf(data: bytes, size: int) -> bytes:
-    """Unpacks `size` bytes.
-
-    Raises
-    ------
-    ValueError
-        If the data are damaged, or unpack to another size. No more than `size` bytes are allocated.
-    """
+    """Unpacks `size` bytes."""
     out = bytearray()
     at, end = 0, len(data)
     try:

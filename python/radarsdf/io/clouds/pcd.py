@@ -21,25 +21,9 @@ _MAX_COMPRESSION = 100  # LZF reaches at most 88: three bytes for 264
 
 
 def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
-    """Reads a point cloud: ascii, binary, or binary_compressed.
+    """The fields with one number a point, (N,) each by name: of ascii, binary or binary_compressed files to version 0.7.
 
-    Parameters
-    ----------
-    path : Path
-        A PCD file, version 0.7 or earlier. Its ``VIEWPOINT`` is not applied: :func:`read_viewpoint` has it.
-
-    Returns
-    -------
-    dict
-        By name, an array (N,) for each field with one number per point. Its dtype is that of the file, or float64 if
-        the file is ASCII.
-
-    Raises
-    ------
-    ValueError, KeyError, IndexError, OverflowError
-        If the file is not a PCD file, or is cut off: :func:`radarsdf.io.clouds.reading.read_columns` says so.
-    OSError
-        If the file cannot be read.
+    ``VIEWPOINT`` is not applied: :func:`read_viewpoint` has it.
     """
     with path.open("rb") as file:
         header = _header(file)
@@ -73,15 +57,7 @@ def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_viewpoint(path: Path) -> NDArray[np.float64]:
-    """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a file, which is tx ty tz qw qx qy qz; the identity without one.
-
-    Raises
-    ------
-    ValueError
-        If it does not hold seven finite numbers.
-    OSError
-        If the file cannot be read.
-    """
+    """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a file, which is tx ty tz qw qx qy qz; the identity without one."""
     with path.open("rb") as file:
         numbers = np.array(_header(file).get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
     if numbers.shape != (7,) or not np.isfinite(numbers).all():

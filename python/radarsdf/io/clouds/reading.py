@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
 from radarsdf.interrupts import whole_import
-from radarsdf.io.clouds.fields import COLUMNS, Fields
+from radarsdf.io.clouds.fields import Fields, names_of
 from radarsdf.io.clouds.las import read_las
 from radarsdf.io.clouds.pcd import read_pcd, read_viewpoint
 from radarsdf.io.clouds.raw_binary import read_bin
@@ -30,6 +30,7 @@ from radarsdf.io.text import (
     check_header,
     numbers_of,
     read_text,
+    separator_of,
     text_rows,
     with_points,
     without_comment,
@@ -38,7 +39,6 @@ from radarsdf.io.text import (
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
 _PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
-_SEPARATORS = (";", ",", "\t", None)  # None: any white space
 
 Columns = dict[str, NDArray[Any]]
 
@@ -46,22 +46,8 @@ Columns = dict[str, NDArray[Any]]
 def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Columns:
     """The columns of a file of points, (N,) each, by name.
 
-    Parameters
-    ----------
-    path : Path
-        A file of `CLOUD_SUFFIXES`.
-    columns : int or sequence of str, optional
-        Of files without names: how many numbers a point has, or their names. Of a ``.bin`` file, its content decides by
-        default.
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged, or of another kind.
-    OSError
-        If it cannot be read.
-    ImportError
-        If it takes a library that is not installed.
+    `columns` are those of files without names: how many numbers a point has, or their names. By default the content of
+    a ``.bin`` file decides.
     """
     check_regular_file(path)
     suffix = path.suffix.lower()
@@ -72,9 +58,7 @@ def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Colu
         return _NAMED[suffix](path) if suffix in _NAMED else _NAMELESS[suffix](path, columns)
     except (ImportError, MemoryError):
         raise
-    except (
-        BaseException
-    ) as error:  # libraries raise exceptions of many kinds for damaged files, OSError among them
+    except BaseException as error:  # libraries raise many kinds for damaged files, OSError among them
         if isinstance(error, OSError) and error.filename is not None:
             raise
         if not isinstance(error, Exception) and type(error).__name__ != _PANIC:
@@ -94,8 +78,8 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        (M, 3) float64, frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places them; the world's, if :func:`radarsdf.io.write_cloud` wrote an origin beside
-        it. Points that are not finite are left out.
+        (M, 3) float64, frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places them; the world's, if
+        :func:`radarsdf.io.write_cloud` wrote an origin next to it. Points that are not finite are left out.
 
     Raises
     ------
@@ -117,25 +101,6 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
         raise ValueError(msg)
     origin = origin_of(path)
     return points if origin is None else points + origin
-
-
-def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
-    """Names of `width` columns that have none in their file."""
-    if columns is not None and not isinstance(columns, int):
-        if len(columns) != width:
-            msg = f"there are {width} columns, but {len(columns)} names"
-            raise ValueError(msg)
-        return list(columns)
-    if width in COLUMNS:
-        return list(COLUMNS[width])
-    if width < 3:
-        msg = f"there are {width} columns; points have three or more"
-        raise ValueError(msg)
-    return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
-
-
-def _bin(path: Path, columns: int | Sequence[str] | None) -> Columns:
-    return read_bin(path, columns, names_of)
 
 
 def _npy(path: Path, columns: int | Sequence[str] | None) -> Columns:
@@ -160,10 +125,7 @@ def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
     if not first:
         return {name: np.zeros(0) for name in names_of(3, None)}
     first = without_comment(first.lstrip("/#% "))  # names may be after a comment sign
-    separator = next(s for s in _SEPARATORS if s is None or s in first)
-    words = (
-        words_of(first) if separator is None else [word.strip().strip('"') for word in first.split(separator)]
-    )
+    separator, words = separator_of(first), words_of(first)
     header = not are_numbers(words)
     if header:
         check_header(words)
@@ -223,11 +185,11 @@ _NAMED: dict[str, Callable[[Path], Columns]] = {
 """Readers of formats that name their columns."""
 
 _NAMELESS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
-    ".bin": _bin,
+    ".bin": read_bin,
     ".npy": _npy,
     **dict.fromkeys(TEXT_SUFFIXES, _text),
 }
-"""Readers of formats that may not, and are told the names."""
+"""Readers of formats that may not."""
 
 CLOUD_SUFFIXES = (*_NAMED, *_NAMELESS)
 """What :func:`read_columns` reads."""

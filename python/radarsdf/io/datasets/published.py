@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sized
 from pathlib import Path
 from typing import Protocol
 
@@ -21,8 +22,8 @@ from radarsdf.io.bags.files import bags_in
 from radarsdf.io.bags.reading import read_bags
 from radarsdf.io.datasets.folders import BASE_T_RADAR, base_T_radar
 from radarsdf.io.datasets.snail_radar import SnailRadar, is_snail_radar
-from radarsdf.io.poses.reading import poses_of, read_calibration, trajectory_of
-from radarsdf.io.poses.trajectory import read_table
+from radarsdf.io.poses.reading import poses_of, read_calibration
+from radarsdf.io.poses.trajectory import pose_matrices_of, read_table, trajectory_of
 from radarsdf.io.scans import Scans
 from radarsdf.io.sources import Request, natural, scans_of_files
 from radarsdf.io.text import read_text
@@ -87,9 +88,7 @@ class MscRad4R:
         stamps = read_table(folder / "3_RADAR" / "timestamp_radar.txt", 3)
         files = sorted((folder / "3_RADAR" / "PCD").glob("*.pcd"), key=natural)
         times_s = [float(seconds + 1e-9 * nanoseconds) for _, seconds, nanoseconds in stamps]
-        if len(times_s) != len(files):
-            msg = f"{folder}: timestamp_radar.txt has {len(times_s)} lines for {len(files)} scans"
-            raise ValueError(msg)
+        _check_count(times_s, files, folder / "3_RADAR" / "timestamp_radar.txt")
         return _of_files(files, times_s, request.extrinsic, request)
 
 
@@ -112,18 +111,14 @@ class ColoRadar:
         clouds = folder / "single_chip" / "pointclouds"
         files = sorted((clouds / "data").glob("radar_pointcloud_*.bin"), key=natural)
         times_s = read_table(clouds / "timestamps.txt", 1)[:, 0].tolist()
-        if len(times_s) != len(files):
-            msg = f"{clouds}: timestamps.txt has {len(times_s)} lines for {len(files)} scans"
-            raise ValueError(msg)
+        _check_count(times_s, files, clouds / "timestamps.txt")
         poses = request.poses
         if poses is None:
             stamps = read_table(folder / "groundtruth" / "timestamps.txt", 1)[:, 0]
             table = read_table(folder / "groundtruth" / "groundtruth_poses.txt", 7)
-            if len(stamps) != len(table):
-                msg = f"{folder}: groundtruth has {len(stamps)} times for {len(table)} poses"
-                raise ValueError(msg)
+            _check_count(stamps, table, folder / "groundtruth" / "timestamps.txt")
             poses = trajectory_of(
-                stamps, table[:, :3], table[:, 3:], str(folder / "groundtruth" / "groundtruth_poses.txt")
+                np.column_stack([stamps, table]), f"{folder / 'groundtruth'}", request.notes
             )
         T_base_sensor = request.extrinsic
         if T_base_sensor is None:
@@ -298,6 +293,12 @@ def _of_files(
     return scans_of_files(files, times_s, poses_of(request.poses, request.notes), T_base_sensor, request)
 
 
+def _check_count(times: Sized, wanted: Sized, path: Path) -> None:
+    if len(times) != len(wanted):
+        msg = f"{path} has {len(times)} lines for {len(wanted)} scans or poses"
+        raise ValueError(msg)
+
+
 def _say_without_extrinsic(name: str, poses: str, request: Request) -> None:
     if request.extrinsic is None:
         request.notes.add(
@@ -315,9 +316,7 @@ def _translation_and_quaternion(path: Path) -> NDArray[np.float64]:
         if [len(row) for row in rows] != [3, 4]:
             msg = "it has not one line x y z and one line qx qy qz qw"
             raise ValueError(msg)
-        track = trajectory_of([0.0, 1.0], [rows[0]] * 2, [rows[1]] * 2, str(path))
+        return check_pose(pose_matrices_of(np.array([[*rows[0], *rows[1]]]))[0], "it")
     except ValueError as error:
         msg = f"{path} is not a transform: {error}"
         raise ValueError(msg) from error
-    transform: NDArray[np.float64] = track.poses(np.zeros(1), 1.0)[0]
-    return transform

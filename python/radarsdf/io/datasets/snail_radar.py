@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 from radarsdf._core import cell_keys
 from radarsdf.io.clouds.reading import read_columns
 from radarsdf.io.datasets.folders import lidar_map, read_transform
-from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, read_trajectory
+from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, read_table, trajectory_of
+from radarsdf.io.scans import Notes
 
 RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")
 """Folders of clouds in a sequence: of the Oculii Eagle, and of the Continental ARS548. The first that is there counts."""
@@ -128,7 +129,8 @@ class SnailRadar:
         if not (self.folder / _TRAJECTORY).is_file():
             msg = f"{self.folder} lacks {_TRAJECTORY}: copy it from full_trajs/<date>/<sequence> of the data set"
             raise ValueError(msg)
-        return read_trajectory(self.folder / _TRAJECTORY)
+        path = self.folder / _TRAJECTORY
+        return trajectory_of(read_table(path, 8), str(path), Notes())
 
     @cached_property
     def T_base_radar(self) -> NDArray[np.float64]:

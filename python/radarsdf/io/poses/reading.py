@@ -13,15 +13,15 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import are_rigid, check_pose, check_poses, pose_matrices, real_array
 from radarsdf.io.files import are_numbers, check_regular_file
 from radarsdf.io.npz import array_in
 from radarsdf.io.poses.columns import pose_columns, rotations_of
-from radarsdf.io.poses.trajectory import MAX_NORM_ERROR, TIME_UNITS, Trajectory, in_seconds
+from radarsdf.io.poses.trajectory import Trajectory, listed, pose_matrices_of, trajectory_of
 from radarsdf.io.scans import Notes
-from radarsdf.io.text import numbers_of, read_text, text_rows, without_unit
+from radarsdf.io.text import numbers_of, read_text, text_rows
+from radarsdf.io.units import SCALES, in_seconds, without_unit
 
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 """Names of files of poses that are found beside scans."""
@@ -30,9 +30,6 @@ FIND_POSES = "radarsdf poses finds them from the radar alone"
 """Ends what is said of scans without poses."""
 
 _TUM_COLUMNS, _KITTI_COLUMNS, _MATRIX_COLUMNS = 8, 12, 16
-_MIN_QUATERNION, _MAX_QUATERNION = 0.49, 1.01  # largest of the four numbers of a unit quaternion
-_G2O = "VERTEX_SE3"
-_LISTED = 5  # lines that a note names
 _CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam")
 
 
@@ -117,17 +114,6 @@ class ScanPoses:
         return T_world_sensor
 
 
-def extrinsic_of(extrinsic: Any) -> NDArray[np.float64] | None:
-    """`extrinsic` as a checked T_base_sensor (4, 4), or None.
-
-    Raises
-    ------
-    ValueError
-        If it is not a rigid transform.
-    """
-    return None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor")
-
-
 def poses_of(
     poses: Any, notes: Notes, calibration: Sequence[Path] = ()
 ) -> StampedPoses | NDArray[np.float64]:
@@ -158,7 +144,6 @@ def read_poses(
           qx, qy, qz and qw or roll, pitch and yaw, as in files of EuRoC, evo and ``rostopic echo -p``. T_world_base by
           time, or without a time in order; other columns are not used;
         - TUM: lines of ``time x y z qx qy qz qw``, s and m: T_world_base by time;
-        - g2o: its lines ``VERTEX_SE3:QUAT``, in order;
         - KITTI: lines of twelve numbers, the first three rows of a matrix. With a calibration ``Tr``, the transform from
           the sensor to the camera, T_world_sensor = inv(Tr) · P · Tr, so that the world is the first scan's sensor frame;
           without one, the lines are taken as T_world_base;
@@ -169,7 +154,7 @@ def read_poses(
         unit of their name. Poses that are not finite or have no unit quaternion, and those whose time repeats, are left
         out; times out of order are sorted.
     notes : Notes
-        Is told what was assumed.
+        Takes what was assumed.
     calibration : sequence of Path
         Files in which the ``Tr`` of a KITTI calibration is looked for.
 
@@ -188,7 +173,14 @@ def read_poses(
     check_regular_file(path)
     if path.suffix.lower() == ".npy":
         return poses_or_nan(np.array(array_in(path)), str(path), notes)
-    heads, rows = _rows_of(path)
+    try:
+        heads, rows = text_rows(path)
+    except ValueError as error:
+        msg = f"{path} is not a table of poses: {error}"
+        raise ValueError(msg) from error
+    if not any(are_numbers(words[-1:]) for _, words in rows):
+        msg = f"{path} is not a table of poses: it has no rows of numbers"
+        raise ValueError(msg)
     width = Counter(len(words) for _, words in rows).most_common(1)[0][0]
     heads = [head for head in heads if len(head) == width]
     table, lines = numbers_of(rows, width), [line for line, _ in rows]
@@ -212,32 +204,8 @@ def read_poses(
     raise ValueError(msg)
 
 
-def _rows_of(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]:
-    """What may be names of columns, and the rows with their lines, of which one has a number at its end."""
-    try:
-        heads, rows = text_rows(path)
-    except ValueError as error:
-        msg = f"{path} is not a table of poses: {error}"
-        raise ValueError(msg) from error
-    if any(words[0].startswith(_G2O) for _, words in rows):
-        rows = [(line, words[1:]) for line, words in rows if words[0].startswith(_G2O)]
-        heads = [["id", "x", "y", "z", "qx", "qy", "qz", "qw"]]
-    if not any(are_numbers(words[-1:]) for _, words in rows):
-        msg = f"{path} is not a table of poses: it has no rows of numbers"
-        raise ValueError(msg)
-    return heads, rows
-
-
 def read_calibration(path: Path) -> NDArray[np.float64] | None:
-    """``Tr``, or ``Tr_velo_to_cam``, of a KITTI calibration, as T_camera_sensor (4, 4); None if the file has neither.
-
-    Raises
-    ------
-    ValueError
-        If it does not hold twelve numbers, or they are no rigid transform.
-    OSError
-        If the file cannot be read.
-    """
+    """``Tr``, or ``Tr_velo_to_cam``, of a KITTI calibration, as T_camera_sensor (4, 4); None if the file has neither."""
     check_regular_file(path)
     try:
         lines = [line.partition(":") for line in read_text(path).splitlines()]
@@ -253,29 +221,6 @@ def read_calibration(path: Path) -> NDArray[np.float64] | None:
     return check_pose(T_camera_sensor, f"{path}: Tr")
 
 
-def trajectory_of(
-    times_s: Sequence[float] | NDArray[np.float64], positions: Any, quaternions: Any, name: str
-) -> Trajectory:
-    """A trajectory of poses in any order, such as of a bag. Of several at one time, the first counts.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two poses, or they are no poses.
-    """
-    times, first = np.unique(np.asarray(times_s, np.float64), return_index=True)
-    if len(times) < 2:
-        msg = f"{name} holds {len(times)} poses at different times; at least two are needed"
-        raise ValueError(msg)
-    xyz = np.asarray(positions, np.float64).reshape(-1, 3)[first]
-    quats = np.asarray(quaternions, np.float64).reshape(-1, 4)[first]
-    largest = np.abs(quats).max(axis=1)  # not the length, whose square overflows for damaged numbers
-    if not (np.isfinite(xyz).all() and ((largest >= _MIN_QUATERNION) & (largest <= _MAX_QUATERNION)).all()):
-        msg = f"{name} holds poses that are not finite, or without a unit quaternion"
-        raise ValueError(msg)
-    return Trajectory(times, xyz, Rotation.from_quat(quats), name)
-
-
 def _named(
     table: NDArray[np.float64],
     columns: dict[str, int],
@@ -288,15 +233,14 @@ def _named(
     if missing := [role for role in ("z", "roll", "pitch") if "qw" not in columns and role not in columns]:
         notes.add(f"{path.name} has no {', '.join(missing)}: taken as 0")
     position = [table[:, columns[axis]] if axis in columns else np.zeros(len(table)) for axis in "xyz"]
-    quaternions = rotations_of(table, columns, head, path.name, notes)
-    poses = np.column_stack([np.zeros(len(table)), *position, quaternions])
+    poses = np.column_stack([*position, rotations_of(table, columns, head, path.name, notes)])
     if "nsec" in columns:
-        poses[:, 0] = table[:, columns["sec"]] + 1e-9 * table[:, columns["nsec"]]
+        times = table[:, columns["sec"]] + 1e-9 * table[:, columns["nsec"]]
     elif "time" in columns:
-        poses[:, 0] = table[:, columns["time"]] * TIME_UNITS.get(without_unit(head[columns["time"]])[1], 1.0)
+        times = table[:, columns["time"]] * SCALES.get(without_unit(head[columns["time"]])[1], 1.0)
     else:
-        return poses_or_nan(_matrices(poses), str(path), notes, lines)
-    return _stamped(poses, path, notes, lines)
+        return poses_or_nan(pose_matrices_of(poses), str(path), notes, lines)
+    return _stamped(np.column_stack([times, poses]), path, notes, lines)
 
 
 def _kitti(
@@ -318,56 +262,16 @@ def _kitti(
 
 
 def _stamped(table: NDArray[np.float64], path: Path, notes: Notes, lines: list[int]) -> Trajectory:
-    """The trajectory in rows (P, 8) of time, position and quaternion. What is no pose is left out, and named."""
-    with np.errstate(over="ignore"):
-        missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
-        wrong = ~missing & (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > MAX_NORM_ERROR)
-    bad = missing | wrong
-    if 2 * wrong.sum() >= max((~missing).sum(), 1):
-        msg = f"{path}: its quaternions qx qy qz qw are not unit quaternions: {_listed(wrong, lines)}"
-        raise ValueError(msg)
-    if bad.any():
-        notes.add(
-            f"{path.name}: {bad.sum()} of {len(table)} poses left out, which are not finite or have no unit quaternion: "
-            f"{_listed(bad, lines)}"
-        )
-    rows = np.flatnonzero(~bad)
-    table = table[rows]
-    table[:, 0] = in_seconds(table[:, 0], path, notes)
-    back = np.diff(table[:, 0], prepend=-np.inf) < 0
-    if back.any():
-        notes.add(
-            f"{path.name} is not in the order of its times, and sorted: {_listed(back, np.array(lines)[rows])}"
-        )
-    _, first = np.unique(table[:, 0], return_index=True)
-    again = np.ones(len(table), bool)
-    again[first] = False
-    if again.any():
-        notes.add(
-            f"{path.name}: {again.sum()} of {len(table)} poses left out, whose times repeat: "
-            f"{_listed(again, np.array(lines)[rows])}"
-        )
-    if len(first) < 2:
-        why = (
-            f", of {len(lines)} lines: {_listed(bad, lines)} not finite or without a rotation"
-            if bad.any()
-            else ""
-        )
-        msg = f"{path} must hold at least two poses at different times, not {len(first)}{why}"
-        raise ValueError(msg)
-    return trajectory_of(table[:, 0], table[:, 1:4], table[:, 4:], str(path))
+    """The trajectory in rows (P, 8) of time, position and quaternion."""
+    finite = np.isfinite(table[:, 0])
+    table[finite, 0] = in_seconds(table[finite, 0], path.name, notes)
+    return trajectory_of(table, str(path), notes, lines)
 
 
 def poses_or_nan(
     poses: NDArray[Any], name: str, notes: Notes, lines: Sequence[int] | None = None
 ) -> NDArray[np.float64]:
-    """Poses (F, 4, 4) in the order of scans. Those that are not finite or rigid are NaN, and named: their scans have none.
-
-    Raises
-    ------
-    ValueError
-        If no pose is rigid, or half of those that are finite are not.
-    """
+    """Poses (F, 4, 4) in the order of scans. Those that are not finite or rigid are NaN, and named: their scans have none."""
     if poses.ndim != 3 or poses.dtype.kind not in "iuf":
         msg = f"{name} must hold poses (F, 4, 4), not {poses.dtype} {poses.shape}"
         raise ValueError(msg)
@@ -384,26 +288,7 @@ def poses_or_nan(
         msg = f"{name}: no pose is finite"
         raise ValueError(msg)
     if bad.any():
-        which = _listed(bad, lines or range(len(bad)), "pose" if lines is None else "line")
         notes.add(
-            f"scans left out: {bad.sum()} of {len(bad)} poses of {name} are not finite and rigid: {which}"
+            f"scans left out: {bad.sum()} of {len(bad)} poses of {name} are not finite and rigid: {listed(bad, lines)}"
         )
     return np.where(bad[:, None, None], np.nan, matrices)
-
-
-def _matrices(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, 4, 4) of rows (P, 8) of time, position and quaternion; NaN where a quaternion is none."""
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, 3] = table[:, 1:4]
-    with np.errstate(over="ignore", invalid="ignore"):
-        unit = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) <= MAX_NORM_ERROR
-    poses[~unit] = np.nan
-    if unit.any():
-        poses[unit, :3, :3] = Rotation.from_quat(table[unit, 4:]).as_matrix()
-    return poses
-
-
-def _listed(mask: NDArray[np.bool_], numbers: Sequence[int] | NDArray[np.int64], what: str = "line") -> str:
-    """The first of those that a mask names."""
-    named = [str(numbers[int(i)]) for i in np.flatnonzero(mask)]
-    return f"{what} {', '.join(named[:_LISTED])}{', …' if len(named) > _LISTED else ''}"

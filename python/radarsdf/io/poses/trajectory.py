@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +19,10 @@ from radarsdf.io.text import number_rows
 MAX_GAP_S = 0.5
 """Longest time between two poses over which poses are interpolated, by default."""
 
-_UNITS = ((1e17, "ns", 1e-9), (1e14, "µs", 1e-6), (1e11, "ms", 1e-3))  # from so much on, since 1970
-TIME_UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-"""Units of times in names of columns, s."""
-
-MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
+_MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
 _ROUNDED_S = 1e-3
-_NEARLY_SAME = 1 - 1e-9  # cosine of half an angle so small that its sine and itself are equal to rounding
+_SMALL = 1e-4  # rad: interpolation is linear
+_LISTED = 5  # poses that a note names
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +51,6 @@ class Trajectory:
         """Poses T_world_base (N, 4, 4) at the times (N,), s.
 
         Between two poses, the position is interpolated linearly and the rotation spherically (slerp).
-
-        Raises
-        ------
-        ValueError
-            If a time is not covered, or the poses before and after it are more than `max_gap_s` apart.
         """
         rotations, positions = self._at(times_s, max_gap_s)
         poses = np.tile(np.eye(4), (len(times_s), 1, 1))
@@ -67,45 +59,29 @@ class Trajectory:
         return poses
 
     def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
-        """Pose T_world_base (4, 4) at one time, s. None where `poses` would raise. Fast for one time of many poses.
+        """Pose T_world_base (4, 4) at one time, s. None where `poses` would raise.
 
-        A millisecond before the first pose or after the last one, or beside one in a longer gap, is at that pose: times in
-        files are rounded.
+        A millisecond before the first pose or after the last one, or next to one in a longer gap, is at that pose: times
+        in files are rounded.
         """
-        nearest_s = min(max(time_s, self.times_s[0]), self.times_s[-1])
-        time_s = nearest_s if abs(nearest_s - time_s) <= _ROUNDED_S else time_s
-        if not self.times_s[0] <= time_s <= self.times_s[-1]:
-            return None
-        after = int(np.searchsorted(self.times_s, time_s))
-        before = after if self.times_s[after] == time_s else after - 1
-        gap_s = self.times_s[after] - self.times_s[before]
-        if gap_s > max_gap_s:
-            nearest = before if time_s - self.times_s[before] < self.times_s[after] - time_s else after
-            if abs(self.times_s[nearest] - time_s) > _ROUNDED_S:
+        after = int(np.clip(np.searchsorted(self.times_s, time_s), 1, len(self.times_s) - 1))
+        both = slice(after - 1, after + 1)
+        first_s, last_s = self.times_s[both]
+        share = (time_s - first_s) / (last_s - first_s)
+        if not 0 <= share <= 1 or last_s - first_s > max_gap_s:
+            share = float(share > 0.5)
+            if not abs(time_s - (last_s if share else first_s)) <= _ROUNDED_S:
                 return None
-            before = after = nearest
-        share = 0.0 if before == after else (time_s - self.times_s[before]) / gap_s
         pose = np.eye(4)
-        pose[:3, :3] = _matrix(_slerp(self._quaternions[before], self._quaternions[after], share))
-        pose[:3, 3] = (1 - share) * self.positions[before] + share * self.positions[after]
+        first, last = self.rotations[both].as_quat()
+        pose[:3, :3] = Rotation.from_quat(_slerp(first, last, share)).as_matrix()
+        pose[:3, 3] = (1 - share) * self.positions[after - 1] + share * self.positions[after]
         return pose
-
-    @cached_property
-    def _quaternions(self) -> NDArray[np.float64]:
-        """(P, 4) qx, qy, qz, qw of `rotations`."""
-        quaternions: NDArray[np.float64] = self.rotations.as_quat()
-        return quaternions
 
     def move(
         self, points: NDArray[np.float64], times_s: NDArray[np.float64], max_gap_s: float
     ) -> NDArray[np.float64]:
-        """Points (N, 3) in the world frame, m, of points (N, 3) in the moving frame, each with its own time (N,), s.
-
-        Raises
-        ------
-        ValueError
-            As `poses`.
-        """
+        """Points (N, 3) in the world frame, m, of points (N, 3) in the moving frame, each with its own time (N,), s."""
         if len(points) == 0:
             return points
         rotations, positions = self._at(times_s, max_gap_s)
@@ -132,88 +108,75 @@ class Trajectory:
 
 
 def _slerp(first: NDArray[np.float64], last: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """The unit quaternion (4,) between two, on the shorter way. SciPy's takes ten times as long for one."""
+    """The quaternion (4,) between two unit ones, the shorter arc. SciPy's takes several times as long for one."""
     cosine = float(first @ last)
-    if cosine < 0:
-        last, cosine = -last, -cosine
-    if cosine > _NEARLY_SAME:
-        mixed = (1 - share) * first + share * last
-    else:
-        angle = math.acos(cosine)
-        mixed = (math.sin((1 - share) * angle) * first + math.sin(share * angle) * last) / math.sin(angle)
-    unit: NDArray[np.float64] = mixed / math.sqrt(mixed @ mixed)
-    return unit
+    angle = math.acos(min(abs(cosine), 1.0))
+    if angle < _SMALL:
+        return first + share * (math.copysign(1, cosine) * last - first)
+    return math.sin((1 - share) * angle) * first + math.copysign(math.sin(share * angle), cosine) * last
 
 
-def _matrix(quaternion: NDArray[np.float64]) -> list[list[float]]:
-    """The rotation matrix (3, 3) of a unit quaternion."""
-    x, y, z, w = quaternion.tolist()
-    return [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mask (P,) of the rows (P, 7) x y z qx qy qz qw that are finite and have a unit quaternion."""
+    with np.errstate(over="ignore", invalid="ignore"):  # of damaged numbers
+        unit = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= _MAX_NORM_ERROR
+    mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
+    return mask
+
+
+def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, 4, 4) of rows (P, 7) x y z qx qy qz qw; NaN where a row is no pose."""
+    good = are_poses(table)
+    poses = np.full((len(table), 4, 4), np.nan)
+    poses[good] = np.eye(4)
+    poses[good, :3, 3] = table[good, :3]
+    if good.any():
+        poses[good, :3, :3] = Rotation.from_quat(table[good, 3:]).as_matrix()
+    return poses
+
+
+def trajectory_of(
+    table: NDArray[np.float64], name: str, notes: Notes | None = None, lines: Sequence[int] | None = None
+) -> Trajectory:
+    """The trajectory in rows (P, 8) of time, position and quaternion, in any order, from these lines of a file.
+
+    Of several poses at one time, the first counts. `notes` take what was left out.
+    """
+    bad = ~(are_poses(table[:, 1:]) & np.isfinite(table[:, 0]))
+    missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
+    rows = np.flatnonzero(~bad)
+    times_s, first = np.unique(table[rows, 0], return_index=True)
+    back, again = np.zeros_like(bad), ~bad
+    back[rows[1:]] = np.diff(table[rows, 0]) < 0
+    again[rows[first]] = False
+    remarks = [
+        f"{name}: {mask.sum()} of {len(table)} poses {what}: {listed(mask, lines)}"
+        for mask, what in (
+            (bad, "left out, which are not finite or not unit quaternions"),
+            (back, "are not in the order of their times, and sorted"),
+            (again, "left out, whose times repeat"),
+        )
+        if mask.any()
     ]
+    if len(times_s) < 2 or 2 * (bad & ~missing).sum() >= (~missing).sum():
+        msg = f"{name} holds {len(times_s)} poses at different times; at least two poses are needed"
+        raise ValueError("; ".join([msg, *remarks]))
+    if notes is not None:
+        for remark in remarks:
+            notes.add(remark)
+    table = table[rows[first]]
+    return Trajectory(times_s, table[:, 1:4], Rotation.from_quat(table[:, 4:]), name)
 
 
-def in_seconds(times: NDArray[np.float64], path: Path, notes: Notes) -> NDArray[np.float64]:
-    """Times (N,) of a file, s. They may be in ms, µs or ns since 1970, which is noted.
-
-    Raises
-    ------
-    ValueError
-        If a time is not finite, or times are of different units.
-    """
-    if not np.isfinite(times).all():
-        msg = f"{path} holds a time that is not finite"
-        raise ValueError(msg)
-    units = {
-        next((unit for unit in _UNITS if abs(time) >= unit[0]), None) for time in times[times != 0].tolist()
-    }
-    if len(units) > 1:
-        msg = f"{path} holds times of different units, such as s and ns"
-        raise ValueError(msg)
-    (unit,) = units or {None}
-    if unit is None:
-        return times
-    notes.add(f"times of {path.name} are taken as {unit[1]} since 1970")
-    return times * unit[2]
-
-
-def read_trajectory(path: Path) -> Trajectory:
-    """Reads a trajectory in the TUM format: lines of ``time x y z qx qy qz qw``, s and m, and comments after ``#``.
-
-    Raises
-    ------
-    ValueError
-        If the file has another format or fewer than two poses, or if times do not ascend or quaternions do not have
-        unit length.
-    OSError
-        If the file cannot be read.
-    """
-    return trajectory_of_table(read_table(path, 8), path)
-
-
-def trajectory_of_table(table: NDArray[np.float64], path: Path) -> Trajectory:
-    """The trajectory in the rows (P, 8) of a TUM file; see :func:`read_trajectory`."""
-    if len(table) < 2 or not (np.diff(table[:, 0]) > 0).all():
-        msg = f"{path} must hold at least two poses, in the order of their times"
-        raise ValueError(msg)
-    if (np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > MAX_NORM_ERROR).any():
-        msg = f"{path}: the last four columns are not unit quaternions qx qy qz qw"
-        raise ValueError(msg)
-    return Trajectory(table[:, 0], table[:, 1:4], Rotation.from_quat(table[:, 4:]), str(path))
+def listed(mask: NDArray[np.bool_], lines: Sequence[int] | None) -> str:
+    """The first poses of a mask (P,), by the lines of their file or else by number."""
+    rows = np.flatnonzero(mask)
+    named = [str(row if lines is None else lines[row]) for row in rows[:_LISTED]]
+    return f"{'pose' if lines is None else 'line'} {', '.join(named)}{', …' if len(rows) > _LISTED else ''}"
 
 
 def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
-    """Reads a text file of finite numbers, (R, columns) float64, with comments after ``#``; None: of any poses.
-
-    Raises
-    ------
-    ValueError
-        If the file holds anything else.
-    OSError
-        If the file cannot be read.
-    """
+    """Reads a text file of finite numbers, (R, columns) float64, with comments after ``#``; None: of any poses."""
     wanted = "poses" if columns is None else f"{columns} columns of numbers"
     try:
         table = np.array(number_rows(path), np.float64)
