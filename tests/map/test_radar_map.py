@@ -260,7 +260,7 @@ def test_repr_says_what_it_is_and_what_its_file_takes(scene, sharp_map, tmp_path
     )
     sharp_map.save(tmp_path / "map.safetensors")
     names = (tmp_path / "map.safetensors").stat().st_size - sharp_map.file_bytes
-    assert 0 < names < 4000
+    assert 0 < names < 5000  # with checksums of all arrays
     config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     assert repr(radarsdf.fit(scene.points, scene.poses, config=config)).startswith("RadarMap(surface, ")
 

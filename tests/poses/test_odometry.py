@@ -226,7 +226,7 @@ def test_doppler_that_tells_no_velocity_is_said(drive):
 def test_wrong_arguments_are_refused(drive, motion):
     points, speeds, times = drive.points[:4], motion.doppler_mps[:4], motion.times_s[:4]
     rates = np.zeros((4, 3))
-    with pytest.raises(ValueError, match="times are missing"):
+    with pytest.raises(ValueError, match="times_s are missing"):
         radarsdf.odometry(points)
     with pytest.raises(ValueError, match="Doppler needs times"):
         radarsdf.odometry(points, doppler_mps=speeds)

@@ -178,7 +178,7 @@ def test_wrong_arguments_are_refused(street):
     points, poses = street.points[:3], street.poses[:3]
     with pytest.raises(ValueError, match="poses are missing"):
         radarsdf.refine_poses(points)
-    with pytest.raises(ValueError, match="times must be one"):
+    with pytest.raises(ValueError, match="times_s must be one"):
         radarsdf.refine_poses(points, poses, times_s=[0.0])
     with pytest.raises(ValueError, match="ascend"):
         radarsdf.refine_poses(points, poses, times_s=[0.0, 2, 1])
