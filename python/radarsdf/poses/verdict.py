@@ -23,9 +23,11 @@ _BY_CHANCE = 1e-3  # probability that true poses seem improved
 # degrees a step is found.
 _LEAST_GAIN = 0.001
 _HELD_OUT = 0.2  # of the returns
-_NEARBY = 0.5  # edge, likewise, of a cell whose returns of other scans only say that scans overlap there
-_MOST_COUNTED = 100_000  # returns of these cells
 _PLACE = 0.25  # edge of a place, in median ranges: what is seen as one thing from near and far is smaller
+_NEARBY = (
+    0.5  # edge of a cell, in median ranges, whose returns of other scans only say that scans overlap there
+)
+_MOST_COUNTED = 100_000  # returns of these cells
 
 
 def held_out(count: int, seed: int) -> NDArray[np.bool_]:

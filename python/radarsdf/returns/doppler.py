@@ -31,9 +31,8 @@ _LEAST_SIGMA_MPS = 1e-3
 _ROUNDS = 4
 _MIN_AGREEING = 0.4  # share of the returns that must agree on a velocity
 _FILLER = 0.2  # share of all returns with one and the same speed, from which on it may be none
-_ONLY_FILLER = (
-    0.9  # likewise, from which on a sensor that stands still cannot be told from one that does not measure
-)
+# Share from which on the other returns are too few to distinguish a sensor that stands still from one that does not measure.
+_ONLY_FILLER = 0.9
 # Deviation of any velocity. Across the directions of all returns, as the vertical of a flat field of view, nothing else is known.
 _ANY_MPS = 100.0
 _FOLDS = (-1.0, 0.0, 1.0)  # intervals by which all three returns of a draw may be folded
