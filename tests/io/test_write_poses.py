@@ -42,7 +42,7 @@ def test_wrong_arguments_are_refused_and_nothing_is_written(tmp_path):
         write_poses(tmp_path / "a.txt", POSES, TIMES)
     with pytest.raises(ValueError, match="needs times"):
         write_poses(tmp_path / "a.tum", POSES)
-    with pytest.raises(ValueError, match="times must be"):
+    with pytest.raises(ValueError, match="times_s must be"):
         write_poses(tmp_path / "a.tum", POSES, TIMES[:3])
     with pytest.raises(ValueError, match="rigid"):
         write_poses(tmp_path / "a.kitti", 2 * POSES)
