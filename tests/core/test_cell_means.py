@@ -101,27 +101,3 @@ def test_far_away_nothing_is_known():
     assert cells.sums(*asked).min() > 0.5
     points = np.array([[1e5, 0, 0], [3e38, 0, 0]], np.float32)
     assert cells.sums(points, asked[1][:2].copy(), asked[2][:2].copy()).tolist() == [0, 0]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"kinds": np.array([[0.0, 0, 0]])}, "edges above 0"),
-        ({"num_tilings": 0}, "num_tilings"),
-        ({"values": np.ones(2, np.float32)}, "values and weights"),
-        ({"shrinkage": 0.0}, "shrinkage"),
-    ],
-)
-def test_what_cannot_be_is_refused(changes, message):
-    points, directions, incidence = views(10)
-    given = {
-        "kinds": KINDS, "num_tilings": 1, "points": points, "directions": directions, "incidence_rad": incidence,
-        "values": np.ones(10, np.float32), "weights": np.ones(10, np.float32), "shrinkage": 1.0, "rounds": 1,
-    }  # fmt: skip
-    with pytest.raises(ValueError, match=message):
-        fit_cell_means(**(given | changes))
-
-
-def test_two_means_of_one_cell_are_refused():
-    with pytest.raises(ValueError, match="different keys"):
-        CellMeans(KINDS, 1, np.array([3, 3], np.uint64), np.ones(2, np.float32))

@@ -37,14 +37,6 @@ def test_points_along_rays_mark_the_cells_of_those_points(count, threads):
         assert len(cells) == len(expected)
 
 
-@pytest.mark.parametrize("far", [np.nan, np.inf, 3e5])
-def test_points_along_rays_that_have_no_cell_are_refused(far):
-    points, directions = rays_of(5)
-    points[3, 1] = far
-    with pytest.raises(ValueError, match="within a million cells"):
-        CellSet(LEAF_M).insert_along(points, directions, OFFSETS_M)
-
-
 def in_columns(cells, column, share):
     """The definition: a hash of the columns' coordinates."""
     hashed = np.zeros(len(cells), np.uint64)
@@ -68,13 +60,6 @@ def test_a_sample_of_columns_is_that_of_its_hash(axes, share):
         np.testing.assert_array_equal(chosen, expected.reshape(-1, len(OFFSETS_M)).any(axis=1))
 
 
-def test_arguments_of_samples_are_checked():
-    points, directions = rays_of(2)
-    for axes, column, share in (([3], 16, 0.5), ([0], 0, 0.5), ([0], 16, np.nan)):
-        with pytest.raises(ValueError, match=r"axes|column"):
-            sample_rays(points, directions, OFFSETS_M, axes, LEAF_M, column, share)
-
-
 @pytest.mark.parametrize("highest", [1, 2**9, 2**40, 2**64])
 @pytest.mark.parametrize("count", [0, 1, 5000])
 def test_the_order_of_keys_is_stable(highest, count):
@@ -91,13 +76,3 @@ def test_rows_of_blocks_are_gathered_side_by_side(count):
         out = np.zeros((count, 8), np.float32)
         gather_rows(blocks, order, out, threads)
         np.testing.assert_array_equal(out, np.concatenate(blocks, 1)[order])
-
-
-def test_arguments_of_gathered_rows_are_checked():
-    block, out = np.zeros((4, 2), np.float32), np.zeros((3, 2), np.float32)
-    gather_rows([block], np.array([3, 0, 0], np.int32), out)
-    for order in ([4, 0, 0], [-1, 0, 0], [0, 0]):
-        with pytest.raises(ValueError, match=r"order|out"):
-            gather_rows([block], np.array(order, np.int32), out)
-    with pytest.raises(ValueError, match="same rows"):
-        gather_rows([block, block[:3]], np.zeros(3, np.int32), np.zeros((3, 4), np.float32))

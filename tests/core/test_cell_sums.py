@@ -66,31 +66,6 @@ def test_sums_over_the_returns_of_a_cell():
         np.testing.assert_array_equal(sums, expected)
 
 
-def test_arguments_are_checked():
-    keys = np.array([1, 2, 3], np.uint64)
-    for wrong in (keys[::-1].copy(), keys[[0, 1, 1]]):
-        with pytest.raises(ValueError, match="ascending"):
-            CellBlocks(wrong)
-    with pytest.raises(ValueError, match="values"):
-        CellBlocks(keys).sum_round(keys, np.zeros((2, 1)), 1.0)
-    with pytest.raises(ValueError, match="values"):
-        CellBlocks(keys).sum_round(keys, np.zeros(3), 1.0)
-    with pytest.raises(ValueError, match="keys"):
-        CellBlocks(keys).rows(keys[None])
-    points, corners = np.zeros((2, 3), np.float32), np.zeros((5, 3), np.int64)
-    for cell in (-1, 5):
-        with pytest.raises(ValueError, match="cells"):
-            sum_returns(points, points, points[:, 0].copy(), np.array([0, cell], np.int32), corners, 0.1)
-    for name, given in (
-        ("directions", (points, points[:1], points[:, 0].copy(), np.zeros(2, np.int32), corners, 0.1)),
-        ("ranges_m", (points, points, points[:1, 0].copy(), np.zeros(2, np.int32), corners, 0.1)),
-        ("corners", (points, points, points[:, 0].copy(), np.zeros(2, np.int32), corners[:, :2].copy(), 0.1)),
-        ("quantum_m", (points, points, points[:, 0].copy(), np.zeros(2, np.int32), corners, 0.0)),
-    ):
-        with pytest.raises(ValueError, match=name):
-            sum_returns(*given)
-
-
 def test_values_between_the_centres_of_cells():
     rng = np.random.default_rng(0)
     size_m, cells = 0.2, some_cells()

@@ -125,21 +125,3 @@ def test_the_bits_do_not_depend_on_threads():
     for answer in answers[1:]:
         for found, expected in zip(answer[:3], answers[0][:3], strict=True):
             np.testing.assert_array_equal(found, expected)
-
-
-def test_shapes_are_checked():
-    given = list(returns())
-    found = CommonPlanes(*given, EXTENT_M, VARIANCES, 3)
-    diagonal, below, gradient, _ = prior(np.random.default_rng(1))
-    with pytest.raises(ValueError, match="below"):
-        found.solve(diagonal, below[1:], gradient, 1e-6, 50, False)
-    with pytest.raises(ValueError, match="diagonal"):
-        found.solve(diagonal[1:], below, gradient, 1e-6, 50, False)
-    with pytest.raises(RuntimeError, match="not determined"):
-        found.solve(-diagonal, 0 * below, gradient, 1e-6, 50, False)
-    for place, wrong, match in ((3, given[3][::-1].copy(), "ascend"), (4, given[4] + 12, "planes must lie")):
-        with pytest.raises(ValueError, match=match):
-            CommonPlanes(*given[:place], wrong, *given[place + 1 :], EXTENT_M, VARIANCES, 3)
-    for extent_m, scans_together in ((0.0, 3), (np.nan, 3), (EXTENT_M, 0)):
-        with pytest.raises(ValueError, match="must be positive"):
-            CommonPlanes(*given, extent_m, VARIANCES, scans_together)

@@ -4,12 +4,7 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
-import gc
-import os
-import signal
-import time
 
 import numpy as np
 import pytest
@@ -17,7 +12,7 @@ import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.field import Field
 from radarsdf.fitting.autograd_gradients import AutogradGradients
-from radarsdf.fitting.core_gradients import CoreGradients, _layers
+from radarsdf.fitting.core_gradients import CoreGradients
 from radarsdf.fitting.gradients import RandomDropout
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.returns.rays import prepare
@@ -171,17 +166,6 @@ def test_threads_change_no_bit_and_parts_only_the_rounding(rays, stage):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * b.abs().max().item())
 
 
-def test_what_fails_meanwhile_leaves_nothing_begun(rays):
-    made = make_batch(rays)
-    dropout = RandomDropout(0.7, torch.Generator().manual_seed(5))
-    with Workers(2) as workers:
-        backend = CoreGradients(made.field, made.config, dropout, workers)
-        with pytest.raises(ZeroDivisionError):
-            backend.joint(made.batch, lambda: 1 / 0)
-        found, _ = backend.joint(made.batch, lambda: None)
-    assert all(loss > 0 for loss in found.losses.values())
-
-
 @pytest.mark.parametrize("stage", STAGES)
 def test_extreme_logits_and_no_samples(rays, stage):
     made = make_batch(rays)
@@ -208,193 +192,3 @@ def test_not_a_number_is_passed_on(rays):
     losses = made.gradients(CoreGradients, "joint").losses
     assert np.isnan(losses["intensity"])
     assert np.isfinite(losses["sdf"])
-
-
-def core_arguments(batch):
-    field = batch.field
-    return {
-        "table": field.cells.table,
-        "features": field.cells.features.detach().numpy(),
-        "frequencies": (409.6, 0, 10),
-        "sdf": _layers(field.sdf_network),
-        "intensity": _layers(field.intensity_network),
-        "sees": (True, True, True),
-        "sigma_m": batch.config.sigma_m,
-        "intensity_in_free_space": False,
-    }
-
-
-def one_more_output(layers):
-    weights, biases = layers
-    return [*weights[:-1], np.repeat(weights[-1], 2, 0)], [*biases[:-1], np.repeat(biases[-1], 2)]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"frequencies": (409.6, 0, 9)}, "encodings of cells and positions"),
-        ({"frequencies": (409.6, 20, 10)}, "frequencies must lie in"),
-        ({"frequencies": (409.6, -1, 10)}, "frequencies must lie in"),
-        ({"frequencies": (0.0, 0, 10)}, "half_width_m must be positive"),
-        ({"sigma_m": 0.0}, "sigma_m must be positive"),
-        ({"sigma_m": float("nan")}, "sigma_m must be positive"),
-        ({"sees": (False, True, True)}, "see what it is said to"),
-        ({"features": np.zeros((3, 8), np.float32)}, "features must have shape"),
-        ({"sdf": ([], [])}, "at least one"),
-        ({"intensity": one_more_output}, "one output"),
-    ],
-)
-def test_the_core_refuses_networks_that_do_not_fit(rays, changes, message):
-    arguments = core_arguments(make_batch(rays))
-    _core.FieldLoss(**arguments)
-    changes = {k: change(arguments[k]) if callable(change) else change for k, change in changes.items()}
-    with pytest.raises(ValueError, match=message):
-        _core.FieldLoss(**(arguments | changes))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"parts": [(200, 100), (200, 201)]}, "of the batch"),
-        ({"parts": [(200, 100), (200, -1)]}, "of the batch"),
-        ({"parts": [(200, 100), (201, 0)]}, "of the batch"),
-        ({"parts": [(-1, -1), (400, 0)]}, "of the batch"),
-        ({"parts": [(200, 100), (199, 0)]}, "in a part"),
-        ({"parts": []}, "in a part"),
-        ({"points": np.zeros((400, 2), np.float32)}, "points must have shape"),
-        ({"sdf_m": np.zeros(399, np.float32)}, "sdf_m must have shape"),
-        ({"sdf_m": np.zeros((400, 1), np.float32)}, "sdf_m must have shape"),
-        ({"rays": np.zeros((400, 7), np.float32)}, "rays must have shape"),
-        ({"rays": np.zeros((8, 400), np.float32).T}, "contiguous rows"),
-        ({"located": np.zeros((400, 2), np.int32)}, "located must have shape"),
-        ({"interpolated_grad": np.zeros((400, 16), np.float32)}, "interpolated_grad must have shape"),
-        ({"dropout": [(7, 0)]}, "keep something"),
-        ({"dropout": [(7, 1)] * 3}, "only the two encodings"),
-    ],
-)
-def test_the_core_refuses_batches_that_do_not_fit(rays, changes, message):
-    made = make_batch(rays)
-    loss, crew = _core.FieldLoss(**core_arguments(made)), _core.Crew(2)
-    sdf_batch = {
-        "points": made.batch.points.numpy(),
-        "sdf_m": made.batch.sdf_m.numpy(),
-        "parts": [(200, 100), (200, 100)],
-        "crew": crew,
-    }
-    batch = sdf_batch | {"rays": made.batch.of_ray.numpy(), "dropout": []}
-    outputs = {
-        "located": np.zeros((400, 3), np.int32),
-        "interpolated_grad": np.zeros((400, 24), np.float32),
-    }
-    calls = {
-        loss.begin_sdf: sdf_batch | outputs | {"weight": 1.0},
-        loss.begin_joint: batch | outputs | {"weights": (1.0, 1.0)},
-        loss.begin_intensity: batch | {"weight": 1.0},
-    }
-    refused = 0
-    for call, arguments in calls.items():
-        call(**arguments)
-        assert np.max(loss.finish(crew)) > 0
-        if changes.keys() <= arguments.keys():
-            refused += 1
-            with pytest.raises(ValueError, match=message):
-                call(**(arguments | changes))
-    assert refused > 0
-
-
-def test_the_core_does_one_batch_after_the_other(rays):
-    made = make_batch(rays)
-    loss, other = (_core.FieldLoss(**core_arguments(made)) for _ in range(2))
-    crew = _core.Crew(2)
-    arguments = [
-        made.batch.points.numpy(),
-        made.batch.sdf_m.numpy(),
-        [(400, 200)],
-        made.batch.of_ray.numpy(),
-        [],
-        1.0,
-    ]
-    with pytest.raises(RuntimeError, match="no batch was begun"):
-        loss.finish(crew)
-    loss.begin_intensity(*arguments, crew)
-    for busy in (loss, other):
-        with pytest.raises(RuntimeError, match="not finished"):
-            busy.begin_intensity(*arguments, crew)
-    expected = loss.finish(crew)
-    other.begin_intensity(*arguments, crew)
-    assert other.finish(crew) == expected
-    # What was begun and is forgotten ends with the crew, and before its arrays.
-    other.begin_intensity(*[np.array(a) if isinstance(a, np.ndarray) else a for a in arguments], crew)
-    del crew, other
-    gc.collect()
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize("pause_s", [0.0, 0.05], ids=["looking", "asleep"])
-def test_a_forked_child_goes_on_with_a_crew_alone(rays, pause_s):
-    made = make_batch(rays)
-    loss, crew = _core.FieldLoss(**core_arguments(made)), _core.Crew(3)
-    points, sdf_m, of_ray = (getattr(made.batch, name).numpy() for name in ("points", "sdf_m", "of_ray"))
-    arguments = points, sdf_m, [(200, 100), (200, 100)], of_ray, [], 1.0, crew
-    loss.begin_intensity(*arguments)
-    expected = loss.finish(crew)
-    time.sleep(pause_s)
-    child = os.fork()
-    if child == 0:
-        signal.alarm(60)
-        loss.begin_intensity(*arguments)
-        same = loss.finish(crew) == expected
-        del arguments, crew  # its threads stayed with the parent
-        os._exit(17 if same else 1)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
-    loss.begin_intensity(*arguments)
-    assert loss.finish(crew) == expected
-
-
-def test_the_core_refuses_other_types_and_a_missing_network(rays):
-    made = make_batch(rays)
-    arguments, crew = core_arguments(made), _core.Crew(1)
-    batch = made.batch
-    outputs = [np.zeros((400, 3), np.int32), np.zeros((400, 24), np.float64)]
-    points, sdf_m = (column.numpy().astype(np.float64) for column in (batch.points, batch.sdf_m))
-    with pytest.raises(TypeError, match="dtype of the features"):
-        _core.FieldLoss(**arguments).begin_sdf(points, sdf_m, [(400, 0)], 1.0, *outputs, crew)
-    with pytest.raises(TypeError):
-        _core.FieldLoss(**(arguments | {"features": np.zeros((3, 8), np.int32)}))
-    loss = _core.FieldLoss(**(arguments | {"intensity": None}))
-    assert loss.intensity_gradients == []
-    with pytest.raises(ValueError, match="no intensity network"):
-        loss.begin_intensity(
-            batch.points.numpy(), batch.sdf_m.numpy(), [(400, 200)], batch.of_ray.numpy(), [], 1.0, crew
-        )
-
-
-def test_the_core_keeps_what_it_reads(rays):
-    made = make_batch(rays)
-    samples, arguments, crew = made.batch, core_arguments(made), _core.Crew(2)
-    arguments["table"] = _core.VertexTable(
-        made.field.cells.table.leaf_keys(), made.config.leaf_size_m, made.config.encoding.num_levels
-    )
-    for name in ("features", "sdf", "intensity"):
-        arguments[name] = copy.deepcopy(arguments[name])
-    loss = _core.FieldLoss(**arguments)
-    batch = (
-        samples.points.numpy(),
-        samples.sdf_m.numpy(),
-        [(400, 200)],
-        samples.of_ray.numpy(),
-        [],
-        1.0,
-        crew,
-    )
-    loss.begin_intensity(*batch)
-    before = loss.finish(crew)
-    gradients = loss.intensity_gradients
-    arguments.clear()
-    gc.collect()
-    loss.begin_intensity(*batch)
-    assert loss.finish(crew) == before
-    del loss
-    gc.collect()
-    assert all(np.isfinite(gradient).all() for gradient in gradients)

@@ -178,11 +178,6 @@ def test_spherical_harmonics_equal_scipy():
     np.testing.assert_allclose(kernels.spherical_harmonics(directions), np.stack(expected, 1), atol=1e-12)
 
 
-def test_spherical_harmonics_refuse_a_gradient():
-    with pytest.raises(NotImplementedError, match="no gradient"):
-        kernels.spherical_harmonics(torch.ones(1, 3, requires_grad=True))
-
-
 def test_same_bits_for_any_number_of_threads():
     points = surface_points(20_000, dtype=np.float32)
     tables = [make_table(points, num_threads=threads) for threads in (1, 2, 3)]
@@ -199,16 +194,6 @@ def test_same_bits_for_any_number_of_threads():
     for other in answers[1:]:
         for first, second in zip(answers[0], other, strict=True):
             np.testing.assert_array_equal(first, second)
-
-
-def test_cells_do_not_depend_on_chunks_or_order():
-    points = surface_points(5000, dtype=np.float32)
-    whole, pieces = _core.CellSet(LEAF_M), _core.CellSet(LEAF_M)
-    whole.insert(points)
-    for chunk in np.array_split(points[::-1], 7):
-        pieces.insert(np.ascontiguousarray(chunk))
-    np.testing.assert_array_equal(whole.sorted_keys(), pieces.sorted_keys())
-    assert len(whole) == len({tuple(c) for c in np.floor(points / np.float32(LEAF_M)).astype(int).tolist()})
 
 
 def test_free_space_above_a_surface_has_no_features():
@@ -245,14 +230,6 @@ def test_wrong_arrays_are_refused():
         _core.VertexTable(np.array([5], np.uint64), LEAF_M, 0)
     with pytest.raises(ValueError, match="not available"):
         _core.set_instruction_set("abacus")
-
-
-def test_empty_batch_and_empty_table():
-    table = make_table(surface_points(10))
-    assert kernels.interpolate(torch.zeros(table.num_rows, 8), torch.zeros(0, 3), table).shape == (0, 24)
-    empty = _core.VertexTable(np.zeros(0, np.uint64), LEAF_M, 3)
-    assert empty.num_rows == 0
-    assert (kernels.interpolate(torch.zeros(0, 8), torch.zeros(5, 3), empty) == 0).all()
 
 
 def test_a_block_of_columns_is_a_valid_gradient():
@@ -320,26 +297,6 @@ def test_the_outermost_cells_of_the_lattice():
     np.testing.assert_allclose(kernels.interpolate(ones, torch.from_numpy(points), table), 3.0, rtol=1e-9)
     with pytest.raises(ValueError, match="within a million cells"):
         make_table(points + LEAF_M * 2)
-
-
-def test_one_row_hit_by_every_sample():
-    count = 1_000_000
-    table = make_table(np.array([[0.1, 0.1, 0.1]]), 3)
-    rng = np.random.default_rng(0)
-    points = rng.uniform(0, LEAF_M, (count, 3)).astype(np.float32)
-    # All of one sign, so that the sum grows to where float32 has lost the small numbers' last digits.
-    grad = rng.uniform(0.5, 1.5, (count, 24)).astype(np.float32)
-    sums = {}
-    for dtype in (torch.float32, torch.float64):
-        features = torch.zeros(table.num_rows, 8, dtype=dtype, requires_grad=True)
-        kernels.interpolate(features, torch.tensor(points, dtype=dtype), table).backward(
-            torch.tensor(grad, dtype=dtype)
-        )
-        sums[dtype] = features.grad.double().numpy()
-    # Weights are one on each plane of each level.
-    total = sums[torch.float64].reshape(3, -1, 8).sum(1)
-    np.testing.assert_allclose(total, 3 * grad.astype(np.float64).sum(0).reshape(3, 8), rtol=1e-6)
-    np.testing.assert_allclose(sums[torch.float32], sums[torch.float64], rtol=2e-3)
 
 
 @pytest.mark.usefixtures("instruction_set")

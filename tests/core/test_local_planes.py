@@ -94,17 +94,3 @@ def test_scores_fall_with_the_distance():
     assert (np.diff(scores[:3]) < -0.03).all()
     assert scores[3] < 0.5 * scores[0]
     assert not planes.scores(scan + [500.0, 0, 0], poses, VARIANCES).any()
-
-
-def test_nothing_has_no_scores():
-    empty = np.zeros((0, 3))
-    assert LocalPlanes(0.8).scores(empty, np.eye(4)[None], VARIANCES).shape == (1, 0)
-    hessian, gradient, doubt, weight = LocalPlanes(0.8).beside(empty, np.eye(4), VARIANCES)
-    assert not hessian.any()
-    assert not gradient.any()
-    assert not doubt.any()
-    assert weight == 0
-    with pytest.raises(ValueError, match="cell_size_m"):
-        LocalPlanes(0.0)
-    with pytest.raises(ValueError, match="poses"):
-        LocalPlanes(0.8).scores(empty, np.eye(4), VARIANCES)

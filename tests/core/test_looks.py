@@ -132,88 +132,6 @@ def test_a_look_is_from_the_sensor_to_the_return():
     assert count_looks(beside, LEAF_M, *ray, scan).tolist() == [0] * 4
 
 
-def test_cells_of_one_cube_have_the_same_looks():
-    rays, scans = rays_of("any", 2000), np.arange(2000, dtype=np.int32)
-    corner = np.array([-8, 0, -16])
-    cells, keys = sorted_cells(corner + np.stack(np.meshgrid(*[np.arange(8)] * 3), -1).reshape(-1, 3))
-    looks = count_looks(keys, LEAF_M, *rays, scans)
-    assert len(looks) == 512
-    assert np.unique(looks).tolist() == [looks_at(cells[:1], LEAF_M, *rays, scans)[0]] != [0]
-
-
-def test_without_rays_and_without_cells():
-    rays = rays_of("any", 10)
-    none = tuple(a[:0] for a in rays)
-    _, keys = sorted_cells([[0, 0, 0], [-9, 4, 4]])
-    assert count_looks(keys, LEAF_M, *none, np.zeros(0, np.int32)).tolist() == [0, 0]
-    assert count_looks(keys[:0], LEAF_M, *rays, np.zeros(10, np.int32)).tolist() == []
-
-
-def changed(arrays, name, value):
-    """The arguments of `count_looks`, one of which is `value`, or made from what it was."""
-    return {**arrays, name: value(arrays[name].copy()) if callable(value) else value}
-
-
-def with_number(row, number):
-    def change(array):
-        array.reshape(-1)[row] = number
-        return array
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "said"),
-    [
-        ("scans", lambda a: a[::-1].copy(), "scans must be ascending"),
-        ("leaf_keys", lambda a: a[::-1].copy(), "ascending"),
-        ("leaf_keys", lambda a: a[None], "leaf_keys must have shape"),
-        ("points", lambda a: a[:, :2].copy(), r"points must have shape \(N, 3\)"),
-        ("points", lambda a: a[0], r"points must have shape \(N, 3\)"),
-        ("directions", lambda a: a[:-1], r"directions must have shape \(9, 3\)"),
-        ("ranges_m", lambda a: a[:-1], "one for each point"),
-        ("ranges_m", lambda a: a[:, None], "one for each point"),
-        ("scans", lambda a: a[:-1], "one for each point"),
-        ("scans", lambda a: a[None], "one for each point"),
-        *((name, with_number(8, n), "finite") for name in ("points", "ranges_m") for n in (np.nan, np.inf)),
-        *(("directions", with_number(26, n), "finite") for n in (np.nan, np.inf)),
-        ("ranges_m", with_number(8, -0.5), "rays must be finite"),
-        ("points", with_number(26, 210_000.0), "within a million cells"),
-        ("points", with_number(0, -210_000.0), "within a million cells"),
-        *(("leaf_size_m", size_m, "cells") for size_m in (0.0, -0.2, np.nan)),
-    ],
-)
-def test_wrong_rays_are_refused(name, value, said):
-    points, directions, ranges_m = rays_of("any", 9)
-    _, keys = sorted_cells([[0, 0, 0], [-9, 4, 4], [50, 0, 1]])
-    arrays = {"leaf_keys": keys, "leaf_size_m": LEAF_M, "points": points, "directions": directions}
-    arrays |= {"ranges_m": ranges_m, "scans": np.arange(9, dtype=np.int32)}
-    count_looks(**arrays)
-    with pytest.raises(ValueError, match=said):
-        count_looks(**changed(arrays, name, value))
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize(("sensor_x_m", "x_m"), [(208_000, 209_200), (209_200, 208_000)])
-def test_sensor_and_return_must_both_be_within_a_million_cells(sensor_x_m, x_m, sign):
-    """The limit is 208,896 m."""
-    _, keys = sorted_cells([[0, 0, 0]])
-    ray = [[sign * x_m, 0, 0]], [[sign * np.sign(x_m - sensor_x_m), 0, 0]], [1200]
-    with pytest.raises(ValueError, match="within a million cells"):
-        count_looks(keys, LEAF_M, *(np.array(a, np.float32) for a in ray), np.zeros(1, np.int32))
-
-
-@pytest.mark.parametrize(
-    ("name", "dtype"), [("leaf_keys", np.int64), ("points", np.float64), ("scans", np.int64)]
-)
-def test_other_types_are_refused(name, dtype):
-    points, directions, ranges_m = rays_of("any", 2)
-    arrays = {"leaf_keys": np.zeros(1, np.uint64), "leaf_size_m": LEAF_M, "points": points}
-    arrays |= {"directions": directions, "ranges_m": ranges_m, "scans": np.zeros(2, np.int32)}
-    with pytest.raises(TypeError, match="incompatible"):
-        count_looks(**changed(arrays, name, lambda a: a.astype(dtype)))
-
-
 @pytest.mark.parametrize("num_cells", [1, 300, 40_000])
 def test_scans_of_cells_are_counted_once(num_cells):
     rng = np.random.default_rng(num_cells)
@@ -231,18 +149,3 @@ def test_cells_without_returns_have_no_scans():
     assert count_scans(none, none, 0).tolist() == []
     assert count_scans(none, none, 3).tolist() == [0, 0, 0]
     assert count_scans(np.array([1, 1, 1], np.int32), np.array([4, 4, 9], np.int32), 3).tolist() == [0, 2, 0]
-
-
-@pytest.mark.parametrize(
-    ("cells", "scans", "said"),
-    [
-        ([0, -1, 1], [0, 0, 1], "cells must lie in"),
-        ([0, 3, 1], [0, 0, 1], "cells must lie in"),
-        ([0, 1, 1], [0, 2, 1], "scans must be ascending"),
-        ([0, 1], [0, 0, 1], "one for each return"),
-        ([[0, 1]], [[0, 0]], "must have shape"),
-    ],
-)
-def test_wrong_cells_are_refused(cells, scans, said):
-    with pytest.raises(ValueError, match=said):
-        count_scans(np.array(cells, np.int32), np.array(scans, np.int32), 3)

@@ -6,7 +6,6 @@ import itertools
 
 import numpy as np
 import pytest
-from radarsdf import _core
 from radarsdf.map.isosurface import extract_cells, marching_cubes, sparse_lattice
 
 from ..mesh_checks import (
@@ -158,12 +157,6 @@ def test_holes_of_a_mask_are_the_only_borders():
         assert cells_in_use(volume, mask)[tuple(centres.T)].all()
 
 
-def test_an_all_false_mask_gives_nothing():
-    vertices, faces = marching_cubes(noise(9), mask=np.zeros((14, 15, 40), dtype=bool))
-    assert vertices.shape == (0, 3)
-    assert faces.shape == (0, 3)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_infinite_samples_are_signs(dtype):
     volume = np.where(sphere(20) > 0, np.inf, -np.inf).astype(dtype)
@@ -176,14 +169,6 @@ def test_infinite_samples_are_signs(dtype):
     assert np.isfinite(one_sided).all()
     far = np.abs(one_sided - np.rint(one_sided)).max(axis=1)
     assert far == pytest.approx(1e-3)  # next to the finite sample
-
-
-def test_the_largest_doubles_do_not_overflow():
-    volume = np.where(sphere(10) > 0, 1.7e308, -1.7e308)
-    for level in (0.0, 1.6e308, -1.6e308):
-        vertices, faces = marching_cubes(volume, level)
-        assert np.isfinite(vertices).all()
-        assert len(faces) > 0
 
 
 @pytest.mark.parametrize(("value", "is_positive"), [(1.0, False), (np.nextafter(1.0, 2), True)])
@@ -200,18 +185,6 @@ def test_a_float32_volume_is_compared_with_the_level_in_double():
     assert len(marching_cubes(volume, 0.1)[1]) == 1
     assert len(marching_cubes(volume, float(third))[1]) == 0
     assert len(marching_cubes(-volume, -float(third))[1]) == 1
-
-
-@pytest.mark.parametrize("level", [1e300, -1e300, 100.0, -100.0])
-def test_a_level_beyond_all_samples_gives_nothing(level):
-    assert len(marching_cubes(noise(10), level)[1]) == 0
-
-
-def test_a_level_beyond_float32_still_cuts_infinite_samples():
-    volume = np.zeros((2, 2, 2), dtype=np.float32)
-    volume[0, 0, 0] = np.inf
-    assert len(marching_cubes(volume, 1e300)[1]) == 1
-    assert len(marching_cubes(-volume, -1e300)[1]) == 1
 
 
 @pytest.mark.parametrize(
@@ -295,14 +268,6 @@ def test_types_of_samples(dtype, kept):
     assert np.array_equal(faces, expected[1])
 
 
-def test_views_of_other_layouts():
-    volume = noise(15, (10, 11, 12))
-    expected = marching_cubes(volume)
-    assert same_mesh(marching_cubes(np.asfortranarray(volume)), expected)
-    assert same_mesh(marching_cubes(np.repeat(volume, 2, axis=2)[:, :, ::2]), expected)
-    assert marching_cubes(volume.tolist())[1].shape == expected[1].shape
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
@@ -322,26 +287,3 @@ def test_views_of_other_layouts():
 def test_wrong_arguments_are_named(arguments, error, message):
     with pytest.raises(error, match=message):
         marching_cubes(**{"volume": np.zeros((3, 3, 3)), **arguments})
-
-
-def test_the_core_checks_for_itself():
-    volume = np.zeros((3, 3, 3))
-    for arguments in (
-        (volume[0], None, [1] * 3, [0] * 3, 0.0),
-        (volume, np.ones((3, 3, 2), dtype=bool), [1] * 3, [0] * 3, 0.0),
-        (volume, None, [1, -1, 1], [0] * 3, 0.0),
-        (volume, None, [1] * 3, [0, np.inf, 0], 0.0),
-        (volume, None, [1] * 3, [0] * 3, np.nan),
-    ):
-        with pytest.raises(ValueError, match=r"."):
-            _core.marching_cubes_dense(*arguments)
-
-
-def test_results_own_their_memory():
-    vertices, faces = marching_cubes(sphere(20))
-    copies = vertices.copy(), faces.copy()
-    for _ in range(5):
-        marching_cubes(noise(16))
-    vertices += 0.0  # writable
-    assert np.array_equal(vertices, copies[0])
-    assert np.array_equal(faces, copies[1])

@@ -101,17 +101,6 @@ def test_worst_volumes_give_manifolds(volume, level, data):
     check(volume, level, mask)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("power", [-149, -140, 0, 120])
-def test_a_power_of_two_changes_nothing(dtype, power):
-    """From denormal numbers to the largest: samples and level that are scaled exactly give the same mesh."""
-    volume = np.random.default_rng(0).integers(-100, 100, (7, 8, 9)).astype(dtype)
-    factor = 2.0**power
-    scaled = (volume.astype(np.float64) * factor).astype(dtype)
-    expected, got = marching_cubes(volume, 3.0), marching_cubes(scaled, 3.0 * factor)
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(expected, got, strict=True))
-
-
 @pytest.mark.parametrize(("field", "characteristic"), [(sphere, 2), (torus, 0)])
 @pytest.mark.parametrize(
     "spacing", [(1, 1, 1), (1e-3, 1.0, 1e3), (1e-150, 1e-140, 1e-145), (1e100, 1e90, 1e95)]
@@ -127,37 +116,6 @@ def test_topology_of_any_spacing(field, characteristic, spacing):
     np.testing.assert_allclose(vertices / spacing, unit, rtol=1e-15)
 
 
-def test_several_surfaces_have_the_sum_of_their_characteristics():
-    n = 20
-    volume = np.concatenate([np.pad(f(n), 1, constant_values=1.0) for f in (sphere, torus, sphere, torus)])
-    vertices, faces = check(volume, 0.0)
-    assert len(single_edges(faces)) == 0
-    assert euler_characteristic(vertices, faces) == 2 + 0 + 2 + 0
-
-
-@pytest.mark.parametrize("hole", [np.nan, "mask"])
-def test_a_hole_lowers_the_characteristic_by_one(hole):
-    volume = sphere(20)
-    mask = np.ones(volume.shape, bool)
-    bottom = tuple(np.argwhere(np.abs(volume[:, 10, 10]) < 0.06)[0]) + (10, 10)
-    mask[bottom] = False
-    vertices, faces = (
-        check(volume, 0.0, mask) if hole == "mask" else check(np.where(mask, volume, np.nan), 0.0)
-    )
-    assert euler_characteristic(vertices, faces) == 1
-    assert len(single_edges(faces)) > 0
-
-
-@pytest.mark.parametrize("level", [0.0, 1.0, -1.0])
-def test_a_volume_of_plateaus_at_the_level(level):
-    volume = np.full((6, 7, 8), level)
-    assert len(marching_cubes(volume, level)[1]) == 0  # nothing is greater than the level
-    volume[2:4, 2:5, 3] = np.nextafter(level, np.inf)
-    vertices, faces = check(volume, level)
-    assert len(single_edges(faces)) == 0
-    assert euler_characteristic(vertices, faces) == 2
-
-
 def test_positions_that_float64_cannot_hold_are_refused():
     with pytest.raises(ValueError, match="beyond float64"):
         marching_cubes(noise(0), spacing=(1e308, 1, 1))
@@ -170,11 +128,3 @@ def test_far_from_the_origin_vertices_keep_apart_as_far_as_the_docstring_says():
     vertices, faces = marching_cubes(noise(1), origin=(1e12, -1e12, 1e12))
     assert len(np.unique(vertices, axis=0)) == len(vertices)
     assert (np.linalg.norm(normals(vertices - vertices[0], faces), axis=1) > 0).all()
-
-
-@pytest.mark.parametrize("num_threads", [-5, 1000, 2**31 - 1])
-def test_any_number_of_threads(num_threads):
-    """More than the system gives would end the program."""
-    volume = noise(2, (3000, 2, 3))
-    for mesh in (marching_cubes(volume, num_threads=num_threads), marching_cubes(volume, num_threads=1)):
-        assert mesh[1].sum() == marching_cubes(volume)[1].sum()

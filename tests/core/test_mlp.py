@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import itertools
 
-import numpy as np
 import pytest
 import torch
-from radarsdf import _core
 from radarsdf.field.mlp import mlp
 from radarsdf.threads import Workers
 
@@ -93,16 +91,6 @@ def pairs(tensors):
     return list(zip(tensors[::2], tensors[1::2], strict=True))
 
 
-def test_columns_of_a_larger_matrix_stay_where_they_are():
-    (wide,), layers = make([30], [6, 2], 70)
-    parts = [wide[:, 3:10], wide[:, 12:30]]
-    layers = [(layers[0][0][:, :25].detach().contiguous(), layers[0][1]), layers[1]]
-    assert_same(mlp(parts, layers), plain(parts, layers), torch.float64)
-    (found,) = torch.autograd.grad(mlp(parts, layers).sum(), wide)
-    (expected,) = torch.autograd.grad(plain(parts, layers).sum(), wide)
-    assert_same(found, expected, torch.float64)
-
-
 def test_same_bits_for_any_number_of_threads():
     inputs, layers = make([24, 60], [32, 32, 1], 40_000, torch.float32)
     found = []
@@ -118,13 +106,6 @@ def test_same_bits_for_any_number_of_threads():
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
-def test_a_row_does_not_depend_on_the_others():
-    inputs, layers = make([24, 60], [32, 32, 1], 1000, torch.float32)
-    out = mlp(inputs, layers)
-    for rows in (slice(0, 1), slice(3, 70), slice(63, 66), slice(999, 1000)):
-        assert torch.equal(mlp([x[rows] for x in inputs], layers), out[rows])
-
-
 def test_what_is_not_a_number_stays_so():
     # A rectifier that made zero of it would hide that a training has diverged.
     inputs, layers = make([4], [16, 1], 3, torch.float32)
@@ -135,55 +116,3 @@ def test_what_is_not_a_number_stays_so():
     with Workers(1):
         grads = torch.autograd.grad(out.sum(), [layers[0][0]])
     assert grads[0].isnan().any()
-
-
-def test_shapes_are_checked():
-    x, w, b = np.zeros((3, 4)), np.zeros((2, 4)), np.zeros(2)
-    out = np.zeros((3, 2))
-    good = {"inputs": [x], "weights": [w], "biases": [b], "out": out, "keep_hidden": True}
-    hidden = _core.mlp(**good)
-    for bad in (
-        {"inputs": [x[:, :3]]},
-        {"inputs": [x[:2]]},
-        {"inputs": [x[0]]},
-        {"inputs": [x.T.copy().T]},
-        {"inputs": []},
-        {"weights": []},
-        {"weights": [w, w]},
-        {"weights": [w, w], "biases": [b, b]},
-        {"weights": [w[0]]},
-        {"weights": [np.zeros((0, 4))], "biases": [np.zeros(0)], "out": np.zeros((3, 0))},
-        {"biases": [np.zeros(3)]},
-        {"biases": [np.zeros((2, 1))]},
-        {"out": np.zeros((3, 1))},
-        {"out": np.zeros((2, 2))},
-        {"out": np.zeros(3)},
-    ):
-        with pytest.raises(ValueError, match=r"must|shape"):
-            _core.mlp(**good | bad)
-    for wrong in ({"inputs": [x.astype(np.float32)]}, {"out": out.astype(np.float32)}, {"biases": [None]}):
-        with pytest.raises(TypeError):
-            _core.mlp(**good | wrong)
-    good = {
-        "inputs": [x],
-        "weights": [w],
-        "biases": [b],
-        "hidden": hidden,
-        "out_grad": out,
-        "weight_grads": [w.copy()],
-        "bias_grads": [b.copy()],
-        "input_grads": [x.copy()],
-    }
-    _core.mlp_backward(**good)
-    for bad in (
-        {"hidden": np.zeros((3, 16))},
-        {"out_grad": np.zeros((3, 1))},
-        {"weight_grads": None},
-        {"weight_grads": []},
-        {"weight_grads": [np.zeros((2, 3))]},
-        {"bias_grads": [np.zeros(1)]},
-        {"input_grads": []},
-        {"input_grads": [np.zeros((3, 3))]},
-    ):
-        with pytest.raises(ValueError, match=r"must|shape"):
-            _core.mlp_backward(**good | bad)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from radarsdf._core import find_passages
 from radarsdf.returns.passages import Passages
 
@@ -75,11 +74,3 @@ def test_threads_make_no_difference_and_a_box_leaves_out_blocks():
     cells = np.random.default_rng(0).integers(-60, 60, (2000, 3))
     dense, _ = one.dense([-60] * 3, (120,) * 3)
     np.testing.assert_array_equal(one.at(cells), dense[tuple((cells + 60).T)])
-
-
-@pytest.mark.parametrize(("row", "value"), [(0, np.nan), (2, -1.0), (3, 100.0)])
-def test_rays_that_are_none_are_refused(row, value):
-    rays = [a.copy() for a in rays_of(10, 2)]
-    rays[row].flat[0] = value
-    with pytest.raises(ValueError, match="rays must be finite"):
-        found(rays)

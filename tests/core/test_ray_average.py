@@ -66,19 +66,6 @@ def test_a_longer_reach_meets_all_the_cells_of_a_shorter_one():
         np.testing.assert_array_equal(far, keys_along(points, directions, 0.6, num_threads))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30, 209_800.0])
-def test_rays_outside_the_lattice_are_refused(value):
-    points, directions, normals, weights = some_rays(10)
-    table = VertexTable(keys_along(points, directions, 0.4), LEAF_M, 1, Encoding.OCTREE)
-    points[3, 1] = value
-    cells = CellSet(LEAF_M)
-    with pytest.raises(ValueError, match="million cells"):
-        cells.insert_rays(points, directions, 0.4)
-    assert len(cells) == 0
-    with pytest.raises(ValueError, match="million cells"):
-        table.average_rays(points, directions, normals, weights, 0.6)
-
-
 @pytest.mark.parametrize("num_levels", [1, 3])
 def test_vertices_of_leaf_cells(num_levels):
     points, directions, *_ = some_rays(300)
@@ -138,37 +125,6 @@ def test_the_same_bits_for_any_number_of_threads():
         np.ascontiguousarray(a[::-1]) for a in rays
     ]  # another order of sums, and no ray lost between groups
     np.testing.assert_allclose(table.average_rays(*backwards, 0.6)[0], one, atol=1e-5)
-
-
-def test_no_ray_and_no_cell():
-    rays = some_rays(20)
-    table = VertexTable(keys_along(rays[0], rays[1], 0.4), LEAF_M, 1, Encoding.OCTREE)
-    assert not np.any(table.average_rays(*(a[:0] for a in rays), 0.6))
-    empty = VertexTable(np.zeros(0, np.uint64), LEAF_M, 1, Encoding.OCTREE)
-    assert len(empty.average_rays(*rays, 0.6)[0]) == 0
-    assert [len(a) for a in empty.leaf_vertices()] == [0, 0]
-
-
-def test_only_an_octree_has_vertices_in_space():
-    rays = some_rays(20)
-    table = VertexTable(keys_along(rays[0], rays[1], 0.4), LEAF_M, 1, Encoding.TRI_QUADTREE)
-    with pytest.raises(ValueError, match="octree"):
-        table.leaf_vertices()
-    with pytest.raises(ValueError, match="octree"):
-        table.average_rays(*rays, 0.6)
-
-
-def test_wrong_arrays_are_refused():
-    points, directions, normals, weights = some_rays(20)
-    table = VertexTable(keys_along(points, directions, 0.4), LEAF_M, 1, Encoding.OCTREE)
-    for wrong in (
-        (points[:5], directions, normals, weights),
-        (points, directions[:5], normals, weights),
-        (points, directions, normals[:, :2], weights),
-        (points, directions, normals, weights[:5]),
-    ):
-        with pytest.raises(ValueError, match="shape"):
-            table.average_rays(*(np.ascontiguousarray(a) for a in wrong), 0.6)
 
 
 def test_the_side_of_a_vertex_is_known_where_many_rays_passed_it_and_behind_many_more():

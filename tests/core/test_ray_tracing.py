@@ -167,27 +167,6 @@ def test_far_apart_triangles_need_little_memory():
     assert agree(found, reference(near, faces, np.zeros(3), directions.astype(np.float64))) >= 0.99
 
 
-def test_nothing_to_meet():
-    tracer = SurfaceTracer(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    found, rows = tracer.first_hits([0, 0, 0], unit_vectors(10), 50.0)
-    assert np.isinf(found).all()
-    assert (rows == -1).all()
-
-
-@pytest.mark.parametrize(
-    ("vertices", "faces", "said"),
-    [
-        (np.zeros((3, 3)), np.array([[0, 1, 3]], np.int32), "does not exist"),
-        (np.zeros((3, 3)), np.array([[0, 1, -1]], np.int32), "does not exist"),
-        (np.full((3, 3), np.nan), np.array([[0, 1, 2]], np.int32), "finite"),
-        (np.zeros((3, 2)), np.array([[0, 1, 2]], np.int32), "shape"),
-    ],
-)
-def test_wrong_meshes(vertices, faces, said):
-    with pytest.raises(ValueError, match=said):
-        SurfaceTracer(vertices, faces)
-
-
 @pytest.mark.parametrize(
     ("origin", "direction", "limit"),
     [([np.nan, 0, 0], 1.0, 5.0), ([0, 0, 0], np.inf, 5.0), ([0, 0, 0], 1.0, -1.0)],

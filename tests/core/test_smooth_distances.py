@@ -143,21 +143,6 @@ def test_without_planes_it_only_bends_less():
     assert len(smoothed(empty, rough[:0], *planes, 3)) == 0
 
 
-def test_what_cannot_be_smoothed_is_refused():
-    table, rough, points, normals, information = scene()
-    with pytest.raises(ValueError, match="distances_m"):
-        smoothed(table, rough[1:], points, normals, information, 3)
-    with pytest.raises(ValueError, match="information"):
-        smoothed(table, rough, points, normals, information[1:], 3)
-    with pytest.raises(ValueError, match="normals"):
-        smoothed(table, rough, points, normals[:, :2].copy(), information, 3)
-    with pytest.raises(ValueError, match="million cells"):
-        smoothed(table, rough, points + np.float32(np.nan), normals, information, 3)
-    planes = VertexTable(table.leaf_keys(), LEAF_M, 1, Encoding.TRI_QUADTREE)
-    with pytest.raises(ValueError, match="octree"):
-        smoothed(planes, np.zeros(planes.num_rows, np.float32), points, normals, information, 3)
-
-
 def test_no_vertex_leaves_its_known_side():
     table, rough, *planes = scene()
     sides = np.random.default_rng(1).integers(-1, 2, len(rough)).astype(np.int8)

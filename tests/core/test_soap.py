@@ -126,35 +126,3 @@ def test_hostile_gradients(dtype):
         assert np.isfinite(memory).all()
         assert np.abs(weights).max() < 100 * 20 * RATE
         assert (np.abs(weights).max() > RATE) == (scale > 1e-15)  # less does not count, as with Adam
-
-
-def test_several_matrices_are_moved_as_if_alone():
-    rng = np.random.default_rng(3)
-    shapes = [(5, 9), (9, 5), (7, 7)]
-    together = [np.zeros(shape, np.float32) for shape in shapes]
-    alone = [np.zeros(shape, np.float32) for shape in shapes]
-    memories, own = [memory_of(w) for w in together], [memory_of(w) for w in alone]
-    for step in range(1, 40):
-        gradients = [rng.normal(size=shape).astype(np.float32) for shape in shapes]
-        _core.soap_step(together, gradients, memories, step, RATE)
-        for w, g, memory in zip(alone, gradients, own, strict=True):
-            _core.soap_step([w], [g], [memory], step, RATE)
-    for a, b in zip(together, alone, strict=True):
-        np.testing.assert_array_equal(a, b)
-        assert a.any()
-
-
-def test_what_does_not_fit_is_refused():
-    weights, gradient = np.zeros((4, 6), np.float32), np.zeros((4, 6), np.float32)
-    memory = memory_of(weights)
-    for arguments, message in [
-        (([weights], [gradient], [memory], 0), "step"),
-        (([weights], [], [memory], 1), "a gradient and a memory"),
-        (([weights], [gradient[:3]], [memory], 1), "gradients"),
-        (([weights], [gradient], [memory[1:]], 1), "memories"),
-        (([weights[0]], [gradient], [memory], 1), "matrices"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            _core.soap_step(*arguments, RATE)
-    with pytest.raises(TypeError):
-        _core.soap_step([weights], [gradient.astype(np.float64)], [memory], 1, RATE)

@@ -98,9 +98,3 @@ def test_rays_from_far_away_and_past_everything():
     beyond = np.array([[0, 0, 500.0]], np.float32)
     along = np.array([[1.0, 0, 0]], np.float32)
     assert surfel_map.first_crossings(beyond, along, ranges_m, 0.0, 0.0, MARGIN_M, 0.0).tolist() == [-1]
-
-
-def test_keys_must_ascend():
-    keys, surfels = a_scene(seed=0)
-    with pytest.raises(ValueError, match="ascending"):
-        SurfelMap(np.ascontiguousarray(keys[::-1]), surfels, CELL_M)

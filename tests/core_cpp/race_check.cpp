@@ -287,8 +287,8 @@ void before_the_training(int threads, Results& results) {
   const std::vector<float> ranges(kPoints, 6.0F);
   std::vector<std::int32_t> scans(kPoints), of_return(kPoints);
   for (std::int32_t i = 0; i < kPoints; ++i) {
-    scans[static_cast<std::size_t>(i)] = i * kScans / kPoints;
-    of_return[static_cast<std::size_t>(i)] = i % (kPlanes + 1) - 1;
+    scans[static_cast<std::size_t>(i)] = static_cast<std::int32_t>(i * kScans / kPoints);
+    of_return[static_cast<std::size_t>(i)] = static_cast<std::int32_t>(i % (kPlanes + 1) - 1);
   }
   std::vector<float> moved(7 * kPoints);
   radarsdf::move_onto_planes(
