@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "helpers.hpp"
+#include "lattice/cell_set.hpp"
 
 namespace {
 
