@@ -15,7 +15,7 @@ import numpy as np
 import viser
 import zstandard
 from numpy.typing import NDArray
-from radarsdf.view import light
+from radarsdf.view import glb as light
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
