@@ -88,8 +88,8 @@ def predicted_over_measured(measured: _Floats, predicted: _Floats) -> bytes:
     figure, (ax,) = _subplots(1)
     low, high = np.percentile(np.concatenate([measured, predicted]), [0.2, 99.8])
     high = max(high, low + 1e-6)
-    limits = [[low, high]] * 2
-    *_, drawn = ax.hist2d(measured, predicted, 60, limits, cmap="viridis", norm=LogNorm(), cmin=1)
+    bins = np.linspace(low, high, 61)
+    *_, drawn = ax.hist2d(measured, predicted, bins, cmap="viridis", norm=LogNorm(), cmin=1)
     ax.plot([low, high], [low, high], color=_SECOND, linewidth=1.5, label="equal")
     ax.set(xlabel="measured intensity", ylabel="predicted intensity", xlim=(low, high), ylim=(low, high))
     ax.legend(frameon=False, loc="upper left")

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
-from radarsdf.view.controls import key, paragraph, table
 from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import glb, lightness_of, shaded
+from radarsdf.view.legends import key, paragraph, table
 from radarsdf.view.scene import add_path
 from radarsdf.view.serving import Page, begin_at
 from radarsdf.view.surface import thinned

@@ -152,16 +152,13 @@ class Canvas:
         self._cloud: Any = None
         if any(quantity.of_sensor for quantity in quantities.values()):
             colors = np.full((len(self._spread), 3), NEUTRAL, np.uint8)
-            local, size_m = self._local[self._spread], _POINT_SIZE * spacing_m
-            self._cloud = server.scene.add_point_cloud(
-                "/surface/cloud",
-                local,
-                colors,
-                point_size=size_m,
-                point_shape="circle",
-                visible=False,
-                **_POINTS,
-            )
+            options = _POINTS | {
+                "point_shape": "circle",
+                "point_size": _POINT_SIZE * spacing_m,
+                "visible": False,
+            }
+            local = self._local[self._spread]
+            self._cloud = server.scene.add_point_cloud("/surface/cloud", local, colors, **options)
 
     def show_scan(self, state: State) -> None:
         """Show the returns of the scan."""
@@ -183,9 +180,9 @@ class Canvas:
                 self._cloud.points = self._local[self._cloud_rows]
             self._cloud.colors = colors
             self.coarse = True
-            for node, visible in ((self._cloud, True), *((mesh, False) for mesh in self._meshes)):
-                if node.visible != visible:
-                    node.visible = visible
+            self._cloud.visible = True
+            for mesh in self._meshes:
+                mesh.visible = False
 
     def show_mesh(self, state: State, superseded: Callable[[], bool]) -> None:
         """Send the mesh, and show it alone once the page has drawn it, unless the state is superseded before."""

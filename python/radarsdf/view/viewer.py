@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
-from radarsdf.view.controls import Controls
 from radarsdf.view.framing import FOV_RAD, Look, look_at_all
+from radarsdf.view.legends import legend, marks, paragraph, table
 from radarsdf.view.quantities import Colors, quantities_of
-from radarsdf.view.scene import HELD_S, SLID_S, Canvas, Painter, ScanClouds, State
+from radarsdf.view.scene import HELD_S, MEASURED_COLOR, SLID_S, Canvas, Painter, ScanClouds, State
 from radarsdf.view.serving import Page, begin_at
 from radarsdf.view.surface import ShownSurface, first_hit
 
@@ -105,23 +106,107 @@ class Viewer(Page):
         x, y, z = (origin if scans is None else scans.poses[0, :3, 3]).tolist()
         self.quantities = quantities_of(radar_map, surface, scans, (x, y, z))
         """What the surface can be coloured by."""
+        self._clicked: NDArray[np.float64] | None = None
         scale = self.quantities["intensity"].scale if radar_map.has_intensity else None
         measured = scale if isinstance(scale, Colors) else None
-        count = 0 if scans is None else len(scans)
-        self._controls = controls = Controls(server, surface, self.quantities, measured, count)
+        self._add_controls(0 if scans is None else len(scans), measured)
         self._clouds = None
         if scans is not None:
-            self._clouds = ScanClouds(server, radar_map, scans, measured, controls.describe_scan)
-        self._clicked: NDArray[np.float64] | None = None
+            self._clouds = ScanClouds(server, radar_map, scans, measured, self._describe_scan)
         self._canvas = Canvas(server, radar_map, surface, self.quantities, self._clouds, self._describe)
         self._gizmo: Any = None
         if radar_map.has_intensity:
             self._add_sensor(np.array([x, y, z]) - origin)
-        state = State((x, y, z), **controls.state(), scan=None if scans is None else 0)
+        state = State((x, y, z), **self._surface_state(), scan=None if scans is None else 0)
         self._painter = Painter(self._canvas, state)
-        controls.connect(self._painter, self._canvas, self._clouds, self._go_to_scan, self._look_at_all)
+        self._connect_controls()
         server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
+
+    def _add_controls(self, scans: int, measured: Colors | None) -> None:
+        """Add the panels. A narrow screen shows the second one folded, so that little covers the map."""
+        gui, surface = self._server.gui, self.surface
+        self._legend = gui.add_html(legend(next(iter(self.quantities.values()))))
+        self._quantity = gui.add_dropdown("colour by", tuple(self.quantities), hint="what the surface shows")
+        hint = "Click on the surface to query the map. Drag the sensor by its arrows."
+        self._answer = gui.add_html(paragraph(hint))
+        self._reset = gui.add_button("Reset view")
+        gui.main_panel.dock_right()
+        panel = gui.add_panel()
+        panel.dock_below(gui.main_panel)
+        largest_m = float(surface.uncertainty_m.max())
+        step_m = 10.0 ** math.floor(math.log10(max(largest_m, 1e-6) / 100))
+        end_m = math.ceil(largest_m / step_m) * step_m
+        with panel.add_tab("controls"):
+            with gui.add_folder("surface"):
+                self._show = gui.add_checkbox("show", True)
+                hint = "hides what is more uncertain"
+                self._uncertainty = gui.add_slider("uncertainty ≤ m", 0.0, end_m, step_m, end_m, hint=hint)
+                hint = f"hides what is less probable; the mesh is {surface.threshold}"
+                self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
+            if scans:
+                with gui.add_folder("scans"):
+                    gui.add_html(marks(measured or MEASURED_COLOR))
+                    self._scan = gui.add_slider("scan", 0, max(scans - 1, 1), 1, 0, disabled=scans == 1)
+                    self._scan_text = gui.add_markdown("")
+                    hint = "returns that the map predicts for this scan"
+                    self._layers = {
+                        "measured": gui.add_checkbox("measured", True),
+                        "predicted": gui.add_checkbox("predicted", True, hint=hint),
+                        "all": gui.add_checkbox("all scans", False),
+                    }
+                    self._path = gui.add_checkbox("trajectory", True)
+
+    def _surface_state(self) -> dict[str, Any]:
+        """The fields of :class:`State` that the controls of the surface set."""
+        return {
+            "max_uncertainty_m": float(self._uncertainty.value),
+            "min_confidence": float(self._confidence.value),
+            "quantity": str(self._quantity.value),
+        }
+
+    def _connect_controls(self) -> None:
+        # Coroutines, because viser would run functions in several threads, in any order.
+        async def on_limit(_: Any) -> None:
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=SLID_S)
+
+        async def on_quantity(_: Any) -> None:
+            self._legend.content = legend(self.quantities[self._quantity.value])
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=0.0)
+
+        async def on_show(_: Any) -> None:
+            self._canvas.node.visible = self._show.value
+
+        async def on_reset(event: Any) -> None:
+            self._look_at_all(event.client)
+
+        self._uncertainty.on_update(on_limit)
+        self._confidence.on_update(on_limit)
+        self._quantity.on_update(on_quantity)
+        self._show.on_update(on_show)
+        self._reset.on_click(on_reset)
+        clouds = self._clouds
+        if clouds is None:
+            return
+
+        async def on_scan(_: Any) -> None:
+            self._go_to_scan(clouds, int(self._scan.value))
+
+        async def on_path(_: Any) -> None:
+            clouds.path.visible = self._path.value
+
+        def on_layer(event: Any) -> None:  # in a thread: all scans take a while
+            for name, box in self._layers.items():
+                if box is event.target:
+                    clouds.set_visible(name, visible=box.value)
+
+        self._scan.on_update(on_scan)
+        self._path.on_update(on_path)
+        for box in self._layers.values():
+            box.on_update(on_layer)
+
+    def _describe_scan(self, text: str) -> None:
+        self._scan_text.content = text
 
     def _look_at_all(self, client: Any) -> Look:
         """Let a page show everything."""
@@ -168,10 +253,9 @@ class Viewer(Page):
 
         self._gizmo.on_update(on_update)
 
-    def _go_to_scan(self, index: int) -> None:
+    def _go_to_scan(self, clouds: ScanClouds, index: int) -> None:
         """Show a scan, and move the sensor to its pose."""
-        assert self._clouds is not None
-        sensor = self._clouds.sensor(index)
+        sensor = clouds.sensor(index)
         if self._gizmo is not None:
             self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
         self._painter.change(scan=index, sensor=sensor, coarse=True, settle_s=SLID_S)
@@ -208,7 +292,7 @@ class Viewer(Page):
         if self._map.has_intensity:
             range_m = float(np.linalg.norm(self._clicked - sensor))
             rows["intensity"] = f"{self._map.intensity(x, sensor)[0]:.1f} from {range_m:.1f} m"
-        self._controls.describe_click(rows)
+        self._answer.content = table(rows)
 
     def _notes(self, voxel_size: float) -> list[str]:
         notes = []
