@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import socket
 import sys
-from types import SimpleNamespace
 
 import pytest
 from radarsdf.view import serving
@@ -24,12 +23,6 @@ def test_a_port_that_is_taken():
 def test_an_address_of_another_machine(host):
     with pytest.raises(OSError, match=f"cannot listen on {host}.*--host"):
         serving.free_port(host, 8080, exactly=False)
-
-
-@pytest.mark.parametrize("port", [-1, 65536])
-def test_no_port_at_all(port):
-    with pytest.raises(ValueError, match="--port"):
-        serving.free_port("127.0.0.1", port, exactly=True)
 
 
 @pytest.mark.parametrize(
@@ -55,30 +48,3 @@ def test_a_browser_is_for_a_screen(monkeypatch):
     assert serving.has_display()
     monkeypatch.setenv("SSH_CONNECTION", "10.0.0.1 22 10.0.0.2 22")
     assert not serving.has_display()
-
-
-GONE = RuntimeError("the client disconnected before")
-NO_STORAGE = RuntimeError("Failed to read localStorage")  # an answer all the same
-
-
-@pytest.mark.parametrize(
-    ("failures", "superseded", "questions"),
-    [
-        ([], False, 3),
-        ([TimeoutError()], False, 4),
-        ([GONE], False, 1),
-        ([NO_STORAGE], False, 3),
-        ([], True, 0),
-    ],
-)
-def test_a_page_is_asked_until_it_has_drawn(failures, superseded, questions):
-    left, asked = list(failures), []
-
-    def get_item(_, timeout):
-        asked.append(timeout)
-        if left:
-            raise left.pop(0)
-
-    clients = {0: SimpleNamespace(local_storage=SimpleNamespace(get_item=get_item))}
-    serving.wait_until_drawn(SimpleNamespace(get_clients=lambda: clients), lambda: superseded)
-    assert len(asked) == questions

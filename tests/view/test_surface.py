@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import glb
-from radarsdf.view.surface import ShownSurface, first_hit, spread_evenly, thinned
+from radarsdf.view.surface import ShownSurface, first_hit, thinned
 from scipy.spatial import cKDTree
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
@@ -37,17 +37,6 @@ def test_a_thinned_mesh_is_the_same_surface_with_the_same_attributes(sharp_map):
 def test_a_map_without_a_surface_here(sharp_map):
     with pytest.raises(ValueError, match="no surface here"):
         ShownSurface.of(sharp_map, 0.2, max_vertices=1000, box=[[90, 90, 90], [91, 91, 91]], progress=False)
-
-
-def test_points_are_spread_evenly():
-    points = np.random.default_rng(1).uniform(0, 10, (20_000, 3)) * [1, 1, 0]
-    points[:15_000, :2] *= 0.1  # most of them in a corner
-    rows, of_point, edge_m = spread_evenly(points, 1000, 0.05)
-    assert 500 < len(set(rows)) == len(rows) <= 1000
-    assert np.linalg.norm(points - points[rows[of_point]], axis=1).max() < 1.8 * edge_m
-    everything, _, edge_m = spread_evenly(points, len(points), 0.05)
-    assert (everything == np.arange(len(points))).all()
-    assert edge_m == 0.05
 
 
 def test_a_glb_has_the_colors_that_were_given():

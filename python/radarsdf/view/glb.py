@@ -37,7 +37,9 @@ def glb(vertices: NDArray[Any], faces: NDArray[Any], colors: NDArray[np.uint8]) 
     """Encode vertices (V, 3), as float32, faces (F, 3) and sRGB colours (V, 3) as the bytes of a GLB file."""
     positions = np.ascontiguousarray(vertices, np.float32)
     indices = np.ascontiguousarray(faces, np.uint32).reshape(-1, 1)
-    views, accessors, size = [], [], 0
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    size = 0
     parts = (positions, indices, light_to_show(colors))
     for part, component, kind in zip(
         parts, (_FLOAT, _UNSIGNED_INT, _FLOAT), ("VEC3", "SCALAR", "VEC3"), strict=True

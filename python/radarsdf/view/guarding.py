@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Refuse requests that do not come from the viewer's own page.
+"""Refuse requests from other web pages in the same browser: they can reach this machine, also by DNS rebinding.
 
-Any web page in the same browser can send requests to this machine, even under a domain of its own that it makes resolve
-to 127.0.0.1 (DNS rebinding). Browsers report `Host`, the name that was requested, and `Origin`, the page that requests.
+Browsers report `Host`, the name that was requested, and `Origin`, the page that requests.
 """
 
 from __future__ import annotations

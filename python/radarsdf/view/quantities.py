@@ -81,15 +81,14 @@ def quantities_of(
     if radar_map.has_intensity:
         some = np.arange(0, len(vertices), max(1, len(vertices) // _SAMPLES))
         scale = _scale(intensity(some, sensor))
-        found["intensity"] = Quantity(
-            "intensity from the sensor, its units", intensity, scale, of_sensor=True
-        )
-    for name, label, values, scale in (
-        ("uncertainty", "uncertainty (standard error), m", surface.uncertainty_m, None),
-        ("confidence", "confidence (probability)", surface.confidence, Colors(0.0, 1.0)),
-        ("height", "height, m", vertices[:, 2], None),
+        found["intensity"] = Quantity("predicted intensity, sensor units", intensity, scale, of_sensor=True)
+    for name, label, values in (
+        ("uncertainty", "uncertainty (standard error), m", surface.uncertainty_m),
+        ("confidence", "confidence (probability)", surface.confidence),
+        ("height", "height, m", vertices[:, 2]),
     ):
-        found[name] = Quantity(label, _looked_up(values), scale or _scale(values))
+        scale = Colors(0.0, 1.0) if name == "confidence" else _scale(values)
+        found[name] = Quantity(label, _looked_up(values), scale)
     if scans is not None:
         edge_m = radar_map.config.leaf_size_m
         observed = functools.cache(lambda: _near_returns(vertices, scans, edge_m))
@@ -103,7 +102,7 @@ def _near_returns(vertices: NDArray[np.float64], scans: Scans, distance_m: float
     returns = np.concatenate([scan.world_points for scan in scans])
     workers = resolve_num_threads(0)
     nearest_m, _ = cKDTree(returns).query(vertices, distance_upper_bound=distance_m, workers=workers)
-    return np.isfinite(nearest_m)
+    return np.asarray(np.isfinite(nearest_m))
 
 
 def _looked_up(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:

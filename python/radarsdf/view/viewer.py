@@ -39,24 +39,14 @@ class Viewer(Page):
     scans : Scans, optional
         Scans with poses to browse, which are kept in memory.
     voxel_size, box, progress, **limits
-        As for :meth:`Map.mesh`.
+        As for :meth:`Map.mesh`, with its errors.
     max_vertices : int
         A mesh with more vertices is thinned.
     host : str
-        Address to listen on. With any but a loopback address, everyone who can reach it sees the page, by this address;
-        with ``0.0.0.0`` by any address and by the machine's name. Requests by other names and from other web pages are
-        refused.
+        Address to listen on. With any but a loopback address, everyone who can reach it sees the page. Requests from
+        other web pages are refused.
     port : int, optional
         Port to listen on. None: 8080, or the next that is free.
-
-    Raises
-    ------
-    ImportError
-        If viser is missing.
-    OSError
-        If host and port cannot be listened on.
-    ValueError
-        If the map has no surface, or for invalid arguments.
     """
 
     def __init__(
