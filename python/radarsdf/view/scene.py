@@ -233,19 +233,18 @@ class ScanClouds:
         colors: Colors | None,
         describe: Callable[[str], None],
     ) -> None:
-        self._server, self._map, self._scans = server, radar_map, scans
-        self._intensities = scans.intensities
+        self._server, self._map, self._scans = server, radar_map, list(scans)
         self._colors, self._describe = colors, describe
         self._shown: int | None = None
         self._clouds: dict[str, Any] = {}
         self._visible = {"measured": True, "predicted": True, "all": False}
-        self.every = max(1, -(-sum(map(len, scans.points)) // _MAX_RETURNS))
+        self.every = max(1, -(-sum(map(len, self._scans)) // _MAX_RETURNS))
         """Of all returns together, one in so many is shown."""
         self.path: Any = add_path(server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, PATH_COLOR)
 
     def sensor(self, index: int) -> Position:
         """Sensor position of a scan, world, m."""
-        x, y, z = self._scans.poses[index, :3, 3].tolist()
+        x, y, z = self._scans[index].T_world_sensor[:3, 3].tolist()
         return x, y, z
 
     def show(self, index: int) -> None:
@@ -253,17 +252,15 @@ class ScanClouds:
         if index == self._shown:
             return
         self._shown = index
-        pose = self._scans.poses[index]
-        world = self._in_world(index)
-        view = self._map.render(pose)
-        measured = None if self._intensities is None else self._intensities[index]
+        scan = self._scans[index]
+        world, view = scan.world_points, self._map.render(scan.T_world_sensor)
         with self._server.atomic():
-            self._draw("measured", world, self._colors_of(measured, len(world)))
+            self._draw("measured", world, self._colors_of(scan))
             self._draw("predicted", view.world_points, np.full((len(view), 3), PREDICTED_COLOR, np.uint8))
-        text = f"scan {index}: {len(world)} returns measured, {len(view)} predicted"
-        if measured is not None and self._map.has_intensity:
-            found = self._map.intensity(world, pose[:3, 3], extrapolate=True)
-            errors = np.abs(found - np.asarray(measured, np.float64))
+        text = f"scan {index}: {len(scan)} returns measured, {len(view)} predicted"
+        if scan.intensities is not None and self._map.has_intensity:
+            found = self._map.intensity(world, scan.T_world_sensor[:3, 3], extrapolate=True)
+            errors = np.abs(found - np.asarray(scan.intensities, np.float64))
             errors = errors[np.isfinite(errors)]
             text += f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
         self._describe(text)
@@ -272,19 +269,17 @@ class ScanClouds:
         """Show or hide the cloud ``measured``, ``predicted`` or ``all``."""
         self._visible[what] = visible
         if what == "all" and visible and "all" not in self._clouds:
-            world = np.concatenate([self._in_world(i) for i in range(len(self._scans))])[:: self.every]
-            measured = None if self._intensities is None else np.concatenate(self._intensities)[:: self.every]
-            self._draw("all", world, self._colors_of(measured, len(world)))
+            world = np.concatenate([scan.world_points for scan in self._scans])
+            colors = np.concatenate([self._colors_of(scan) for scan in self._scans])
+            self._draw("all", world[:: self.every], colors[:: self.every])
         if what in self._clouds:
             self._clouds[what].visible = visible
 
-    def _colors_of(self, intensities: NDArray[Any] | None, count: int) -> NDArray[np.uint8]:
-        if intensities is None or self._colors is None:
-            return np.full((count, 3), MEASURED_COLOR, np.uint8)
-        return self._colors(np.asarray(intensities, np.float64))
-
-    def _in_world(self, index: int) -> NDArray[np.float64]:
-        return Scan(self._scans.points[index], self._scans.poses[index]).world_points
+    def _colors_of(self, scan: Scan) -> NDArray[np.uint8]:
+        """(N, 3) sRGB of measured returns."""
+        if scan.intensities is None or self._colors is None:
+            return np.full((len(scan), 3), MEASURED_COLOR, np.uint8)
+        return self._colors(np.asarray(scan.intensities, np.float64))
 
     def _draw(self, what: str, world: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
         local = (world - self._map.origin).astype(np.float32)
