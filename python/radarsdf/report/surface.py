@@ -103,7 +103,7 @@ def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Flo
     `vertices` (V, 3) and `sensors` (F, 3), which are drawn as points, are in m near the origin, since the page computes
     in float32. viser exports the scene of a server, which listens on this machine for less than a second. Its
     compressed program contains addresses of other machines, which this scene does not use; the report's content
-    security policy forbids to fetch them.
+    security policy forbids fetching them.
     """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
     to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
