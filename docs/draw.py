@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 import radarsdf
 from radarsdf.changes.changes import APPEARED, COLORS, GONE, MOVED, NAMES, SAME, UNSEEN
-from radarsdf.render.figures import new_figure, png_of
+from radarsdf.render.figures import new_figure, png_of, save_view_picture
 from radarsdf.render.picture import render, save_picture
-from radarsdf.render.view_picture import save_view_picture
 from radarsdf.simulate import Box, Scene, simulate
 from radarsdf.simulate.materials import CONCRETE
 

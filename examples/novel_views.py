@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import radarsdf
-from radarsdf.render.view_picture import save_view_picture
+from radarsdf.render.figures import save_view_picture
 from scipy.spatial import cKDTree
 
 HELD_OUT = 10

@@ -85,7 +85,7 @@ def draw_small(patch):
     """Reports with small pictures and few samples of the truth, so that they take less time."""
     patch.setattr("radarsdf.report.surface._WIDTH", 160)
     patch.setattr("radarsdf.report.surface._HEIGHT", 100)
-    patch.setattr("radarsdf.report.truth._SAMPLES", 20_000)
+    patch.setattr("radarsdf.report.errors._SAMPLES", 20_000)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from radarsdf.render.view_picture import save_view_picture
+from radarsdf.render.figures import save_view_picture
 from scipy.spatial import cKDTree
 
 from .experiment import Experiment, Options, Row, Task, fit, groups

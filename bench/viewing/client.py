@@ -15,7 +15,7 @@ import numpy as np
 import viser
 import zstandard
 from numpy.typing import NDArray
-from radarsdf.view import light
+from radarsdf.view import glb
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -171,9 +171,9 @@ class Glb(NamedTuple):
     @property
     def colors(self) -> NDArray[np.float64]:
         """(V, 3) sRGB that the page shows, 0 to 255: after three.js's ACESFilmicToneMapping."""
-        a, b, c, d, e = light._FIT
-        x = self.light.astype(np.float64) @ light._IN.T / light._EXPOSURE
-        linear = np.clip((x * (x + a) - b) / (x * (c * x + d) + e) @ light._OUT.T, 0, 1)
+        a, b, c, d, e = glb._FIT
+        x = self.light.astype(np.float64) @ glb._IN.T / glb._EXPOSURE
+        linear = np.clip((x * (x + a) - b) / (x * (c * x + d) + e) @ glb._OUT.T, 0, 1)
         shown: NDArray[np.float64] = 255 * np.where(
             linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
         )

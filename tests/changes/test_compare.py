@@ -172,14 +172,14 @@ def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
 def test_the_command_writes_a_page_and_shows_what_changed(maps, tmp_path, capsys, monkeypatch):
     pytest.importorskip("viser", reason="the extra view is not installed")
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    from radarsdf.view import changed  # noqa: PLC0415
+    from radarsdf.view import pages  # noqa: PLC0415
 
     def stop(view):
         assert view.port > 0
         raise KeyboardInterrupt
 
     draw_small(monkeypatch)
-    monkeypatch.setattr(changed.ChangesView, "wait", stop)
+    monkeypatch.setattr(pages.ChangesView, "wait", stop)
     for number, name in ((0, "a"), (2, "b")):
         maps[number].save(tmp_path / f"{name}.safetensors")
     page = tmp_path / "changes.html"

@@ -107,9 +107,9 @@ def test_report(city, scans_file, tmp_path):
     assert "<title>city</title>" in text
     assert "all 3,000 returns of the 2 scans that the fit left out" in text
     assert "F-score, nothing discarded" in text
-    for words in ("Tiles", "Leaf cells", "Noise along the beam", "the intensity network", "training"):
+    for words in ("Tiles", "Leaf cells", "Noise in range", "the intensity network", "Training"):
         assert words in text
-    assert "missing" not in text
+    assert "Missing" not in text
 
 
 def test_view(city, scans_file):
@@ -120,7 +120,7 @@ def test_view(city, scans_file):
         radarsdf.load(city), read_scans(scans_file), voxel_size=0.2, port=0, progress=False
     ) as viewer:
         assert len(viewer.surface.vertices) > 1000
-        viewer._walk.show(1)
+        viewer._clouds.show(1)
         assert np.abs(viewer._canvas._local).max() < 100  # float32 is fine enough
 
 
@@ -136,7 +136,7 @@ def test_a_tile_that_is_missing_is_said(broken, scans_file, tmp_path, capsys):
     page = tmp_path / "report.html"
     assert call("report", out, scans_file, "-o", page, *VOXEL, "--quiet") == 0
     assert "more are in no tile" in page.read_text("utf-8")
-    assert "Tiles that are missing" in page.read_text("utf-8")
+    assert "Missing tiles" in page.read_text("utf-8")
 
 
 @pytest.mark.parametrize("command", ["info", "mesh", "eval", "render", "report", "view"])

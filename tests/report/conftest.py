@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A report of the small scene, with scans held out and ground truth, written once."""
+"""A report of the small scene, with held-out scans and ground truth, written once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import radarsdf
 from ..conftest import draw_small, with_truth
 from .reading import Page
 
-HOSTILE = """<script>alert("$title")</script>'&amp;.safetensors"""
+HOSTILE = """<script>alert("{{ title }}")</script>'&amp;.safetensors"""
 
 
 @pytest.fixture(scope="session")
@@ -21,17 +21,9 @@ def subject(scene, radar_map):
     from radarsdf.report.subject import Subject  # noqa: PLC0415
 
     scans = with_truth(scene)
-    train, test = np.arange(1, 6), np.arange(1)
-    findings = [radarsdf.Finding("made_up", "warning", "<b>1 of 2</b>", "Mend <i>it</i>.")]
-    return Subject(
-        radar_map,
-        HOSTILE,
-        scans.select(train),
-        scans.select(test),
-        findings,
-        voxel_size_m=0.25,
-        progress=False,
-    )
+    train, test = scans.select(np.arange(1, 6)), scans.select(np.arange(1))
+    findings = [radarsdf.Finding("made_up", "warning", "<b>1 of 2</b>", "Repair <i>it</i>.")]
+    return Subject(radar_map, HOSTILE, train, test, findings, voxel_size_m=0.25, progress=False)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -43,7 +35,7 @@ def small_pictures():
 
 @pytest.fixture(scope="session")
 def written(subject, tmp_path_factory):
-    """The file of the report, and its page as it is read."""
+    """The path of the report, and its page."""
     from radarsdf.report.writing import write_report  # noqa: PLC0415
 
     path = tmp_path_factory.mktemp("report") / "report.html"

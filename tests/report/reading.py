@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a browser sees in a page, as far as tests ask."""
+"""Parse a page as a browser would."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ class Page(HTMLParser):
         self.elements, self.frames, self.sections, self.stack = [], [], {}, []
         self._section = ""
         self.feed(html)
+        self.sections = {name: " ".join(text.split()) for name, text in self.sections.items()}
 
     def handle_starttag(self, tag, attrs):
         found = dict(attrs)

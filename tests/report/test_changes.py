@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The page about what changed says it in words, and shows it."""
+"""The report of what changed names each change, lists it and shows it."""
 
 from __future__ import annotations
 
@@ -28,55 +28,32 @@ def surface(kinds):
     return ChangedSurface(vertices, faces, kind, np.full(len(kind), 0.9, np.float32), moved, change)
 
 
-def changes_of(kinds):
-    report = {
-        "alignment": "The maps were taken as they are.",
-        "areas_m2": {NAMES[kind]: 4.0 * kinds.count(kind) for kind in (APPEARED, 1, MOVED, REPAINTED)},
-        "compared_m2": 20.0,
-        "reflectance": "It was not compared." if len(kinds) == 1 else "All returns are +0.4 stronger.",
-    }
-    return Changes(surface([SAME]), surface(kinds), np.eye(4), report)
-
-
-@pytest.fixture(scope="module")
-def write(tmp_path_factory):
+@pytest.mark.parametrize("kinds", [[SAME], [SAME, APPEARED, MOVED, REPAINTED]])
+def test_each_change_is_named_listed_and_shown(kinds, tmp_path):
     pytest.importorskip("viser", reason="the extra view is not installed")
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     from radarsdf.report.changes import write_changes_report  # noqa: PLC0415
 
-    def written(changes):
-        path = tmp_path_factory.mktemp("changes") / "changes.html"
-        size = write_changes_report(path, changes, ("monday", HOSTILE), 0.2, changes.regions(0.1))
-        assert size == path.stat().st_size
-        return Page(path.read_text("utf-8"))
-
-    return written
-
-
-def test_each_change_is_said_listed_and_shown(write):
-    page = write(changes_of([SAME, APPEARED, MOVED, REPAINTED]))
-    words = page.sections["conclusion"]
-    assert "4.0 m² in one place, the largest round (1.0, 4.0, 0.0) m." in words
-    assert "+0.4 stronger" in words
-    assert "unseen, not gone" in words
-    assert "Gone" not in words
-    listed = page.sections["changes"]
-    for expected in ("appeared", "moved by 0.25 m", "repainted, 6.5 stronger", "2.0 × 2.0 × 0.0", "0.90"):
-        assert expected in listed
-    assert len(page.all("img")) == 3 + 3
+    areas_m2 = {NAMES[kind]: 4.0 * kinds.count(kind) for kind in (APPEARED, 1, MOVED, REPAINTED)}
+    report = {
+        "alignment": "As <b>given</b>.",
+        "areas_m2": areas_m2,
+        "compared_m2": 20.0,
+        "reflectance": "+0.4",
+    }
+    changes = Changes(surface([SAME]), surface(kinds), np.eye(4), report)
+    regions, path = changes.regions(0.1), tmp_path / "changes.html"
+    assert write_changes_report(path, changes, ("monday", HOSTILE), 0.2, regions) == path.stat().st_size
+    page = Page(path.read_text("utf-8"))
+    assert "As <b>given</b>." in page.sections["conclusion"]
+    for region in regions:
+        assert region.kind.capitalize() in page.sections["conclusion"]
+        assert region.words in page.sections["changes"]
+    assert len(regions) == len(kinds) - 1
+    assert len(page.all("tr")) == (1 + len(regions) if regions else 0)
+    assert len(page.all("img")) == 3 + len(regions)
     assert len(page.frames) == 1
-    assert all(picture["alt"] for picture in page.all("img"))
     styles = [found.get("style", "") for found in page.all("i")]
-    for color in COLORS.values():
-        assert "background:rgb({} {} {})".format(*color) in styles
-    # No markup of names, and nothing from elsewhere.
+    assert all("background:rgb({} {} {})".format(*color) in styles for color in COLORS.values())
     assert not page.all("script")
     assert all(address.startswith(("#", "data:")) for address in page.addresses())
-
-
-def test_without_changes_it_says_so(write):
-    page = write(changes_of([SAME]))
-    assert "No place changed" in page.sections["conclusion"]
-    assert "It was not compared" in page.sections["conclusion"]
-    assert "Nothing changed." in page.sections["changes"]
-    assert "places" not in page.sections

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The page in a real browser without a screen: a drag and a click by the mouse, and every frame that is drawn."""
+"""The page in a headless browser: a drag and a click by the mouse, every frame meanwhile, and a narrow screen."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from radarsdf.io import Scans
 from radarsdf.map.colors import intensity_colors
-from radarsdf.view.light import shaded
+from radarsdf.view.glb import shaded
 from radarsdf.view.viewer import Viewer
 from scipy.spatial import cKDTree
 

@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
         check_mesh_path(options.out)
     check_outputs([options.out, options.report], [options.map, *inputs_of(options)])
     if options.report is not None:
-        from radarsdf.report.extras import require_extras
+        from radarsdf.report.page import require_extras
 
         require_extras()
     if options.view:
@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _show(changes: Changes, regions: Sequence[Region], edge_m: float, options: argparse.Namespace) -> None:
     """Serve a page until Ctrl-C, and say where."""
-    from radarsdf.view.changed import ChangesView
+    from radarsdf.view.pages import ChangesView
     from radarsdf.view.serving import url_of
 
     with ChangesView(changes, regions, edge_m, host=options.host, port=options.port) as view:

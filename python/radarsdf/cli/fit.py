@@ -144,7 +144,7 @@ def _check_report(options: argparse.Namespace) -> None:
     """Refuse a report that could not be made, before the work."""
     if options.report is None:
         return
-    from radarsdf.report.extras import require_extras
+    from radarsdf.report.page import require_extras
 
     require_extras()
     if options.dry_run:

@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> None:
         **shares,
     )
     if options.picture:
-        from radarsdf.render.grid_picture import save_grid_picture
+        from radarsdf.render.figures import save_grid_picture
 
         save_grid_picture(options.picture, grid, low, high)
     for path in outputs:

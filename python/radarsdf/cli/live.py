@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from radarsdf import LiveMap
     from radarsdf.io.scans import Scans
     from radarsdf.live.replay import Replay
-    from radarsdf.view.growing import GrowingView
+    from radarsdf.view.pages import GrowingView
 
 _SHOWN_EVERY_S = 0.5
 
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> None:
     with contextlib.ExitStack() as stack:
         shown = None
         if options.view:
-            from radarsdf.view.growing import GrowingView
+            from radarsdf.view.pages import GrowingView
 
             shown = _Shown(live, stack.enter_context(GrowingView(host=options.host, port=options.port)))
             stack.callback(shown.stop)

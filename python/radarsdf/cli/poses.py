@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
         write_poses(options.out, scans.poses, scans.times_s)
     results.add(f"{len(scans.poses)} poses written to {options.out}", out=options.out)
     if options.picture is not None:
-        from radarsdf.render.trajectory_picture import save_trajectory_picture
+        from radarsdf.render.figures import save_trajectory_picture
 
         drawn = (
             {"found": scans.poses} if posed.given is None else {"given": posed.given, "refined": scans.poses}

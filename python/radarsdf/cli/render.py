@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.files import check_outputs
     from radarsdf.io.npz import write_scans
     from radarsdf.map.views import scans_of_views
-    from radarsdf.render.view_picture import save_view_picture
+    from radarsdf.render.figures import save_view_picture
 
     suffix = options.out.suffix.lower()
     if suffix not in _SUFFIXES:

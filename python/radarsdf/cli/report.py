@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the page."""
-    from radarsdf.report.extras import require_extras
+    from radarsdf.report.page import require_extras
 
     require_extras()
     if options.holdout is not None and options.scans is None:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
-    from radarsdf.view.page import Page
+    from radarsdf.view.serving import Page
 
 
 def say(text: str = "", end: str = "\n") -> None:

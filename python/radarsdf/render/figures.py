@@ -1,17 +1,29 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Figures of matplotlib, an extra. They need no display, and no setting of the user's is changed."""
+"""Figures by matplotlib, an extra: views, grids and trajectories. They need no display and leave its settings alone."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
+from os import PathLike
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from radarsdf.extras import require
+from radarsdf.grids.grid import Grid
+from radarsdf.io.files import write_whole
+from radarsdf.map.views import View
+
+_UNKNOWN = "#d0d0d0"
+_TRAJECTORY_COLORS = ("#d95f02", "#1b6ca8", "#2a7f3f", "#8e44ad")
+_MAX_RETURNS = 60_000  # that a picture of trajectories shows
 
 
 def new_figure(**options: Any) -> Any:
-    """A figure of matplotlib, which `options` are for.
+    """Create a matplotlib figure without a display; `options` are those of ``matplotlib.figure.Figure``.
 
     Raises
     ------
@@ -28,7 +40,151 @@ def new_figure(**options: Any) -> Any:
 
 
 def png_of(figure: Any, **options: Any) -> bytes:
-    """The bytes of a PNG file."""
+    """Encode a figure as PNG; `options` are those of ``Figure.savefig``."""
     file = io.BytesIO()
     figure.savefig(file, format="png", **options)
     return file.getvalue()
+
+
+def save_view_picture(
+    path: str | PathLike[str], views: Sequence[View], measured: Sequence[NDArray[Any] | None] = ()
+) -> None:
+    """Save a PNG picture of views, one row each.
+
+    The columns are the measured returns, if there are any, and the predicted ones, both as range over azimuth, and the
+    range to the first surface along each beam, as elevation over azimuth.
+
+    Parameters
+    ----------
+    path : path-like
+        The PNG file. An existing file is replaced once the new one is complete.
+    views : sequence of View
+        At least one.
+    measured : sequence of arrays, optional
+        For each view, the returns measured from there: (N, 3) sensor frame, m, or (N, 4) with their intensity. None
+        where nothing was measured.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed. It comes with the extra `plot`.
+    OSError
+        If the file cannot be written.
+    """
+    scans = list(measured) or [None] * len(views)
+    columns = 3 if any(scan is not None for scan in scans) else 2
+    figure = new_figure(figsize=(4.6 * columns, 3.6 * len(views)), dpi=100, layout="constrained")
+    rows = figure.subplots(len(views), columns, squeeze=False)
+    for axes, view, scan in zip(rows, views, scans, strict=True):
+        measured_values = None if scan is None or scan.shape[1] == 3 else scan[:, 3]
+        known = [v for v in (view.intensities, measured_values) if v is not None and len(v)]
+        limits = np.quantile(np.concatenate(known), [0.02, 0.98]) if known else np.array([0.0, 1.0])
+        if scan is not None:
+            _draw_returns(axes[0], view, scan[:, :3], measured_values, limits, "measured")
+        drawn = _draw_returns(axes[-2], view, view.points, view.intensities, limits, "predicted")
+        if view.intensities is not None:
+            figure.colorbar(drawn, ax=axes[-2], label="intensity")
+        azimuth_deg, elevation_deg = np.rad2deg(view.azimuth_rad), np.rad2deg(view.elevation_rad)
+        image = axes[-1].pcolormesh(
+            azimuth_deg, elevation_deg, view.beam_ranges_m, cmap="viridis_r", shading="nearest"
+        )
+        axes[-1].set(title="first surface", xlabel="azimuth, °", ylabel="elevation, °")
+        axes[-1].invert_xaxis()  # as the sensor sees it: left is left
+        figure.colorbar(image, ax=axes[-1], label="range, m")
+    write_whole(path, png_of(figure, dpi=100))
+
+
+def _draw_returns(
+    axes: Any,
+    view: View,
+    points: NDArray[Any],
+    values: NDArray[Any] | None,
+    limits: NDArray[np.float64],
+    title: str,
+) -> Any:
+    azimuth_deg = np.rad2deg(np.arctan2(points[:, 1], points[:, 0]))
+    colors = "tab:blue" if values is None else values
+    drawn = axes.scatter(
+        azimuth_deg,
+        np.linalg.norm(points, axis=1),
+        2,
+        colors,
+        vmin=limits[0],
+        vmax=limits[1],
+        linewidths=0,
+    )
+    axes.set(title=f"{title}: {len(points)} returns", xlabel="azimuth, °", ylabel="range, m")
+    axes.set(xlim=np.rad2deg(view.sensor.azimuth_rad)[::-1], ylim=(0, view.sensor.range_m[1]))
+    return drawn
+
+
+def save_grid_picture(path: str | PathLike[str], grid: Grid, lower_m: float, upper_m: float) -> None:
+    """Save a PNG picture of a grid from above. `lower_m`, `upper_m`: the heights of :meth:`Grid.flat`."""
+    x, y, _ = grid.shape
+    (x_m, y_m), size_m = grid.origin[:2], grid.voxel_size
+    extent = (x_m, x_m + x * size_m, y_m, y_m + y * size_m)
+    size_in = (12.0, float(np.clip(12.0 * y / x, 4.0, 14.0)))
+    figure = new_figure(figsize=size_in, dpi=110, facecolor="white", layout="constrained")
+
+    def draw(axes: Any, values: NDArray[Any], title: str, **options: Any) -> None:
+        shown = values.T.astype(np.float32)
+        image = axes.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **options)
+        axes.set_facecolor(_UNKNOWN)
+        axes.set_title(title, fontsize=10)
+        axes.set(xlabel="x, m", ylabel="y, m")
+        figure.colorbar(image, ax=axes, shrink=0.8)
+
+    (ground, cost), (occupancy, clearance) = figure.subplots(2, 2)
+    costs, state = grid.costmap(), grid.flat(lower_m, upper_m).state
+    known = np.isfinite(costs.height_m).any()
+    low, high = np.nanpercentile(costs.height_m, [2, 98]) if known else (0, 1)
+    draw(ground, costs.height_m, "ground height, m", vmin=low, vmax=high)
+    costs_known = np.where(costs.cost >= 0, costs.cost, np.nan)
+    draw(cost, costs_known, "cost for wheels, 100: impassable", cmap="inferno", vmin=0, vmax=100)
+    title = f"{lower_m:g} to {upper_m:g} m above ground: 0 free, 1 occupied"
+    draw(occupancy, np.where(state < 0, np.nan, state), title, cmap="RdYlGn_r", vmin=0, vmax=1)
+    level = int(np.argmax(grid.free.sum(axis=(0, 1))))
+    distance_m = grid.distances().not_free_m[:, :, level]
+    title = f"clearance at z = {grid.origin[2] + (level + 0.5) * size_m:.1f} m, m"
+    draw(clearance, np.where(distance_m > 0, distance_m, np.nan), title, cmap="Blues")
+    write_whole(path, png_of(figure))
+
+
+def save_trajectory_picture(
+    path: str | PathLike[str],
+    points: Sequence[NDArray[Any]],
+    trajectories: Mapping[str, NDArray[np.float64]],
+) -> None:
+    """Save a PNG picture of trajectories from above, with the returns.
+
+    `points`: (N_i, 3) per scan, sensor frame, m; the last trajectory places them. `trajectories`: poses (F, 4, 4)
+    T_world_sensor by name.
+    """
+    poses = list(trajectories.values())[-1]
+    step = max(1, sum(map(len, points)) // _MAX_RETURNS)
+    world = np.concatenate(
+        [
+            np.einsum("ij,nj->ni", T[:2, :3], np.asarray(scan[::step], np.float64)) + T[:2, 3]
+            for scan, T in zip(points, poses, strict=True)
+        ]
+    )
+    paths = {name: path[:, :2, 3] for name, path in trajectories.items()}
+    positions = np.concatenate(list(paths.values()))
+    low, high = np.percentile(np.concatenate([world, positions]), [1, 99], axis=0)
+    low, high = np.minimum(low, positions.min(axis=0)), np.maximum(high, positions.max(axis=0))
+    width, height = np.maximum(high - low, 1.0)
+
+    size_in = (8.0, float(np.clip(8.0 * height / width, 3.0, 10.0)))
+    figure = new_figure(figsize=size_in, dpi=120, facecolor="white", layout="constrained")
+    axes = figure.add_subplot()
+    axes.scatter(*world.T, s=0.6, c="#b9b9b9", linewidths=0, rasterized=True)
+    widths = np.linspace(3.5, 1.5, len(paths)) if len(paths) > 1 else [1.8]
+    for (name, xy), color, line_width in zip(paths.items(), _TRAJECTORY_COLORS, widths, strict=False):
+        axes.plot(*xy.T, color=color, linewidth=line_width, label=name)
+        axes.plot(*xy[0], "o", color=color, markersize=5)
+    axes.set_xlim(low[0] - 0.03 * width, high[0] + 0.03 * width)
+    axes.set_ylim(low[1] - 0.03 * height, high[1] + 0.03 * height)
+    axes.set_aspect("equal")
+    axes.set(xlabel="x, m", ylabel="y, m")
+    axes.legend(loc="best", frameon=True)
+    write_whole(path, png_of(figure))

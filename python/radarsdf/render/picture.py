@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Pictures of a mesh, drawn in NumPy: no display, OpenGL or viewer is needed."""
+"""Pictures of a mesh, drawn in NumPy: they need no display and no OpenGL."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ def render(
     height: int = 1000,
     viewpoint: ArrayLike | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw a mesh on white, lit from behind the viewer, upper left.
+    """Render a mesh on white, lit from behind the viewer, upper left.
 
     Parameters
     ----------
     mesh : trimesh.Trimesh
         The surface, m, with z up. Both sides of a triangle are drawn.
     colors : (V, 3) or (V, 4) array_like of uint8, optional
-        Colours of the vertices. Alpha is ignored. None draws in light grey.
+        Vertex colours. Alpha is ignored. None: light grey.
     width, height : int
         Size of the picture in pixels.
     viewpoint : (3,) array_like, optional
-        Position of the viewer, world frame, m. The view is directed and zoomed to the mesh. None looks down obliquely
-        on its longer side. Triangles that are partly behind the viewer are not drawn.
+        Position of the viewer, world frame, m. The view is aimed at the mesh and zoomed to fill the picture. None:
+        obliquely from above one of its longer sides. Triangles that reach behind the viewer are not drawn.
 
     Returns
     -------
@@ -54,7 +54,7 @@ def render(
     Raises
     ------
     ValueError
-        If the mesh has no triangles, or the colours or the viewpoint have a wrong shape.
+        If the mesh has no triangles, or the shape of the colours or of the viewpoint is wrong.
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
@@ -107,20 +107,20 @@ def save_picture(
     height: int = 1000,
     viewpoint: ArrayLike | None = None,
 ) -> None:
-    """Save a PNG picture of a mesh, with a colour bar if a scalar gives the colours.
+    """Save a PNG picture of a mesh, with a colour bar if a scalar colours it.
 
     Parameters
     ----------
     path : path-like
-        The PNG file. An old file is replaced once the new one is complete.
+        The PNG file. An existing file is replaced once the new one is complete.
     mesh : trimesh.Trimesh
         The surface, m, with z up.
     scalar : (V,) array_like, optional
-        A value for each vertex, such as its intensity. NaN is drawn grey. None draws the surface in light grey.
+        A value per vertex, such as its intensity. NaN is grey. None: all of the surface is light grey.
     label : str
-        Text at the colour bar. It should name the unit.
+        Text of the colour bar, with the unit.
     low, high : float, optional
-        Limits of the colours. None means the 2nd and the 98th percentile.
+        Limits of the colour scale. None: the 2nd and the 98th percentile.
     width, height : int
         Size of the picture in pixels.
     viewpoint : (3,) array_like, optional
@@ -131,7 +131,7 @@ def save_picture(
     ImportError
         If matplotlib is not installed. It comes with the extra `plot`.
     ValueError
-        As `render` and `intensity_colors`, or if `scalar` has a wrong shape.
+        As `render` and `intensity_colors`, or if the shape of `scalar` is wrong.
     OSError
         If the file cannot be written.
     """
@@ -167,10 +167,9 @@ def save_picture(
 
 
 def eye_around(points: _Floats, turn_deg: float = 25.0, rise_deg: float = 36.0) -> _Floats:
-    """Position (3,) from which points (N, 3), m, with z up, are seen as a whole.
+    """Position (3,) from which all points (N, 3), m, with z up, are visible, `rise_deg` above the horizon.
 
-    It stands before the southern one of their two longer sides, then goes round them by `turn_deg`, anticlockwise as
-    seen from above, and is `rise_deg` above the horizon.
+    It faces the southern one of their two longer sides, turned by `turn_deg`, anticlockwise as seen from above.
     """
     center, radius = middle_of(points)
     spread = points[:, :2] - points[:, :2].mean(axis=0)
@@ -183,13 +182,13 @@ def eye_around(points: _Floats, turn_deg: float = 25.0, rise_deg: float = 36.0) 
 
 
 def middle_of(points: _Floats) -> tuple[_Floats, float]:
-    """Centre (3,) of the box round points (N, 3), and half its diagonal. A few stray points do not decide."""
+    """Centre (3,) of the bounding box of points (N, 3), and half its diagonal, without a few stray points."""
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     return 0.5 * (low + high), max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
 def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tuple[_Floats, _Floats]:
-    """Position (3,) of the eye relative to `origin`, and the unit vectors right, up and forward, (3, 3)."""
+    """Position (3,) of the eye relative to `origin`, and its axes (3, 3): right, up, forward."""
     center, radius = middle_of(points)
     if viewpoint is None:
         eye = eye_around(points)

@@ -15,21 +15,9 @@ _CREASE = np.cos(np.deg2rad(40.0))  # edges with a larger angle are drawn sharp,
 
 
 def project(seen: _Floats, faces: _Integers, size: tuple[int, int]) -> tuple[_Floats, _Floats, _Floats]:
-    """Perspective projection of the vertices, zoomed so that the mesh fills the picture.
+    """Column, row and 1 / depth (V,) of vertices (V, 3) along right, up and forward of the eye, zoomed to fill the picture.
 
-    Parameters
-    ----------
-    seen : (V, 3) float64
-        Vertices relative to the eye along right, up and forward, m.
-    faces : (F, 3) int64
-        The triangles.
-    size : (int, int)
-        Height and width of the picture, pixels.
-
-    Returns
-    -------
-    x, y, nearness : (V,) float64
-        Column and row, pixels, and 1 / depth, which is NaN behind the viewer.
+    1 / depth is NaN behind the viewer. `size`: height and width, pixels.
     """
     depth = seen[:, 2]
     depth = np.where(depth > 1e-3 * np.abs(depth).max(), depth, np.nan)
@@ -49,24 +37,11 @@ def project(seen: _Floats, faces: _Integers, size: tuple[int, int]) -> tuple[_Fl
 
 
 def rasterise(x: _Floats, y: _Floats, nearness: _Floats, size: tuple[int, int]) -> tuple[_Integers, _Floats]:
-    """Index of the nearest triangle at the centre of each pixel, -1 where there is none, and its 1 / depth.
+    """Index of the nearest triangle at the centre of each pixel (height, width), else -1, and its 1 / depth, else 0.
 
-    Scan-line conversion: each line of pixel centres enters a triangle through one edge and leaves it through another.
-    Both triangles at an edge compute the same crossing, and a pixel on it belongs to the triangle on the right, so
-    there are no gaps and no overlaps.
-
-    Parameters
-    ----------
-    x, y, nearness : (F, 3) float64
-        Column, row and 1 / depth of the corners of the triangles.
-    size : (int, int)
-        Height and width of the picture, pixels.
-
-    Returns
-    -------
-    ids : (height, width) int64
-    nearest : (height, width) float64
-        0 where there is no triangle.
+    `x`, `y`, `nearness` (F, 3): column, row and 1 / depth of the corners. Scan-line conversion: each line of pixel
+    centres enters a triangle through one edge and leaves it through another. Both triangles at an edge compute the same
+    crossing, and a pixel on it belongs to the triangle on the right, so there are no gaps and no overlaps.
     """
     height, width = size
     ids, nearest = np.full(height * width, -1, dtype=np.int64), np.zeros(height * width)
@@ -101,16 +76,13 @@ def rasterise(x: _Floats, y: _Floats, nearness: _Floats, size: tuple[int, int]) 
 
 
 def _expand(counts: _Integers) -> tuple[_Integers, _Integers]:
-    """Index of the owner, and number within the owner, of each item: for counts 2, 0, 3, 0 0 2 2 2 and 0 1 0 1 2."""
+    """Owner of each item, and its number within the owner: of counts 2, 0, 3, these are 0 0 2 2 2 and 0 1 0 1 2."""
     owner = np.repeat(np.arange(len(counts)), counts)
     return owner, np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def barycentric(x: _Floats, y: _Floats, column: _Integers, row: _Integers) -> _Floats:
-    """Barycentric weights (N, 3) of the corners at pixel centres.
-
-    They are clipped to [0, 1], because for very thin triangles rounding can put the centre outside.
-    """
+    """Barycentric weights (N, 3) of the corners at pixel centres, clipped: rounding can put a centre outside thin triangles."""
     px, py = column + 0.5, row + 0.5
     a = (x[:, 1] - px) * (y[:, 2] - py) - (x[:, 2] - px) * (y[:, 1] - py)
     b = (x[:, 2] - px) * (y[:, 0] - py) - (x[:, 0] - px) * (y[:, 2] - py)
@@ -121,7 +93,7 @@ def barycentric(x: _Floats, y: _Floats, column: _Integers, row: _Integers) -> _F
 
 
 def corner_normals(vertices: _Floats, faces: _Integers) -> _Floats:
-    """Normals (F, 3, 3) at the corners of triangles: of the vertex on smooth surfaces, else of the triangle."""
+    """Normals (F, 3, 3) at the corners of triangles: the vertex normal on smooth surfaces, else the face normal."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     own = np.cross(b - a, c - a)
     shared = np.zeros_like(vertices)
@@ -134,16 +106,13 @@ def corner_normals(vertices: _Floats, faces: _Integers) -> _Floats:
 
 
 def contours(nearness: _Floats, step: int) -> NDArray[np.float32]:
-    """Factors (height, width) of the brightness by eye-dome lighting: a pixel with nearer pixels beside it is darker.
-
-    This makes steps and edges visible. `step` is the distance to the pixels beside it, in pixels.
-    """
+    """Brightness factors (height, width) of eye-dome lighting: a pixel is darker if those `step` pixels away are nearer."""
     far = -np.log(np.where(nearness > 0, nearness, np.nan)).astype(np.float32)
     far[np.isnan(far)] = np.inf
     padded = np.pad(far, step, constant_values=np.inf)
     hidden = np.zeros_like(far)
     for dy, dx in ((0, 1), (1, 0), (1, 2), (2, 1), (0, 0), (0, 2), (2, 0), (2, 2)):
-        beside = padded[dy * step : dy * step + far.shape[0], dx * step : dx * step + far.shape[1]]
+        neighbour = padded[dy * step : dy * step + far.shape[0], dx * step : dx * step + far.shape[1]]
         with np.errstate(invalid="ignore"):
-            hidden += np.nan_to_num(np.maximum(far - beside, 0.0), nan=0.0, posinf=0.0)
+            hidden += np.nan_to_num(np.maximum(far - neighbour, 0.0), nan=0.0, posinf=0.0)
     return np.exp(-6.0 * np.minimum(hidden / 8, 0.12)).astype(np.float32)

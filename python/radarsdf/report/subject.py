@@ -14,46 +14,46 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.checking.finding import Finding
-from radarsdf.io.scans import Scans, TruthKind
+from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
-from radarsdf.view.thinning import thinned
+from radarsdf.view.surface import thinned
 
-MOST_VERTICES = 160_000
-"""In the 3D scene and the pictures. A larger mesh is thinned for them."""
+MAX_VERTICES = 160_000
+"""Of the mesh in the 3D scene and the pictures. A larger one is thinned for them."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A map, and what is known besides it."""
+    """A map and the data it is compared with."""
 
     radar_map: Map
     name: str
-    """Of the map, for the heading."""
+    """Title of the page."""
     scans: Scans | None = None
-    """The scans that the map was fitted to, or those that it is compared with. None: the map stands alone."""
+    """The scans that the map was fitted to, or is compared with."""
     held_out: Scans | None = None
-    """Scans that the fit left out. None: there are none, or it is not known which."""
+    """Scans that the fit left out, if known."""
     findings: Sequence[Finding] | None = None
-    """What :func:`radarsdf.check` says of all scans. None: it was not asked."""
+    """The result of :func:`radarsdf.check` on all scans. None: they were not checked."""
     voxel_size_m: float = 0.1
-    """Edge of the voxels of the mesh that is measured."""
+    """Voxel edge of the mesh that is evaluated."""
     box: ArrayLike | None = None
-    """(2, 3) the part of the world that counts, m. None: all."""
+    """(2, 3) corners of the part of the world to report on, m. None: all."""
     progress: bool | None = None
     """As for :meth:`Map.mesh`."""
     limits: Mapping[str, Any] = field(default_factory=dict)
-    """What the mesh leaves out, such as `min_confidence`: as :meth:`Map.mesh`."""
+    """What the mesh leaves out, such as `min_confidence`: keyword arguments of :meth:`Map.mesh`."""
 
     @property
     def viewpoint(self) -> NDArray[np.float64]:
-        """(3,) sensor position for which intensities are predicted: of the middle scan, or the mean of all; world, m."""
+        """(3,) sensor position for predicted intensities: of the middle scan, or the map's origin; world, m."""
         if self.scans is None:
             return self.radar_map.origin
         return np.asarray(self.scans.poses[len(self.scans) // 2, :3, 3], np.float64)
 
     @cached_property
     def mesh(self) -> Any:
-        """The mesh that is measured, with intensities if the map has any."""
+        """The mesh that is evaluated, with intensities if the map has any."""
         viewpoint = self.viewpoint if self.radar_map.has_intensity else None
         return self.radar_map.mesh(
             self.voxel_size_m, box=self.box, viewpoint=viewpoint, progress=self.progress, **self.limits
@@ -61,27 +61,21 @@ class Subject:
 
     @cached_property
     def shown(self) -> tuple[Any, float]:
-        """The mesh that is shown, and how far apart its vertices are, m."""
-        return thinned(self.mesh, MOST_VERTICES, self.voxel_size_m)
+        """The mesh that is drawn, and its vertex spacing, m."""
+        return thinned(self.mesh, MAX_VERTICES, self.voxel_size_m)
 
     @cached_property
     def ground_truth(self) -> NDArray[np.float64] | None:
-        """(M, 3) points of the truth in the box, world, m. None if there are none."""
-        truth = None if self.scans is None else self.scans.ground_truth
-        if truth is None:
+        """(M, 3) ground-truth points in the box, world, m. None if there are none."""
+        if self.scans is None or self.scans.ground_truth is None:
             return None
-        truth = np.asarray(truth, np.float64)
+        truth = np.asarray(self.scans.ground_truth, np.float64)
         if self.box is not None:
             low, high = np.asarray(self.box, np.float64)
             truth = truth[((truth >= low) & (truth <= high)).all(axis=1)]
         return truth if len(truth) else None
 
-    @property
-    def truth_kind(self) -> TruthKind:
-        """Where the truth comes from."""
-        return "lidar" if self.scans is None else self.scans.truth_kind
-
     @cached_property
     def truth_tree(self) -> Any:
-        """The points of the truth, to be asked for the nearest. Only where there are some."""
+        """k-d tree of the ground-truth points, of which there must be some."""
         return cKDTree(self.ground_truth)

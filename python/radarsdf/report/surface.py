@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The section of the surface: to be turned round, and from three sides."""
+"""Pictures of the surface, and the 3D scene."""
 
 from __future__ import annotations
 
 import io
+import re
 from typing import Any
 
 import numpy as np
@@ -13,116 +14,116 @@ from numpy.typing import NDArray
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.map.threshold import Threshold
 from radarsdf.render.picture import eye_around, middle_of, render
-from radarsdf.report.page import Section, color_bar, frame, grid, image, note, paragraph
-from radarsdf.report.scene import scene_page
+from radarsdf.report.page import css_color
 from radarsdf.report.subject import Subject
 from radarsdf.view.framing import Look, look_at_all
+from radarsdf.view.glb import glb
+from radarsdf.view.serving import begin_at, free_port, start_server, stop_server
+
+_Floats = NDArray[np.float64]
+_Colors = NDArray[np.uint8]
 
 _WIDTH, _HEIGHT = 1040, 650  # pixels
-_FRAME_ASPECT = 8 / 5  # of the frame of the 3D scene on any screen, as in the page's style
-_JPEG_QUALITY = 82
+_SCENE_ASPECT = 8 / 5  # of its frame on any screen, see the style in page.html
+_STEPS_PER_M = 1024  # vertices are rounded to it: fewer digits save a sixth of the file
+_SENSOR_COLOR = (0, 114, 178)
+# The icon is the only address of another machine in viser's page, though only as the name of an XML namespace.
+_ICON = re.compile(r'<link\s+rel="icon".*?/>', re.DOTALL)
+_FIRST_SIDE = (25.0, 36.0)
 SIDES = {
-    "One long side": (25.0, 36.0),
+    "One long side": _FIRST_SIDE,
     "The other long side": (205.0, 36.0),
-    "Steeply from above": (0.0, 70.0),  # not straight: walls would be lines
+    "Steeply from above": (0.0, 70.0),  # not straight down: walls would be lines
 }
-"""Names of the sides, and turn and rise of each, degrees."""
-HINT = (
-    "Drag to turn it, scroll or pinch to come nearer, drag with the right button or two fingers to move it."
-)
-"""Below a scene."""
+"""Name, turn and rise of each view, degrees."""
 
 
-def surface_section(subject: Subject) -> Section:
-    """The surface that is shown, coloured by intensity if the map has any."""
+def surface_values(subject: Subject) -> dict[str, Any] | None:
+    """Values of the surface section, or None if there is no surface."""
     mesh, spacing_m = subject.shown
-    anchor, title = "surface", "Surface"
     if len(mesh.faces) == 0:
-        return Section(anchor, title, [paragraph("The map has no surface here.")])
-    values = mesh.vertex_attributes.get("intensity")
-    colors, legend = colored(values, "intensity, sensor units")
-    where = "(" + ", ".join(f"{x:.1f}" for x in subject.viewpoint) + ") m"
-    painted = (
-        f"coloured by the intensity predicted for a sensor at {where}" if values is not None else "in grey"
+        return None
+    colors, legend = colored(
+        mesh.vertex_attributes.get("intensity"), len(mesh.vertices), "intensity, sensor units"
     )
-    body = [
-        frame(_scene(subject, colors), "The surface in three dimensions"),
-        legend,
-        note(HINT + (" Blue points are positions of the sensor." if subject.scans is not None else "")),
-        from_all_sides(mesh, colors, f"The surface, {painted}."),
-        paragraph(f"The surface is {painted}. Frame: world, with z up."),
-        paragraph(f"It is {Threshold.of_mesh(subject.mesh.metadata)}."),
-    ]
-    if spacing_m != subject.voxel_size_m:
-        body.append(
-            note(
-                f"Shown are {len(mesh.faces):,} triangles, with corners about {spacing_m:.3g} m apart. With the voxels of "
-                f"{subject.voxel_size_m:g} m that all numbers of this page are of, there are "
-                f"{len(subject.mesh.faces):,}: too many for a page that opens fast."
-            )
-        )
-    return Section(anchor, title, body)
+    origin = subject.radar_map.origin
+    sensors = None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin
+    return {
+        "scene": scene(np.asarray(mesh.vertices, np.float64) - origin, mesh.faces, colors, sensors),
+        "sensors": sensors is not None,
+        "legend": legend,
+        "views": views(mesh, colors),
+        "viewpoint": subject.viewpoint,
+        "threshold": Threshold.of_mesh(subject.mesh.metadata),
+        "triangles": len(subject.mesh.faces),
+        "shown_triangles": len(mesh.faces),
+        "spacing_m": spacing_m,
+        "voxel_size_m": subject.voxel_size_m,
+    }
 
 
 def colored(
-    values: NDArray[Any] | None, label: str, limits: tuple[float, float] | None = None
-) -> tuple[NDArray[np.uint8], str]:
-    """Colours (V, 3) of values (V,) of vertices, and a legend in HTML. NaN is grey.
+    values: NDArray[Any] | None, count: int, label: str, limits: tuple[float, float] | None = None
+) -> tuple[_Colors, dict[str, Any] | None]:
+    """Colours (V, 3) of vertex values (V,), and their legend. NaN is grey, and so is everything without values.
 
-    `limits` None: the 2nd and the 98th percentile. `values` None: all are grey, and there is no legend.
+    `limits` None: the 2nd and the 98th percentile.
     """
     if values is None or not np.isfinite(values).any():
-        return np.full((0 if values is None else len(values), 3), NEUTRAL, np.uint8), ""
-    low, high = np.nanpercentile(values, [2, 98]) if limits is None else limits
-    steps = intensity_colors(np.linspace(0, 1, 9), 0, 1)[:, :3]
-    bar = color_bar([(int(r), int(g), int(b)) for r, g, b in steps], f"{low:.3g}", f"{high:.3g}", label)
-    return intensity_colors(values, float(low), float(high))[:, :3], bar
+        return np.full((count, 3), NEUTRAL, np.uint8), None
+    low, high = map(float, np.nanpercentile(values, [2, 98]) if limits is None else limits)
+    stops = intensity_colors(np.linspace(0, 1, 9), 0, 1)[:, :3].tolist()
+    legend = {"low": low, "high": high, "label": label, "stops": [css_color(stop) for stop in stops]}
+    return intensity_colors(values, low, high)[:, :3], legend
 
 
-def from_all_sides(mesh: Any, colors: NDArray[np.uint8], text: str) -> str:
-    """Pictures of a mesh from :data:`SIDES`; `text` says what they show."""
-    return grid(
-        *(image(picture(mesh, colors, side), f"{text} View: {side.lower()}.", f"{side}.") for side in SIDES)
-    )
+def views(mesh: Any, colors: _Colors) -> dict[str, bytes]:
+    """Pictures of a mesh by the names of :data:`SIDES`."""
+    return {name: picture(mesh, colors, *side) for name, side in SIDES.items()}
 
 
-def first_look(points: NDArray[np.float64], vertices: NDArray[np.float64]) -> Look:
-    """At all `points` (N, 3), from where the first picture of a mesh with these vertices (V, 3) is taken."""
-    to_eye = eye_around(vertices, *SIDES["One long side"]) - middle_of(vertices)[0]
-    return look_at_all(points, to_eye, _FRAME_ASPECT)
+def picture(mesh: Any, colors: _Colors, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
+    """JPEG picture of a mesh with vertex colours (V, 3), seen as :func:`eye_around` says."""
+    return jpeg(mesh, colors, eye_around(np.asarray(mesh.vertices, np.float64), turn_deg, rise_deg))
 
 
-def picture(
-    mesh: Any,
-    colors: NDArray[np.uint8],
-    side: str = "One long side",
-    to_eye: NDArray[np.float64] | None = None,
-) -> bytes:
-    """A picture of a mesh as a JPEG file. Colours (V, 3) of its vertices; none, (0, 3): grey. `to_eye` (3,): from where, not a side."""
+def jpeg(mesh: Any, colors: _Colors, viewpoint: _Floats) -> bytes:
+    """JPEG picture of a mesh with vertex colours (V, 3) from a viewpoint (3,), m."""
     from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
 
-    vertices = np.asarray(mesh.vertices, np.float64)
-    if to_eye is None:
-        viewpoint = eye_around(vertices, *SIDES[side])
-    else:
-        middle, size_m = middle_of(vertices)
-        viewpoint = middle + 2 * size_m * to_eye / np.linalg.norm(to_eye)
-    pixels = render(mesh, colors if len(colors) else None, width=_WIDTH, height=_HEIGHT, viewpoint=viewpoint)
+    pixels = render(mesh, colors, width=_WIDTH, height=_HEIGHT, viewpoint=viewpoint)
     file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format="jpeg", quality=_JPEG_QUALITY, optimize=True)
+    Image.fromarray(pixels).save(file, format="jpeg", quality=82, optimize=True)
     return file.getvalue()
 
 
-def _scene(subject: Subject, colors: NDArray[np.uint8]) -> str:
-    mesh, _ = subject.shown
-    origin = subject.radar_map.origin
-    vertices = np.asarray(mesh.vertices, np.float64) - origin
-    sensors = None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin
+def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Floats | None = None) -> str:
+    """Self-contained HTML page that shows a mesh in 3D, made by viser.
+
+    `vertices` (V, 3) and `sensors` (F, 3), which are drawn as points, are in m near the origin, since the page computes
+    in float32. viser exports the scene of a server, which listens on this machine for less than a second. Its
+    compressed program contains addresses of other machines, which this scene does not use; the report's content
+    security policy forbids fetching them.
+    """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
-    return scene_page(
-        vertices,
-        np.asarray(mesh.faces, np.int32),
-        colors if len(colors) else np.full((len(vertices), 3), NEUTRAL, np.uint8),
-        sensors,
-        first_look(everything, vertices),
-    )
+    to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
+    look: Look = look_at_all(everything, to_eye, _SCENE_ASPECT)
+    host = "127.0.0.1"
+    server: Any = start_server(host, free_port(host, 0, exactly=True))
+    try:
+        data = glb(np.round(vertices * _STEPS_PER_M) / _STEPS_PER_M, faces, colors)
+        server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
+        if sensors is not None:
+            server.scene.add_point_cloud(
+                "/sensor",
+                sensors.astype(np.float32),
+                _SENSOR_COLOR,
+                point_size=0.008 * float(np.linalg.norm(look.position - look.look_at)),
+                point_shape="circle",
+                precision="float32",
+            )
+        begin_at(server, look)
+        document: str = server.get_scene_serializer().as_html()
+    finally:
+        stop_server(server)
+    return _ICON.sub("", document)

@@ -1,87 +1,79 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Puts the sections together, and writes the page."""
+"""The report of a map."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
+from typing import Any
 
-from radarsdf.report.conclusion import conclusion_section
-from radarsdf.report.extras import require_extras
-from radarsdf.report.intensity import intensity_section
-from radarsdf.report.page import write_page
+import numpy as np
+
+from radarsdf.config.fit_config import FitConfig, flat_settings
+from radarsdf.config.toml import to_toml
+from radarsdf.report import plots
+from radarsdf.report.errors import error_values, intensity_values, uncertainty_values
+from radarsdf.report.page import require_extras, write_page
 from radarsdf.report.subject import Subject
-from radarsdf.report.surface import surface_section
-from radarsdf.report.training import (
-    configuration_section,
-    findings_section,
-    skipped_section,
-    training_section,
-    versions_section,
-)
-from radarsdf.report.trajectory import trajectory_section
-from radarsdf.report.truth import truth_section, uncertainty_section
+from radarsdf.report.surface import surface_values
+from radarsdf.versions import versions
 
 
 def write_report(path: str | PathLike[str], subject: Subject) -> int:
-    """Write a page about a map, whole or not at all. It holds all that it shows.
+    """Write a self-contained HTML page about a map, whole or not at all, and return its size, bytes.
 
-    Parameters
-    ----------
-    path : path-like
-        The HTML file. An old file is replaced once the new one is complete.
-    subject : Subject
-        What it is about.
-
-    Returns
-    -------
-    int
-        Size of the file, bytes.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib or viser is missing.
-    ValueError
-        As :meth:`Map.mesh`.
-    MemoryError
-        If the voxels of the mesh need too much memory.
-    OSError
-        If the file cannot be written.
+    Raises an ImportError if matplotlib or viser is missing, and otherwise as :meth:`Map.mesh` and ``open``.
     """
     require_extras()
-    errors, error_facts, of_surface = truth_section(subject)
-    uncertainty, of_uncertainty = uncertainty_section(subject)
-    intensity, intensity_facts, of_intensity = intensity_section(subject)
-    poses, of_poses = trajectory_section(subject)
-    sections = [
-        conclusion_section(subject, [*of_poses, *of_surface, *of_uncertainty, *of_intensity]),
-        findings_section(subject),
-        *poses,
-        surface_section(subject),
-        errors,
-        uncertainty,
-        intensity,
-        training_section(subject),
-        skipped_section(subject),
-        configuration_section(subject),
-        versions_section(),
-    ]
-    facts = [*_facts(subject), *error_facts, *intensity_facts]
-    return write_page(path, subject.name, "report", facts, sections)
-
-
-def _facts(subject: Subject) -> list[tuple[str, str]]:
-    """What stands above all."""
     report = subject.radar_map.report
-    facts = []
-    if subject.scans is not None:
-        facts.append(("Scans", f"{len(subject.scans):,}"))
-    if "returns" in report:
-        facts.append(("Returns", f"{report['returns']:,}"))
-        facts.append(
-            ("Fit", f"{sum(v for k, v in report.items() if k.endswith('_s') and k != 'skipped_s'):.1f} s")
-        )
-    facts.append(("Surface", f"{subject.mesh.area:,.0f} m²"))
-    facts.append(("Map", f"{subject.radar_map.file_bytes / 1e6:.1f} MB"))
-    return facts
+    return write_page(
+        path,
+        "report.html",
+        subject=subject,
+        report=report,
+        noise=report.get("noise"),
+        fit_s=sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s"),
+        problems=[finding for finding in subject.findings or () if finding.severity != "note"],
+        poses=pose_values(report.get("poses")),
+        surface=surface_values(subject),
+        errors=error_values(subject),
+        uncertainty=uncertainty_values(subject),
+        intensity=intensity_values(subject),
+        losses=_loss_plot(report.get("loss_history", {})),
+        configuration=_configuration(subject.radar_map.config),
+        versions=versions(),
+    )
+
+
+def pose_values(poses: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Values of the section about refined or found poses. `poses`: their part of a map's report, None if taken as given."""
+    if poses is None:
+        return None
+    after = np.array(poses["after"])
+    before = None if poses["before"] is None else np.array(poses["before"])
+    sigma_m, sigma_deg = np.array(poses["sigma_m"]), np.degrees(poses["sigma_rad"])
+    known = bool(sigma_m.any())
+    return {
+        "verdict": poses["verdict"],
+        "improved": poses["improved"],
+        "trajectory": plots.trajectory(before, after),
+        "uncertainties": plots.pose_uncertainties(poses["scans"], sigma_m, sigma_deg) if known else None,
+        "sigma": (np.median(sigma_m), np.median(sigma_deg)) if known else None,
+        "length_m": np.linalg.norm(np.diff(after, axis=0), axis=1).sum(),
+        "moved_m": None if before is None else np.linalg.norm(after - before, axis=1),
+        "step_m": poses["step_m"],
+        "step_deg": None if poses["step_rad"] is None else np.degrees(poses["step_rad"]),
+    }
+
+
+def _loss_plot(history: Mapping[str, Any]) -> bytes | None:
+    names = {"sdf": "surface", "intensity": "intensity"}
+    trained = {names[key]: loss for key, loss in history.items() if key in names and loss["losses"]}
+    return plots.losses(trained) if trained else None
+
+
+def _configuration(config: FitConfig) -> dict[str, Any]:
+    settings, defaults = flat_settings(config.to_dict()), flat_settings(FitConfig().to_dict())
+    changed = [(name, value, defaults[name]) for name, value in settings.items() if value != defaults[name]]
+    return {"changed": changed, "toml": to_toml(config)}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Where to look from, so that all is seen and the frame is filled."""
+"""Where to put the camera so that everything is visible and fills the frame."""
 
 from __future__ import annotations
 
@@ -11,56 +11,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 FOV_RAD = 0.85
-"""Vertical field of view of the first look: less than viser's, so that walls stay upright."""
-TO_EYE = np.array([-0.33, -0.57, 0.5])
-"""From what is seen to the eye, in the first look of a page."""
+"""Vertical field of view: less than viser's, so that walls stay upright."""
 ASPECT = 1.3
-"""Width of the frame of a page over its height, until it tells its own."""
+"""Width over height of a page's frame, until the page reports its own."""
+_TO_EYE = np.array([-0.33, -0.57, 0.5])
 _MARGIN = 1.08
-_STEPS = 4
 
 _Floats = NDArray[np.float64]
 
 
 class Look(NamedTuple):
-    """A look at a scene."""
+    """A camera pose."""
 
     position: _Floats
-    """(3,) of the eye, m."""
+    """(3,) m."""
     look_at: _Floats
-    """(3,) what is in the middle, and turned round, m."""
+    """(3,) the point in the middle, which the user rotates the view about, m."""
 
 
 def look_at_all(
-    points: _Floats, to_eye: _Floats = TO_EYE, aspect: float = ASPECT, fov_rad: float = FOV_RAD
+    points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT, fov_rad: float = FOV_RAD
 ) -> Look:
-    """The nearest look in a direction in which all points are seen.
-
-    Parameters
-    ----------
-    points
-        (N, 3) m, with z up.
-    to_eye
-        (3,) from the points to the eye, of any length, not upright.
-    aspect
-        Width of the frame over its height.
-    fov_rad
-        Vertical field of view.
-    """
+    """The nearest camera that sees all points (N, 3), m, with z up, in the direction `to_eye` (3,), which is not vertical."""
     back = to_eye / np.linalg.norm(to_eye)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     up = np.cross(back, right)
     tangent = math.tan(fov_rad / 2) / _MARGIN
     depth_m = points @ back
-    # An eye at a along an axis and t back sees a point x if |x - a| <= slope * (t - depth).
+    # A camera at a along an axis and t back sees a point x if |x - a| <= slope * (t - depth).
     sides = [(axis, points @ axis, slope) for axis, slope in ((right, tangent * aspect), (up, tangent))]
     ends = [((depth_m + x / slope).max(), (depth_m - x / slope).max(), slope) for _, x, slope in sides]
     far_m = max(float(one + other) / 2 for one, other, _ in ends)
     middle = np.zeros(3)
     for (axis, x, _), (one, other, slope) in zip(sides, ends, strict=True):
         a = slope * (one - other) / 2
-        for _ in range(_STEPS):  # where the frame is wider than needed, the middle is elsewhere
+        for _ in range(4):  # where the frame is wider than needed, the middle is elsewhere
             at = (x - a) / (far_m - depth_m)
             a += (at.max() + at.min()) / 2 * float(far_m - depth_m.mean())
         middle = middle + a * axis

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A coloured mesh as the bytes of a GLB file, the one format in which viser takes colours of vertices."""
+"""A coloured mesh as GLB, the one format in which viser takes vertex colours, and colours that its page shows right."""
 
 from __future__ import annotations
 
@@ -11,34 +11,44 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.view.light import light_to_show
-
-_UNLIT = "KHR_materials_unlit"  # the colours are as given, and those of the cloud and of the scale
+_UNLIT = "KHR_materials_unlit"  # colours are shown as given, as those of point clouds and of legends
 _MATERIAL = {
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-    "doubleSided": True,  # the back of a surface is seen too, from below or from behind
+    "doubleSided": True,
     "extensions": {_UNLIT: {}},
 }
 _FLOAT, _UNSIGNED_INT = 5126, 5125
+_TO_LIGHT = np.array([-0.35, -0.5, 0.79])
+_SHADE = 0.87  # lightness of what faces away from the light: colours must stay close to those of the legend
+
+_SRGB = np.arange(256) / 255
+_LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
+# viser's page passes all meshes, even unlit ones, through three.js's ACESFilmicToneMapping, which turns indigo into navy
+# and yellow into olive. It is, on linear colours c:
+#     _OUT @ ((x² + a x - b) / (c x² + d x + e)), with x = _IN @ c / _EXPOSURE
+_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
+_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
+_EXPOSURE = 0.6
+_FIT = (0.0245786, 0.000090537, 0.983729, 0.4329510, 0.238081)
+_BITS = np.uint32(13)  # of the 23 of a number, finer than the 256 steps of a screen: zeros compress better
 
 
-def glb(vertices: NDArray[Any], faces: NDArray[np.int32], colors: NDArray[np.uint8]) -> bytes:
-    """Bytes of vertices (V, 3), which become float32, faces (F, 3) and sRGB colours (V, 3)."""
+def glb(vertices: NDArray[Any], faces: NDArray[Any], colors: NDArray[np.uint8]) -> bytes:
+    """Encode vertices (V, 3), as float32, faces (F, 3) and sRGB colours (V, 3) as the bytes of a GLB file."""
     positions = np.ascontiguousarray(vertices, np.float32)
-    parts = (positions, np.ascontiguousarray(faces, np.uint32).reshape(-1, 1), light_to_show(colors))
-    views, accessors, start = [], [], 0
-    for part in parts:
-        numbers = part.shape[1] == 3
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": part.nbytes})
+    indices = np.ascontiguousarray(faces, np.uint32).reshape(-1, 1)
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    size = 0
+    parts = (positions, indices, light_to_show(colors))
+    for part, component, kind in zip(
+        parts, (_FLOAT, _UNSIGNED_INT, _FLOAT), ("VEC3", "SCALAR", "VEC3"), strict=True
+    ):
         accessors.append(
-            {
-                "bufferView": len(views) - 1,
-                "componentType": _FLOAT if numbers else _UNSIGNED_INT,
-                "count": len(part),
-                "type": "VEC3" if numbers else "SCALAR",
-            }
+            {"bufferView": len(views), "componentType": component, "count": len(part), "type": kind}
         )
-        start += part.nbytes
+        views.append({"buffer": 0, "byteOffset": size, "byteLength": part.nbytes})
+        size += part.nbytes
     accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     primitive = {"attributes": {"POSITION": 0, "COLOR_0": 2}, "indices": 1, "material": 0}
     tree = {
@@ -49,18 +59,38 @@ def glb(vertices: NDArray[Any], faces: NDArray[np.int32], colors: NDArray[np.uin
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
         "materials": [_MATERIAL],
-        "buffers": [{"byteLength": start}],
+        "buffers": [{"byteLength": size}],
         "bufferViews": views,
         "accessors": accessors,
     }
     text = json.dumps(tree, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    return b"".join(
-        [
-            struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + start),
-            struct.pack("<I4s", len(text), b"JSON"),
-            text,
-            struct.pack("<I4s", start, b"BIN\0"),
-            *(part.tobytes() for part in parts),
-        ]
-    )
+    header = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + size)
+    chunks = [struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", size, b"BIN\0")]
+    return b"".join([header, *chunks, *(part.tobytes() for part in parts)])
+
+
+def lightness_of(normals: NDArray[Any]) -> NDArray[np.float32]:
+    """(V,) lightness factor, at most 1, for normals (V, 3), which makes the shape visible."""
+    light = np.clip(np.asarray(normals, np.float64) @ _TO_LIGHT, 0.0, 1.0)
+    return np.asarray(_SHADE + (1 - _SHADE) * light, np.float32)
+
+
+def shaded(colors: NDArray[np.uint8], lightness: NDArray[Any]) -> NDArray[np.uint8]:
+    """Scale the OKLab lightness and chroma of sRGB colours (V, 3) by factors (V,): both are cube roots of light."""
+    light = _LINEAR[colors] * np.asarray(lightness, np.float64)[:, None] ** 3
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    shown: NDArray[np.uint8] = np.rint(255 * srgb).astype(np.uint8)
+    return shown
+
+
+def light_to_show(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(V, 3) linear colours of an unlit mesh that the page shows as these sRGB colours (V, 3): the inverse tone mapping."""
+    a, b, c, d, e = _FIT
+    y = _LINEAR[colors] @ np.linalg.inv(_OUT).T
+    square, slope, rest = 1 - c * y, a - d * y, -b - e * y
+    x = (-slope + np.sqrt(np.maximum(slope**2 - 4 * square * rest, 0))) / (2 * square)
+    light = np.ascontiguousarray(_EXPOSURE * x @ np.linalg.inv(_IN).T, np.float32)
+    bits = light.view(np.uint32)
+    half = np.uint32(1) << (_BITS - np.uint32(1))
+    return ((bits + half) >> _BITS << _BITS).view(np.float32)

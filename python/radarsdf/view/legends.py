@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the colours and the marks of the page mean, as HTML."""
+"""Legends and texts of a page's panels, as HTML."""
 
 from __future__ import annotations
 
@@ -9,83 +9,71 @@ from html import escape
 
 import numpy as np
 
-from radarsdf.view.quantities import Classes, Colors, Quantity
-
-_STOPS = 9
-_BLOCK = '<div style="margin:0.4em 0.8em;font-size:0.85em;line-height:1.4">{}</div>'
-_ENDS = (
-    '<div style="display:flex;justify-content:space-between;font-variant-numeric:tabular-nums">'
-    "<span>{low:.3g}</span><span>{high:.3g}</span></div>"
-)
-_MARK = (
-    '<div style="display:flex;align-items:center;gap:0.5em"><i style="flex:none;width:{width};height:{height};'
-    'background:{color};{shape}"></i><span>{text}</span></div>'
-)
-_DIAMOND = "transform:rotate(45deg);margin:0 0.15em"
+from radarsdf.view.quantities import Color, Colors, Quantity
+from radarsdf.view.scene import PATH_COLOR, PREDICTED_COLOR
 
 
 def legend(quantity: Quantity) -> str:
-    """The scale of a quantity, with its ends and its unit."""
+    """The colour scale of a quantity as HTML."""
     scale = quantity.scale
-    if isinstance(scale, Colors):
-        return _BLOCK.format(
-            f"<div>{quantity.label}</div>{_bar(scale)}{_ENDS.format(low=scale.low, high=scale.high)}"
-        )
-    return _BLOCK.format("".join(_patches(scale)))
-
-
-def marks(
-    measured: Colors | tuple[int, int, int], predicted: tuple[int, int, int], path: tuple[int, int, int]
-) -> str:
-    """How measured and predicted returns and the path of the sensor are drawn. `measured`: a scale, or one colour."""
-    if isinstance(measured, Colors):
-        color = f"linear-gradient(135deg,{_stops(measured)})"
-        text = f"measured, by intensity {measured.low:.3g} to {measured.high:.3g}"
-    else:
-        color, text = _rgb(measured), "measured"
-    return _BLOCK.format(
-        _MARK.format(width="0.8em", height="0.8em", color=color, shape="border-radius:50%", text=text)
-        + _MARK.format(width="0.5em", height="0.5em", color=_rgb(predicted), shape=_DIAMOND, text="predicted")
-        + _MARK.format(width="0.8em", height="0.2em", color=_rgb(path), shape="", text="path of the sensor")
+    if not isinstance(scale, Colors):
+        return key(dict(reversed(list(zip(scale.names, scale.colors, strict=True)))))
+    bar = f"height:0.8em;border-radius:0.2em;background:linear-gradient(to right,{_stops(scale)})"
+    ends = "display:flex;justify-content:space-between;font-variant-numeric:tabular-nums"
+    return _block(
+        f'<div>{quantity.label}</div><div style="{bar}"></div>'
+        f'<div style="{ends}"><span>{scale.low:.3g}</span><span>{scale.high:.3g}</span></div>'
     )
 
 
-def key(colors: Mapping[str, tuple[int, int, int]]) -> str:
-    """What fixed colours mean."""
-    return _BLOCK.format("".join(_patch(name, color) for name, color in colors.items()))
+def marks(measured: Colors | Color) -> str:
+    """How measured and predicted returns and the sensor's path are drawn, as HTML. `measured`: a scale, or one colour."""
+    color, text = "", "measured"
+    if isinstance(measured, Colors):
+        color = f"linear-gradient(135deg,{_stops(measured)})"
+        text += f", by intensity {measured.low:.3g} to {measured.high:.3g}"
+    else:
+        color = _css(measured)
+    return _block(
+        _mark(text, color, "border-radius:50%")
+        + _mark(
+            "predicted", _css(PREDICTED_COLOR), "transform:rotate(45deg);margin:0 0.15em", "0.5em", "0.5em"
+        )
+        + _mark("path of the sensor", _css(PATH_COLOR), height="0.2em")
+    )
+
+
+def key(colors: Mapping[str, Color]) -> str:
+    """The meaning of fixed colours as HTML."""
+    return _block("".join(_mark(name, _css(color), "border-radius:0.2em") for name, color in colors.items()))
 
 
 def paragraph(text: str) -> str:
-    """A text."""
-    return _BLOCK.format(escape(text))
+    """A text as HTML."""
+    return _block(escape(text))
 
 
 def table(rows: Mapping[str, str]) -> str:
-    """Names and values, one below the other."""
+    """Names and values as HTML."""
     cells = (f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows.items())
-    return _BLOCK.format(f'<table style="border-spacing:0.6em 0">{"".join(cells)}</table>')
+    return _block(f'<table style="border-spacing:0.6em 0">{"".join(cells)}</table>')
 
 
-def _patches(classes: Classes) -> list[str]:
-    return [
-        _patch(name, color)
-        for name, color in zip(reversed(classes.names), reversed(classes.colors), strict=True)
-    ]
+def _block(html: str) -> str:
+    return f'<div style="margin:0.4em 0.8em;font-size:0.85em;line-height:1.4">{html}</div>'
 
 
-def _patch(name: str, color: tuple[int, int, int]) -> str:
-    return _MARK.format(
-        width="0.8em", height="0.8em", color=_rgb(color), shape="border-radius:0.2em", text=escape(name)
+def _mark(text: str, background: str, style: str = "", width: str = "0.8em", height: str = "0.8em") -> str:
+    return (
+        '<div style="display:flex;align-items:center;gap:0.5em">'
+        f'<i style="flex:none;width:{width};height:{height};background:{background};{style}"></i>'
+        f"<span>{escape(text)}</span></div>"
     )
 
 
-def _bar(scale: Colors) -> str:
-    return f'<div style="height:0.8em;border-radius:0.2em;background:linear-gradient(to right,{_stops(scale)})"></div>'
-
-
 def _stops(scale: Colors) -> str:
-    return ",".join(map(_rgb, scale(np.linspace(scale.low, scale.high, _STOPS)).tolist()))
+    return ",".join(map(_css, scale(np.linspace(scale.low, scale.high, 9)).tolist()))
 
 
-def _rgb(color: tuple[int, int, int]) -> str:
+def _css(color: Color) -> str:
     return "rgb({},{},{})".format(*color)

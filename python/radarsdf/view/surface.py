@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The surface of a map as the page shows it."""
+"""The surface that a page shows: thinned to what a browser can draw, and clickable."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,37 +14,37 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import whole_number
 from radarsdf.map.meshing import renumbered, with_all
 from radarsdf.map.threshold import Threshold
-from radarsdf.view.thinning import thinned
+from radarsdf.view.glb import lightness_of
 
 if TYPE_CHECKING:
+    import trimesh
+
     from radarsdf.map.map import Map
 
 _Floats = NDArray[np.float64]
 _Rows = NDArray[np.int64]
 
-_FEWEST = 1000  # vertices: less is not worth a look
-_TO_LIGHT = (-0.35, -0.5, 0.79)
-_SHADE = 0.87  # lightness where the light does not come: colours must still be those of the scale
+_MIN_VERTICES = 1000  # of max_vertices: fewer are not worth a look
 
 
 @dataclass(frozen=True)
 class ShownSurface:
-    """Triangles with what the map knows of their vertices."""
+    """Triangles and what the map knows about their vertices."""
 
     vertices: _Floats
     """(V, 3) world, m."""
     faces: NDArray[np.int32]
-    """(F, 3) rows of vertices. They face free space."""
+    """(F, 3) rows of vertices. Normals point into free space."""
     uncertainty_m: NDArray[np.float32]
     """(V,) see `Map.uncertainty`."""
     confidence: NDArray[np.float32]
     """(V,) see `Map.confidence`."""
     lightness: NDArray[np.float32]
-    """(V,) factor of the lightness of colours, at most 1, so that the shape is seen."""
+    """(V,) lightness factor of colours."""
     threshold: Threshold
-    """From which confidence on the mesh was kept."""
+    """The confidence from which on the mesh was kept."""
     spacing_m: float
-    """How far apart vertices are: the edge of the voxels, or more if the mesh was thinned."""
+    """Vertex spacing: the voxel edge, or more if the mesh was thinned."""
 
     @classmethod
     def of(
@@ -56,42 +57,101 @@ class ShownSurface:
         progress: bool | None = None,
         **limits: Any,
     ) -> ShownSurface:
-        """Mesh a map, and thin the mesh if it has more than `max_vertices`. `limits`: as `Map.mesh`.
-
-        Raises
-        ------
-        ValueError
-            If there is no surface, or as `Map.mesh`.
-        """
-        whole_number(max_vertices, "max_vertices", _FEWEST)
+        """Mesh a map, and thin the mesh to `max_vertices`. `limits`: as `Map.mesh`. Raises a ValueError without a surface."""
+        whole_number(max_vertices, "max_vertices", _MIN_VERTICES)
         mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress, **limits)
         threshold = Threshold.of_mesh(mesh.metadata)
-        mesh, edge_m = thinned(mesh, max_vertices, voxel_size)
+        mesh, spacing_m = thinned(mesh, max_vertices, voxel_size)
         if len(mesh.vertices) == 0:
             msg = "the map has no surface here"
             raise ValueError(msg)
-        attributes = mesh.vertex_attributes
         return cls(
             np.asarray(mesh.vertices, np.float64),
             np.asarray(mesh.faces, np.int32),
-            np.asarray(attributes["uncertainty_m"], np.float32),
-            np.asarray(attributes["confidence"], np.float32),
-            lightness_of(np.asarray(mesh.vertex_normals, np.float64)),
+            np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float32),
+            np.asarray(mesh.vertex_attributes["confidence"], np.float32),
+            lightness_of(mesh.vertex_normals),
             threshold,
-            edge_m,
+            spacing_m,
         )
 
     def kept(self, max_uncertainty_m: float, min_confidence: float) -> NDArray[np.bool_]:
-        """(V,) whether a vertex is to be seen."""
+        """(V,) whether a vertex is within the limits."""
         return (self.uncertainty_m <= max_uncertainty_m) & (self.confidence >= min_confidence)
 
     def part(self, kept: NDArray[np.bool_]) -> tuple[_Rows, NDArray[np.int32]]:
-        """The triangles of which all vertices are kept: rows of their vertices (N,), and faces (M, 3) as rows of those."""
+        """Rows (N,) of the vertices of triangles with all vertices kept, and these triangles (M, 3) as rows of them."""
         used, faces = renumbered(len(kept), self.faces[with_all(kept, self.faces)])
         return np.flatnonzero(used), faces
 
 
-def lightness_of(normals: _Floats) -> NDArray[np.float32]:
-    """(V,) factor of the lightness of colours for normals (V, 3), so that the shape is seen."""
-    light: NDArray[np.float64] = np.clip(normals @ np.array(_TO_LIGHT), 0.0, 1.0)
-    return (_SHADE + (1 - _SHADE) * light).astype(np.float32)
+def spread_evenly(points: _Floats, count: int, edge_m: float) -> tuple[_Rows, _Rows, float]:
+    """Choose at most `count` evenly spread points of (N, 3), m: the nearest to the mean of each cube of a grid.
+
+    Returns the chosen rows (M,), which of the M represents each point (N,), and the edge of the cubes, m. `edge_m`: the
+    spacing of the points, where the search begins.
+    """
+    if len(points) <= count:
+        everything = np.arange(len(points))
+        return everything, everything, edge_m
+    edge_m *= math.sqrt(len(points) / count)
+    while True:
+        cells = np.floor((points - points.min(axis=0)) / edge_m).astype(np.int64)
+        shape = cells.max(axis=0) + 1
+        keys = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
+        _, of_point, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        if len(counts) <= count:
+            break
+        edge_m *= 1.1
+    means = np.stack([np.bincount(of_point, points[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
+    order = np.lexsort((np.linalg.norm(points - means[of_point], axis=1), of_point))
+    return order[np.cumsum(counts) - counts], of_point, edge_m
+
+
+def thinned(mesh: trimesh.Trimesh, max_vertices: int, edge_m: float) -> tuple[trimesh.Trimesh, float]:
+    """Cluster the vertices of a mesh in cubes, of which one each stays with its attributes, if it has too many.
+
+    Returns the mesh and its vertex spacing, m, which is `edge_m` if nothing was to be done.
+    """
+    import trimesh  # noqa: PLC0415 - slow
+
+    vertices: Any = mesh.vertices
+    rows, of_point, spacing_m = spread_evenly(np.asarray(vertices, np.float64), max_vertices, edge_m)
+    if len(rows) == len(vertices):
+        return mesh, edge_m
+    corners = of_point[mesh.faces].astype(np.int32)
+    a, b, c = corners.T
+    used, faces = renumbered(len(rows), corners[(a != b) & (b != c) & (c != a)])
+    rows = rows[used]
+    thin = trimesh.Trimesh(vertices[rows], faces, process=False)
+    thin.update_faces(thin.unique_faces())
+    thin.metadata |= mesh.metadata
+    for name, values in mesh.vertex_attributes.items():
+        thin.vertex_attributes[name] = np.asarray(values)[rows]
+    return thin, spacing_m
+
+
+def first_hit(
+    vertices: _Floats, faces: NDArray[np.int32], ray_origin: ArrayLike, ray_direction: ArrayLike
+) -> _Floats | None:
+    """Point (3,) where a ray first hits a mesh, or None: Möller and Trumbore's test. The direction is of any length."""
+    origin, direction = np.asarray(ray_origin, np.float64), np.asarray(ray_direction, np.float64)
+    direction = direction / np.linalg.norm(direction)
+    corners = vertices[faces]
+    # A triangle can be hit only if its first corner is no farther from the ray's line than the longest edge.
+    offsets = corners[:, 0] - origin
+    away_m = np.linalg.norm(offsets - np.outer(offsets @ direction, direction), axis=1)
+    edges_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    a, b, c = corners[away_m <= edges_m.max(initial=0.0)].transpose(1, 0, 2)
+    p = np.cross(direction, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):  # triangles along the ray
+        inverse = 1 / np.einsum("ij,ij->i", b - a, p)
+        u = np.einsum("ij,ij->i", origin - a, p) * inverse
+        q = np.cross(origin - a, b - a)
+        v = q @ direction * inverse
+        distances_m = np.einsum("ij,ij->i", c - a, q) * inverse
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (distances_m > 0) & np.isfinite(distances_m)
+    if not hit.any():
+        return None
+    point: _Floats = origin + distances_m[hit].min() * direction
+    return point

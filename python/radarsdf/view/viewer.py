@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The page: a server with the surface, the sensor, the scans and the controls."""
+"""The viewer of a map."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,61 +12,41 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
-from radarsdf.view.canvas import SurfaceCanvas
-from radarsdf.view.controls import Controls
 from radarsdf.view.framing import FOV_RAD, Look, look_at_all
-from radarsdf.view.page import Page, begin_at
-from radarsdf.view.painter import HELD_S, SLID_S, Painter, Wish
-from radarsdf.view.picking import first_hit
+from radarsdf.view.legends import legend, marks, paragraph, table
 from radarsdf.view.quantities import Colors, quantities_of
-from radarsdf.view.surface import ShownSurface
-from radarsdf.view.walk import Walk
+from radarsdf.view.scene import HELD_S, MEASURED_COLOR, SLID_S, Canvas, Painter, ScanClouds, State
+from radarsdf.view.serving import Page, begin_at
+from radarsdf.view.surface import ShownSurface, first_hit
 
-_GIZMO_SHARE = 0.06  # size of the handles of the sensor in diagonals of the surface
-_MARK_SHARE = 0.012  # radius of the mark of a click in distances to it: so large on the screen, near and far
-_MARK_COLOR = (0, 190, 255)  # not one of a scale
-_CLICKED = "/clicked"
+_GIZMO_SHARE = 0.06  # size of the sensor's handles, in diagonals of the surface
+_MARK_SHARE = 0.012  # radius of the mark of a click, in distances to it: of one size on the screen
+_MARK_COLOR = (0, 190, 255)  # not on the colour scale
 
 
 class Viewer(Page):
     """Serves a map in the browser until it is stopped.
 
-    While the sensor is dragged, at most 30,000 vertices are recoloured, spread evenly over the surface: intensities of
-    all take too long for ten updates a second on two cores. All are recoloured when the drag ends. The scale of the
-    colours does not change: it is the range from the 2nd to the 98th percentile of the values on the surface, of
-    intensities that of what is predicted for the first position. The page shows the map's local frame, so that float32
-    is fine enough for any coordinates; numbers are world coordinates.
+    While the sensor is dragged, 30,000 vertices, spread evenly, are recoloured; all of them are when the drag ends. The
+    colour scale is fixed: from the 2nd to the 98th percentile of the values on the surface, for intensities of those
+    predicted for the first sensor position. The page computes in float32 in the map's local frame, but displays world
+    coordinates.
 
     Parameters
     ----------
     radar_map : RadarMap or TiledMap
         The map.
     scans : Scans, optional
-        Scans with poses, to walk through. Their returns are kept in memory.
-    voxel_size : float
-        Edge of the voxels of the mesh, m.
-    box : (2, 3) array_like, optional
-        Lower and upper corner of the part to be shown, world, m.
+        Scans with poses to browse, which are kept in memory.
+    voxel_size, box, progress, **limits
+        As for :meth:`Map.mesh`, with its errors.
     max_vertices : int
-        A mesh of more vertices is thinned.
+        A mesh with more vertices is thinned.
     host : str
-        Address to listen on. Others than those of this machine alone let everyone in who can reach it, by this address;
-        with ``0.0.0.0`` by any address and the name of the machine. Other names, and pages of others, are refused.
+        Address to listen on. With any but a loopback address, everyone who can reach it sees the page. Requests from
+        other web pages are refused.
     port : int, optional
         Port to listen on. None: 8080, or the next that is free.
-    progress : bool, optional
-        Whether to show a progress bar. By default only on a terminal.
-    **limits
-        What the mesh leaves out, such as ``min_confidence``: as :meth:`Map.mesh`.
-
-    Raises
-    ------
-    ImportError
-        If viser is missing.
-    OSError
-        If host and port cannot be listened on.
-    ValueError
-        If the map has no surface, or for wrong arguments.
     """
 
     def __init__(
@@ -86,7 +67,7 @@ class Viewer(Page):
         self.surface = ShownSurface.of(
             radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
         )
-        """What is shown."""
+        """The mesh that is shown."""
         self._start()
         try:
             self._fill(scans)
@@ -94,10 +75,10 @@ class Viewer(Page):
             super().stop()
             raise
         self.notes = self._notes(voxel_size)
-        """Sentences on what is shown coarser or thinner than it is."""
+        """What is shown more coarsely than it is, in words."""
 
     def wait(self) -> None:
-        """Wait until the viewer is stopped, from another thread or by Ctrl-C. An error in its thread is raised here."""
+        """Wait until the viewer is stopped, from another thread or by Ctrl-C. Raises an error of its thread."""
         self._painter.wait()
 
     def stop(self) -> None:
@@ -106,46 +87,119 @@ class Viewer(Page):
         super().stop()
 
     def _fill(self, scans: Scans | None) -> None:
-        origin, vertices = self._map.origin, self.surface.vertices
+        """Add everything to the page."""
+        server, radar_map, surface = self._server, self._map, self.surface
+        origin = radar_map.origin
         path = np.zeros((0, 3)) if scans is None else scans.poses[:, :3, 3] - origin
-        self._extent = np.concatenate([vertices - origin, path])
-        size_m = float(np.linalg.norm(np.ptp(self._extent, axis=0)))
-        server = self._server
+        self._extent = np.concatenate([surface.vertices - origin, path])
         begin_at(server, look_at_all(self._extent))
-        start = origin if scans is None else scans.poses[0, :3, 3]
-        first = (float(start[0]), float(start[1]), float(start[2]))
-        self.quantities = quantities_of(self._map, self.surface, scans, first)
+        x, y, z = (origin if scans is None else scans.poses[0, :3, 3]).tolist()
+        self.quantities = quantities_of(radar_map, surface, scans, (x, y, z))
         """What the surface can be coloured by."""
-        measured = None
-        if "intensity" in self.quantities:
-            scale = self.quantities["intensity"].scale
-            measured = scale if isinstance(scale, Colors) else None
-        self._walk = None
-        count = 0 if scans is None else len(scans)
-        self._controls = controls = Controls(server, self.surface, self.quantities, measured, count)
-        if scans is not None:
-            self._walk = Walk(server, self._map, scans, measured, controls.say_of_scan)
         self._clicked: NDArray[np.float64] | None = None
-        self._canvas = SurfaceCanvas(
-            server, self._map, self.surface, self.quantities, self._walk, self._describe
-        )
-        wish = Wish(
-            first,
-            max_uncertainty_m=controls.max_uncertainty_m,
-            min_confidence=controls.min_confidence,
-            quantity=controls.quantity,
-            scan=None if self._walk is None else 0,
-        )
+        scale = self.quantities["intensity"].scale if radar_map.has_intensity else None
+        measured = scale if isinstance(scale, Colors) else None
+        self._add_controls(0 if scans is None else len(scans), measured)
+        self._clouds = None
+        if scans is not None:
+            self._clouds = ScanClouds(server, radar_map, scans, measured, self._describe_scan)
+        self._canvas = Canvas(server, radar_map, surface, self.quantities, self._clouds, self._describe)
         self._gizmo: Any = None
-        if self._map.has_intensity:
-            self._add_sensor(np.array(first) - origin, size_m)
-        self._painter = Painter(self._canvas, wish)
-        controls.connect(self._painter, self._canvas, self._walk, self._go_to_scan, self._look_at_all)
+        if radar_map.has_intensity:
+            self._add_sensor(np.array([x, y, z]) - origin)
+        state = State((x, y, z), **self._surface_state(), scan=None if scans is None else 0)
+        self._painter = Painter(self._canvas, state)
+        self._connect_controls()
         server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
 
+    def _add_controls(self, scans: int, measured: Colors | None) -> None:
+        """Add the panels. A narrow screen shows the second one folded, so that little covers the map."""
+        gui, surface = self._server.gui, self.surface
+        self._legend = gui.add_html(legend(next(iter(self.quantities.values()))))
+        self._quantity = gui.add_dropdown("colour by", tuple(self.quantities), hint="what the surface shows")
+        hint = "Click on the surface to query the map. Drag the sensor by its arrows."
+        self._answer = gui.add_html(paragraph(hint))
+        self._reset = gui.add_button("Reset view")
+        gui.main_panel.dock_right()
+        panel = gui.add_panel()
+        panel.dock_below(gui.main_panel)
+        largest_m = float(surface.uncertainty_m.max())
+        step_m = 10.0 ** math.floor(math.log10(max(largest_m, 1e-6) / 100))
+        end_m = math.ceil(largest_m / step_m) * step_m
+        with panel.add_tab("controls"):
+            with gui.add_folder("surface"):
+                self._show = gui.add_checkbox("show", True)
+                hint = "hides what is more uncertain"
+                self._uncertainty = gui.add_slider("uncertainty ≤ m", 0.0, end_m, step_m, end_m, hint=hint)
+                hint = f"hides what is less probable; the mesh is {surface.threshold}"
+                self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
+            if scans:
+                with gui.add_folder("scans"):
+                    gui.add_html(marks(measured or MEASURED_COLOR))
+                    self._scan = gui.add_slider("scan", 0, max(scans - 1, 1), 1, 0, disabled=scans == 1)
+                    self._scan_text = gui.add_markdown("")
+                    hint = "returns that the map predicts for this scan"
+                    self._layers = {
+                        "measured": gui.add_checkbox("measured", True),
+                        "predicted": gui.add_checkbox("predicted", True, hint=hint),
+                        "all": gui.add_checkbox("all scans", False),
+                    }
+                    self._path = gui.add_checkbox("trajectory", True)
+
+    def _surface_state(self) -> dict[str, Any]:
+        """The fields of :class:`State` that the controls of the surface set."""
+        return {
+            "max_uncertainty_m": float(self._uncertainty.value),
+            "min_confidence": float(self._confidence.value),
+            "quantity": str(self._quantity.value),
+        }
+
+    def _connect_controls(self) -> None:
+        # Coroutines, because viser would run functions in several threads, in any order.
+        async def on_limit(_: Any) -> None:
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=SLID_S)
+
+        async def on_quantity(_: Any) -> None:
+            self._legend.content = legend(self.quantities[self._quantity.value])
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=0.0)
+
+        async def on_show(_: Any) -> None:
+            self._canvas.node.visible = self._show.value
+
+        async def on_reset(event: Any) -> None:
+            self._look_at_all(event.client)
+
+        self._uncertainty.on_update(on_limit)
+        self._confidence.on_update(on_limit)
+        self._quantity.on_update(on_quantity)
+        self._show.on_update(on_show)
+        self._reset.on_click(on_reset)
+        clouds = self._clouds
+        if clouds is None:
+            return
+
+        async def on_scan(_: Any) -> None:
+            self._go_to_scan(clouds, int(self._scan.value))
+
+        async def on_path(_: Any) -> None:
+            clouds.path.visible = self._path.value
+
+        def on_layer(event: Any) -> None:  # in a thread: all scans take a while
+            for name, box in self._layers.items():
+                if box is event.target:
+                    clouds.set_visible(name, visible=box.value)
+
+        self._scan.on_update(on_scan)
+        self._path.on_update(on_path)
+        for box in self._layers.values():
+            box.on_update(on_layer)
+
+    def _describe_scan(self, text: str) -> None:
+        self._scan_text.content = text
+
     def _look_at_all(self, client: Any) -> Look:
-        """Let a page show all that there is."""
+        """Let a page show everything."""
         camera = client.camera
         look = look_at_all(self._extent, aspect=_aspect(camera))
         with client.atomic():
@@ -156,7 +210,7 @@ class Viewer(Page):
 
     # Coroutines, because viser would run functions in several threads, in any order.
     async def _on_connect(self, client: Any) -> None:
-        """Let a new page show all, also after its frame has changed, until somebody looks elsewhere."""
+        """Let a new page show everything, also after its frame has changed, until the user moves the camera."""
         first = look_at_all(self._extent)  # which a page may take after it was told a better one
         aspect, look = _aspect(client.camera), self._look_at_all(client)
 
@@ -168,36 +222,33 @@ class Viewer(Page):
 
         client.camera.on_update(on_update)
 
-    def _add_sensor(self, position: NDArray[np.float64], size_m: float) -> None:
-        scale = _GIZMO_SHARE * size_m
-        far = 1e6
+    def _add_sensor(self, position: NDArray[np.float64]) -> None:
+        scale = _GIZMO_SHARE * float(np.linalg.norm(np.ptp(self._extent, axis=0)))
         self._gizmo = self._server.scene.add_transform_controls(
             "/sensor",
             scale,
             disable_rotations=True,
             depth_test=False,
-            translation_limits=((-far, far),) * 3,
+            translation_limits=((-1e6, 1e6),) * 3,
             position=tuple(position),
         )
         self._server.scene.add_icosphere("/sensor/ball", scale / 8, (20, 20, 24))
 
-        # A coroutine, because viser would run functions in several threads, in any order.
         async def on_update(event: Any) -> None:
             sensor = self._map.origin + np.asarray(event.target.position, np.float64)
             ended = event.phase == "end"
-            self._painter.wish(
+            self._painter.change(
                 sensor=tuple(sensor.tolist()), coarse=not ended, settle_s=0.0 if ended else HELD_S
             )
 
         self._gizmo.on_update(on_update)
 
-    def _go_to_scan(self, index: int) -> None:
-        """Show a scan, and move the sensor to where it was measured."""
-        assert self._walk is not None
-        sensor = self._walk.sensor(index)
+    def _go_to_scan(self, clouds: ScanClouds, index: int) -> None:
+        """Show a scan, and move the sensor to its pose."""
+        sensor = clouds.sensor(index)
         if self._gizmo is not None:
             self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
-        self._painter.wish(scan=index, sensor=sensor, coarse=True, settle_s=SLID_S)
+        self._painter.change(scan=index, sensor=sensor, coarse=True, settle_s=SLID_S)
 
     def _on_click(self, event: Any) -> None:
         vertices = self.surface.vertices - self._map.origin
@@ -206,9 +257,10 @@ class Viewer(Page):
             return
         self._clicked = point + self._map.origin
         away_m = float(np.linalg.norm(point - np.asarray(event.ray_origin)))
+        radius_m = max(_MARK_SHARE * away_m, 0.5 * self.surface.spacing_m)
         self._server.scene.add_icosphere(
-            _CLICKED,
-            max(_MARK_SHARE * away_m, 0.5 * self.surface.spacing_m),
+            "/clicked",
+            radius_m,
             _MARK_COLOR,
             position=tuple(point),
             cast_shadow=False,
@@ -216,11 +268,11 @@ class Viewer(Page):
         )
         self._describe(self._painter.newest)
 
-    def _describe(self, wish: Wish) -> None:
-        """Say what the map knows of the point that was clicked last, for the sensor of a wish."""
+    def _describe(self, state: State) -> None:
+        """Show what the map knows about the point that was clicked, for the sensor of a state."""
         if self._clicked is None:
             return
-        x = self._clicked[None]
+        x, sensor = self._clicked[None], np.array(state.sensor)
         rows = {
             "position": "{:.3f}, {:.3f}, {:.3f} m".format(*self._clicked),
             "signed distance": f"{self._map.sdf(x)[0]:+.3f} m",
@@ -228,9 +280,9 @@ class Viewer(Page):
             "confidence": f"{self._map.confidence(x)[0]:.2f}",
         }
         if self._map.has_intensity:
-            range_m = float(np.linalg.norm(self._clicked - np.array(wish.sensor)))
-            rows["intensity"] = f"{self._map.intensity(x, np.array(wish.sensor))[0]:.1f} from {range_m:.1f} m"
-        self._controls.say_of_click(rows)
+            range_m = float(np.linalg.norm(self._clicked - sensor))
+            rows["intensity"] = f"{self._map.intensity(x, sensor)[0]:.1f} from {range_m:.1f} m"
+        self._answer.content = table(rows)
 
     def _notes(self, voxel_size: float) -> list[str]:
         notes = []
@@ -239,8 +291,8 @@ class Viewer(Page):
                 f"the mesh is thinned to {len(self.surface.vertices)} vertices, {self.surface.spacing_m:.2g} m apart: "
                 "--max-vertices allows more, --box shows a part"
             )
-        if self._walk is not None and self._walk.every > 1:
-            notes.append(f"of all returns together, one in {self._walk.every} is shown")
+        if self._clouds is not None and self._clouds.every > 1:
+            notes.append(f"of all returns together, one in {self._clouds.every} is shown")
         return notes
 
 
@@ -250,5 +302,4 @@ def _aspect(camera: Any) -> float:
 
 
 def _is_at(camera: Any, look: Look) -> bool:
-    """Whether a page looks from there."""
     return bool(np.allclose(camera.position, look.position, atol=0.01))

@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Simple pages: a surface that grows, and what changed between two maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
+from radarsdf.view.framing import look_at_all
+from radarsdf.view.glb import glb, lightness_of, shaded
+from radarsdf.view.legends import key, paragraph, table
+from radarsdf.view.scene import add_path
+from radarsdf.view.serving import Page, begin_at
+from radarsdf.view.surface import thinned
+
+if TYPE_CHECKING:
+    import trimesh
+
+_SURFACE_COLOR, _PATH_COLOR = (150, 160, 170), (0, 190, 255)
+_MAX_VERTICES = 500_000
+_MAX_LISTED = 12  # changes
+_NOTES = {"unseen": ": not observed by the other map", "gone": ": of the earlier map"}
+MEANING = {
+    NAMES[kind] + _NOTES.get(NAMES[kind], ""): color for kind, color in sorted(COLORS.items(), reverse=True)
+}
+"""sRGB colours of changes by their meaning."""
+
+
+def centre_of(region: Region) -> str:
+    """The centre of a change, world, in words."""
+    return "({:.1f}, {:.1f}, {:.1f}) m".format(*region.box.mean(axis=0))
+
+
+class GrowingView(Page):
+    """Serves the current surface and trajectory until it is stopped. `host`, `port`: as for :class:`Page`."""
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
+        super().__init__(host, port)
+        self._start()
+        self._origin: NDArray[np.float64] | None = None
+
+    def show(self, mesh: trimesh.Trimesh, path: NDArray[np.float64]) -> None:
+        """Replace what is shown by a mesh and the sensor positions (F, 3), world, m."""
+        if len(mesh.faces) == 0:
+            return
+        vertices = np.asarray(mesh.vertices, np.float64)
+        server = self._server
+        if self._origin is None:  # of the page, which computes in float32
+            self._origin = path[0].copy()
+            begin_at(server, look_at_all(vertices - self._origin))
+        local, faces = (vertices - self._origin).astype(np.float32), np.asarray(mesh.faces, np.uint32)
+        with server.atomic():
+            server.scene.add_mesh_simple(
+                "/surface", local, faces, color=_SURFACE_COLOR, side="double", flat_shading=True
+            )
+            if len(path) > 1:
+                add_path(server, "/path", path - self._origin, _PATH_COLOR)
+
+
+class ChangesView(Page):
+    """Serves the coloured surface of :meth:`Changes.mesh` with a legend until it is stopped.
+
+    `regions`: the changes to list. `edge_m`: vertex spacing of the surfaces. `host`, `port`: as for :class:`Page`.
+    Raises a ValueError if there is no surface.
+    """
+
+    def __init__(
+        self,
+        changes: Changes,
+        regions: Sequence[Region],
+        edge_m: float,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+    ) -> None:
+        super().__init__(host, port)
+        mesh: Any = thinned(changes.mesh(), _MAX_VERTICES, edge_m)[0]
+        if len(mesh.faces) == 0:
+            msg = "there is no surface here"
+            raise ValueError(msg)
+        vertices = np.asarray(mesh.vertices, np.float64)
+        local = vertices - vertices.mean(axis=0)  # the page computes in float32
+        colors = shaded(colors_of(mesh.vertex_attributes["kind"]), lightness_of(mesh.vertex_normals))
+        self._start()
+        server = self._server
+        begin_at(server, look_at_all(local))
+        data = glb(local, mesh.faces, colors)
+        server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
+        rows = {
+            centre_of(region): f"{region.words}, {region.area_m2:.1f} m²" for region in regions[:_MAX_LISTED]
+        }
+        server.gui.add_html(key(MEANING))
+        server.gui.add_html(paragraph(changes.report["alignment"]))
+        server.gui.add_html(table(rows) if rows else paragraph("Nothing changed."))

@@ -1,0 +1,298 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What a viewer's page shows: the surface and one scan. A thread draws the newest state that controls asked for.
+
+viser takes vertex colours only with a whole mesh. That is too much for each step of a drag, and the page would be blank
+between two meshes. So a step recolours a cloud of some vertices in place. After the drag a new mesh is sent, and what is
+shown stays until the page has drawn it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.io.scans import Scan, Scans
+from radarsdf.map.colors import NEUTRAL
+from radarsdf.map.map import Map
+from radarsdf.view.glb import glb, shaded
+from radarsdf.view.quantities import Colors, Position, Quantity
+from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
+from radarsdf.view.surface import ShownSurface, spread_evenly
+
+HELD_S = 2.0
+"""The mesh is drawn after the sensor was held still for so long."""
+SLID_S = 0.25
+"""A slider reports no end of a drag: this pause counts as one."""
+PATH_COLOR = (40, 44, 52)
+MEASURED_COLOR = (0, 72, 140)  # without intensities
+PREDICTED_COLOR = (0, 158, 115)  # not on the intensity scale, so that predictions stand out from the surface
+
+# On two cores, intensities of 30,000 points take about 0.025 s, of 400,000 about 0.4 s.
+_DRAG_POINTS = 30_000
+_POINT_SIZE = 1.4  # in vertex spacings, so that there are no holes between points
+_MAX_RETURNS = 200_000  # of all scans together
+# In float16 points would be on a grid of 3 cm at 60 m.
+_POINTS = {"point_shading": "flat", "precision": "float32"}
+_CLOUD_STYLES = {
+    "measured": ("circle", 0.25),
+    "predicted": ("diamond", 0.2),
+    "all": ("circle", 0.2),
+}  # size, m
+
+
+@dataclass(frozen=True)
+class State:
+    """What the page is to show."""
+
+    sensor: Position
+    """World, m."""
+    max_uncertainty_m: float
+    min_confidence: float
+    quantity: str = ""
+    scan: int | None = None
+    coarse: bool = False
+    """Whether the sensor is moving: the cloud is shown first."""
+    settle_s: float = 0.0
+    """The mesh is drawn if nothing changes for so long."""
+
+
+class Painter:
+    """Draws the newest state on a canvas, from a thread of its own. States that are superseded are skipped."""
+
+    def __init__(self, canvas: Any, state: State) -> None:
+        self._canvas, self._state = canvas, state
+        self._changed = threading.Condition()
+        self._pending, self._stopped = True, False
+        self._ended = threading.Event()
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="radarsdf view", daemon=True)
+        self._thread.start()
+
+    @property
+    def newest(self) -> State:
+        """The state, which may not be drawn yet."""
+        return self._state
+
+    def change(self, **fields: Any) -> None:
+        """Change the state, from any thread, without waiting."""
+        with self._changed:
+            self._state = dataclasses.replace(self._state, **fields)
+            self._pending = True
+            self._changed.notify_all()
+
+    def wait(self) -> None:
+        """Wait for the end of the thread. Raises the error that ended it."""
+        while not self._ended.wait(WAIT_STEP_S):
+            pass
+        if self._error is not None:
+            raise self._error
+
+    def stop(self) -> None:
+        """End the thread, after what it is drawing."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _superseded(self, within_s: float | None = 0.0) -> bool:
+        with self._changed:
+            return self._changed.wait_for(lambda: self._pending or self._stopped, within_s)
+
+    def _run(self) -> None:
+        try:
+            while self._superseded(within_s=None) and not self._stopped:
+                with self._changed:
+                    self._pending, state = False, self._state
+                self._canvas.show_scan(state)
+                if state.coarse:
+                    self._canvas.show_cloud(state)
+                if not self._superseded(state.settle_s):
+                    self._canvas.show_mesh(state, self._superseded)
+        except BaseException as error:  # noqa: BLE001 - `wait` raises it
+            self._error = error
+        finally:
+            self._ended.set()
+
+
+class Canvas:
+    """Draws the surface, coloured by a quantity, and the scan. `shown` is called with a state when its mesh was sent."""
+
+    def __init__(
+        self,
+        server: Any,
+        radar_map: Map,
+        surface: ShownSurface,
+        quantities: Mapping[str, Quantity],
+        scans: ScanClouds | None,
+        shown: Callable[[State], None],
+    ) -> None:
+        self._server, self._surface, self._quantities = server, surface, quantities
+        self._scans, self._shown = scans, shown
+        self._local = (surface.vertices - radar_map.origin).astype(np.float32)
+        self._spread, _, spacing_m = spread_evenly(surface.vertices, _DRAG_POINTS, surface.spacing_m)
+        self._cloud_rows = self._spread
+        self._cloud_limits: tuple[float, float] | None = None
+        self._drawn: Hashable = None  # what the mesh depends on
+        self._meshes: list[Any] = []  # the newest is last; the others go when the page has drawn that
+        self.sent = 0
+        """Meshes sent so far."""
+        self.faces = surface.faces
+        """(F, 3) the triangles that are shown, rows of the vertices."""
+        self.coarse = False
+        """Whether the cloud is shown."""
+        self.node: Any = server.scene.add_frame("/surface", show_axes=False)
+        """The parent of mesh and cloud."""
+        self._cloud: Any = None
+        if any(quantity.of_sensor for quantity in quantities.values()):
+            colors = np.full((len(self._spread), 3), NEUTRAL, np.uint8)
+            options = _POINTS | {
+                "point_shape": "circle",
+                "point_size": _POINT_SIZE * spacing_m,
+                "visible": False,
+            }
+            local = self._local[self._spread]
+            self._cloud = server.scene.add_point_cloud("/surface/cloud", local, colors, **options)
+
+    def show_scan(self, state: State) -> None:
+        """Show the returns of the scan."""
+        if self._scans is not None and state.scan is not None:
+            self._scans.show(state.scan)
+
+    def show_cloud(self, state: State) -> None:
+        """Recolour the cloud and show it instead of the mesh, if the quantity depends on the sensor."""
+        if not self._quantities[state.quantity].of_sensor:
+            return
+        limits = (state.max_uncertainty_m, state.min_confidence)
+        moved = limits != self._cloud_limits
+        if moved:
+            self._cloud_rows = self._spread[self._surface.kept(*limits)[self._spread]]
+            self._cloud_limits = limits
+        colors = self._colors(self._cloud_rows, state)
+        with self._server.atomic():
+            if moved:
+                self._cloud.points = self._local[self._cloud_rows]
+            self._cloud.colors = colors
+            self.coarse = True
+            self._cloud.visible = True
+            for mesh in self._meshes:
+                mesh.visible = False
+
+    def show_mesh(self, state: State, superseded: Callable[[], bool]) -> None:
+        """Send the mesh, and show it alone once the page has drawn it, unless the state is superseded before."""
+        limits = (state.max_uncertainty_m, state.min_confidence)
+        drawn = (limits, state.quantity, state.sensor if self._quantities[state.quantity].of_sensor else None)
+        if drawn == self._drawn and not self.coarse:
+            self._shown(state)
+            return
+        rows, faces = self._surface.part(self._surface.kept(*limits))
+        colors = self._colors(rows, state)
+        if superseded():
+            return
+        old, self._meshes = self._meshes, []
+        if len(faces):
+            self.sent += 1
+            data = glb(self._local[rows], faces, colors)
+            name = f"/surface/mesh {self.sent}"
+            self._meshes = [self._server.scene.add_glb(name, data, cast_shadow=False, receive_shadow=False)]
+        self.faces = rows[faces].astype(np.int32)
+        wait_until_drawn(self._server, superseded)
+        if superseded():
+            self._meshes = old + self._meshes
+            return
+        with self._server.atomic():
+            for mesh in old:
+                mesh.remove()
+            self.coarse, self._drawn = False, drawn
+            if self._cloud is not None:
+                self._cloud.visible = False
+        self._shown(state)
+
+    def _colors(self, rows: NDArray[np.int64], state: State) -> NDArray[np.uint8]:
+        colors = self._quantities[state.quantity].colors(rows, state.sensor)
+        return shaded(colors, self._surface.lightness[rows])
+
+
+class ScanClouds:
+    """The sensor's path, and the returns of one scan, measured and predicted, or of all scans.
+
+    `colors`: the scale of measured intensities. `describe` is called with a sentence about the scan that is shown.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        radar_map: Map,
+        scans: Scans,
+        colors: Colors | None,
+        describe: Callable[[str], None],
+    ) -> None:
+        self._server, self._map, self._scans = server, radar_map, list(scans)
+        self._colors, self._describe = colors, describe
+        self._shown: int | None = None
+        self._clouds: dict[str, Any] = {}
+        self._visible = {"measured": True, "predicted": True, "all": False}
+        self.every = max(1, -(-sum(map(len, self._scans)) // _MAX_RETURNS))
+        """Of all returns together, one in so many is shown."""
+        self.path: Any = add_path(server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, PATH_COLOR)
+
+    def sensor(self, index: int) -> Position:
+        """Sensor position of a scan, world, m."""
+        x, y, z = self._scans[index].T_world_sensor[:3, 3].tolist()
+        return x, y, z
+
+    def show(self, index: int) -> None:
+        """Show the returns of a scan."""
+        if index == self._shown:
+            return
+        self._shown = index
+        scan = self._scans[index]
+        world, view = scan.world_points, self._map.render(scan.T_world_sensor)
+        with self._server.atomic():
+            self._draw("measured", world, self._colors_of(scan))
+            self._draw("predicted", view.world_points, np.full((len(view), 3), PREDICTED_COLOR, np.uint8))
+        text = f"scan {index}: {len(scan)} returns measured, {len(view)} predicted"
+        if scan.intensities is not None and self._map.has_intensity:
+            found = self._map.intensity(world, scan.T_world_sensor[:3, 3], extrapolate=True)
+            errors = np.abs(found - np.asarray(scan.intensities, np.float64))
+            errors = errors[np.isfinite(errors)]
+            text += f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
+        self._describe(text)
+
+    def set_visible(self, what: str, visible: bool) -> None:
+        """Show or hide the cloud ``measured``, ``predicted`` or ``all``."""
+        self._visible[what] = visible
+        if what == "all" and visible and "all" not in self._clouds:
+            world = np.concatenate([scan.world_points for scan in self._scans])
+            colors = np.concatenate([self._colors_of(scan) for scan in self._scans])
+            self._draw("all", world[:: self.every], colors[:: self.every])
+        if what in self._clouds:
+            self._clouds[what].visible = visible
+
+    def _colors_of(self, scan: Scan) -> NDArray[np.uint8]:
+        """(N, 3) sRGB of measured returns."""
+        if scan.intensities is None or self._colors is None:
+            return np.full((len(scan), 3), MEASURED_COLOR, np.uint8)
+        return self._colors(np.asarray(scan.intensities, np.float64))
+
+    def _draw(self, what: str, world: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
+        local = (world - self._map.origin).astype(np.float32)
+        if what in self._clouds:
+            self._clouds[what].points, self._clouds[what].colors = local, colors
+            return
+        shape, size_m = _CLOUD_STYLES[what]
+        options = _POINTS | {"point_shape": shape, "point_size": size_m, "visible": self._visible[what]}
+        self._clouds[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
+
+
+def add_path(server: Any, name: str, path: NDArray[Any], color: tuple[int, int, int]) -> Any:
+    """Add a line through points (N, 3), m, to the scene."""
+    path = path.astype(np.float32)
+    segments = np.stack([path[:-1], path[1:]], axis=1)
+    return server.scene.add_line_segments(name, segments, color, thickness=3.0, thickness_units="screen")

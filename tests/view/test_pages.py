@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Pages of a growing surface and of changes, in coordinates that float32 can hold."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from radarsdf.changes.changes import APPEARED, COLORS, GONE, NAMES, REPAINTED, SAME, ChangedSurface, Changes
+from radarsdf.view import pages, serving
+
+FAR = np.array([4e5, 5e6, 100.0])  # UTM: float32 would round it to half a metre
+
+
+@pytest.fixture
+def server(monkeypatch):
+    shown, texts = {}, []
+    scene = SimpleNamespace(
+        add_glb=lambda name, data, **_: shown.update({name: data}),
+        add_mesh_simple=lambda name, *mesh, **_: shown.update({name: mesh}),
+        add_line_segments=lambda name, points, *_, **__: shown.update({name: points}),
+    )
+    server = SimpleNamespace(
+        scene=scene, initial_camera=SimpleNamespace(), atomic=nullcontext, shown=shown, texts=texts
+    )
+    server.gui = SimpleNamespace(add_html=texts.append)
+    monkeypatch.setattr(serving, "require_viser", lambda: None)
+    monkeypatch.setattr(serving, "start_server", lambda *_: server)
+    monkeypatch.setattr(serving, "stop_server", lambda _: None)
+    return server
+
+
+def test_a_growing_surface_is_replaced(server):
+    path = FAR + np.array([[0, 0, 1.5], [1, 0, 1.5], [2, 0, 1.5]])
+    with pages.GrowingView(port=0) as view:
+        view.show(trimesh.Trimesh(), path)
+        assert server.shown == {}
+        for size in (1.0, 2.0):
+            mesh = trimesh.creation.box([size] * 3)
+            mesh.apply_translation(FAR)
+            view.show(mesh, path)
+    vertices, faces = server.shown["/surface"]
+    assert vertices.dtype == np.float32
+    assert np.allclose(np.ptp(vertices, axis=0), 2.0, atol=1e-6)
+    assert len(faces) == 12
+    assert server.shown["/path"].shape == (2, 2, 3)
+    assert np.abs(server.initial_camera.position).max() < 100
+
+
+def triangles(kinds, offset):
+    vertices = np.concatenate([np.eye(3) + FAR + offset + [2.0 * i, 0, 0] for i in range(len(kinds))])
+    kind = np.repeat(np.array(kinds, np.int8), 3)
+    unknown = np.full(len(kind), np.nan, np.float32)
+    change = np.where(kind == REPAINTED, -6.0, np.nan).astype(np.float32)
+    faces = np.arange(len(kind), dtype=np.int32).reshape(-1, 3)
+    return ChangedSurface(vertices, faces, kind, np.full(len(kind), 0.9, np.float32), unknown, change)
+
+
+def test_changes_have_their_colours_and_a_legend(server, monkeypatch):
+    meshes = []
+    monkeypatch.setattr(pages, "glb", lambda *mesh: meshes.append(mesh) or b"glb")
+    after = triangles([SAME, APPEARED, REPAINTED], [0, 0, 0])
+    changes = Changes(triangles([GONE], [0, 3.0, 0]), after, np.eye(4), {"alignment": "As <given>."})
+    with pages.ChangesView(changes, changes.regions(), 0.2, port=0):
+        assert server.shown == {"/surface": b"glb"}
+    ((vertices, faces, colors),) = meshes
+    assert np.abs(vertices).max() < 10
+    assert len(faces) == 4
+    for rows, kind in ((slice(3, 6), APPEARED), (slice(6, 9), REPAINTED), (slice(9, 12), GONE)):
+        shown, fixed = colors[rows].astype(float), np.array(COLORS[kind], float)
+        assert np.abs(shown / shown.max(axis=1, keepdims=True) - fixed / fixed.max()).max() < 0.1
+    legend, alignment, table = server.texts
+    assert all("rgb({},{},{})".format(*COLORS[kind]) in legend and NAMES[kind] in legend for kind in NAMES)
+    assert "As &lt;given&gt;." in alignment
+    assert all(region.words in table for region in changes.regions())
+    nothing = ChangedSurface(*(values[:0] for values in vars(after).values()))
+    with pytest.raises(ValueError, match="no surface"):
+        pages.ChangesView(Changes(nothing, nothing, np.eye(4), changes.report), [], 0.2, port=0)
