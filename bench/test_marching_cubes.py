@@ -16,7 +16,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.map.isosurface import extract_cells, marching_cubes, mesh_components, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, marching_cubes, mesh_components, sparse_lattice
 
 
 def sphere_256():

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from radarsdf.map.isosurface import extract_cells, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

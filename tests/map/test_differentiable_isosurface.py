@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import _core
-from radarsdf.map.isosurface import extract_cells, marching_cubes, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
 
 from ..mesh_checks import cells_in_use, noise, sphere
 

@@ -13,9 +13,9 @@ import radarsdf
 import torch
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents
-from radarsdf.map.isosurface import mesh_components
+from radarsdf.map.marching_cubes import mesh_components
+from radarsdf.map.mesh import _corner_distances, _smooth_in_cells, _voxels_of, crossed
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.map.voxels import _corner_distances, _smooth_in_cells, _voxels_of, crossed
 from scipy.spatial import KDTree
 
 from ..conftest import ground_and_wall
@@ -178,7 +178,7 @@ def test_two_meshes_of_one_map_are_the_same_bits(sharp_map):
 @pytest.mark.parametrize("voxel_size", [0.1, 0.15])
 def test_small_parts_give_the_same_bits(sharp_map, mesh_of, voxel_size, monkeypatch):
     whole = mesh_of(voxel_size)
-    monkeypatch.setattr("radarsdf.map.voxels._PART", 1 << 12)  # of a large map, as many parts
+    monkeypatch.setattr("radarsdf.map.mesh._PART", 1 << 12)  # of a large map, as many parts
     parts = sharp_map.mesh(voxel_size)
     np.testing.assert_array_equal(parts.vertices, whole.vertices)
     np.testing.assert_array_equal(parts.faces, whole.faces)
@@ -304,7 +304,7 @@ def test_a_viewpoint_needs_intensities(scene):
 
 def lattice(radar_map, voxel_size):
     voxels = occupied_voxels(radar_map, voxel_size)
-    return radarsdf.map.isosurface.sparse_lattice(voxels)
+    return radarsdf.map.marching_cubes.sparse_lattice(voxels)
 
 
 @pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
@@ -335,7 +335,7 @@ def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
     mesh = mesh_of(voxel_size)
     assert mesh.metadata["leaf_cells_searched"] == len(searched)
     assert mesh.metadata["leaf_cells"] == len(cells)
-    monkeypatch.setattr("radarsdf.map.voxels.crossed", lambda cells, *_: cells)
+    monkeypatch.setattr("radarsdf.map.mesh.crossed", lambda cells, *_: cells)
     whole = sharp_map.mesh(voxel_size)
     assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4 if voxel_size in (0.05, 0.1) else 1e-3)
     distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.map.meshing import Surface
+from radarsdf.map.mesh import Surface
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Tally, Threshold
 

@@ -10,7 +10,7 @@ import pickle
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.map.views import _spread
+from radarsdf.map.view import _spread
 from radarsdf.returns.noise import SensorNoise
 
 from .test_meshing import moved, surface_distance
@@ -131,7 +131,7 @@ def test_a_huge_sensor_takes_no_more_than_the_map_has(sharp_map, monkeypatch):
     all_patches = sharp_map.render(POSE, everywhere, returns=1e8)
     assert len(all_patches) <= len(sharp_map._traced.centres)
     assert all_patches.beam_ranges_m.size <= 1_000_000
-    monkeypatch.setattr("radarsdf.map.views._BLOCK", 100)
+    monkeypatch.setattr("radarsdf.map.view._BLOCK", 100)
     np.testing.assert_array_equal(sharp_map.render(POSE, everywhere, returns=1e8).points, all_patches.points)
 
 

@@ -107,7 +107,7 @@ def two_processes():
         return ProcessPoolExecutor(2, multiprocessing.get_context("spawn"))
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["radarsdf.fitting.fit", "radarsdf.map.meshing", "radarsdf.tiles.fit_tiles"]
+        ["radarsdf.fitting.fit", "radarsdf.map.mesh", "radarsdf.tiles.fit_tiles"]
     )
     return ProcessPoolExecutor(2, context)
 

@@ -342,7 +342,7 @@ class LiveMap:
 
         The arguments and the result are those of :meth:`Map.mesh`. The mesh is empty if there is no surface.
         """
-        from radarsdf.map.meshing import Limits  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.map.mesh import Limits  # noqa: PLC0415 - trimesh is slow to import
 
         with self._reading:
             num_threads = resolve_num_threads(self._state.config.num_threads)

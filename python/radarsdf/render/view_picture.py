@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.files import write_whole
-from radarsdf.map.views import View
+from radarsdf.map.view import View
 from radarsdf.render.figures import new_figure, png_of
 
 _DPI = 100

@@ -18,10 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
-from radarsdf.map.isosurface import extract_cells, sparse_lattice
-from radarsdf.map.meshing import Surface, TriangleLimits, renumbered
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.mesh import Surface, TriangleLimits, crossed, renumbered
 from radarsdf.map.threshold import TALLY_NUMBERS
-from radarsdf.map.voxels import crossed
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours

@@ -30,9 +30,9 @@ from radarsdf.tiles.tile_fit import report_of
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.map.gridding import CellsInBox
+    from radarsdf.map.queries import CellsInBox
     from radarsdf.map.threshold import Threshold
-    from radarsdf.map.views import ViewedMap
+    from radarsdf.map.view import ViewedMap
     from radarsdf.tiles.grid import Tile
 
 _Floats = NDArray[np.float64]

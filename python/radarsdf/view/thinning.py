@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.map.meshing import renumbered
+from radarsdf.map.mesh import renumbered
 
 if TYPE_CHECKING:
     import trimesh

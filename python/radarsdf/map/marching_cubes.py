@@ -1,28 +1,34 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Triangle meshes of the level sets of sampled fields, by marching cubes.
+"""Triangle meshes of the level sets of sampled fields, by marching cubes; of tensors as autograd functions.
 
 A cell here is a cube of eight neighbouring samples: a voxel of marching cubes. Its corners are in C order:
 corner ``4 * dx + 2 * dy + dz`` is at ``(dx, dy, dz)`` from the lower one. Results do not depend on the number
 of threads.
+
+A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of its length.
+It moves along this edge when a or b changes, and depends on no other sample. Triangles have no gradient: they
+change only where a sample changes its sign.
 """
 
 from __future__ import annotations
 
-from typing import TypeAlias, overload
+from collections.abc import Callable
+from typing import Any, TypeAlias, overload
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from radarsdf import _core
 from radarsdf.checks import real_array, refuse_masked
-from radarsdf.map import differentiable_isosurface
 
 Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
 TensorMesh: TypeAlias = tuple[Tensor, Tensor]
-
-__all__ = ["extract_cells", "marching_cubes", "mesh_components", "sparse_lattice"]
+_Arrays: TypeAlias = tuple[NDArray[Any], ...]
+_SMALL_INTEGERS = 2  # bytes: float32 holds all of them
 
 
 @overload
@@ -35,8 +41,6 @@ def marching_cubes(
     mask: ArrayLike | None = None,
     num_threads: int = 0,
 ) -> TensorMesh: ...
-
-
 @overload
 def marching_cubes(
     volume: ArrayLike,
@@ -47,8 +51,6 @@ def marching_cubes(
     mask: ArrayLike | None = None,
     num_threads: int = 0,
 ) -> Mesh: ...
-
-
 def marching_cubes(
     volume: ArrayLike | Tensor,
     level: float = 0.0,
@@ -136,41 +138,29 @@ def marching_cubes(
         msg = f"volume must have three axes, not {len(shape)}"
         raise ValueError(msg)
     usable = None if mask is None else _as_mask(mask, shape)
-    placement = _as_placement(spacing, origin, shape)
-    if isinstance(samples, Tensor):
-        samples = differentiable_isosurface.as_samples(samples, "volume")
-        return differentiable_isosurface.volume_mesh(
-            samples, usable, *placement, _as_level(level), num_threads
-        )
-    return _core.marching_cubes_dense(samples, usable, *placement, _as_level(level), num_threads)
+    step, start = _as_placement(spacing, origin, shape)
+    iso = _as_level(level)
+    rest = usable, step, start, iso, num_threads
+    if not isinstance(samples, Tensor):
+        return _core.marching_cubes_dense(samples, *rest)
+    return _tensor_mesh(
+        _as_float_tensor(samples, "volume"),
+        lambda samples: _core.marching_cubes_dense(samples, *rest),
+        lambda samples: _core.marching_cubes_dense_with_edges(samples, *rest),
+        lambda samples, edges, grad, into: _core.marching_cubes_dense_backward(
+            samples, edges, grad, step, iso, into, num_threads
+        ),
+    )
 
 
 @overload
 def extract_cells(
-    corners: ArrayLike,
-    values: Tensor,
-    cells: ArrayLike,
-    level: float = 0.0,
-    *,
-    spacing: ArrayLike = ...,
-    origin: ArrayLike = ...,
-    num_threads: int = 0,
+    corners: ArrayLike, values: Tensor, cells: ArrayLike, level: float = ..., **options: Any
 ) -> TensorMesh: ...
-
-
 @overload
 def extract_cells(
-    corners: ArrayLike,
-    values: ArrayLike,
-    cells: ArrayLike,
-    level: float = 0.0,
-    *,
-    spacing: ArrayLike = ...,
-    origin: ArrayLike = ...,
-    num_threads: int = 0,
+    corners: ArrayLike, values: ArrayLike, cells: ArrayLike, level: float = ..., **options: Any
 ) -> Mesh: ...
-
-
 def extract_cells(
     corners: ArrayLike,
     values: ArrayLike | Tensor,
@@ -221,16 +211,19 @@ def extract_cells(
     """
     corners = _as_int32(corners, "corners")
     furthest = max(-float(corners.min(initial=0)), float(corners.max(initial=0))) + 1
-    rest = (
-        _as_int32(cells, "cells"),
-        *_as_placement(spacing, origin, (furthest,) * 3),
-        _as_level(level),
-        num_threads,
+    step, start = _as_placement(spacing, origin, (furthest,) * 3)
+    iso = _as_level(level)
+    rest = _as_int32(cells, "cells"), step, start, iso, num_threads
+    if not isinstance(values, Tensor):
+        return _core.marching_cubes_sparse(corners, _as_samples(values, "values"), *rest)
+    return _tensor_mesh(
+        _as_float_tensor(values, "values"),
+        lambda samples: _core.marching_cubes_sparse(corners, samples, *rest),
+        lambda samples: _core.marching_cubes_sparse_with_edges(corners, samples, *rest),
+        lambda samples, edges, uppers, grad, into: _core.marching_cubes_sparse_backward(
+            samples, edges, uppers, grad, step, iso, into, num_threads
+        ),
     )
-    if isinstance(values, Tensor):
-        samples = differentiable_isosurface.as_samples(values, "values")
-        return differentiable_isosurface.cells_mesh(corners, samples, *rest)
-    return _core.marching_cubes_sparse(corners, _as_samples(values, "values"), *rest)
 
 
 def sparse_lattice(
@@ -303,6 +296,59 @@ def mesh_components(faces: ArrayLike, num_vertices: int) -> tuple[NDArray[np.int
     ([0, 1, 0], [2, 1])
     """
     return _core.mesh_components(_as_int32(faces, "faces"), num_vertices)
+
+
+def _tensor_mesh(
+    samples: Tensor,
+    plain: Callable[[NDArray[Any]], _Arrays],
+    with_edges: Callable[[NDArray[Any]], _Arrays],
+    pull_back: Callable[..., None],
+) -> TensorMesh:
+    """Vertices and faces by one of two calls of the core, and their gradient by the third. It keeps what it names alone."""
+    if samples.requires_grad and torch.is_grad_enabled():
+        mesh: TensorMesh = _OfSamples.apply(samples, with_edges, pull_back)  # type: ignore[no-untyped-call]
+        return mesh
+    vertices, faces = plain(samples.detach().numpy())
+    return torch.from_numpy(vertices), torch.from_numpy(faces)
+
+
+class _OfSamples(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        samples: Tensor,
+        with_edges: Callable[[NDArray[Any]], _Arrays],
+        pull_back: Callable[..., None],
+    ) -> TensorMesh:
+        vertices, faces, *edges = map(torch.from_numpy, with_edges(samples.detach().numpy()))
+        ctx.save_for_backward(samples, *edges)
+        ctx.pull_back = pull_back
+        ctx.mark_non_differentiable(faces)
+        ctx.set_materialize_grads(False)  # or the faces' gradient would be zeros of their size
+        return vertices, faces
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, vertices_grad: Tensor | None, _: Tensor | None
+    ) -> tuple[Tensor | None, None, None]:
+        if vertices_grad is None:
+            return None, None, None
+        samples, *edges = (saved.detach().numpy() for saved in ctx.saved_tensors)
+        # The core fills it. NumPy asks for huge pages, as PyTorch does not.
+        grad = np.empty(samples.shape, samples.dtype)
+        ctx.pull_back(samples, *edges, vertices_grad.contiguous().numpy(), grad)
+        return torch.from_numpy(grad), None, None
+
+
+def _as_float_tensor(values: Tensor, name: str) -> Tensor:
+    """`values` in C order as float32 or float64, whichever the array functions would take for this type."""
+    kind = values.dtype
+    if kind.is_complex:
+        msg = f"{name} must be real numbers, not {kind}"
+        raise TypeError(msg)
+    small = kind.is_floating_point or kind.itemsize <= _SMALL_INTEGERS
+    return values.to(torch.float32 if small and kind != torch.float64 else torch.float64).contiguous()
 
 
 def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[np.float64]:
