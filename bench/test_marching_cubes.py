@@ -261,18 +261,6 @@ def test_map_vtk_flying_edges(benchmark, map_lattice, backend, threads):
     check_map(*FlyingEdges.arrays(mesh), map_lattice.crossed_edges(of_cells=False))
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_sparse_gradient(benchmark, shell, threads):
-    benchmark.group = "gradient of the extraction from a shell"
-    _, corners, cells = sparse_lattice(shell)
-    values = torch.from_numpy((np.linalg.norm(corners, axis=1) - 200.0).astype(np.float32)).requires_grad_()
-    vertices, _ = extract_cells(corners, values, cells, num_threads=threads)
-    # The distance grows by one along the way outwards, so a surface lowered by d moves outwards by d.
-    outwards = vertices.detach() / vertices.detach().norm(dim=1, keepdim=True)
-    (grad,) = benchmark(torch.autograd.grad, vertices, values, outwards, retain_graph=True)
-    assert float(grad.sum(dtype=torch.float64)) == pytest.approx(-len(vertices), rel=0.01)
-
-
 def check_map(vertices, faces, crossed_edges):
     assert len(vertices) == crossed_edges
     assert np.array_equal(np.unique(faces), np.arange(len(vertices)))

@@ -35,7 +35,7 @@ from radarsdf.changes.probability import (
     share_of_changes,
 )
 from radarsdf.changes.reflectance import Differences
-from radarsdf.checks import check_box, instance
+from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.grids.occupancy import check_passages
@@ -105,7 +105,9 @@ def compare(
     A thing that stood on the ground is "moved" where its top was about parallel to the ground and within two leaf cells of it.
     Intensities near what appeared, went or moved are left out.
     """
-    instance(before, Map, "before")
+    if not isinstance(before, Map):
+        msg = f"before must be a map, not {type(before).__name__}"
+        raise TypeError(msg)
     if not isinstance(after, Map):
         after = fit(after, poses, intensities, config=_quick(before.config), progress=progress)
     elif poses is not None or intensities is not None:

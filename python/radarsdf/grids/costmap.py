@@ -93,8 +93,7 @@ class Columns(NamedTuple):
     @property
     def z(self) -> NDArray[np.float64]:
         """(Z,) heights of the voxels' centres, world, m."""
-        centres: NDArray[np.float64] = (np.arange(self.occupied.shape[2]) + 0.5) * self.voxel_size
-        return self.origin[2] + centres
+        return np.asarray(self.origin[2] + (np.arange(self.occupied.shape[2]) + 0.5) * self.voxel_size)
 
     @property
     def top_m(self) -> float:

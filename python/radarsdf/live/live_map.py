@@ -342,7 +342,7 @@ class LiveMap:
 
         The arguments and the result are those of :meth:`Map.mesh`. The mesh is empty if there is no surface.
         """
-        from radarsdf.map.mesh import Limits  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.map.threshold import Limits  # noqa: PLC0415 - only a mesh needs it
 
         with self._reading:
             num_threads = resolve_num_threads(self._state.config.num_threads)
@@ -355,7 +355,12 @@ class LiveMap:
                 self._state.forget_surface()
                 raise
         voxel_m = found.scene.config.leaf_size_m
-        limits = Limits.of(voxel_m, min_confidence, max_uncertainty, min_component_triangles)
+        limits = Limits.of(
+            voxel_m,
+            min_confidence=min_confidence,
+            max_uncertainty=max_uncertainty,
+            min_component_triangles=min_component_triangles,
+        )
         return found.surface.mesh(found.scene.origin, limits, found.leaf_cells)
 
     def map(self) -> RadarMap:

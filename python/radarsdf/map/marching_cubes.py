@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Triangle meshes of the level sets of sampled fields, by marching cubes; of tensors as autograd functions.
+"""Triangle meshes of the level sets of sampled fields, by marching cubes; of tensors with gradients.
 
 A cell here is a cube of eight neighbouring samples: a voxel of marching cubes. Its corners are in C order:
 corner ``4 * dx + 2 * dy + dz`` is at ``(dx, dy, dz)`` from the lower one. Results do not depend on the number
@@ -13,7 +13,6 @@ change only where a sample changes its sign.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, TypeAlias, overload
 
 import numpy as np
@@ -27,7 +26,6 @@ from radarsdf.checks import real_array, refuse_masked
 
 Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
 TensorMesh: TypeAlias = tuple[Tensor, Tensor]
-_Arrays: TypeAlias = tuple[NDArray[Any], ...]
 _SMALL_INTEGERS = 2  # bytes: float32 holds all of them
 
 
@@ -143,87 +141,48 @@ def marching_cubes(
     rest = usable, step, start, iso, num_threads
     if not isinstance(samples, Tensor):
         return _core.marching_cubes_dense(samples, *rest)
-    return _tensor_mesh(
-        _as_float_tensor(samples, "volume"),
-        lambda samples: _core.marching_cubes_dense(samples, *rest),
-        lambda samples: _core.marching_cubes_dense_with_edges(samples, *rest),
-        lambda samples, edges, grad, into: _core.marching_cubes_dense_backward(
-            samples, edges, grad, step, iso, into, num_threads
-        ),
-    )
+    samples = _as_float_tensor(samples)
+    if samples.requires_grad and torch.is_grad_enabled():
+        mesh: TensorMesh = _MarchingCubes.apply(samples, *rest)  # type: ignore[no-untyped-call]
+        return mesh
+    vertices, faces = _core.marching_cubes_dense(samples.detach().numpy(), *rest)
+    return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 
-@overload
-def extract_cells(
-    corners: ArrayLike, values: Tensor, cells: ArrayLike, level: float = ..., **options: Any
-) -> TensorMesh: ...
-@overload
-def extract_cells(
-    corners: ArrayLike, values: ArrayLike, cells: ArrayLike, level: float = ..., **options: Any
-) -> Mesh: ...
 def extract_cells(
     corners: ArrayLike,
-    values: ArrayLike | Tensor,
+    values: ArrayLike,
     cells: ArrayLike,
     level: float = 0.0,
     *,
     spacing: ArrayLike = (1.0, 1.0, 1.0),
     origin: ArrayLike = (0.0, 0.0, 0.0),
     num_threads: int = 0,
-) -> Mesh | TensorMesh:
-    """Triangulate the surface on which a field crosses a level, in some cells of a lattice.
-
-    The mesh is that of `marching_cubes` on a volume in which these cells are in use, with vertices and faces
-    in another order. Time and memory are proportional to the numbers of cells and corners. The vertices of a
-    tensor's mesh can be differentiated by `values`, as for `marching_cubes`.
+) -> Mesh:
+    """:func:`marching_cubes` in some cells of a lattice. Time and memory are proportional to their number.
 
     Parameters
     ----------
-    corners : array_like of int32, shape (K, 3)
+    corners : (K, 3) array_like of int32
         Lattice coordinates. None may occur twice.
-    values : array_like or Tensor, shape (K,)
-        The field at the corners, with types as for `marching_cubes`. Cells with a NaN corner are left out.
-    cells : array_like of int32, shape (M, 8)
-        Rows of `corners` for each cell, in C order, as `sparse_lattice` gives them. No cell may occur twice.
+    values : (K,) array_like
+        The field at the corners. Cells with a NaN corner are left out.
+    cells : (M, 8) array_like of int32
+        Rows of `corners` for each cell, as :func:`sparse_lattice` gives them. No cell may occur twice.
     level, spacing, origin, num_threads
-        As for `marching_cubes`; `origin` is the position of lattice point (0, 0, 0).
+        As for :func:`marching_cubes`; `origin` is the position of lattice point (0, 0, 0).
 
     Returns
     -------
-    vertices : ndarray of float64, shape (V, 3)
-        Positions in world units. A Tensor if `values` are one.
-    faces : ndarray of int32, shape (F, 3)
-        Rows of `vertices`, counter-clockwise seen from the positive side. A Tensor if `values` are one.
-
-    Raises
-    ------
-    TypeError
-        If `values` are not real, or `corners` or `cells` not integers.
-    ValueError
-        If a shape does not fit, or a cell refers to a corner that does not exist.
-
-    Examples
-    --------
-    >>> _, corners, cells = sparse_lattice([[0, 0, 0]])
-    >>> vertices, faces = extract_cells(corners, [1.0, -1, -1, -1, -1, -1, -1, -1], cells)
-    >>> vertices.sum(axis=0).tolist(), faces.shape
-    ([0.5, 0.5, 0.5], (1, 3))
+    vertices : (V, 3) ndarray of float64
+    faces : (F, 3) ndarray of int32
+        Those of :func:`marching_cubes`, in another order.
     """
     corners = _as_int32(corners, "corners")
     furthest = max(-float(corners.min(initial=0)), float(corners.max(initial=0))) + 1
-    step, start = _as_placement(spacing, origin, (furthest,) * 3)
-    iso = _as_level(level)
-    rest = _as_int32(cells, "cells"), step, start, iso, num_threads
-    if not isinstance(values, Tensor):
-        return _core.marching_cubes_sparse(corners, _as_samples(values, "values"), *rest)
-    return _tensor_mesh(
-        _as_float_tensor(values, "values"),
-        lambda samples: _core.marching_cubes_sparse(corners, samples, *rest),
-        lambda samples: _core.marching_cubes_sparse_with_edges(corners, samples, *rest),
-        lambda samples, edges, uppers, grad, into: _core.marching_cubes_sparse_backward(
-            samples, edges, uppers, grad, step, iso, into, num_threads
-        ),
-    )
+    placement = _as_placement(spacing, origin, (furthest,) * 3)
+    samples, rows = _as_samples(values, "values"), _as_int32(cells, "cells")
+    return _core.marching_cubes_sparse(corners, samples, rows, *placement, _as_level(level), num_threads)
 
 
 def sparse_lattice(
@@ -233,122 +192,79 @@ def sparse_lattice(
 
     Parameters
     ----------
-    cells : array_like of int32, shape (M, 3)
-        Lattice coordinates of the lower corners of the cells, in any order. Cells may be repeated.
-    num_threads : int
-        0: as many as OpenMP uses.
+    cells : (M, 3) array_like of int32
+        Lattice coordinates of the lower corners of the cells, in any order, with repetitions.
 
     Returns
     -------
-    unique_cells : ndarray of int32, shape (M', 3)
+    unique_cells : (M', 3) ndarray of int32
         The different rows of `cells`, sorted by x, then y, then z.
-    corners : ndarray of int32, shape (K, 3)
+    corners : (K, 3) ndarray of int32
         Lattice coordinates of all their corners, without repetitions, sorted likewise.
-    cell_corners : ndarray of int32, shape (M', 8)
+    cell_corners : (M', 8) ndarray of int32
         Rows of `corners` for each cell, in C order.
-
-    Raises
-    ------
-    TypeError
-        If `cells` are not integers.
-    ValueError
-        If the shape does not fit, or the bounding box of the cells has more than 2^63 cells.
-
-    Examples
-    --------
-    >>> unique_cells, corners, cell_corners = sparse_lattice([[0, 0, 1], [0, 0, 0], [0, 0, 1]])
-    >>> unique_cells.tolist(), corners.shape
-    ([[0, 0, 0], [0, 0, 1]], (12, 3))
-    >>> corners[cell_corners[1, 0]].tolist()
-    [0, 0, 1]
     """
     return _core.sparse_lattice(_as_int32(cells, "cells"), num_threads)
 
 
 def mesh_components(faces: ArrayLike, num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Label the connected components of a mesh. Faces are connected if they share a vertex.
-
-    Parameters
-    ----------
-    faces : array_like of int32, shape (F, 3)
-        Rows of the vertices.
-    num_vertices : int
-        Number of vertices.
+    """Connected components of faces (F, 3), which share vertices.
 
     Returns
     -------
-    labels : ndarray of int32, shape (F,)
-        Component of each face; components are numbered in the order of their first faces.
-    sizes : ndarray of int64, shape (C,)
+    labels : (F,) ndarray of int32
+        Component of each face, numbered in the order of their first faces.
+    sizes : (C,) ndarray of int64
         Number of faces of each component.
-
-    Raises
-    ------
-    TypeError
-        If `faces` are not integers.
-    ValueError
-        If the shape does not fit, or a face refers to a vertex that does not exist.
-
-    Examples
-    --------
-    >>> labels, sizes = mesh_components([[0, 1, 2], [3, 4, 5], [2, 1, 6]], 7)
-    >>> labels.tolist(), sizes.tolist()
-    ([0, 1, 0], [2, 1])
     """
     return _core.mesh_components(_as_int32(faces, "faces"), num_vertices)
 
 
-def _tensor_mesh(
-    samples: Tensor,
-    plain: Callable[[NDArray[Any]], _Arrays],
-    with_edges: Callable[[NDArray[Any]], _Arrays],
-    pull_back: Callable[..., None],
-) -> TensorMesh:
-    """Vertices and faces by one of two calls of the core, and their gradient by the third. It keeps what it names alone."""
-    if samples.requires_grad and torch.is_grad_enabled():
-        mesh: TensorMesh = _OfSamples.apply(samples, with_edges, pull_back)  # type: ignore[no-untyped-call]
-        return mesh
-    vertices, faces = plain(samples.detach().numpy())
-    return torch.from_numpy(vertices), torch.from_numpy(faces)
-
-
-class _OfSamples(torch.autograd.Function):
+class _MarchingCubes(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
         samples: Tensor,
-        with_edges: Callable[[NDArray[Any]], _Arrays],
-        pull_back: Callable[..., None],
+        mask: NDArray[np.bool_] | None,
+        spacing: list[float],
+        origin: list[float],
+        level: float,
+        num_threads: int,
     ) -> TensorMesh:
-        vertices, faces, *edges = map(torch.from_numpy, with_edges(samples.detach().numpy()))
-        ctx.save_for_backward(samples, *edges)
-        ctx.pull_back = pull_back
+        vertices, faces, edges = map(
+            torch.from_numpy,
+            _core.marching_cubes_dense_with_edges(
+                samples.detach().numpy(), mask, spacing, origin, level, num_threads
+            ),
+        )
+        ctx.save_for_backward(samples, edges)
+        ctx.placement = spacing, level, num_threads
         ctx.mark_non_differentiable(faces)
         ctx.set_materialize_grads(False)  # or the faces' gradient would be zeros of their size
         return vertices, faces
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, vertices_grad: Tensor | None, _: Tensor | None
-    ) -> tuple[Tensor | None, None, None]:
+    def backward(ctx: Any, vertices_grad: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
         if vertices_grad is None:
-            return None, None, None
-        samples, *edges = (saved.detach().numpy() for saved in ctx.saved_tensors)
+            return (None,) * 6
+        samples, edges = (saved.detach().numpy() for saved in ctx.saved_tensors)
+        spacing, level, num_threads = ctx.placement
         # The core fills it. NumPy asks for huge pages, as PyTorch does not.
         grad = np.empty(samples.shape, samples.dtype)
-        ctx.pull_back(samples, *edges, vertices_grad.contiguous().numpy(), grad)
-        return torch.from_numpy(grad), None, None
+        upstream = vertices_grad.contiguous().numpy()
+        _core.marching_cubes_dense_backward(samples, edges, upstream, spacing, level, grad, num_threads)
+        return torch.from_numpy(grad), *(None,) * 5
 
 
-def _as_float_tensor(values: Tensor, name: str) -> Tensor:
-    """`values` in C order as float32 or float64, whichever the array functions would take for this type."""
-    kind = values.dtype
+def _as_float_tensor(volume: Tensor) -> Tensor:
+    """`volume` in C order as float32 or float64, whichever would be taken of an array of this type."""
+    kind = volume.dtype
     if kind.is_complex:
-        msg = f"{name} must be real numbers, not {kind}"
+        msg = f"volume must be real numbers, not {kind}"
         raise TypeError(msg)
     small = kind.is_floating_point or kind.itemsize <= _SMALL_INTEGERS
-    return values.to(torch.float32 if small and kind != torch.float64 else torch.float64).contiguous()
+    return volume.to(torch.float32 if small and kind != torch.float64 else torch.float64).contiguous()
 
 
 def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[np.float64]:

@@ -100,21 +100,18 @@ class Surface:
             cells_searched,
         )
 
-    def within(self, limits: dict[str, float]) -> NDArray[np.bool_]:
-        """(F,) faces whose vertices are within limits, by the names of `LIMITS`."""
-        known = np.ones(len(self.vertices), bool)
-        for name, value in limits.items():
-            known &= LIMITS[name].keeps(getattr(self, LIMITS[name].column), value)
-        return with_all(known, self.faces)
-
     def allowed(self, limits: TriangleLimits) -> NDArray[np.bool_]:
         """(F,) faces that pass every per-triangle limit."""
-        return self.within(limits._asdict())
+        within = np.ones(len(self.vertices), bool)
+        for name, value in limits.items():
+            limit = LIMITS[name]
+            within &= limit.keeps(getattr(self, limit.column), value)
+        return with_all(within, self.faces)
 
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
         """(F,) faces that a mesh keeps."""
         min_confidence = self.threshold(limits).min_confidence
-        kept = self.within({**limits.of_triangles._asdict(), "min_confidence": min_confidence})
+        kept = self.allowed(limits.of_triangles | {"min_confidence": min_confidence})
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces[rows], len(self.vertices))

@@ -25,35 +25,34 @@ _COMPONENT_TRIANGLES = 30  # of the smallest component that is kept, in voxels o
 
 
 class Limit(NamedTuple):
-    """One limit of a mesh on a number of its vertices."""
+    """A limit of a mesh on its vertices: an argument of `Map.mesh`. A triangle is kept if its three vertices are within it."""
 
-    column: str  # Attribute of :class:`radarsdf.map.mesh.Surface` that is compared, (V,)
-    keeps: Callable[
-        [NDArray[np.float32], float], NDArray[np.bool_]
-    ]  # Which of its values a limit keeps, (V,)
+    column: str  # attribute of `Surface` that is compared, (V,)
+    keeps: Callable[[NDArray[np.float32], float], NDArray[np.bool_]]  # which of its values are within, (V,)
     lowest: float
     highest: float
-    default: float | None
-    """None: found from the whole surface."""
+    default: float | None  # None: `Tally.threshold` finds it from the whole surface
 
 
-# Each is an argument of `Map.mesh`. Triangles keep all limits at their three vertices.
 LIMITS = {
     "max_uncertainty": Limit(
         "uncertainty_m",
         lambda values, limit: np.nan_to_num(values, nan=np.inf) <= limit,
-        0.0,
-        math.inf,
-        math.inf,
+        lowest=0.0,
+        highest=math.inf,
+        default=math.inf,
     ),
-    "min_confidence": Limit("confidence", lambda values, limit: values >= limit, 0.0, 1.0, None),
+    "min_confidence": Limit(
+        "confidence",
+        lambda values, limit: values >= limit,
+        lowest=0.0,
+        highest=1.0,
+        default=None,
+    ),
 }
 
-
-class TriangleLimits(NamedTuple):
-    """Limits that do not depend on the rest of the surface: a tile applies these alone."""
-
-    max_uncertainty: float = math.inf
+TriangleLimits = dict[str, float]
+"""Values of limits, by the names of `LIMITS`, that do not depend on the rest of the surface: a tile applies these alone."""
 
 
 class Limits(NamedTuple):
@@ -65,22 +64,20 @@ class Limits(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        voxel_m: float,
-        min_confidence: float | None = None,
-        max_uncertainty: float | None = None,
-        min_component_triangles: int | None = None,
+        cls, voxel_m: float, *, min_component_triangles: int | None = None, **given: float | None
     ) -> Limits:
         """The arguments of :meth:`Map.mesh`, checked, with defaults filled in."""
-        given = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
-        checked = {name: _checked(name, value) for name, value in given.items()}
-        of_triangles = {name: checked[name] for name in TriangleLimits._fields}
+        if unknown := given.keys() - LIMITS.keys():
+            msg = f"a mesh has no limit {', '.join(sorted(unknown))}"
+            raise TypeError(msg)
+        found = {name: _checked(name, given.get(name)) for name in LIMITS}
+        min_confidence = found.pop("min_confidence")
         if min_component_triangles is None:
             # In larger voxels fewer, of more area.
             min_component_triangles = round(_COMPONENT_TRIANGLES * min(1.0, VOXEL_M / voxel_m))
         return cls(
-            checked["min_confidence"],
-            TriangleLimits(**of_triangles),  # type: ignore[arg-type] - they have a default
+            min_confidence,
+            {name: value for name, value in found.items() if value is not None},
             whole_number(min_component_triangles, "min_component_triangles", 0),
         )
 
