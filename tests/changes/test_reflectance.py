@@ -103,15 +103,6 @@ def test_intensities_in_other_units_are_not_compared(drives, maps, units):
         assert found.report["compared_m2"] > 100
 
 
-def test_linear_powers_in_the_same_units_are_compared(drives):
-    linear = [
-        radarsdf.fit(drive.points, drive.poses, [10 ** (db / 10) for db in drive.intensities], config=QUICK)
-        for drive in drives[:2]
-    ]
-    found = radarsdf.compare(*linear, align_frames=False)
-    assert found.report["intensity_offset"] is not None
-
-
 def test_noise_and_few_views_are_no_other_units():
     rng = np.random.default_rng(0)
     strength = rng.normal(0, 4, 2000)

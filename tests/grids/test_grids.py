@@ -7,7 +7,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import radarsdf
-import trimesh
 from radarsdf.cli import main
 from radarsdf.grids.costmap import Wheels
 from radarsdf.grids.grid import Grid
@@ -35,15 +34,6 @@ def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
     assert grid.at([[np.nan, 0, 0], [1e9, 0, 0]]).tolist() == [-1, -1]
 
 
-def test_probabilities_agree_with_the_states(sharp_map):
-    grid = sharp_map.grid(BOX, 0.2, occupied_from=0.8, free_to=0.02)
-    known = grid.probability[np.isfinite(grid.probability)]
-    assert 0 <= known.min() < known.max() <= 1
-    assert grid.probability[grid.occupied].min() >= 0.8
-    # Rays alone leave less than 0.02; a surface that is nearby adds to it.
-    assert np.median(grid.probability[grid.free]) < 0.02
-
-
 def test_a_voxel_that_a_surface_grazes_is_not_free():
     """No return is in it, for they were moved onto the surface, and rays pass it above the ground often enough."""
     drive = radarsdf.simulate.KINDS["tunnel"](seed=5, frames=12)
@@ -54,23 +44,6 @@ def test_a_voxel_that_a_surface_grazes_is_not_free():
     grid = radar_map.grid([lower, lower + [24, 24, 3]], 0.2)
     assert (grid.at(drive.ground_truth) == 0).mean() < 0.0003
     assert grid.free.sum() * 0.2**3 > 190
-
-
-def test_seven_scans_from_one_place_free_what_is_before_a_facade():
-    """Rays that graze the ground pass cells that the field alone would put a cell behind it: it is longer than the distance."""
-    drive = radarsdf.simulate.KINDS["facade"](seed=5, frames=21)
-    config = radarsdf.FitConfig(num_threads=1)
-    radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
-    grid = radar_map.grid([[5, 0, -1], [25, 14.5, 5]], 0.2)
-    assert grid.free.sum() * 0.2**3 > 500
-    assert (grid.at(drive.ground_truth) == 0).mean() < 0.001
-
-
-def test_a_saved_map_has_the_same_grid(grid, sharp_map, tmp_path):
-    sharp_map.save(tmp_path / "map.safetensors")
-    again = radarsdf.load(tmp_path / "map.safetensors").grid(BOX, 0.2)
-    np.testing.assert_array_equal(again.state, grid.state)
-    np.testing.assert_array_equal(again.probability, grid.probability)
 
 
 def test_larger_voxels_are_free_only_throughout(sharp_map):
@@ -176,12 +149,6 @@ def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refus
         made(np.ones((2, 2, 2)), [0.07, 0.2, 0.4], 0.2).save(tmp_path / "off.bt")
     with pytest.raises(ValueError, match="32768"):
         made(np.ones((2, 2, 2)), [7000.0, 0, 0], 0.2).save(tmp_path / "far.bt")
-
-
-def test_a_ply_holds_what_is_known(grid, tmp_path):
-    grid.save(tmp_path / "grid.ply")
-    cloud = trimesh.load(tmp_path / "grid.ply")
-    assert len(cloud.vertices) == (~grid.unknown).sum()
 
 
 def test_a_map_without_passages_says_so(scene):

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.map.mesh import Surface
-from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Tally, Threshold
 
 WALL_X_M = 10.1
@@ -66,15 +64,6 @@ def test_a_patch_that_one_scan_of_many_saw_is_left_out(of_many):
 def test_a_patch_that_one_scan_of_few_saw_is_kept(of_few):
     everything, default = of_few.mesh(min_confidence=0, **MESH), of_few.mesh(**MESH)
     assert triangles_near(default, PATCH_X_M) == triangles_near(everything, PATCH_X_M) > 200
-
-
-def test_a_patch_is_kept_where_few_of_many_scans_looked(of_many):
-    """As the first test, but for the looks: only every tenth scan looked there."""
-    contents = of_many._contents
-    few = dataclasses.replace(of_many.evidence, looks=of_many.evidence.looks // 10)
-    mesh = RadarMap(dataclasses.replace(contents, evidence=few)).mesh(**MESH)
-    everything = of_many.mesh(min_confidence=0, **MESH)
-    assert triangles_near(mesh, PATCH_X_M) == triangles_near(everything, PATCH_X_M) > 200
 
 
 @pytest.mark.parametrize("name", ["of_many", "of_few"])
@@ -137,19 +126,6 @@ def test_the_less_can_be_reached_the_more_is_kept():
     seen, unseen = (tally(*surface, existing=existing).threshold() for existing in (1, 3))
     assert unseen.min_confidence == 0.4 < seen.min_confidence
     assert unseen.coverage_of_observed == pytest.approx(0.9 / 3)
-
-
-def test_where_nothing_can_be_reached_all_that_adds_something_is_kept():
-    """One scan saw everything, and nothing was seen twice: how much there is nobody knows."""
-    found = tally([1, 1, 1], [0.9, 0.5, 0.2], [5, 3, 1], once=1.6)
-    assert found.reachable == 0
-    assert found.threshold().min_confidence == 0.2
-    assert found.threshold().coverage_of_observed == 0
-
-
-def test_nothing_has_a_threshold_too():
-    found = tally([], np.zeros(0), [], existing=0).threshold()
-    assert found == Threshold(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_the_sums_of_parts_are_those_of_the_whole(of_many):

@@ -65,7 +65,7 @@ class ConfidenceMetrics(TypedDict):
 def uncertainty_metrics(
     error_m: ArrayLike, uncertainty_m: ArrayLike, *, bins: int = 20
 ) -> UncertaintyMetrics:
-    """Compare errors with the standard errors that were predicted for them.
+    """Compare errors with their predicted standard errors.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def uncertainty_metrics(
 
 
 def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike, *, bins: int = 10) -> ConfidenceMetrics:
-    """Compare confidences in a surface with the share of them that is right.
+    """Compare confidences in a surface with the share of true surface.
 
     Parameters
     ----------

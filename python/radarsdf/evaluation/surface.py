@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Errors of a mesh against lidar points: accuracy, completion, F-score and smoothness."""
+"""Errors of a mesh against lidar points: accuracy, completion, F-score and smoothness; metrics as text."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,8 @@ from scipy.spatial import cKDTree
 from radarsdf._core import cell_keys
 from radarsdf.checks import check_box, positions, positive, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
+
+from .intensity import IntensityMetrics
 
 if TYPE_CHECKING:
     import trimesh
@@ -66,7 +68,7 @@ def surface_metrics(
     truncation_m: float = 2.0,
     num_threads: int = 0,
 ) -> SurfaceMetrics:
-    """Measure a mesh against ground-truth points by the paper's definitions.
+    """Compute the errors of a mesh against ground-truth points by the paper's definitions.
 
     Parameters
     ----------
@@ -95,9 +97,9 @@ def surface_metrics(
     Returns
     -------
     SurfaceMetrics
-        - `accuracy_error_m`: mean distance from a mesh sample to the ground truth, over the samples within `outlier_m`.
-          None if there are none. `accuracy_ratio`: share *of these* below `threshold_m`, 0 if there are none.
-          `outlier_ratio`: share of the samples that were left out.
+        - `accuracy_error_m`: mean distance from a mesh sample to the ground truth, over the samples within `outlier_m`;
+          None without any. `accuracy_ratio`: share *of these* below `threshold_m`, 0 without any. `outlier_ratio`:
+          share of the samples that were left out.
         - `completion_error_m`: mean truncated distance from a ground-truth point to the nearest mesh sample.
           `completion_ratio`: share below `threshold_m`.
         - `f_score`: harmonic mean of `accuracy_ratio` and `completion_ratio`, as in the paper. It does not punish
@@ -127,6 +129,7 @@ def surface_metrics(
     positive(threshold_m, "threshold_m")
     positive(outlier_m, "outlier_m")
     positive(truncation_m, "truncation_m")
+    seed, num_threads = whole_number(seed, "seed", 0), whole_number(num_threads, "num_threads", 0)
     corners = None if box is None else check_box(box)
     points = _in_box(positions(ground_truth, "ground_truth"), corners)
     if len(points) == 0:
@@ -141,15 +144,13 @@ def surface_metrics(
     if corners is not None:
         corners = corners - origin
 
-    workers = resolve_num_threads(whole_number(num_threads, "num_threads", 0))
+    workers = resolve_num_threads(num_threads)
     reach = max(outlier_m, threshold_m)
     tree = cKDTree(points)
     completion = np.full(len(points), float(truncation_m))
     total = kept = right_kept = right = 0
     kept_sum = 0.0
-    for block in _sample_blocks(
-        vertices, faces, corners, samples, np.random.default_rng(whole_number(seed, "seed", 0))
-    ):
+    for block in _sample_blocks(vertices, faces, corners, samples, np.random.default_rng(seed)):
         # The search finds distances strictly below its bound, and a sample at outlier_m exactly is an inlier.
         distance, _ = tree.query(block, distance_upper_bound=np.nextafter(reach, np.inf), workers=workers)
         inliers = distance[distance <= outlier_m]
@@ -250,6 +251,55 @@ def gamma_from_moments(angles_rad: ArrayLike) -> tuple[float | None, float | Non
     return (mean**2 / variance if variance > _ANGLE_NOISE_RAD**2 else None), mean, variance
 
 
+def format_metrics(metrics: SurfaceMetrics | IntensityMetrics) -> str:
+    """Format metrics as a few aligned lines of text.
+
+    Parameters
+    ----------
+    metrics : SurfaceMetrics or IntensityMetrics
+        Result of `surface_metrics` or `intensity_metrics`.
+
+    Returns
+    -------
+    str
+        Lines without a trailing newline. Surface errors are in centimetres and ratios in percent, as in the paper's
+        tables; intensity errors are in sensor units.
+
+    Examples
+    --------
+    >>> from radarsdf.evaluation import intensity_metrics
+    >>> print(format_metrics(intensity_metrics([60.0, 70.0], [61.0, 68.0])))
+    intensity error  mean 1.50  median 1.50  (2 returns, radarsdf-intensity-1)
+    """
+    if "mae" in metrics:
+        i = cast("IntensityMetrics", metrics)
+        count = f"({i['num_returns']} returns, {i['protocol']})"
+        return f"intensity error  mean {i['mae']:.2f}  median {i['medae']:.2f}  {count}"
+    s = metrics
+    shape, mean = _number(s["gamma_shape"], ""), _number(s["gamma_mean"], " rad", digits=3)
+    variance = _number(s["gamma_variance"], " rad²", digits=3)
+    of = f"{s['num_mesh_samples']} mesh samples and {s['num_ground_truth']} ground-truth points"
+    rows = {
+        "accuracy": f"error {_number(s['accuracy_error_m'], ' cm', 100)}  ratio {_percent(s['accuracy_ratio'])}"
+        f"  outliers beyond {s['outlier_m']:g} m {_percent(s['outlier_ratio'])}",
+        "completion": f"error {_number(s['completion_error_m'], ' cm', 100)}"
+        f"  ratio {_percent(s['completion_ratio'])}",
+        "F-score": f"{_percent(s['f_score'])}  with nothing discarded {_percent(s['f_score_all'])}"
+        f" (precision {_percent(s['precision'])})",
+        "angles": f"gamma shape {shape}  mean {mean}  variance {variance}",
+        "protocol": f"{s['protocol']}  threshold {s['threshold_m']:g} m  {of} ({s['ground_truth_sha256'][:12]})",
+    }
+    return "\n".join(f"{name:<12}{text}" for name, text in rows.items())
+
+
+def _number(value: float | None, unit: str, factor: float = 1.0, digits: int = 2) -> str:
+    return "undefined" if value is None else f"{value * factor:.{digits}f}{unit}"
+
+
+def _percent(ratio: float) -> str:
+    return _number(ratio, " %", 100)
+
+
 def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0 else 0.0
 
@@ -286,7 +336,7 @@ def _sample_blocks(
     samples: int,
     rng: np.random.Generator,
 ) -> Iterator[_Points]:
-    """Samples drawn uniformly by area, in blocks of neighbouring triangles, so that searches stay in cache."""
+    """Samples uniform by area, in blocks of neighbouring triangles, so that searches stay in cache."""
     if corners is not None and len(faces):
         x = vertices[faces]
         faces = faces[((x.max(axis=1) >= corners[0]) & (x.min(axis=1) <= corners[1])).all(axis=1)]
@@ -297,7 +347,7 @@ def _sample_blocks(
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if area.sum() == 0:
         return
-    # The number of samples on each triangle, distributed as if the samples were drawn one by one.
+    # Samples on each triangle, distributed as if they were drawn one by one.
     last = np.cumsum(rng.multinomial(samples, area / area.sum()))
     for start in range(0, samples, _CHUNK):
         index = np.searchsorted(last, np.arange(start, min(start + _CHUNK, samples)), side="right")

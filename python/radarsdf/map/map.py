@@ -448,24 +448,24 @@ class Map(MapParts):
         """
 
     @property
-    @abstractmethod
     def config(self) -> FitConfig:
         """Settings of the fit."""
+        return self._contents_of_any.config
 
     @property
-    @abstractmethod
     def report(self) -> dict[str, Any]:
         """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
+        return self._contents_of_any.report
 
     @property
-    @abstractmethod
     def sensor(self) -> Sensor:
         """The radar, estimated from the scans of the fit."""
+        return self._contents_of_any.sensor
 
     @property
-    @abstractmethod
     def intensity_scale(self) -> IntensityScale | None:
         """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
+        return self._contents_of_any.intensity_scale
 
     @property
     def has_intensity(self) -> bool:
@@ -473,9 +473,9 @@ class Map(MapParts):
         return self.intensity_scale is not None
 
     @property
-    @abstractmethod
     def rough_share(self) -> float:
         """Clutter ratio: share of the returns that lie on no thin surface, in [0, 1]."""
+        return self._contents_of_any.rough_share
 
     @property
     @abstractmethod

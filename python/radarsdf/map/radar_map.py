@@ -13,16 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.sensor import Sensor
 
 if TYPE_CHECKING:
     import trimesh
@@ -99,26 +96,6 @@ class RadarMap(Map):
 
     def save(self, path: str | PathLike[str]) -> None:
         storage.save_contents(self._contents, path)
-
-    @property
-    def config(self) -> FitConfig:
-        return self._contents.config
-
-    @property
-    def report(self) -> dict[str, Any]:
-        return self._contents.report
-
-    @property
-    def sensor(self) -> Sensor:
-        return self._contents.sensor
-
-    @property
-    def intensity_scale(self) -> IntensityScale | None:
-        return self._contents.intensity_scale
-
-    @property
-    def rough_share(self) -> float:
-        return self._contents.rough_share
 
     @property
     def origin(self) -> NDArray[np.float64]:
