@@ -13,8 +13,7 @@ import radarsdf
 import trimesh
 from radarsdf.changes.alignment import align
 from radarsdf.changes.changes import APPEARED, GONE, UNSEEN
-from radarsdf.changes.placed import PlacedMap
-from radarsdf.changes.probability import _passed
+from radarsdf.changes.probability import PlacedMap, _passed
 from radarsdf.cli import main
 from radarsdf.poses.rigid import transform
 from radarsdf.simulate import Box
@@ -103,7 +102,7 @@ def wall_alone(maps):
 
 @pytest.mark.parametrize(
     "shift_m",
-    [(0.1, 0, 0), (-0.3, 0, 0), (0, 0, 0.1), (0.3, 0.15, 0.03), (1, 0, 0), (-0.7, 0.5, 0.1)],
+    [(-0.3, 0, 0), (0, 0, 0.1), (0.3, 0.15, 0.03), (-0.7, 0.5, 0.1)],
     ids=str,
 )
 def test_a_wall_is_aligned_along_its_normal_and_left_along_itself(wall_alone, shift_m):

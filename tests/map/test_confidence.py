@@ -125,23 +125,6 @@ def test_twice_the_scans_make_surer_only_what_is_no_surface(radar_map, rough_sha
         assert odds[1] < 0.3 * odds[0]
 
 
-def test_a_fit_to_scans_given_twice_has_twice_the_evidence(scene):
-    # What is a gap, a ghost or noise is found from the number of returns.
-    noise = {"range_noise_m": 0.05, "azimuth_noise_rad": 0.01, "elevation_noise_rad": 0.01}
-    config = FitConfig.quick(
-        num_threads=2, encoding={"bridge_cells": 0}, returns={"drop_ghosts": False} | noise
-    )
-    once, twice = (
-        radarsdf.fit(
-            scene.points * n, np.tile(scene.poses, (n, 1, 1)), config=config, progress=False
-        ).evidence
-        for n in (1, 2)
-    )
-    np.testing.assert_allclose(twice.information, 2 * once.information, rtol=1e-5)
-    np.testing.assert_array_equal(twice.detections, 2 * once.detections)
-    np.testing.assert_array_equal(twice.looks, 2 * once.looks)
-
-
 def test_places_have_the_evidence_of_their_cells(radar_map):
     """In the middle of a cell, none of its neighbours counts."""
     contents, evidence = radar_map._contents, radar_map.evidence

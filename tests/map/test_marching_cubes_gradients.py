@@ -9,7 +9,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from radarsdf import _core, marching_cubes
+from radarsdf import marching_cubes
 
 from ..mesh_checks import cells_in_use, noise, sphere
 
@@ -154,24 +154,6 @@ def test_small_floats_have_a_gradient_of_their_own_type(dtype):
     assert (leaf.grad != 0).sum() > 50
 
 
-def test_views_of_other_layouts():
-    volume = off_the_level(16, (6, 7, 8))
-    expected = gradient(volume)
-    weights = torch.from_numpy(np.random.default_rng(5).normal(size=marching_cubes(volume)[0].shape))
-    for view, back in (
-        (torch.tensor(volume.transpose(2, 0, 1).copy()), lambda t: t.permute(1, 2, 0)),
-        (torch.tensor(np.repeat(volume, 2, axis=2)), lambda t: t[:, :, ::2]),
-    ):
-        leaf = view.requires_grad_()
-        vertices, _ = marching_cubes(back(leaf))
-        (vertices * weights).sum().backward()
-        np.testing.assert_array_equal(back(leaf.grad), expected)
-    leaf = torch.tensor(volume, requires_grad=True)
-    vertices, _ = marching_cubes(leaf)
-    vertices.backward(weights.T.contiguous().T)  # not in C order
-    np.testing.assert_array_equal(leaf.grad, expected)
-
-
 @pytest.mark.parametrize("shape", [(0, 0, 0), (4, 4, 1), (3, 3, 3)])
 def test_empty_meshes_have_a_gradient_of_zero(shape):
     leaf = torch.ones(shape, requires_grad=True)
@@ -197,16 +179,3 @@ def test_what_has_no_gradient_is_refused():
     samples += 1
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         vertices.sum().backward()
-
-
-def test_the_core_refuses_edges_of_other_samples():
-    volume = sphere(9)
-    vertices, _, edges = _core.marching_cubes_dense_with_edges(volume, None, [1] * 3, [0] * 3, 0.0)
-    rest = [1] * 3, 0.0, np.zeros_like(volume)
-    for wrong in (edges + 3 * 9**3, edges - 3 * 9**3, edges[::-1].copy(), np.full_like(edges, 3 * 9**3 - 1)):
-        with pytest.raises(ValueError, match="edges"):
-            _core.marching_cubes_dense_backward(volume, wrong, vertices, *rest)
-    with pytest.raises(ValueError, match="edges"):
-        _core.marching_cubes_dense_backward(volume, edges[1:], vertices, *rest)
-    with pytest.raises(ValueError, match="vertices_grad"):
-        _core.marching_cubes_dense_backward(volume, edges, vertices[:, :2].copy(), *rest)

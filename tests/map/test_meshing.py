@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 
 import numpy as np
 import pytest
@@ -85,16 +84,6 @@ def test_triangles_face_free_space(mesh):
     assert np.average(mesh.face_normals[ground, 2] > 0.7, weights=area[ground]) > 0.95
     assert np.average(mesh.face_normals[wall, 0] < -0.7, weights=area[wall]) > 0.95
     np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-6)
-
-
-@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
-def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, mesh_of, voxel_size):
-    mesh = mesh_of(voxel_size)
-    assert len(mesh.faces) > 0
-    # Vertices may lie on the very border, the middle of a triangle does not.
-    assert sharp_map.observed(mesh.triangles_center).mean() > 0.9999
-    towards_middle = np.repeat(mesh.triangles_center, 3, axis=0) - mesh.triangles.reshape(-1, 3)
-    assert sharp_map.observed(mesh.triangles.reshape(-1, 3) + 0.01 * towards_middle).mean() > 0.999
 
 
 @pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.15, 0.2, 0.3])
@@ -219,28 +208,6 @@ def test_where_there_is_no_surface_the_mesh_is_empty(sharp_map, viewpoint):
     assert len(none.vertices) == len(none.faces) == 0
 
 
-def lattice(radar_map, voxel_size):
-    voxels = occupied_voxels(radar_map, voxel_size)
-    return radarsdf.map.marching_cubes.sparse_lattice(voxels)
-
-
-@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
-def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
-    voxels, corners, voxel_corners = lattice(sharp_map, voxel_size)
-    values = _corner_distances(sharp_map._contents, voxel_size, voxels, corners, voxel_corners, False)
-    some = np.random.default_rng(0).permutation(len(voxels))[:10_000]
-    voxel_corners = voxel_corners[some]
-    centres = (voxels[some] + 0.5) * voxel_size
-    inner = corners[voxel_corners] * voxel_size
-    inner = inner + 0.01 * (centres[:, None] - inner)
-    nearby = sharp_map.sdf(inner.reshape(-1, 3) + sharp_map.origin).reshape(-1, 8)
-    jump = np.abs(values[voxel_corners] - nearby)
-    # Every voxel sees at its corners what the map says just inside of it. Without features the distance would be
-    # that of free space, decimetres off.
-    assert np.quantile(jump, 0.999) < 0.02
-    assert sharp_map.field.cells.occupied(torch.from_numpy(inner.reshape(-1, 3).astype(np.float32))).all()
-
-
 # Voxels that do not divide the cells are moved otherwise at the border: there, a few vertices differ.
 @pytest.mark.parametrize("voxel_size", [0.05, 0.07, 0.1, 0.13])
 def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
@@ -258,33 +225,6 @@ def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
     distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)
     even = voxel_size in (0.05, 0.1)
     assert np.quantile(distance_m, 0.9999 if even else 0.998) < 1e-4  # other batches, other rounding
-
-
-def names(lattice):
-    """A number for each row of lattice coordinates (..., 3): NumPy compares numbers many times as fast as rows."""
-    x, y, z = np.moveaxis(np.asarray(lattice).astype(np.int64) + 2**20, -1, 0)
-    return x << 42 | y << 21 | z
-
-
-@pytest.mark.parametrize("voxel_size", [0.07, 0.15, 0.3, 0.45])
-def test_uneven_voxels_cover_the_cells_and_little_more(sharp_map, voxel_size):
-    cells = sharp_map.field.cells.table.leaf_cells()
-    voxels = occupied_voxels(sharp_map, voxel_size)
-    voxels = voxels[np.unique(names(voxels), return_index=True)[1]]
-    # The middle of each cell is covered; a hair to either side, as it may lie on a face between two voxels.
-    middle = (cells + 0.5) * LEAF_M / voxel_size
-    covered = np.zeros(len(cells), bool)
-    for side in itertools.product((-1e-6, 1e-6), repeat=3):
-        covered |= np.isin(names(np.floor(middle + side)), names(voxels))
-    assert covered.all()
-    # Each voxel overlaps some occupied cell.
-    low = np.floor(voxels * voxel_size / LEAF_M + 1e-6).astype(int)
-    high = np.ceil((voxels + 1) * voxel_size / LEAF_M - 1e-6).astype(int)
-    overlaps = np.zeros(len(voxels), bool)
-    for step in itertools.product(range((high - low).max()), repeat=3):
-        cell = low + step
-        overlaps |= (cell < high).all(axis=1) & np.isin(names(cell), names(cells))
-    assert overlaps.all()
 
 
 def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path):

@@ -142,30 +142,3 @@ def test_the_sums_of_parts_are_those_of_the_whole(of_many):
     np.testing.assert_allclose(together.sums(), surface.tally.sums(), rtol=1e-9, atol=1e-9)
     assert together.area_m2.sum() == pytest.approx(surface.part(np.zeros(3), middle | ~middle).area)
     assert together.threshold().min_confidence == surface.tally.threshold().min_confidence
-
-
-def wall_and_clutter(scans):
-    """A wall, and before it 30 places where a scan in 25 has four returns."""
-    places = np.random.default_rng(5).uniform([4, -1.5, -1.5], [8, 1.5, 1.5], (30, 3))
-    places[:, 1:] *= places[:, :1] / WALL_X_M  # all scans look through them at the wall
-    rng = np.random.default_rng(0)
-    points = []
-    for _ in range(scans):
-        here = places[rng.random(len(places)) < 0.04]
-        clutter = here[:, None] + rng.uniform(-0.2, 0.2, (len(here), 4, 3))
-        points.append(np.concatenate([plane(rng, WALL_X_M, 2.0, 50), clutter.reshape(-1, 3)]))
-    return fit(points)
-
-
-def test_ten_times_the_scans_bring_no_more_false_surface():
-    false_m2, all_of_it_m2 = [], []
-    for scans in (15, 150):
-        radar_map = wall_and_clutter(scans)
-        for found, arguments in ((false_m2, {}), (all_of_it_m2, {"min_confidence": 0})):
-            mesh = radar_map.mesh(progress=False, **arguments)
-            is_false = mesh.triangles_center[:, 0] < WALL_X_M - 0.6
-            found.append(mesh.area_faces[is_false].sum())
-            assert mesh.area_faces[~is_false].sum() > 13  # of 16 m² of wall
-    assert 0 < false_m2[1] < false_m2[0]
-    assert all_of_it_m2[1] > 3 * all_of_it_m2[0] > 0  # repeated often enough to be meshed
-    assert false_m2[1] / all_of_it_m2[1] < 0.2 * false_m2[0] / all_of_it_m2[0]
