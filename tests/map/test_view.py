@@ -12,7 +12,7 @@ import pytest
 import radarsdf
 from radarsdf.map.view import _spread
 
-from .test_meshing import moved, surface_distance
+from .test_mesh import moved, surface_distance
 
 POSE = np.eye(4)
 POSE[:3, 3] = 1.3, 0.4, 1.5
