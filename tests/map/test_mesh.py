@@ -235,3 +235,28 @@ def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path)
     assert confidence.min() >= mesh.metadata["min_confidence"] > 0
     mesh.export(tmp_path / "mesh.ply")
     assert b"property float confidence" in (tmp_path / "mesh.ply").read_bytes()[:1000]
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        *(("voxel_size", size) for size in (0, np.nan, 1e13)),
+        *(("box", box) for box in ([[0, 0, 0]], [[1, 0, 0], [0, 1, 1]], [[0, 0, 0], [1e13] * 3])),
+        *(("viewpoint", place) for place in ([1, 2], [np.nan, 0, 0], [1e13, 0, 0])),
+        *(("min_confidence", limit) for limit in (-0.1, 1.1, np.nan)),
+        *(("max_uncertainty", limit) for limit in (-0.1, np.nan)),
+        ("min_component_triangles", -1),
+    ],
+)
+def test_wrong_arguments_are_refused_by_name(sharp_map, name, wrong):
+    with pytest.raises(ValueError, match=name):
+        sharp_map.mesh(**{name: wrong})
+
+
+def test_without_intensities_there_is_no_viewpoint(scene):
+    bare = radarsdf.fit(scene.points, scene.poses, config=radarsdf.FitConfig.quick(), progress=False)
+    assert not bare.has_intensity
+    with pytest.raises(ValueError, match="without"):
+        bare.mesh(viewpoint=SENSOR)
+    with pytest.raises(ValueError, match="without intensities"):
+        bare.intensity(SENSOR[None], SENSOR)

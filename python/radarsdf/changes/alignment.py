@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch  # noqa: F401 - before the core
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
@@ -59,7 +58,7 @@ class Alignment:
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
     improved: bool = False
     """Whether the surfaces show that the frames are apart, at a significance level of 0.001."""
-    words: str = "The maps were taken as they are."  # The verdict in one sentence
+    words: str = "The maps were taken as they are."  # the verdict in one sentence
 
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
         """(N,) standard error of the alignment at places (N, 3) along their normals (N, 3), m."""

@@ -135,8 +135,8 @@ class Errors:
     At edges, in corners and at ghosts both maps are worse than their uncertainty says, so some distances are far off.
     """
 
-    freedom: float  # Degrees of freedom. Few: some distances are far larger than the others.
-    scale: float  # By how much they are larger than the standard errors say
+    freedom: float  # degrees of freedom. Few: some distances are far larger than the others.
+    scale: float  # by how much they are larger than the standard errors say
 
     @classmethod
     def of(cls, distance_m: Floats, sigma_m: Floats, reach_m: Floats) -> Errors:

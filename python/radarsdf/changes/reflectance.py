@@ -72,11 +72,11 @@ class _Near(NamedTuple):
 class Differences:
     """Differences of mean intensities between two days, each at one place from one view."""
 
-    between: _Means  # Later less earlier, without `offset`
-    within: list[_Means]  # Of each day, what its own map leaves of the intensities
-    offset: float  # By so much more all returns are stronger, sensor units
-    reach_m: float  # Means that are so close to a place belong to it, m
-    width: float  # Of the range of intensities, sensor units
+    between: _Means  # later less earlier, without `offset`
+    within: list[_Means]  # of each day, what its own map leaves of the intensities
+    offset: float  # by so much more all returns are stronger, sensor units
+    reach_m: float  # means that are so close to a place belong to it, m
+    width: float  # of the range of intensities, sensor units
     other_units: float | None
     """How many times as widely the later intensities spread, if the two days are in different units. None: they are not."""
 

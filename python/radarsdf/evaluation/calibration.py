@@ -103,11 +103,8 @@ def uncertainty_metrics(
 
     Notes
     -----
-    Points of equal uncertainty share their mean squared error before they are put into bins. So the order of the points
-    does not matter.
-
-    Neighbouring points of a surface have much the same error. So numbers from one surface scatter more than those of
-    as many independent errors would.
+    Points of equal uncertainty share their mean squared error, so the order of the points does not matter. Neighbouring points
+    of a surface have correlated errors, so numbers of one surface scatter more than those of independent errors.
 
     Examples
     --------

@@ -50,8 +50,7 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
     Raises
     ------
     ValueError
-        If the shapes differ, there is no return, or a value is not finite. Every return needs a prediction: a method
-        that leaves out difficult returns would look better than it is.
+        If the shapes differ, there is no return, or a value is not finite: every return needs a prediction.
     TypeError
         If the values are not real numbers.
     """
@@ -75,10 +74,7 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
 
 
 def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Split scans into training scans and held-out scans.
-
-    In ascending order, scans 0, `every`, 2 · `every`, … are held out. The paper holds out every tenth scan and does
-    not say which is the first.
+    """Split scans into training and held-out ones: in ascending order, scans 0, `every`, 2 · `every`, … are held out.
 
     Parameters
     ----------
@@ -143,8 +139,7 @@ class KNNIntensity:
     candidates, k : int
         Sizes of the two selections, 1 ≤ k ≤ candidates.
     distance_scale_m, angle_scale_rad : float
-        Noise of the returns: differences far below these values do not change a weight, so no single return takes all
-        the weight.
+        Noise of the returns: smaller differences hardly change a weight.
     num_threads : int
         Threads of the search; 0 means as many as PyTorch uses.
 
@@ -155,9 +150,8 @@ class KNNIntensity:
 
     Notes
     -----
-    The paper gives neither `k`, `candidates` nor the weights, and none are right for all scenes. On real drives an average over the
-    nearest returns counts more than a similar view: 8 of 8 or 16 of 16. Where the view decides, as in the simulated
-    scenes, 16 of 128 or 256 have a fifth less error than the defaults. So compare with :meth:`chosen`.
+    The paper gives neither `k`, `candidates` nor the weights, and none are right for all scenes: on real drives 8 of 8 or
+    16 of 16, on the simulated scenes 16 of 128 or 256. So compare with :meth:`chosen`.
 
     Examples
     --------
@@ -231,18 +225,16 @@ class KNNIntensity:
         points_world, sensor_positions, intensities, distance_scale_m, angle_scale_rad, num_threads
             As for the class. Give the training scans only: a choice that sees the evaluation is not fair.
         scans : (N,) array_like
-            Scan number of each return, integers. Whole scans are held out: a return's neighbours within its own scan
-            share its view and much of its noise, and would always seem right.
+            Scan number of each return, integers. Whole scans are held out, since returns of one scan share view and noise.
         every : int
             Distance between held-out scans, at least 2; see :func:`holdout`.
         max_queries : int
-            Of the held-out returns, at most so many are predicted, evenly spread. It limits the time to seconds.
+            Held-out returns that are predicted at most, evenly spread.
 
         Returns
         -------
         KNNIntensity
-            With the numbers in `candidates` and `k`. Of a single scan none can be held out: it has the defaults of the
-            class.
+            Of a single scan none can be held out: it has the defaults of the class.
 
         Raises
         ------
@@ -251,8 +243,7 @@ class KNNIntensity:
 
         Notes
         -----
-        On three simulated scenes and five real drives the choice has at most 0.6 % more error than the best of these
-        numbers for the evaluation itself.
+        On three simulated scenes and five real drives the error is at most 0.6 % above that of the best choice.
         """
         make = partial(
             cls, distance_scale_m=distance_scale_m, angle_scale_rad=angle_scale_rad, num_threads=num_threads

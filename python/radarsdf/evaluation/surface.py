@@ -118,9 +118,6 @@ def surface_metrics(
 
     Notes
     -----
-    Memory is bounded: besides mesh and ground truth, there is one block of samples and its search tree at a time,
-    200 MB in all for 400,000 triangles and 300,000 points.
-
     The completion measures distances to samples, not to triangles. Even a perfect mesh has a completion error of half
     the spacing of the samples, 0.5 · sqrt(area / samples): 5 mm for 1e7 samples on 1000 m². Compare meshes at equal
     `samples`.
@@ -239,10 +236,8 @@ def gamma_from_moments(angles_rad: ArrayLike) -> tuple[float | None, float | Non
 
     Notes
     -----
-    The paper does not name its estimator. In all twelve rows of its table shape = mean² / variance within rounding, so
-    its distribution begins at zero.
-    Maximum likelihood is not used: it needs the mean logarithm of the angles, which one angle of zero makes undefined,
-    and on flat walls rounding errors of 1e-8 rad would decide the shape.
+    The paper does not name its estimator, but in all twelve rows of its table shape = mean² / variance within rounding.
+    Maximum likelihood needs the mean logarithm of the angles, which an angle of zero makes undefined.
     """
     angles = real_array(angles_rad, "angles_rad")
     if angles.size == 0:

@@ -36,13 +36,13 @@ class WholeMap:
 class MapContents(WholeMap):
     """The parts of a map."""
 
-    field: Field  # In the local frame
+    field: Field  # in the local frame
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
     reflectance: Reflectance | None
     """Intensities in closed form, or what the network leaves of them. None: the network alone, or no intensities."""
-    evidence: Evidence  # Of each leaf cell
-    sensor: Sensor  # The radar, estimated from the scans of the fit
+    evidence: Evidence  # of each leaf cell
+    sensor: Sensor  # the radar, estimated from the scans of the fit
     report: dict[str, Any]
     """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
     passages: Passages = dataclasses.field(default_factory=Passages.none)

@@ -275,7 +275,7 @@ class Map(MapParts):
         sensor_positions : (N, 3) or (3,) array_like or Tensor
             World, m.
         extrapolate : bool
-            Whether to answer where nothing was observed, too, for instance for a comparison with all returns of a
+            Whether to predict where nothing was observed, too, for instance to compare with all returns of a
             held-out scan.
 
         Returns

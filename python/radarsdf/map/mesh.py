@@ -44,11 +44,11 @@ class Surface:
 
     vertices: NDArray[np.float64]  # (V, 3) local frame, m
     faces: NDArray[np.int32]  # (F, 3) rows of the vertices, counter-clockwise seen from free space
-    evidence: queries.EvidenceAt  # Of each vertex
+    evidence: queries.EvidenceAt  # of each vertex
     confidence: NDArray[np.float32]  # (V,) see :meth:`Map.confidence`
     uncertainty_m: NDArray[np.float32]  # (V,) see :meth:`Map.uncertainty`
-    tally: Tally  # Its area by confidence
-    cells_searched: int  # Number of leaf cells in which the surface can be
+    tally: Tally  # its area by confidence
+    cells_searched: int  # number of leaf cells in which the surface can be
 
     @classmethod
     def of(
@@ -216,7 +216,7 @@ class SampledLattice(NamedTuple):
     corners: NDArray[np.int32]  # (K, 3) lattice coordinates
     voxel_corners: NDArray[np.int32]  # (M, 8) rows of `corners` for each voxel
     distances_m: NDArray[np.float32]  # (K,) signed distance at each corner, m
-    cells_searched: int  # Number of leaf cells in which the surface can be
+    cells_searched: int  # number of leaf cells in which the surface can be
 
 
 def sample_lattice(

@@ -341,9 +341,9 @@ class CellsInBox:
     """Rays and returns in the leaf cells of a box, arrays of leaf cells."""
 
     corner: NDArray[np.float64]  # (3,) lower corner of the first cell, world, m
-    passed: NDArray[np.uint8]  # Number of scans with a ray through the cell, up to 7
-    returns: NDArray[np.bool_]  # Whether there are returns in it
-    observed: NDArray[np.bool_]  # Whether it is a leaf cell of the map
+    passed: NDArray[np.uint8]  # number of scans with a ray through the cell, up to 7
+    returns: NDArray[np.bool_]  # whether there are returns in it
+    observed: NDArray[np.bool_]  # whether it is a leaf cell of the map
 
 
 def dense_cells(

@@ -100,7 +100,7 @@ def scans_of_views(views: Iterable[View]) -> Scans:
 class TracedSurface:
     """The surface of a map as rays meet it, and patches that may have returns. It is made once for a map."""
 
-    tracer: SurfaceTracer  # Of the triangles that the mesh keeps by default, local frame
+    tracer: SurfaceTracer  # of the triangles that the mesh keeps by default, local frame
     centres: _Floats  # (P, 3) patches: middles of all triangles where the field crosses zero, local frame, m
     normals: _Floats  # (P, 3) unit vectors towards free space
     areas_m2: _Floats  # (P,) of the patches
@@ -149,12 +149,12 @@ class TracedSurface:
 class ViewedMap:
     """What views of a map need of it."""
 
-    surface: TracedSurface  # What beams meet, local frame
+    surface: TracedSurface  # what beams meet, local frame
     origin: _Floats  # (3,) of the local frame, world, m
     roughness: float  # See :func:`radarsdf.map.queries.roughness`
     intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None
     """Intensities (N,) of returns from points (N, 3) to a sensor (3,), local frame, m. None: the map has none."""
-    max_memory_bytes: int | None  # What views may take. None: what the system has left.
+    max_memory_bytes: int | None  # what views may take. None: what the system has left.
 
     @classmethod
     def of(cls, contents: MapContents, surface: TracedSurface) -> ViewedMap:
