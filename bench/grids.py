@@ -108,7 +108,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
             radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
         box = box_of(drive)
         with timed() as gridding:
-            grid = radar_map.grid(box, VOXEL_M)
+            grid = radarsdf.grid(radar_map, box, VOXEL_M)
         places = seen_places(drive, box, options.places, rng)
         yield {
             "scene": name,

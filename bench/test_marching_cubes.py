@@ -16,7 +16,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.map.isosurface import extract_cells, marching_cubes, mesh_components, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, marching_cubes, mesh_components, sparse_lattice
 
 
 def sphere_256():
@@ -259,18 +259,6 @@ def test_map_vtk_flying_edges(benchmark, map_lattice, backend, threads):
     benchmark.group = map_group(map_lattice)
     mesh = benchmark(FlyingEdges(map_lattice.volume, backend, threads).run)
     check_map(*FlyingEdges.arrays(mesh), map_lattice.crossed_edges(of_cells=False))
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_sparse_gradient(benchmark, shell, threads):
-    benchmark.group = "gradient of the extraction from a shell"
-    _, corners, cells = sparse_lattice(shell)
-    values = torch.from_numpy((np.linalg.norm(corners, axis=1) - 200.0).astype(np.float32)).requires_grad_()
-    vertices, _ = extract_cells(corners, values, cells, num_threads=threads)
-    # The distance grows by one along the way outwards, so a surface lowered by d moves outwards by d.
-    outwards = vertices.detach() / vertices.detach().norm(dim=1, keepdim=True)
-    (grad,) = benchmark(torch.autograd.grad, vertices, values, outwards, retain_graph=True)
-    assert float(grad.sum(dtype=torch.float64)) == pytest.approx(-len(vertices), rel=0.01)
 
 
 def check_map(vertices, faces, crossed_edges):

@@ -13,7 +13,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.map.traced_surface import TracedSurface
+from radarsdf.map.view import TracedSurface
 
 RAYS = (600, 2000)  # elevations, azimuths
 

@@ -9,7 +9,7 @@ import itertools
 from functools import cache
 
 import numpy as np
-from radarsdf.map.isosurface import marching_cubes
+from radarsdf.map.marching_cubes import marching_cubes
 
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # C order
 MIN_FRACTION = 1e-3
@@ -28,7 +28,7 @@ def cell_triangles(pattern):
 
 
 def reference_marching_cubes(volume, level=0.0, spacing=(1, 1, 1), origin=(0, 0, 0), mask=None):
-    """Same mesh as `radarsdf.map.isosurface.marching_cubes`, in another order."""
+    """Same mesh as `radarsdf.map.marching_cubes.marching_cubes`, in another order."""
     usable = ~np.isnan(volume) if mask is None else mask & ~np.isnan(volume)
     vertex_of_edge, vertices, faces = {}, [], []
     for cell in itertools.product(*(range(n - 1) for n in volume.shape)):

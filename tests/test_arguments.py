@@ -22,7 +22,7 @@ from hypothesis.extra import numpy as hnp
 from radarsdf import FitConfig
 from radarsdf.evaluation import KNNIntensity, holdout, intensity_metrics, surface_metrics
 from radarsdf.io.npz import read_scans
-from radarsdf.map.isosurface import marching_cubes
+from radarsdf.map.marching_cubes import marching_cubes
 from radarsdf.returns.rays import prepare
 from radarsdf.simulate import SCENES, RadarSensor, simulate
 

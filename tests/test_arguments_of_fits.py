@@ -12,7 +12,7 @@ import radarsdf
 from hypothesis import given
 from hypothesis import strategies as st
 from radarsdf import FitConfig
-from radarsdf.map.isosurface import extract_cells, mesh_components, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 
 from .test_arguments import FLOATS, THINGS, answer, arrays, examples, mostly, pose
 

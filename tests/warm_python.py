@@ -39,7 +39,7 @@ _IMPORTED = (
     "radarsdf.cli",
     "radarsdf.evaluation",
     "radarsdf.fitting.fit",
-    "radarsdf.map.meshing",
+    "radarsdf.map.mesh",
     "radarsdf.simulate",
 )
 

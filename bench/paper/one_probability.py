@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from radarsdf.evaluation import confidence_metrics, surface_metrics
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
-from radarsdf.map.meshing import Limits, Surface
-from radarsdf.map.threshold import Tally, areas_round
+from radarsdf.map.mesh import Surface
+from radarsdf.map.threshold import Limits, Tally, areas_round
 from radarsdf.simulate import KINDS, SCENES
 from scipy.spatial import cKDTree
 from scipy.special import expit

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import radarsdf
 import radarsdf.fitting.fit  # else the first fit and the first mesh would import these, in the measured time
-import radarsdf.map.meshing
+import radarsdf.map.mesh
 
 from bench.settings import PRESETS
 from bench.timing import timed

@@ -15,9 +15,11 @@ from .config.fit_config import FitConfig as FitConfig
 from .fitting.fit import fit as fit
 from .fitting.stopping import Diverged as Diverged
 from .fitting.stopping import Interrupted as Interrupted
+from .grids.grid import Grid as Grid
+from .grids.occupancy import grid as grid
 from .live.live_map import LiveMap as LiveMap
-from .map.isosurface import marching_cubes as marching_cubes
 from .map.map import Map as Map
+from .map.marching_cubes import marching_cubes as marching_cubes
 from .map.radar_map import RadarMap as RadarMap
 from .poses.odometry import Odometry as Odometry
 from .poses.odometry import odometry as odometry

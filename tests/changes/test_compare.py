@@ -13,14 +13,12 @@ import radarsdf
 import trimesh
 from radarsdf.changes.alignment import align
 from radarsdf.changes.changes import APPEARED, GONE, UNSEEN
-from radarsdf.changes.placed import PlacedMap
-from radarsdf.changes.probability import _passed, share_of_changes
+from radarsdf.changes.probability import PlacedMap, _passed
 from radarsdf.cli import main
 from radarsdf.poses.rigid import transform
 from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
-from ..conftest import draw_small
 from .conftest import QUICK, drives_past
 
 TAKEN, PUT = np.array([2.5, 2.5, 0.5]), np.array([2.5, -3.0, 0.5])
@@ -104,7 +102,7 @@ def wall_alone(maps):
 
 @pytest.mark.parametrize(
     "shift_m",
-    [(0.1, 0, 0), (-0.3, 0, 0), (0, 0, 0.1), (0.3, 0.15, 0.03), (1, 0, 0), (-0.7, 0.5, 0.1)],
+    [(-0.3, 0, 0), (0, 0, 0.1), (0.3, 0.15, 0.03), (-0.7, 0.5, 0.1)],
     ids=str,
 )
 def test_a_wall_is_aligned_along_its_normal_and_left_along_itself(wall_alone, shift_m):
@@ -169,36 +167,6 @@ def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
         np.testing.assert_array_equal(arrays["before_kind"], changes.before.kind)
 
 
-def test_the_command_writes_a_page_and_shows_what_changed(maps, tmp_path, capsys, monkeypatch):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    from radarsdf.view import pages  # noqa: PLC0415
-
-    def stop(view):
-        assert view.port > 0
-        raise KeyboardInterrupt
-
-    draw_small(monkeypatch)
-    monkeypatch.setattr(pages.ChangesView, "wait", stop)
-    for number, name in ((0, "a"), (2, "b")):
-        maps[number].save(tmp_path / f"{name}.safetensors")
-    page = tmp_path / "changes.html"
-    arguments = [
-        "compare",
-        *(str(tmp_path / f"{n}.safetensors") for n in "ab"),
-        "--report",
-        str(page),
-        "--view",
-    ]
-    assert main(arguments) == 0
-    said = capsys.readouterr().out
-    assert "what changed is on http://" in said
-    assert f"{page} written" in said
-    text = page.read_text("utf-8")
-    assert "a.safetensors and b.safetensors: what changed" in text
-    assert text.count("data:image/jpeg") >= 5
-
-
 def test_maps_without_passages_and_poses_of_maps_are_refused(maps, drives):
     drive = drives[0]
     blind = radarsdf.fit(drive.points[:4], drive.poses[:4], config=radarsdf.FitConfig.quick())
@@ -206,16 +174,6 @@ def test_maps_without_passages_and_poses_of_maps_are_refused(maps, drives):
         radarsdf.compare(maps[0], blind)
     with pytest.raises(ValueError, match="a map has its own"):
         radarsdf.compare(maps[0], maps[1], drive.poses)
-
-
-def test_the_share_of_changes_is_found_and_chance_makes_none():
-    rng = np.random.default_rng(0)
-    none = -0.5 * rng.normal(size=20_000) ** 2 + np.log(
-        3
-    )  # what is seen of nothing, a little likelier by change
-    assert share_of_changes(np.where(none > 1, -0.1, none - 2)) < 1e-3
-    mixed = np.where(rng.random(20_000) < 0.1, 8.0, -8.0)
-    assert abs(share_of_changes(mixed) - (mixed > 0).mean()) < 0.005
 
 
 def test_rays_that_pass_tell_that_a_surface_went():

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from radarsdf.map.isosurface import extract_cells, marching_cubes, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
 
 from ..mesh_checks import (
     area,

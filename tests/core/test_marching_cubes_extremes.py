@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from radarsdf.map.isosurface import extract_cells, marching_cubes, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
 
 from ..mesh_checks import (
     cells_in_use,

@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from radarsdf.map.isosurface import marching_cubes, mesh_components
+from radarsdf.map.marching_cubes import marching_cubes, mesh_components
 
 from ..mesh_checks import directed_edges, grid, noise
 

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from radarsdf.map.isosurface import sparse_lattice
+from radarsdf.map.marching_cubes import sparse_lattice
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -56,29 +55,6 @@ def test_wrong_by_two(factor, ence):
     assert m["nll"] > uncertainty_metrics(error_m, uncertainty_m)["nll"] + 0.3
 
 
-def test_one_uncertainty_for_all_hides_nothing():
-    """The mean is right, so one global factor would be 1. But no bin can tell good points from bad ones."""
-    error_m, uncertainty_m = drawn()
-    m = uncertainty_metrics(error_m, np.full(len(error_m), np.sqrt(np.mean(uncertainty_m**2))))
-    assert m["ence"] < 0.02
-    assert m["coverage_50"] > 0.7  # heavy tails
-    assert m["nll"] > uncertainty_metrics(error_m, uncertainty_m)["nll"] + 0.3
-
-
-def test_a_bias_shows():
-    error_m, uncertainty_m = drawn()
-    m = uncertainty_metrics(error_m + uncertainty_m, uncertainty_m)
-    assert m["z_mean"] == pytest.approx(1, abs=0.02)
-    assert m["z_rms"] == pytest.approx(math.sqrt(2), abs=0.02)
-
-
-def test_wrong_order_shows():
-    error_m, uncertainty_m = drawn()
-    m = uncertainty_metrics(error_m, 0.01 / uncertainty_m)
-    assert not m["deciles_in_order"]
-    assert m["worst_decile_factor"] > 50
-
-
 @pytest.mark.parametrize("factor", [0.01, 3.281, 1000.0])
 def test_other_units_change_only_what_has_a_unit(factor):
     error_m, uncertainty_m = drawn(5000)
@@ -91,19 +67,6 @@ def test_other_units_change_only_what_has_a_unit(factor):
         np.testing.assert_allclose(other[name], factor * np.array(m[name]), rtol=1e-9)
     assert other["nll"] == pytest.approx(m["nll"] + math.log(factor), abs=1e-9)
     assert other["deciles_in_order"] == m["deciles_in_order"]
-
-
-def test_signs_and_order_of_the_points_do_not_matter():
-    error_m, uncertainty_m = drawn(3000)
-    uncertainty_m = np.round(uncertainty_m, 1) + 0.05  # most are equal to many others
-    order = np.random.default_rng(1).permutation(3000)
-    m = uncertainty_metrics(error_m, uncertainty_m)
-    shuffled = uncertainty_metrics(error_m[order], uncertainty_m[order])
-    mirrored = uncertainty_metrics(-error_m, uncertainty_m)
-    for name in (*LEVELS, "ence", "nll", "z_rms", "rmse_m", "worst_decile_factor"):
-        assert shuffled[name] == pytest.approx(m[name], rel=1e-12), name
-        assert mirrored[name] == pytest.approx(m[name], rel=1e-12), name
-    assert mirrored["mean_error_m"] == -m["mean_error_m"]
 
 
 def test_bins_agree_with_a_plain_loop():
@@ -119,32 +82,12 @@ def test_bins_agree_with_a_plain_loop():
     assert m["ence"] == pytest.approx(np.mean(np.abs(np.subtract(predicted, measured)) / predicted))
 
 
-def test_unknown_points_do_not_count():
-    error_m, uncertainty_m = drawn(500)
-    m = uncertainty_metrics(error_m, uncertainty_m)
-    more_error = np.append(error_m, [np.nan, 9.0, np.nan])
-    more_uncertainty = np.append(uncertainty_m, [0.1, np.nan, np.nan])
-    assert uncertainty_metrics(more_error, more_uncertainty) == {**m, "num_unknown": 3}
-
-
-def test_results_are_json_also_without_any_error():
-    m = uncertainty_metrics(np.zeros(50), np.full(50, 0.1))
-    assert m["coverage_50"] == 1
-    assert m["ence"] == 1
-    assert math.isfinite(m["worst_decile_factor"])
-    json.dumps(m, allow_nan=False)
-    json.dumps(confidence_metrics([0.3], [True]), allow_nan=False)
-
-
 @pytest.mark.parametrize(
     ("error_m", "uncertainty_m", "message"),
     [
         (np.zeros(30), np.ones(31), "must both be"),
-        (np.zeros((30, 1)), np.ones((30, 1)), "must both be"),
-        (0.0, 1.0, "must both be"),
         (np.zeros(30), np.zeros(30), "uncertainty_m must be"),
         (np.zeros(30), -np.ones(30), "uncertainty_m must be"),
-        (np.zeros(30), np.full(30, np.inf), "uncertainty_m must be"),
         (np.full(30, -np.inf), np.ones(30), "error_m must be"),
         (np.zeros(19), np.ones(19), "19 points are too few"),
         (np.full(30, np.nan), np.ones(30), "0 points are too few"),
@@ -170,14 +113,6 @@ def test_perfect_confidences():
     assert m["true_share"] == pytest.approx(0.5, abs=0.01)
 
 
-def test_too_high_confidences():
-    rng = np.random.default_rng(0)
-    confidence = rng.random(50_000)
-    m = confidence_metrics(confidence, rng.random(50_000) < confidence / 2)
-    assert m["worst_gap"] == pytest.approx(0.475, abs=0.03)  # of the last bin
-    assert m["mean_gap"] == pytest.approx(0.25, abs=0.02)
-
-
 def test_auc_agrees_with_all_pairs():
     rng = np.random.default_rng(0)
     confidence, truth = np.round(rng.random(200), 1), rng.random(200) < 0.4
@@ -197,18 +132,11 @@ def test_bins_of_few_points_do_not_make_the_worst_gap():
     assert confidence_metrics(confidence, confidence > 2, bins=1000)["worst_gap"] > 0.9
 
 
-def test_points_without_confidence_do_not_count():
-    m = confidence_metrics([0.0, 1.0, np.nan], [0, 1, 1])
-    assert (m["num_points"], m["num_unknown"], m["brier"], m["auc"]) == (2, 1, 0.0, 1.0)
-
-
 @pytest.mark.parametrize(
     ("confidence", "is_true", "message"),
     [
         ([0.5], [True, False], "must both be"),
-        ([[0.5]], [[True]], "must both be"),
         ([1.5], [True], r"in \[0, 1\]"),
-        ([-0.1], [True], r"in \[0, 1\]"),
         ([0.5], [0.5], "True or False"),
         ([0.5], [np.nan], "True or False"),
         ([np.nan], [True], "no point has a confidence"),

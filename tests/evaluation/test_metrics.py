@@ -12,7 +12,6 @@ from radarsdf.evaluation import (
     PROTOCOL,
     KNNIntensity,
     format_metrics,
-    gamma_from_moments,
     holdout,
     intensity_metrics,
     surface_metrics,
@@ -71,24 +70,6 @@ def test_shifted_plane(shift, right, outlier_ratio, offset):
         assert m["accuracy_error_m"] == pytest.approx(abs(shift), rel=0.01)
 
 
-def test_a_distant_surface_counts_the_truncation():
-    m = surface_metrics(plane(7.0), grid(step=0.2), samples=1000)
-    assert m["completion_error_m"] == 2.0
-    assert m["outlier_ratio"] == 1.0
-
-
-def test_sphere_against_its_own_points():
-    sphere = trimesh.creation.icosphere(subdivisions=4, radius=2.0)
-    truth = np.random.default_rng(0).normal(size=(100_000, 3))
-    truth *= 2.0 / np.linalg.norm(truth, axis=1, keepdims=True)
-    m = surface_metrics(sphere, truth, samples=300_000)
-    assert m["f_score"] == m["f_score_all"] == 1.0
-    assert m["outlier_ratio"] == 0.0
-    # Nearest of N random points on area A: half a mean spacing, 0.5 * sqrt(A / N), plus a sagitta of 2 mm.
-    assert m["accuracy_error_m"] == pytest.approx(0.5 * math.sqrt(16 * math.pi / 100_000), rel=0.05)
-    assert m["completion_error_m"] == pytest.approx(0.5 * math.sqrt(16 * math.pi / 300_000), rel=0.05)
-
-
 def bumpy():
     mesh = plane(0.0, size=10.0, cells=40)
     x, y, _ = mesh.vertices.T
@@ -113,21 +94,6 @@ def test_agrees_with_the_definitions(mesh):
     for name, value in by_definition(samples, truth).items():
         tolerance = {"rel": 0.005} if name.endswith("_m") else {"abs": 0.005}
         assert m[name] == pytest.approx(value, **tolerance), name
-
-
-def test_many_blocks_are_as_good_as_one(monkeypatch):
-    truth = bumpy().vertices + 0.05
-    whole = surface_metrics(bumpy(), truth, samples=100_000)
-    monkeypatch.setattr("radarsdf.evaluation.surface._CHUNK", 3000)
-    parts = surface_metrics(bumpy(), truth, samples=100_000)
-    for name in ("accuracy_error_m", "completion_error_m", "completion_ratio", "precision"):
-        assert parts[name] == pytest.approx(whole[name], rel=0.005)
-
-
-def test_samples_are_uniform_by_area():
-    small, large = plane(0.0, size=1.0, cells=20), plane(0.3, size=3.0, cells=2)
-    m = surface_metrics(trimesh.util.concatenate([small, large]), grid(), samples=100_000)
-    assert m["precision"] == pytest.approx(0.1, abs=0.004)  # 1 m² of 10 m², though 800 of 808 triangles
 
 
 def test_box_crops_mesh_and_ground_truth():
@@ -156,11 +122,6 @@ def test_discarding_hides_what_f_score_all_shows():
     assert m["f_score_all"] == pytest.approx(2 * 0.25 / 1.25, abs=0.01)
 
 
-def test_threshold_beyond_the_discard():
-    m = surface_metrics(plane(0.45), grid(step=0.05), samples=1000, threshold_m=0.5)
-    assert (m["accuracy_error_m"], m["accuracy_ratio"], m["precision"]) == (None, 0.0, 1.0)
-
-
 def test_same_seed_same_numbers_on_any_number_of_threads():
     truth = bumpy().vertices + 0.1
     one = surface_metrics(bumpy(), truth, samples=20_000, seed=5, num_threads=1)
@@ -169,14 +130,6 @@ def test_same_seed_same_numbers_on_any_number_of_threads():
     assert one == two
     assert one["accuracy_error_m"] != other["accuracy_error_m"]
     assert one["ground_truth_sha256"] == other["ground_truth_sha256"]
-
-
-def test_gamma_of_gamma_distributed_angles():
-    angles = np.random.default_rng(0).gamma(0.9, 0.4, size=400_000)
-    shape, mean, variance = gamma_from_moments(angles)
-    assert shape == pytest.approx(0.9, rel=0.02)
-    assert mean == pytest.approx(0.36, rel=0.02)
-    assert variance == pytest.approx(0.144, rel=0.02)
 
 
 @pytest.mark.parametrize("flip", [False, True], ids=["wound", "some triangles flipped"])
@@ -193,13 +146,6 @@ def test_angles_of_a_cube(flip):
     assert m["gamma_shape"] == pytest.approx(2.0)
 
 
-def test_angles_match_trimesh_on_a_wound_mesh():
-    mesh = bumpy()
-    m = surface_metrics(mesh, mesh.vertices, samples=1000)
-    assert m["gamma_mean"] == pytest.approx(mesh.face_adjacency_angles.mean(), rel=1e-9)
-    assert m["gamma_variance"] == pytest.approx(mesh.face_adjacency_angles.var(), rel=1e-9)
-
-
 def test_angles_without_a_distribution_are_none_not_nan():
     tilted = plane()
     tilted.apply_transform(trimesh.transformations.rotation_matrix(0.3, [1.0, 2.0, 0.5]))
@@ -212,17 +158,6 @@ def test_angles_without_a_distribution_are_none_not_nan():
     assert (m["gamma_shape"], m["gamma_mean"], m["gamma_variance"], m["num_angles"]) == (None, None, None, 0)
     assert "undefined" in format_metrics(m)
     json.dumps(m, allow_nan=False)
-
-
-def test_triangles_without_area_change_nothing():
-    vertices = np.vstack([plane().vertices, np.full((3, 3), -100.0)])
-    faces = np.vstack(
-        [plane().faces, [[0, 0, 1], [0, 1, 2], [5, 5, 5], [81, 82, 83]]]
-    )  # 0, 1, 2 are on a line
-    m = surface_metrics(trimesh.Trimesh(vertices, faces, process=False), grid(step=0.1), samples=10_000)
-    assert m["num_mesh_samples"] == 10_000
-    assert m["outlier_ratio"] == 0.0
-    assert m["gamma_mean"] == pytest.approx(0.0, abs=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -275,20 +210,6 @@ def scene(num, rng):
     return points, sensors, 60 + 5 * np.sin(points[:, 0]) + 25 * view[:, 1]
 
 
-@pytest.mark.parametrize("offset", [0.0, 5e6])
-def test_knn_follows_position_and_view(offset):
-    rng = np.random.default_rng(0)
-    points, sensors, intensity = scene(60_000, rng)
-    x, at, expected = scene(500, rng)
-    spread = np.abs(expected - np.median(expected)).mean()
-    errors = {}
-    for candidates, k in ((256, 16), (16, 16)):
-        knn = KNNIntensity(points + offset, sensors + offset, intensity, candidates=candidates, k=k)
-        errors[candidates] = intensity_metrics(knn.predict(x + offset, at + offset), expected)["mae"]
-    assert errors[256] < 0.15 * spread
-    assert errors[256] < 0.5 * errors[16]  # here the view decides, so choosing by it must pay
-
-
 def test_knn_is_the_weighted_mean_it_says():
     rng = np.random.default_rng(1)
     points, sensors, intensity = scene(300, rng)
@@ -325,26 +246,6 @@ def seen(kind, rng, scans=24, returns=400):
     return points, sensors, intensity + rng.normal(0, 1, len(points)), number
 
 
-@pytest.mark.parametrize("kind", ["fine", "view"])
-def test_knn_chooses_what_suits_the_scene(kind):
-    points, sensors, intensity, number = seen(kind, np.random.default_rng(0))
-    test = np.isin(number, holdout(number, 4)[1])
-    train = points[~test], sensors[~test], intensity[~test]
-    knn = KNNIntensity.chosen(*train, number[~test], max_queries=1000)
-    assert knn.candidates <= 4 if kind == "fine" else knn.candidates >= 128
-
-    def error(baseline):
-        predicted = baseline.predict(points[test], sensors[test])
-        return intensity_metrics(predicted, intensity[test])["mae"]
-
-    errors = {
-        (k, c): error(KNNIntensity(*train, k=k, candidates=c))
-        for k, c in ((1, 1), (4, 4), (16, 16), (16, 20), (4, 64), (16, 256))
-    }
-    assert error(knn) <= 1.02 * min(errors.values())
-    assert error(knn) < 0.8 * errors[16, 20]  # the defaults suit neither scene
-
-
 def test_the_choice_is_that_of_an_inner_hold_out():
     points, sensors, intensity, number = seen("view", np.random.default_rng(1), scans=6, returns=60)
     number = number * 7 - 3  # any numbers
@@ -360,49 +261,6 @@ def test_the_choice_is_that_of_an_inner_hold_out():
     assert (knn.k, knn.candidates) == min(errors, key=errors.get)
     whole = KNNIntensity(points, sensors, intensity, k=knn.k, candidates=knn.candidates)  # of all six scans
     assert (knn.predict(points, sensors + 1) == whole.predict(points, sensors + 1)).all()
-
-
-def test_whole_scans_are_held_out_to_choose():
-    """The returns of one scan share its noise here. Its own returns are no fair neighbours."""
-    points, sensors, _, number = seen("view", np.random.default_rng(2), scans=12)
-    intensity = 60 + np.random.default_rng(3).normal(0, 5, 12)[number]
-    knn = KNNIntensity.chosen(points, sensors, intensity, number)
-    assert (knn.k, knn.candidates) == (32, 32)  # an average over many scans
-    knn = KNNIntensity.chosen(points, sensors, intensity, np.arange(len(points)))  # as if each were a scan
-    assert (knn.k, knn.candidates) != (32, 32)
-
-
-def test_the_choice_is_the_same_for_other_threads_and_orders():
-    scans = seen("view", np.random.default_rng(6), scans=12, returns=100)
-    order = np.random.default_rng(7).permutation(1200)
-    found = [KNNIntensity.chosen(*scans, num_threads=threads) for threads in (1, 1, 2)]
-    found.append(KNNIntensity.chosen(*(a[order] for a in scans)))
-    assert len({(knn.k, knn.candidates) for knn in found}) == 1
-    assert len({knn.predict(*scans[:2]).tobytes() for knn in found[:3]}) == 1
-
-
-def test_a_choice_in_parts_is_the_same(monkeypatch):
-    scans = seen("view", np.random.default_rng(4), returns=100)
-    whole = KNNIntensity.chosen(*scans)
-    monkeypatch.setattr("radarsdf.evaluation.intensity._CHUNK", 3000)
-    parts = KNNIntensity.chosen(*scans)
-    assert (whole.k, whole.candidates) == (parts.k, parts.candidates)
-    assert (whole.predict(*scans[:2]) == parts.predict(*scans[:2])).all()
-
-
-def test_a_choice_from_little_and_bad_input():
-    points, sensors, intensity, number = seen("view", np.random.default_rng(5), scans=2, returns=3)
-    one = KNNIntensity.chosen(points, sensors, intensity, np.zeros(6, int))
-    assert (one.k, one.candidates) == (6, 6)  # the defaults, of so few
-    two = KNNIntensity.chosen(points, sensors, intensity, number)
-    assert two.k <= two.candidates <= 3
-    for scans in (number[:5], number * 1.0, number[:, None], np.ma.masked_equal(number, 0)):
-        with pytest.raises(ValueError, match="scans"):
-            KNNIntensity.chosen(points, sensors, intensity, scans)
-    with pytest.raises(ValueError, match="every"):
-        KNNIntensity.chosen(points, sensors, intensity, number, every=1)
-    with pytest.raises(ValueError, match="max_queries"):
-        KNNIntensity.chosen(points, sensors, intensity, number, max_queries=0)
 
 
 def test_knn_with_few_returns_and_bad_input():

@@ -193,10 +193,10 @@ for part in ("networkx", "scipy", "shapely"):
     if (child := os.fork()) == 0:  # PyTorch, which takes seconds, is imported for all three
         sys.meta_path.insert(0, Press())
         try:
-            import radarsdf.map.meshing
+            import radarsdf.map.mesh
         except KeyboardInterrupt:
             print("stopped", *presses, flush=True)
-        import radarsdf.map.meshing  # and now it is whole
+        import radarsdf.map.mesh  # and now it is whole
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         os._exit(17)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17

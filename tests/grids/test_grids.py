@@ -7,7 +7,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import radarsdf
-import trimesh
 from radarsdf.cli import main
 from radarsdf.grids.costmap import Wheels
 from radarsdf.grids.grid import Grid
@@ -17,7 +16,7 @@ BOX = [[5.0, -5.03, -1.57], [22.0, 4.97, 4.43]]
 
 @pytest.fixture(scope="module")
 def grid(sharp_map):
-    return sharp_map.grid(BOX, 0.2)
+    return radarsdf.grid(sharp_map, BOX, 0.2)
 
 
 def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
@@ -35,15 +34,6 @@ def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
     assert grid.at([[np.nan, 0, 0], [1e9, 0, 0]]).tolist() == [-1, -1]
 
 
-def test_probabilities_agree_with_the_states(sharp_map):
-    grid = sharp_map.grid(BOX, 0.2, occupied_from=0.8, free_to=0.02)
-    known = grid.probability[np.isfinite(grid.probability)]
-    assert 0 <= known.min() < known.max() <= 1
-    assert grid.probability[grid.occupied].min() >= 0.8
-    # Rays alone leave less than 0.02; a surface that is nearby adds to it.
-    assert np.median(grid.probability[grid.free]) < 0.02
-
-
 def test_a_voxel_that_a_surface_grazes_is_not_free():
     """No return is in it, for they were moved onto the surface, and rays pass it above the ground often enough."""
     drive = radarsdf.simulate.KINDS["tunnel"](seed=5, frames=12)
@@ -51,31 +41,14 @@ def test_a_voxel_that_a_surface_grazes_is_not_free():
     radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
     # The ground is the border of two voxels.
     lower = np.floor(drive.poses[6, :3, 3] / 0.2) * 0.2 - [12, 12, 2]
-    grid = radar_map.grid([lower, lower + [24, 24, 3]], 0.2)
+    grid = radarsdf.grid(radar_map, [lower, lower + [24, 24, 3]], 0.2)
     assert (grid.at(drive.ground_truth) == 0).mean() < 0.0003
     assert grid.free.sum() * 0.2**3 > 190
 
 
-def test_seven_scans_from_one_place_free_what_is_before_a_facade():
-    """Rays that graze the ground pass cells that the field alone would put a cell behind it: it is longer than the distance."""
-    drive = radarsdf.simulate.KINDS["facade"](seed=5, frames=21)
-    config = radarsdf.FitConfig(num_threads=1)
-    radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
-    grid = radar_map.grid([[5, 0, -1], [25, 14.5, 5]], 0.2)
-    assert grid.free.sum() * 0.2**3 > 500
-    assert (grid.at(drive.ground_truth) == 0).mean() < 0.001
-
-
-def test_a_saved_map_has_the_same_grid(grid, sharp_map, tmp_path):
-    sharp_map.save(tmp_path / "map.safetensors")
-    again = radarsdf.load(tmp_path / "map.safetensors").grid(BOX, 0.2)
-    np.testing.assert_array_equal(again.state, grid.state)
-    np.testing.assert_array_equal(again.probability, grid.probability)
-
-
 def test_larger_voxels_are_free_only_throughout(sharp_map):
     box = [[4.8, -4.8, -1.6], [21.6, 4.8, 4.4]]
-    coarse, fine = sharp_map.grid(box, 0.4), sharp_map.grid(box, 0.2)
+    coarse, fine = radarsdf.grid(sharp_map, box, 0.4), radarsdf.grid(sharp_map, box, 0.2)
     x, y, z = coarse.shape
     parts = fine.state.reshape(x, 2, y, 2, z, 2).transpose(0, 2, 4, 1, 3, 5).reshape(x, y, z, 8)
     np.testing.assert_array_equal(coarse.free, (parts == 0).all(axis=-1))
@@ -166,7 +139,7 @@ def test_octomap_reads_each_voxel_as_it_is(grid, tmp_path):
 def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refused(sharp_map, tmp_path):
     for size in (0.13, 0.2, 0.5):
         box = np.array([[9.07, -2.93, -0.71], [14.0, 2.0, 1.2]])
-        grid = sharp_map.grid(box, size)
+        grid = radarsdf.grid(sharp_map, box, size)
         np.testing.assert_allclose(grid.origin / size, np.round(grid.origin / size), atol=1e-9)
         upper = grid.origin + np.array(grid.shape) * size
         assert ((grid.origin <= box[0]) & (box[0] < grid.origin + size)).all()
@@ -178,17 +151,11 @@ def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refus
         made(np.ones((2, 2, 2)), [7000.0, 0, 0], 0.2).save(tmp_path / "far.bt")
 
 
-def test_a_ply_holds_what_is_known(grid, tmp_path):
-    grid.save(tmp_path / "grid.ply")
-    cloud = trimesh.load(tmp_path / "grid.ply")
-    assert len(cloud.vertices) == (~grid.unknown).sum()
-
-
 def test_a_map_without_passages_says_so(scene):
     quick = radarsdf.FitConfig.quick()
     radar_map = radarsdf.fit(scene.points, scene.poses, config=quick, progress=False)
     with pytest.raises(ValueError, match=r"returns\.passages"):
-        radar_map.grid(BOX)
+        radarsdf.grid(radar_map, BOX)
 
 
 def test_tiles_have_the_grid_of_their_cells(tmp_path):
@@ -198,7 +165,7 @@ def test_tiles_have_the_grid_of_their_cells(tmp_path):
     whole = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
     radarsdf.fit_tiles(scans, tmp_path / "city", tile_size=12.8, halo=6.4, config=config, progress=False)
     tiles = radarsdf.load(tmp_path / "city")
-    a, b = (radar_map.grid(whole.extent, 0.2) for radar_map in (whole, tiles))
+    a, b = (radarsdf.grid(radar_map, whole.extent, 0.2) for radar_map in (whole, tiles))
     assert (a.occupied == b.occupied).mean() > 0.99
     cells, of_tiles = (radar_map.cells_round(*(whole.extent + 0.05)) for radar_map in (whole, tiles))
     np.testing.assert_allclose(cells.corner, of_tiles.corner)
@@ -230,15 +197,3 @@ def test_the_command_writes_all_files(sharp_map, tmp_path, capsys):
     with np.load(tmp_path / "d.npz") as distances, np.load(tmp_path / "g.npz") as grid:
         assert distances["occupied_m"].shape == grid["state"].shape == (65, 30, 20)
     assert {path.name for path in tmp_path.iterdir()} >= {*names, "g.pgm", "c.npz"}
-
-
-def test_a_box_one_voxel_high_has_costs_and_shows_no_ground(sharp_map):
-    thin = sharp_map.grid([[15.0, -3.0, 0.8], [21.0, 3.0, 1.0]], 0.2)
-    assert thin.shape[2] == 1
-    costs = thin.costmap()
-    assert np.isnan(costs.height_m).all()
-    np.testing.assert_array_equal(costs.cost, np.where(thin.occupied[..., 0], 100, -1))
-    assert (costs.cost == 100).any()
-    with pytest.raises(ValueError, match=r"ground between z = 0\.80 and 1\.00 m"):
-        thin.flat()
-    assert thin.distances().not_free_m.shape == thin.shape

@@ -11,7 +11,7 @@ from radarsdf import FitConfig, LiveMap
 from radarsdf._core import cell_keys
 from radarsdf.live.ghosts import means_of, surfels_of
 from radarsdf.live.regions import REGION_CELLS, RegionTable, cubes_of, regions_of, regions_round
-from radarsdf.map.meshing import Surface
+from radarsdf.map.mesh import Surface
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.ghosts import find_ghosts
 

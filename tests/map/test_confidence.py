@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import pickle
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from radarsdf.map import queries
 from radarsdf.map.queries import EvidenceAt
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence
-from scipy.special import erf
 
 from ..conftest import ground_and_wall
 
@@ -109,30 +107,6 @@ def test_it_is_at_most_the_share_of_the_errors_within_a_cell(radar_map, error_ce
     assert unlikely <= found.reach.item()
 
 
-def test_neighbours_help_as_a_thin_plate_does(radar_map):
-    """The standard error in the middle of a lattice of independent observations, of which second differences are small."""
-    n, bend_cells = 41, 2.0
-    second = np.diff(np.eye(n), 2, axis=0)
-    first = np.diff(np.eye(n), axis=0)
-    plate = sum(
-        np.kron(a.T @ a, b.T @ b) * weight
-        for a, b, weight in ((second, np.eye(n), 1), (np.eye(n), second, 1), (first, first, 2))
-    )
-    for error_cells in (1.0, 2.0):  # of the nine cells of a surface
-        information = np.eye(n * n) / (9 * error_cells**2) + plate / bend_cells**2
-        expected = np.sqrt(np.linalg.inv(information)[n * n // 2, n * n // 2])
-        reach = queries.probabilities(radar_map._contents, at(ERROR_OF_A_CELL / error_cells**2, 9, 9)).reach
-        assert erf(np.sqrt(0.5) / expected) == pytest.approx(reach.item(), abs=0.04)
-
-
-def test_it_spans_the_probabilities(radar_map):
-    """Of a surface that most scans see to a tenth of a cell, and of what one scan in a thousand saw once."""
-    sure = confidence(radar_map, 100 * ERROR_OF_A_CELL, 900, 1000, rough_share=0.02)
-    unsure = confidence(radar_map, ERROR_OF_A_CELL, 1, 1000, rough_share=0.4)
-    assert sure > 0.95
-    assert unsure < 0.1
-
-
 @pytest.mark.parametrize("rough_share", [0.0, 0.05, 0.3])
 def test_twice_the_scans_make_surer_only_what_is_no_surface(radar_map, rough_share):
     """Half of the returns that a surface has at least are more improbable by chance of many scans than of few."""
@@ -151,23 +125,6 @@ def test_twice_the_scans_make_surer_only_what_is_no_surface(radar_map, rough_sha
         assert odds[1] < 0.3 * odds[0]
 
 
-def test_a_fit_to_scans_given_twice_has_twice_the_evidence(scene):
-    # What is a gap, a ghost or noise is found from the number of returns.
-    noise = {"range_noise_m": 0.05, "azimuth_noise_rad": 0.01, "elevation_noise_rad": 0.01}
-    config = FitConfig.quick(
-        num_threads=2, encoding={"bridge_cells": 0}, returns={"drop_ghosts": False} | noise
-    )
-    once, twice = (
-        radarsdf.fit(
-            scene.points * n, np.tile(scene.poses, (n, 1, 1)), config=config, progress=False
-        ).evidence
-        for n in (1, 2)
-    )
-    np.testing.assert_allclose(twice.information, 2 * once.information, rtol=1e-5)
-    np.testing.assert_array_equal(twice.detections, 2 * once.detections)
-    np.testing.assert_array_equal(twice.looks, 2 * once.looks)
-
-
 def test_places_have_the_evidence_of_their_cells(radar_map):
     """In the middle of a cell, none of its neighbours counts."""
     contents, evidence = radar_map._contents, radar_map.evidence
@@ -183,39 +140,3 @@ def test_places_have_the_evidence_of_their_cells(radar_map):
         queries.confidence(contents, at(*dataclasses.astuple(evidence))).numpy()[known],
         atol=1e-3,
     )
-
-
-def test_files_and_pickles_give_the_same_bits(radar_map, tmp_path):
-    radar_map.save(tmp_path / "map.safetensors")
-    x = np.random.default_rng(0).uniform([8, -6, -0.3], [20, 6, 0.3], (3000, 3))
-    rough = RadarMap(dataclasses.replace(radar_map._contents, rough_share=0.123))
-    rough.save(tmp_path / "rough.safetensors")
-    assert (rough.confidence(x) < radar_map.confidence(x)).mean() > 0.5
-    for before, name in ((radar_map, "map"), (rough, "rough")):
-        for after in (
-            radarsdf.load(tmp_path / f"{name}.safetensors"),
-            pickle.loads(pickle.dumps(before)),
-        ):
-            assert after.confidence(x).tobytes() == before.confidence(x).tobytes()
-            assert after.uncertainty(x).tobytes() == before.uncertainty(x).tobytes()
-            assert after.rough_share == before.rough_share
-            for a, b in zip(*(dataclasses.astuple(m.evidence) for m in (after, before)), strict=True):
-                assert (a.dtype, a.tobytes()) == (b.dtype, b.tobytes())
-            meshes = [m.mesh(0.2, progress=False) for m in (after, before)]
-            assert len(meshes[0].faces) > 0
-            for attribute in ("confidence", "uncertainty_m"):
-                np.testing.assert_array_equal(*(mesh.vertex_attributes[attribute] for mesh in meshes))
-
-
-def test_what_is_missing_counts_in_deviations_of_chance(radar_map):
-    """A surface that answers as often as it should misses next to nothing, however many scans looked."""
-
-    def missing(detections, looks):
-        evidence = EvidenceAt(*torch.tensor([[1.0], [float(detections)], [float(looks)]]))
-        return queries.terms(radar_map._contents, evidence)[0, 2].item()
-
-    assert missing(50, 100) < 0.02 > missing(5000, 10_000)
-    assert missing(0, 1) < 0.4
-    # 25 are expected, with a deviation of 5: three of them are missing, ten times as many are 9.5.
-    assert missing(10, 100) == pytest.approx(3, rel=0.03)
-    assert missing(100, 1000) == pytest.approx(9.5, rel=0.01)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 
 import numpy as np
@@ -12,9 +11,6 @@ import pytest
 import radarsdf
 import torch
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
-from radarsdf.map.queries import evaluate, evidence, to_local
-from radarsdf.map.radar_map import RadarMap
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 
@@ -60,48 +56,6 @@ def test_numpy_in_numpy_out_torch_in_torch_out(query):
         assert not tensor.requires_grad
 
 
-def test_lists_are_double_precision(query):
-    name, function = query
-    x = near_surface(5)
-    answer = function(x.tolist())
-    assert answer.dtype == (np.bool_ if name == "observed" else np.float64)
-    np.testing.assert_array_equal(answer, function(x))
-
-
-def test_precision_of_the_answer_does_not_decide_that_of_the_query(sharp_map):
-    far = RadarMap(dataclasses.replace(sharp_map._contents, origin=sharp_map.origin + [5e5, 5.4e6, 0]))
-    x = near_surface(300)
-    for near_query, far_query in ((sharp_map.sdf, far.sdf), (sharp_map.gradient, far.gradient)):
-        difference = np.abs(far_query(x + [5e5, 5.4e6, 0]) - near_query(x))
-        # float64 at UTM coordinates resolves 1e-9 m, float32 of the local frame 1e-6 m; float32 there half a metre.
-        assert np.nanmedian(difference) < 1e-4
-    assert (far.observed(x + [5e5, 5.4e6, 0]) == sharp_map.observed(x)).mean() > 0.999
-
-
-def test_strided_and_read_only_arrays(query):
-    _, function = query
-    x = near_surface(40)
-    wide = np.zeros((80, 6))
-    wide[::2, ::2] = x
-    view = wide[::2, ::2]
-    view.setflags(write=False)
-    np.testing.assert_array_equal(function(view), function(x))
-    np.testing.assert_array_equal(function(np.asfortranarray(x)), function(x))
-    read_only = x.copy()  # as those that trimesh gives
-    read_only.setflags(write=False)
-    np.testing.assert_array_equal(function(read_only), function(x))
-    np.testing.assert_array_equal(function(torch.from_numpy(wide)[::2, ::2]), function(x))
-
-
-def test_queries_leave_their_input_alone(query):
-    _, function = query
-    x = torch.from_numpy(near_surface(20)).requires_grad_()
-    before = x.detach().clone()
-    function(x)
-    assert torch.equal(x.detach(), before)
-    assert x.grad is None
-
-
 def test_one_sensor_position_or_one_each(sharp_map):
     x = on_surface(sharp_map, 30)
     one = sharp_map.intensity(x, SENSOR)
@@ -115,11 +69,6 @@ def test_one_sensor_position_or_one_each(sharp_map):
     assert not np.allclose(each, one, atol=1e-3)
 
 
-def test_a_point_at_the_sensor_has_a_finite_intensity(sharp_map):
-    x = on_surface(sharp_map, 3)
-    assert np.isfinite(sharp_map.intensity(x, x)).all()
-
-
 @pytest.mark.parametrize("shape", [(3,), (5, 2), (5, 4), (2, 5, 3), ()])
 def test_wrong_shapes(query, shape):
     _, function = query
@@ -127,12 +76,6 @@ def test_wrong_shapes(query, shape):
         function(np.zeros(shape))
     with pytest.raises(ValueError, match=r"positions must have shape \(N, 3\)"):
         function(torch.zeros(shape))
-
-
-@pytest.mark.parametrize("shape", [(4, 3), (6, 3), (1, 3), (2,), (5, 2), ()])
-def test_wrong_sensor_positions(sharp_map, shape):
-    with pytest.raises(ValueError, match="positions must have shape"):
-        sharp_map.intensity(near_surface(5), np.zeros(shape))
 
 
 def test_empty_queries(query):
@@ -167,33 +110,6 @@ def test_chunks_do_not_change_answers(query):
         np.testing.assert_array_equal(whole, pieces)
     else:  # a matrix product of other height may add in another order
         np.testing.assert_allclose(whole, pieces, atol=2e-4 if name == "intensity" else 2e-5, rtol=1e-5)
-
-
-def test_evaluate_keeps_the_order_and_wants_no_gradient():
-    x = torch.arange(50_000.0)[:, None]
-    grads = []
-
-    def double(chunk):
-        grads.append(torch.is_grad_enabled())
-        return 2 * chunk[:, 0]
-
-    assert torch.equal(evaluate(double, x), 2 * x[:, 0])
-    assert len(grads) > 2
-    assert not any(grads)
-    assert torch.is_grad_enabled()
-
-
-def test_an_error_in_a_chunk_arrives():
-    def fail(chunk):
-        if chunk[0, 0] > 20_000:
-            msg = "broken chunk"
-            raise ArithmeticError(msg)
-        return chunk[:, 0]
-
-    threads = torch.get_num_threads()
-    with pytest.raises(ArithmeticError, match="broken chunk"):
-        evaluate(fail, torch.arange(50_000.0)[:, None])
-    assert torch.get_num_threads() == threads
 
 
 def test_many_threads_at_once_get_the_answers_of_one(sharp_map):
@@ -237,21 +153,6 @@ def test_gradient_is_the_derivative_of_the_distance(sharp_map):
     assert np.median(gradient[x[:, 0] < 19.5, 2]) > 0.5
 
 
-def test_nbytes_is_that_of_features_and_weights(scene, sharp_map):
-    vertices = sharp_map.report["vertices"]
-    features = vertices * 8 * 4
-    encoding = (
-        3 * 8 + 6 * 10
-    )  # three levels of eight features, sine and cosine of ten frequencies on three axes
-    sdf = (encoding * 32 + 32) + (32 * 32 + 32) + (32 + 1)
-    width = sharp_map.field.intensity_network.layers[0].in_features
-    intensity = (width * 64 + 64) + 2 * (64 * 64 + 64) + (64 + 1)
-    assert sharp_map.nbytes == features + 4 * (sdf + intensity)
-    config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
-    without = radarsdf.fit(scene.points, scene.poses, config=config, origin=sharp_map.origin, progress=False)
-    assert without.nbytes == features + 4 * sdf
-
-
 def test_repr_says_what_it_is_and_what_its_file_takes(scene, sharp_map, tmp_path):
     cells = sharp_map.report["leaf_cells"]
     assert (
@@ -263,54 +164,3 @@ def test_repr_says_what_it_is_and_what_its_file_takes(scene, sharp_map, tmp_path
     assert 0 < names < 5000  # with checksums of all arrays
     config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     assert repr(radarsdf.fit(scene.points, scene.poses, config=config)).startswith("RadarMap(surface, ")
-
-
-def test_the_report_counts(scene, sharp_map):
-    report = sharp_map.report
-    assert report["returns"] == sum(map(len, scene.points))
-    assert report["returns_used"] == report["returns"]  # none is nearer than 2.5 m
-    assert report["iterations"] == {"sdf": 150, "intensity": 60}
-    assert all(np.isfinite(loss) and loss > 0 for loss in report["losses"].values())
-    assert all(report[name] >= 0 for name in ("prepare_s", "occupied_cells_s", "training_s"))
-
-
-def test_a_map_without_intensities_says_so(scene):
-    config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
-    radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
-    assert not radar_map.has_intensity
-    with pytest.raises(ValueError, match="fitted without intensities"):
-        radar_map.intensity(near_surface(3), SENSOR)
-
-
-def test_intensity_scale():
-    values = np.array([-20.0, 5.0, 30.0], np.float32)
-    scale = IntensityScale.of(values)
-    np.testing.assert_allclose(scale.to_unit(values), [0, 0.5, 1])
-    np.testing.assert_allclose(scale.to_sensor(torch.from_numpy(scale.to_unit(values))), values)
-    assert IntensityScale.of(None) is None
-
-
-def test_confidence_is_that_of_the_returns_round_a_point(sharp_map, scene):
-    returns = np.concatenate(
-        [p @ T[:3, :3].T + T[:3, 3] for p, T in zip(scene.points, scene.poses, strict=True)]
-    )
-    confidence = sharp_map.confidence(returns)
-    assert confidence.dtype == np.float64
-    assert (confidence > 0).all()
-    assert (confidence < 1).all()
-    near = np.abs(returns[:, None] - returns[None, :300]).max(axis=2) < 0.3  # 27 cells of 0.2 m, centred
-    # The odds grow with what these tell together. Their number alone counts only where they are too few for a surface.
-    ranges_m = np.linalg.norm(np.concatenate(scene.points), axis=1)
-    range_m, azimuth_rad, elevation_rad = sharp_map.report["noise"].values()
-    information = 1 / (range_m**2 + ranges_m**2 * (azimuth_rad**2 + elevation_rad**2))
-    odds = confidence[:300] / (1 - confidence[:300])
-    assert np.corrcoef(information @ near, odds)[0, 1] > 0.8
-    assert (sharp_map.confidence(returns + [0, 0, 50.0]) == 0).all()
-    # Continuous: no step from one cell to the next. It falls steeply only where the information ends.
-    line = np.linspace(returns[0] - 0.5, returns[0] + 0.5, 2001)
-    found = evidence(sharp_map._contents, to_local(sharp_map._contents, torch.from_numpy(line)))
-    for column in found:
-        assert column.diff().abs().max() < 0.02 * column.max()
-    known = (found.information > 0.01 * found.information.max()).numpy()
-    assert 0.1 < known.mean() < 0.9
-    assert np.abs(np.diff(sharp_map.confidence(line)))[known[1:] & known[:-1]].max() < 0.02

@@ -8,7 +8,6 @@ import json
 import math
 import os
 import pickle
-import stat
 
 import numpy as np
 import pytest
@@ -33,13 +32,9 @@ def fitted(scene, *, with_intensity=True, **changes):
 
 @pytest.fixture(scope="module")
 def saved(scene, tmp_path_factory):
-    """A map, its file, and the file's parts."""
-    return saved_parts(fitted(scene), tmp_path_factory.mktemp("map"))
-
-
-def saved_parts(radar_map, folder):
-    """A map, its file in this folder, and the file's parts."""
-    path = folder / "map.safetensors"
+    """A map with all parts, its file, and the file's parts."""
+    radar_map = fitted(scene, reflectance="both", returns={"passages": True})
+    path = tmp_path_factory.mktemp("map") / "map.safetensors"
     radar_map.save(path)
     with open_tensors(path) as file:
         return radar_map, path, {name: file.array(name).clone() for name in file.names}, file.metadata
@@ -119,17 +114,7 @@ def test_the_file_is_plain_safetensors_with_units(saved):
     assert start != b"PK"  # what torch.save writes: a zip of pickles
 
 
-def test_loading_unpickles_nothing(saved, monkeypatch):
-    def refuse(*_, **__):
-        pytest.fail("the loader unpickles")
-
-    monkeypatch.setattr(pickle, "load", refuse)
-    monkeypatch.setattr(pickle, "loads", refuse)
-    monkeypatch.setattr(torch, "load", refuse)
-    radarsdf.load(saved[1])
-
-
-@pytest.mark.parametrize("keep", [0, 1, 7, 8, 9, 500, 0.5, 0.99, -1])
+@pytest.mark.parametrize("keep", [0, 8, 500, 0.5, -1])
 def test_truncated_files(saved, tmp_path, keep):
     data = saved[1].read_bytes()
     path = tmp_path / "cut.safetensors"
@@ -138,159 +123,103 @@ def test_truncated_files(saved, tmp_path, keep):
         radarsdf.load(path)
 
 
-@pytest.mark.parametrize(
-    "content", [b"\xff" * 64, b"PK\x03\x04" + b"\0" * 60, b"ply\nformat ascii 1.0\n", b"\x80\x04N."]
-)
-def test_garbage(tmp_path, content):
-    path = tmp_path / "garbage.safetensors"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"garbage\.safetensors is not a whole radarsdf map"):
-        radarsdf.load(path)
-
-
-def test_files_of_other_programs(tmp_path):
-    for metadata in (None, {"format": "pt"}, {"format": "radarsdf.mesh", "format_version": "1"}):
-        save_file({"weight": torch.zeros(3)}, tmp_path / "other.safetensors", metadata)
+def test_files_of_other_programs_and_versions(saved, tmp_path):
+    _, _, tensors, metadata = saved
+    path = tmp_path / "other.safetensors"
+    for foreign in (None, {"format": "pt"}, {"format": "radarsdf.mesh", "format_version": "1"}):
+        save_file({"weight": torch.zeros(3)}, path, foreign)
         with pytest.raises(ValueError, match="is not a radarsdf map"):
-            radarsdf.load(tmp_path / "other.safetensors")
-
-
-@pytest.mark.parametrize("version", ["4", "9", "10", "12", "", "1.5", "-1", "one"])
-def test_other_versions(saved, tmp_path, version):
-    _, _, tensors, metadata = saved
-    path = write(tmp_path / "new.safetensors", tensors, metadata | {"format_version": version})
-    with pytest.raises(ValueError, match="format version"):
-        radarsdf.load(path)
-
-
-def test_confidence_survives_the_file(saved):
-    radar_map, path, _, _ = saved
-    x = np.random.default_rng(0).uniform([8, -6, -0.3], [20, 6, 0.3], (1000, 3))
-    confidence = radarsdf.load(path).confidence(x)
-    np.testing.assert_array_equal(confidence, radar_map.confidence(x))
-    assert confidence.max() > 0.3
-
-
-@pytest.mark.parametrize("fault", ["missing", "longer", "flat", "float64", "int64", "int32"])
-@pytest.mark.parametrize("name", ["information", "detections", "looks"])
-def test_evidence_of_another_shape_or_type(saved, tmp_path, name, fault):
-    _, _, tensors, metadata = saved
-    changed = dict(tensors)
-    match fault:
-        case "missing":
-            del changed[name]
-        case "longer":
-            changed[name] = torch.cat([tensors[name], tensors[name][-1:]])
-        case "flat":
-            changed[name] = tensors[name].reshape(1, -1)
-        case _:
-            changed[name] = tensors[name].to(getattr(torch, fault))
-    with pytest.raises(ValueError, match=name):
-        radarsdf.load(write(tmp_path / "wrong.safetensors", changed, metadata))
-
-
-@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
-def test_information_that_cannot_be(saved, tmp_path, value):
-    _, _, tensors, metadata = saved
-    information = tensors["information"].clone()
-    information[5] = value
-    path = write(tmp_path / "wrong.safetensors", tensors | {"information": information}, metadata)
-    with pytest.raises(ValueError, match="information"):
-        radarsdf.load(path)
-
-
-@pytest.mark.parametrize("value", [-0.01, 1.01, math.nan, math.inf, "much", None, [0.1]])
-def test_rough_shares_that_cannot_be(saved, tmp_path, value):
-    _, _, tensors, metadata = saved
-    spoilt = with_description(metadata, lambda d: d.update(rough_share=value))
-    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
-        radarsdf.load(write(tmp_path / "wrong.safetensors", tensors, spoilt))
-
-
-@pytest.mark.parametrize("value", [-0.01, math.nan, math.inf, "many", None, [2.5]])
-def test_returns_per_cell_that_cannot_be(saved, tmp_path, value):
-    _, _, tensors, metadata = saved
-    spoilt = with_description(metadata, lambda d: d.update(returns_per_cell=value))
-    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
-        radarsdf.load(write(tmp_path / "wrong.safetensors", tensors, spoilt))
-
-
-def test_files_that_are_not_there(tmp_path):
+            radarsdf.load(path)
+    for version in ("10", "12", "", "1.5", "one"):
+        write(path, tensors, metadata | {"format_version": version})
+        with pytest.raises(ValueError, match="format version"):
+            radarsdf.load(path)
+    for content in (b"\xff" * 64, b"ply\nformat ascii 1.0\n"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+            radarsdf.load(path)
     with pytest.raises(FileNotFoundError, match="nothing"):
         radarsdf.load(tmp_path / "nothing.safetensors")
-    with pytest.raises(ValueError, match=f"{tmp_path} is no map"):
-        radarsdf.load(tmp_path)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("name", ["field.cells.features", "field.sdf_network.layers.0.weight", "origin"])
-def test_values_that_are_not_finite(saved, tmp_path, name, value):
+def test_files_without_checksums_are_read(saved, tmp_path):
+    radar_map, _, tensors, metadata = saved
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, tmp_path / "old", metadata)
+    x = np.random.default_rng(0).uniform([8, -5, -1], [20.5, 5, 2], (100, 3))
+    np.testing.assert_array_equal(radarsdf.load(tmp_path / "old").sdf(x), radar_map.sdf(x))
+
+
+def last(value):
+    """A tensor with another last number."""
+
+    def changed(tensor):
+        tensor = tensor.clone()
+        tensor.view(-1)[-1] = value
+        return tensor
+
+    return changed
+
+
+def longer(tensor):
+    return torch.cat([tensor, tensor[-1:]])
+
+
+def flat(tensor):
+    return tensor.reshape(1, -1)
+
+
+TENSORS = [
+    *((name, last(math.nan)) for name in ("field.cells.features", "field.sdf_network.layers.0.weight")),
+    *((name, last(math.inf)) for name in ("origin", "information", "reflectance.means")),
+    *((name, last(math.nan)) for name in ("echoes.intensities",)),
+    ("information", last(-1.0)),
+    *(
+        (name, change)
+        for name in ("information", "detections", "field.cells.features", "origin", "leaf_keys")
+        for change in (longer, flat, torch.Tensor.half)
+    ),
+    ("leaf_keys", torch.Tensor.neg),
+    ("reflectance.plane_keys", lambda t: t.flip(0)),
+    ("reflectance.table", lambda t: t[1:]),
+    ("passages.keys", lambda t: t * 0),
+    ("echoes.counts", torch.zeros_like),
+    ("echoes.points", lambda t: t[:-1]),
+    ("echoes.directions", lambda t: t.to(torch.int16)),
+]
+
+
+@pytest.mark.parametrize(("name", "change"), TENSORS)
+def test_tensors_that_do_not_fit(saved, tmp_path, name, change):
     _, _, tensors, metadata = saved
-    damaged = tensors[name].clone()
-    damaged.view(-1)[-1] = value
-    path = write(tmp_path / "nan.safetensors", tensors | {name: damaged}, metadata)
-    with pytest.raises(ValueError, match="finite"):
+    path = write(tmp_path / "bad.safetensors", tensors | {name: change(tensors[name])}, metadata)
+    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
         radarsdf.load(path)
 
 
 @pytest.mark.parametrize(
-    "name", ["field.cells.features", "field.sdf_network.layers.2.bias", "origin", "leaf_keys"]
+    "name", ["information", "looks", "field.sdf_network.layers.2.bias", "passages.planes"]
 )
-@pytest.mark.parametrize("fault", ["missing", "longer", "flat", "half"])
-def test_tensors_that_do_not_fit(saved, tmp_path, name, fault):
+def test_a_tensor_that_is_missing_or_too_many(saved, tmp_path, name):
     _, _, tensors, metadata = saved
-    changed = dict(tensors)
-    match fault:
-        case "missing":
-            del changed[name]
-        case "longer":
-            changed[name] = torch.cat([tensors[name], tensors[name][-1:]])
-        case "flat":
-            changed[name] = tensors[name].reshape(1, -1)
-        case "half":
-            changed[name] = tensors[name].half()
-    with pytest.raises(ValueError, match=r"."):
-        radarsdf.load(write(tmp_path / "bad.safetensors", changed, metadata))
-
-
-def test_a_tensor_too_many(saved, tmp_path):
-    _, _, tensors, metadata = saved
-    path = write(tmp_path / "more.safetensors", tensors | {"field.extra": torch.zeros(2)}, metadata)
-    with pytest.raises(ValueError, match="extra"):
-        radarsdf.load(path)
-
-
-@pytest.mark.parametrize("keys", [[5, 5], [7, 5], [-1, 3], [2**62]])
-def test_cells_that_cannot_be(saved, tmp_path, keys):
-    _, _, tensors, metadata = saved
-    path = write(tmp_path / "keys.safetensors", tensors | {"leaf_keys": torch.tensor(keys)}, metadata)
-    with pytest.raises(ValueError, match=r"."):
-        radarsdf.load(path)
+    for changed in ({n: t for n, t in tensors.items() if n != name}, tensors | {"field.x": torch.zeros(2)}):
+        with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+            radarsdf.load(write(tmp_path / "bad.safetensors", changed, metadata))
 
 
 DAMAGE = {
     "unknown setting": lambda d: d["config"].update(colour="red"),
-    "unknown setting of a group": lambda d: d["config"]["training"].update(colour="red"),
     "a group a list": lambda d: d["config"].update(training=[1, 2]),
-    "a group null": lambda d: d["config"].update(training=None),
     "setting out of range": lambda d: d["config"].update(leaf_size_m=-0.2),
-    "setting of another type": lambda d: d["config"]["training"].update(batch_size="many"),
-    "fractional count": lambda d: d["config"]["encoding"].update(num_levels=2.5),
     "number beyond floats": lambda d: d["config"]["training"].update(sigma_cells=10**400),
     "other levels": lambda d: d["config"]["encoding"].update(num_levels=5),
     "other width": lambda d: d["config"]["networks"].update(sdf_hidden=[33, 32]),
-    "no config": lambda d: d.pop("config"),
     "config a list": lambda d: d.update(config=[1, 2]),
     "no report": lambda d: d.pop("report"),
     "report a number": lambda d: d.update(report=3),
-    "no rough share": lambda d: d.pop("rough_share"),
-    "no returns per cell": lambda d: d.pop("returns_per_cell"),
-    "no scale": lambda d: d.pop("intensity_scale"),
+    "clutter ratio": lambda d: d.update(rough_share=1.01),
+    "returns per cell": lambda d: d.update(returns_per_cell=math.nan),
     "scale of one number": lambda d: d.update(intensity_scale=[1.0]),
-    "scale a word": lambda d: d.update(intensity_scale=["low", "high"]),
-    "scale not a number": lambda d: d.update(intensity_scale=[float("nan"), 1.0]),
     "scale upside down": lambda d: d.update(intensity_scale=[2.0, 1.0]),
-    "scale beyond floats": lambda d: d.update(intensity_scale=[10**400, 1]),
     "intensity without weights": lambda d: d.update(intensity_scale=None),
 }
 
@@ -299,18 +228,8 @@ DAMAGE = {
 def test_descriptions_that_do_not_fit(saved, tmp_path, damage):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "bad.safetensors", tensors, with_description(metadata, DAMAGE[damage]))
-    with pytest.raises(ValueError, match=r"."):
+    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
         radarsdf.load(path)
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", "[" * 100_000])
-def test_descriptions_that_are_none(saved, tmp_path, text):
-    _, _, tensors, metadata = saved
-    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
-        radarsdf.load(write(tmp_path / "bad.safetensors", tensors, metadata | {"description": text}))
-    without = {k: v for k, v in metadata.items() if k != "description"}
-    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
-        radarsdf.load(write(tmp_path / "none.safetensors", tensors, without))
 
 
 @pytest.mark.parametrize("failing", ["fsync", "replace"])
@@ -333,56 +252,8 @@ def test_a_failing_save_leaves_the_old_file_and_nothing_else(saved, tmp_path, mo
     assert path.read_bytes() == b"the old map"
 
 
-def test_saving_where_nothing_can_be_written(saved, tmp_path):
-    radar_map = saved[0]
-    with pytest.raises(OSError, match="absent"):
-        radar_map.save(tmp_path / "absent" / "map.safetensors")
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(OSError, match="folder"):
-        radar_map.save(tmp_path / "folder")
-    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
-    assert not list((tmp_path / "folder").iterdir())
-
-
-@pytest.mark.skipif(os.name != "posix", reason="POSIX permissions")
-def test_a_saved_map_has_the_permissions_of_any_new_file(saved, tmp_path):
-    before = os.umask(0o027)
-    try:
-        saved[0].save(tmp_path / "map.safetensors")
-        (tmp_path / "other").write_bytes(b"")
-    finally:
-        os.umask(before)
-    modes = [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("map.safetensors", "other")]
-    assert modes == [0o640, 0o640]
-
-
-def test_saving_overwrites_and_takes_strings(saved, tmp_path):
-    path = str(tmp_path / "map.safetensors")
-    for _ in range(2):
-        saved[0].save(path)
-    assert os.listdir(tmp_path) == ["map.safetensors"]  # noqa: PTH208 - a string is the point
-    assert repr(radarsdf.load(path)) == repr(saved[0])
-
-
-@pytest.fixture(scope="module")
-def saved_closed_form(scene, tmp_path_factory):
-    """A quick map with intensities, its file, and the file's parts."""
-    config = FitConfig.quick()
-    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
-    return saved_parts(radar_map, tmp_path_factory.mktemp("map"))
-
-
-def test_intensities_in_closed_form_are_kept(scene, saved_closed_form):
-    radar_map, path, _, _ = saved_closed_form
-    points = scene.points[0] + scene.poses[0, :3, 3]
-    expected = radar_map.intensity(points, SENSOR)
-    assert np.nanstd(expected) > 0
-    for other in (radarsdf.load(path), pickle.loads(pickle.dumps(radar_map))):
-        np.testing.assert_array_equal(other.intensity(points, SENSOR), expected)
-
-
-def test_what_the_network_leaves_is_added_and_kept(scene, tmp_path):
-    alone, both = (fitted(scene, reflectance=answers) for answers in ("network", "both"))
+def test_what_the_network_leaves_is_added_and_kept(scene, saved):
+    alone, both = fitted(scene, reflectance="network"), saved[0]
     world = [
         scan @ pose[:3, :3].T + pose[:3, 3] for scan, pose in zip(scene.points, scene.poses, strict=True)
     ]
@@ -393,28 +264,8 @@ def test_what_the_network_leaves_is_added_and_kept(scene, tmp_path):
         np.abs(radar_map.intensity(*asked, extrapolate=True) - measured).mean() for radar_map in (alone, both)
     ]
     assert errors[1] < 0.9 * errors[0]
-    both.save(tmp_path / "map.safetensors")
-    again = radarsdf.load(tmp_path / "map.safetensors")
+    again = radarsdf.load(saved[1])
     np.testing.assert_array_equal(again.intensity(*asked), both.intensity(*asked))
-
-
-@pytest.mark.parametrize(
-    ("name", "spoil"),
-    [
-        ("reflectance.means", lambda t: t * math.nan),
-        ("reflectance.means", lambda t: t[1:]),
-        ("reflectance.coefficients", lambda t: t[1:]),
-        ("reflectance.table", lambda t: t[1:]),
-        ("reflectance.normals", lambda t: t.double()),
-        ("reflectance.plane_keys", lambda t: t.flip(0)),
-        ("reflectance.mean_keys", lambda t: t * 0),
-    ],
-)
-def test_damaged_intensities_in_closed_form_are_refused(saved_closed_form, tmp_path, name, spoil):
-    _, _, tensors, metadata = saved_closed_form
-    spoilt = write(tmp_path / "map.safetensors", tensors | {name: spoil(tensors[name])}, metadata)
-    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
-        radarsdf.load(spoilt)
 
 
 def test_columns_of_features_that_are_zero_are_not_in_the_file(saved, tmp_path):
@@ -430,23 +281,20 @@ def test_columns_of_features_that_are_zero_are_not_in_the_file(saved, tmp_path):
     assert again.nbytes == quick.nbytes > 3 * (tmp_path / "quick.safetensors").stat().st_size / 2
 
 
-def test_echoes_are_kept_bit_for_bit(scene, tmp_path):
-    radar_map, path, tensors, metadata = saved_parts(fitted(scene, returns={"passages": True}), tmp_path)
-    loaded, expected = radarsdf.load(path).echoes(), radar_map.echoes()
+def test_view_statistics_are_kept_bit_for_bit(saved):
+    loaded, expected = radarsdf.load(saved[1]).echoes(), saved[0].echoes()
     assert len(expected.counts) > 100
     for name in ("points", "directions", "ranges_m", "intensities", "counts"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(expected, name))
     assert loaded.sigma == expected.sigma > 0
-    for name, wrong, what in (
-        ("counts", torch.zeros_like(tensors["echoes.counts"]), "the echoes hold numbers out of range"),
-        ("points", tensors["echoes.points"][:-1], "the echoes have arrays of wrong shapes"),
-        (
-            "intensities",
-            tensors["echoes.intensities"] * math.nan,
-            "intensities of the echoes is not .* finite",
-        ),
-        ("directions", tensors["echoes.directions"].to(torch.int16), r"directions of .* torch\.int8"),
-    ):
-        write(path, tensors | {f"echoes.{name}": wrong}, metadata)
-        with pytest.raises(ValueError, match=f"is not a whole radarsdf map: {what}"):
-            radarsdf.load(path)
+
+
+def test_what_load_would_refuse_is_not_saved(scene, tmp_path):
+    radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(), progress=False)
+    path = tmp_path / "map.safetensors"
+    radar_map.save(path)
+    before = path.read_bytes()
+    radar_map.field.cells.features[3, 0] = np.nan
+    with pytest.raises(ValueError, match="features"):
+        radar_map.save(path)
+    assert path.read_bytes() == before

@@ -4,15 +4,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.map.meshing import Surface
-from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Tally, Threshold
 
 WALL_X_M = 10.1
@@ -66,15 +64,6 @@ def test_a_patch_that_one_scan_of_many_saw_is_left_out(of_many):
 def test_a_patch_that_one_scan_of_few_saw_is_kept(of_few):
     everything, default = of_few.mesh(min_confidence=0, **MESH), of_few.mesh(**MESH)
     assert triangles_near(default, PATCH_X_M) == triangles_near(everything, PATCH_X_M) > 200
-
-
-def test_a_patch_is_kept_where_few_of_many_scans_looked(of_many):
-    """As the first test, but for the looks: only every tenth scan looked there."""
-    contents = of_many._contents
-    few = dataclasses.replace(of_many.evidence, looks=of_many.evidence.looks // 10)
-    mesh = RadarMap(dataclasses.replace(contents, evidence=few)).mesh(**MESH)
-    everything = of_many.mesh(min_confidence=0, **MESH)
-    assert triangles_near(mesh, PATCH_X_M) == triangles_near(everything, PATCH_X_M) > 200
 
 
 @pytest.mark.parametrize("name", ["of_many", "of_few"])
@@ -139,19 +128,6 @@ def test_the_less_can_be_reached_the_more_is_kept():
     assert unseen.coverage_of_observed == pytest.approx(0.9 / 3)
 
 
-def test_where_nothing_can_be_reached_all_that_adds_something_is_kept():
-    """One scan saw everything, and nothing was seen twice: how much there is nobody knows."""
-    found = tally([1, 1, 1], [0.9, 0.5, 0.2], [5, 3, 1], once=1.6)
-    assert found.reachable == 0
-    assert found.threshold().min_confidence == 0.2
-    assert found.threshold().coverage_of_observed == 0
-
-
-def test_nothing_has_a_threshold_too():
-    found = tally([], np.zeros(0), [], existing=0).threshold()
-    assert found == Threshold(0.0, 0.0, 0.0, 0.0, 0.0)
-
-
 def test_the_sums_of_parts_are_those_of_the_whole(of_many):
     surface = Surface.of(of_many._contents, 0.2)
     middle = surface.vertices[surface.faces].mean(axis=1)[:, 1] > 0
@@ -166,30 +142,3 @@ def test_the_sums_of_parts_are_those_of_the_whole(of_many):
     np.testing.assert_allclose(together.sums(), surface.tally.sums(), rtol=1e-9, atol=1e-9)
     assert together.area_m2.sum() == pytest.approx(surface.part(np.zeros(3), middle | ~middle).area)
     assert together.threshold().min_confidence == surface.tally.threshold().min_confidence
-
-
-def wall_and_clutter(scans):
-    """A wall, and before it 30 places where a scan in 25 has four returns."""
-    places = np.random.default_rng(5).uniform([4, -1.5, -1.5], [8, 1.5, 1.5], (30, 3))
-    places[:, 1:] *= places[:, :1] / WALL_X_M  # all scans look through them at the wall
-    rng = np.random.default_rng(0)
-    points = []
-    for _ in range(scans):
-        here = places[rng.random(len(places)) < 0.04]
-        clutter = here[:, None] + rng.uniform(-0.2, 0.2, (len(here), 4, 3))
-        points.append(np.concatenate([plane(rng, WALL_X_M, 2.0, 50), clutter.reshape(-1, 3)]))
-    return fit(points)
-
-
-def test_ten_times_the_scans_bring_no_more_false_surface():
-    false_m2, all_of_it_m2 = [], []
-    for scans in (15, 150):
-        radar_map = wall_and_clutter(scans)
-        for found, arguments in ((false_m2, {}), (all_of_it_m2, {"min_confidence": 0})):
-            mesh = radar_map.mesh(progress=False, **arguments)
-            is_false = mesh.triangles_center[:, 0] < WALL_X_M - 0.6
-            found.append(mesh.area_faces[is_false].sum())
-            assert mesh.area_faces[~is_false].sum() > 13  # of 16 m² of wall
-    assert 0 < false_m2[1] < false_m2[0]
-    assert all_of_it_m2[1] > 3 * all_of_it_m2[0] > 0  # repeated often enough to be meshed
-    assert false_m2[1] / all_of_it_m2[1] < 0.2 * false_m2[0] / all_of_it_m2[0]

@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 from radarsdf import Odometry, RefinedPoses
-from radarsdf.map.fit_report import checked_report
+from radarsdf.map.storage import checked_report
 from radarsdf.poses.way import pose_sigmas, way_of
 
 

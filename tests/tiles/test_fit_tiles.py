@@ -106,9 +106,7 @@ def two_processes():
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return ProcessPoolExecutor(2, multiprocessing.get_context("spawn"))
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(
-        ["radarsdf.fitting.fit", "radarsdf.map.meshing", "radarsdf.tiles.fit_tiles"]
-    )
+    context.set_forkserver_preload(["radarsdf.fitting.fit", "radarsdf.map.mesh", "radarsdf.tiles.fit_tiles"])
     return ProcessPoolExecutor(2, context)
 
 

@@ -12,7 +12,7 @@ import shutil
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.map.fit_report import checked_report
+from radarsdf.map.storage import checked_report
 from radarsdf.tiles.fit_tiles import run_fits
 from radarsdf.tiles.pieces import Piece
 from radarsdf.tiles.plan import Plan, failure_of, failure_path, map_path

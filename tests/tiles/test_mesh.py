@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import radarsdf
 import trimesh
-from radarsdf.map.isosurface import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.meshing import Surface
+from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
+from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Threshold
 
 from .conftest import TILE_M

@@ -11,7 +11,6 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import TiledMap
-from radarsdf.map.gridding import plane_at
 
 from .conftest import CONFIG, TILE_M
 
@@ -152,7 +151,7 @@ def test_planes_take_one_pass_over_the_tiles(city, monkeypatch):
     monkeypatch.setattr(
         type(city), "known_shares", lambda *args, **options: passes.append(1) or shares(*args, **options)
     )
-    found_m, normals = plane_at(city, x)
+    found_m, normals = city.tangent_planes(x)
     assert len(passes) == 1
     length = np.linalg.norm(gradient, axis=1)
     np.testing.assert_allclose(found_m, distance_m / np.maximum(length, 1), rtol=1e-6, atol=1e-12)

@@ -4,19 +4,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-import torch  # noqa: F401 - before the core
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from radarsdf._core import LocalPlanes
-from radarsdf.changes.placed import Floats, PlacedMap
 from radarsdf.changes.probability import (
     PARALLEL,
     REACH_CELLS,
+    Floats,
+    PlacedMap,
     odds_of_differences,
     posterior,
     share_of_changes,
@@ -51,16 +51,14 @@ _ERRORS = 3.0  # standard errors by which poses that agree about as well differ 
 class Alignment:
     """Where one map lies in the frame of another."""
 
-    T_before_after: Floats
+    T_before_after: Floats = field(default_factory=lambda: np.eye(4))
     """(4, 4) from the later map's world to that of the earlier one, m. The identity unless `improved`."""
-    covariance: Floats
+    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     """(6, 6) of translation, m, and rotation vector about `centre`, rad."""
-    centre: Floats
-    """(3,) world of the earlier map, m."""
-    improved: bool
+    centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
+    improved: bool = False
     """Whether the surfaces show that the frames are apart, at a significance level of 0.001."""
-    words: str
-    """The verdict in one sentence."""
+    words: str = "The maps were taken as they are."  # the verdict in one sentence
 
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
         """(N,) standard error of the alignment at places (N, 3) along their normals (N, 3), m."""
@@ -69,24 +67,19 @@ class Alignment:
         return np.sqrt(np.maximum(variance, 0))
 
 
-def unaligned() -> Alignment:
-    """Both maps are in one frame, and it is taken as it is."""
-    return Alignment(np.eye(4), np.zeros((6, 6)), np.zeros(3), False, "The maps were taken as they are.")
-
-
 def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     """Move the later map so that its surface lies on that of the earlier one, if that is more than chance explains.
 
-    It begins where the frames are, and where a search by planes finds significantly more agreement. The verdict is about the
-    offset over its standard errors: surfaces that lie along it become no nearer, however far it is.
+    It starts from the given frames, and from where a search by planes finds significantly more agreement. The verdict is on
+    the offset over its standard errors: surfaces that lie along it become no nearer, however far it is.
     """
     if min(len(placed.faces) for placed in (before, after)) < CELLS_OF_SURFACE:
-        return unaligned()
+        return Alignment()
     surface, target = _Surface.of(after), _Target(before, cKDTree(before.vertices))
 
     def far(pose: Floats) -> Floats:
         """(N,) logarithms of the distances between the surfaces, about equal where they lie on each other."""
-        near_m, _, distance_m = target.nearest(turned(surface.points, pose[:3, :3]) + pose[:3, 3])
+        near_m, _, distance_m = target.nearest(_placed(surface.points, pose))
         distance_m = np.where(near_m <= target.reach_m, distance_m, near_m)
         found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
         return found
@@ -100,13 +93,13 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     offset = surface.offset(pose)
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
     by_chance = np.sqrt(chi2.isf(_BY_CHANCE, len(offset)))
-    moved_m = np.sqrt(((after.at(pose).to_common(surface.points) - surface.points) ** 2).sum(1).mean())
+    moved_m = np.sqrt(((_placed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
     figures = (
         f"{moved_m:.3f} m, root mean square, {sigmas:.1f} standard errors, by chance up to {by_chance:.1f}"
     )
     if sigmas <= by_chance or left.mean() >= as_given.mean():
         words = f"The frames were taken as they are: surfaces do not show that they are apart ({figures})."
-        return Alignment(np.eye(4), covariance, surface.centre, False, words)
+        return Alignment(covariance=covariance, centre=surface.centre, words=words)
     words = f"The later map was moved so that its surface lies on the earlier one ({figures})."
     if unsure.size:
         words += f" Along {unsure.shape[1]} of 6 axes, surfaces do not determine it: there it stays as given."
@@ -115,18 +108,13 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
 
 @dataclass(frozen=True)
 class _Surface:
-    """Points of the later surface, in the frame that is given."""
+    """Points of the later surface, in its given frame."""
 
-    points: Floats
-    """(N, 3) m."""
-    normals: Floats
-    """(N, 3)"""
-    sigma_m: Floats
-    """(N,) standard errors, m."""
-    patches: NDArray[np.int64]
-    """(N,) number of the patch of each."""
-    centre: Floats
-    """(3,) m."""
+    points: Floats  # (N, 3) m
+    normals: Floats  # (N, 3)
+    sigma_m: Floats  # (N,) standard errors, m
+    patches: NDArray[np.int64]  # (N,) number of the patch of each
+    centre: Floats  # (3,) m
 
     @classmethod
     def of(cls, placed: PlacedMap) -> _Surface:
@@ -200,7 +188,7 @@ def _searched(before: PlacedMap, surface: _Surface) -> Floats:
 
 
 def _determined(target: _Target, surface: _Surface, start: Floats) -> tuple[Floats, Floats, Floats]:
-    """The pose that the surfaces lead to, its covariance, and axes (6, K) that they do not determine: there it stays as given."""
+    """The pose that fits the surfaces, its covariance, and axes (6, K) that they do not determine: there it stays as given."""
     information = np.diag(_APART**-2.0)
     pose, covariance = _settled(target, surface, start, information)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
@@ -219,14 +207,15 @@ def _determined(target: _Target, surface: _Surface, start: Floats) -> tuple[Floa
 
 
 def _settled(target: _Target, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
-    """By Gauss and Newton's method; and the covariance. What changed counts as little as it is probable that it did not.
+    """The pose by Gauss and Newton's method, and its covariance. Points are weighted by the probability that they did not change.
 
-    Normals of both maps have errors, which are independent: products of normals of different maps tell along which axes surfaces determine the
-    pose (instrumental variables). Errors are correlated in a patch, so its sums say how certain the equations are (Hansen 1982).
+    Errors of the normals of both maps are independent: products of normals of different maps tell along which axes surfaces
+    determine the pose (instrumental variables). Errors are correlated in a patch, so the scatter of its sums is the
+    covariance of the equations (Hansen 1982).
     """
     covariance = np.linalg.inv(prior)
     for _ in range(_ITERATIONS):
-        there, own = turned(surface.points, pose[:3, :3]) + pose[:3, 3], turned(surface.normals, pose[:3, :3])
+        there, own = _placed(surface.points, pose), turned(surface.normals, pose[:3, :3])
         offset = surface.offset(pose)
         near_m, rows, distance_m = target.nearest(there)
         normals = target.placed.normals[rows]
@@ -259,7 +248,12 @@ def _settled(target: _Target, surface: _Surface, pose: Floats, prior: Floats) ->
     return pose, np.asarray(covariance, np.float64)
 
 
+def _placed(points: Floats, pose: Floats) -> Floats:
+    """Points (N, 3) moved by a pose (4, 4)."""
+    return turned(points, pose[:3, :3]) + pose[:3, 3]
+
+
 def _jacobian(from_centre: Floats, normals: Floats) -> Floats:
-    """(N, 6) by how much places move along their normals if all are shifted, and turned about a centre."""
+    """(N, 6) derivatives of the places along their normals by a translation, and by a rotation about a centre."""
     turns = np.einsum("ni,nij->nj", normals, -skew(from_centre))
     return np.concatenate([normals, turns], axis=1)

@@ -11,21 +11,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.changes.placed import Floats
 from radarsdf.checks import path_of
 from radarsdf.io.npz import write_arrays
-from radarsdf.map.isosurface import mesh_components
+from radarsdf.map.marching_cubes import mesh_components
 from radarsdf.map.threshold import across_triangles
 
 if TYPE_CHECKING:
     import trimesh
+
+Floats = NDArray[np.float64]
 
 UNSEEN, SAME, GONE, APPEARED, MOVED, REPAINTED = -1, 0, 1, 2, 3, 4
 NAMES = {
     UNSEEN: "unseen", SAME: "same", GONE: "gone", APPEARED: "appeared", MOVED: "moved", REPAINTED: "repainted",
 }  # fmt: skip
 CHANGED = (APPEARED, GONE, MOVED, REPAINTED)
-# Told from each other by colour-blind people, too (Okabe and Ito 2008).
+# Distinguishable by colour-blind people, too (Okabe and Ito 2008).
 COLORS = {
     UNSEEN: (225, 225, 225), SAME: (165, 165, 165), GONE: (213, 94, 0), APPEARED: (0, 158, 115),
     MOVED: (230, 159, 0), REPAINTED: (204, 121, 167),
@@ -34,25 +35,33 @@ COLORS = {
 
 @dataclass(frozen=True)
 class ChangedSurface:
-    """The surface of one map, and what became of it in the other."""
+    """The surface of one map, and how it differs in the other."""
 
     vertices: Floats
     """(V, 3) world of the earlier map, m."""
     faces: NDArray[np.int32]
     """(F, 3) rows of vertices. They face free space."""
     kind: NDArray[np.int8]
-    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved, 4 repainted. Unseen: the other map does not tell. Repainted, on the
-    later surface: as it was, but for its reflectance."""
+    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved, 4 repainted. Unseen: the other map does not know the place.
+    Repainted, on the later surface: only the reflectance changed."""
     probability: NDArray[np.float32]
     """(V,) of that change; of the likeliest one where it is the same or unseen."""
     moved_m: NDArray[np.float32]
-    """(V,) how far the surface moved along its normal towards free space, m. NaN where it did not."""
+    """(V,) how far the surface moved along its normal towards free space, m. NaN for other kinds."""
     intensity_change: NDArray[np.float32]
-    """(V,) later less earlier intensity from views that both drives had, sensor units, without what all places have in
-    common. NaN where there were none."""
+    """(V,) later less earlier intensity from views that both drives had, sensor units, without the offset that all places have
+    in common. NaN without such views."""
 
     def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
-        """(F,) kind of each face, that of most of its vertices, or the first; and areas, m²."""
+        """Kinds and areas of the faces.
+
+        Returns
+        -------
+        kind : (F,) ndarray of int8
+            That of most of its vertices, or of the first.
+        area_m2 : (F,) ndarray of float64
+            m².
+        """
         kinds = self.kind[self.faces]
         _, twice_m2 = across_triangles(self.vertices, self.faces)
         return np.where(kinds[:, 1] == kinds[:, 2], kinds[:, 1], kinds[:, 0]), 0.5 * twice_m2
@@ -60,7 +69,7 @@ class ChangedSurface:
 
 @dataclass(frozen=True)
 class Region:
-    """Faces of one change that hang together."""
+    """A connected component of faces of one kind of change."""
 
     kind: str
     """``appeared``, ``gone``, ``moved`` or ``repainted``."""
@@ -97,14 +106,24 @@ class Changes:
     T_before_after: Floats
     """(4, 4) from the later map's world to that of the earlier one, m."""
     report: dict[str, Any]
-    """`alignment`: in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map tells of; `changed_share`, the
-    probable share of it that changed; `scale` and `freedom`: over their standard errors, distances between the maps follow
-    Student's t with so many degrees of freedom, so much widened;
-    `reflectance`: what intensities have in common, in words, or why they were not compared; `intensity_offset`, by which all of them
-    changed, sensor units, None if they were not compared."""
+    """`alignment`: in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map knows; `changed_share`, the
+    estimated share of it that changed; `freedom` and `scale` of Student's t, which distances between the maps follow over
+    their standard errors; `reflectance`: the common offset of intensities in words, or why they were not compared;
+    `intensity_offset`, sensor units, None if they were not compared."""
 
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:
-        """Changes that hang together, the largest first; without those of a smaller area, m²."""
+        """Connected components of changes.
+
+        Parameters
+        ----------
+        min_area_m2 : float
+            Smaller regions are left out, m².
+
+        Returns
+        -------
+        list of Region
+            The largest first.
+        """
         found = []
         for surface, kinds in ((self.before, (GONE, MOVED)), (self.after, (APPEARED, MOVED, REPAINTED))):
             of_faces, areas = surface.of_faces()
@@ -115,26 +134,30 @@ class Changes:
                 for faces in np.split(rows[order], np.cumsum(sizes)[:-1]) if len(rows) else []:
                     vertices = np.unique(surface.faces[faces])
                     x = surface.vertices[vertices]
-                    found.append(
-                        Region(
-                            NAMES[kind], np.stack([x.min(axis=0), x.max(axis=0)]), float(areas[faces].sum()),
-                            float(surface.probability[vertices].mean()),
-                            _mean(surface.moved_m[vertices]) if kind == MOVED else None,
-                            _mean(surface.intensity_change[vertices]) if kind == REPAINTED else None,
-                        )
-                    )  # fmt: skip
-        found.sort(key=lambda region: -region.area_m2)
-        return [region for region in found if region.area_m2 >= min_area_m2]
+                    region = Region(
+                        NAMES[kind],
+                        np.stack([x.min(axis=0), x.max(axis=0)]),
+                        float(areas[faces].sum()),
+                        float(surface.probability[vertices].mean()),
+                        _mean(surface.moved_m[vertices]) if kind == MOVED else None,
+                        _mean(surface.intensity_change[vertices]) if kind == REPAINTED else None,
+                    )
+                    if region.area_m2 >= min_area_m2:
+                        found.append(region)
+        return sorted(found, key=lambda region: -region.area_m2)
 
     def mesh(self) -> trimesh.Trimesh:
-        """The later surface, and of the earlier one what is gone or moved, in colours.
+        """The later surface, and the faces of the earlier one that are gone or moved, in colours.
 
-        Green appeared, vermilion is gone, orange moved, purple was repainted, grey is the same, and light
-        grey was not seen before. `kind`, `probability`, `moved_m` and `intensity_change` are attributes of the vertices.
+        Returns
+        -------
+        trimesh.Trimesh
+            World of the earlier map, m. Green appeared, vermilion is gone, orange moved, purple was repainted, grey is the
+            same, and light grey is unseen. ``vertex_attributes`` are `kind`, `probability`, `moved_m` and `intensity_change`.
         """
         import trimesh  # noqa: PLC0415 - slow to import
 
-        from radarsdf.map.meshing import renumbered  # noqa: PLC0415 - it imports trimesh
+        from radarsdf.map.mesh import renumbered  # noqa: PLC0415 - it imports trimesh
 
         of_faces, _ = self.before.of_faces()
         lost = self.before.faces[(of_faces == GONE) | (of_faces == MOVED)]
@@ -151,7 +174,7 @@ class Changes:
         return mesh
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes the changes to a file. An old one is replaced only once the new one is complete.
+        """Write the changes to a file. An old one is replaced only once the new one is complete.
 
         Parameters
         ----------
@@ -172,7 +195,10 @@ class Changes:
         if target.suffix != ".npz":
             write_mesh(target, self.mesh())
             return
-        arrays = {f"{side}_{name}": value for side in ("before", "after") for name, value in vars(getattr(self, side)).items()}  # fmt: skip
+        surfaces = {"before": self.before, "after": self.after}
+        arrays = {
+            f"{side}_{name}": value for side, of in surfaces.items() for name, value in vars(of).items()
+        }
         write_arrays(target, {"T_before_after": self.T_before_after} | arrays, compressed=True)
 
 

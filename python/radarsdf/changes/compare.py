@@ -5,12 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.changes.alignment import Alignment, align, unaligned
+from radarsdf.changes.alignment import Alignment, align
 from radarsdf.changes.changes import (
     APPEARED,
     CHANGED,
@@ -23,11 +24,12 @@ from radarsdf.changes.changes import (
     ChangedSurface,
     Changes,
 )
-from radarsdf.changes.placed import Floats, PlacedMap
 from radarsdf.changes.probability import (
-    Absence,
-    Beside,
+    REACH_CELLS,
     Errors,
+    Floats,
+    PlacedMap,
+    Side,
     errors_of,
     posterior,
     share_of_changes,
@@ -36,10 +38,10 @@ from radarsdf.changes.reflectance import Differences
 from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
+from radarsdf.grids.occupancy import check_passages
 from radarsdf.io.scans import Scans
-from radarsdf.map.gridding import check_passages
 from radarsdf.map.map import Map
-from radarsdf.map.meshing import renumbered
+from radarsdf.map.mesh import renumbered
 
 _PROBABLE = 0.5  # more likely than not
 _LEVEL = np.cos(np.pi / 4)  # least part of a level surface's normal that is upright
@@ -59,13 +61,12 @@ def compare(
     box: ArrayLike | None = None,
     progress: bool | None = None,
 ) -> Changes:
-    """What appeared, what is gone, what moved its surface and what was repainted between two maps.
+    """Find what appeared, is gone, moved its surface or was repainted between two maps of one place.
 
-    "Not seen" is not "gone". A surface is gone only where rays of the later drive passed the place, and it appeared only where
-    those of the earlier drive did. A place that the other drive did not see through is unseen. How likely a change is follows
-    from both maps: from their distance beside their uncertainty, from how many scans hit the place and passed it on both
-    days, from the confidence of the surface that changed, and from how strong returns were that were seen alike. How much changes at
-    all is found from all places together.
+    Unseen is not gone. A surface is gone only where rays of the later drive passed the place, and it appeared only where
+    those of the earlier drive did; elsewhere it is unseen. The probability of a change follows from the distance of the
+    surfaces and its standard error, from how many scans hit the place and passed it on both days, from the confidence of the
+    surface that changed, and from intensities of equal views. The share of what changed is estimated from all places together.
 
     Parameters
     ----------
@@ -93,16 +94,16 @@ def compare(
     Raises
     ------
     ValueError
-        If a map does not keep what rays passed or has no surface, for wrong arguments, or if the maps do not fit together: they saw no surface
-        in common, or of the level or of the steep surfaces that they have in common, more would have changed than agrees.
+        If a map has no free-space crossings (``returns.passages``) or no surface, for wrong arguments, or if the maps do not
+        fit together: they saw no surface in common, or of the level or of the steep surfaces that they have in common, more
+        would have changed than agrees.
     TypeError
         If `before` is no map.
 
     Notes
     -----
     A thing that stood on the ground is "moved" where its top was about parallel to the ground and within two leaf cells of it.
-    Repainted is what both maps have, but what answers more strongly or weakly on the later day, from views that both drives had.
-    Echoes near what appeared, went or moved are left out.
+    Intensities near what appeared, went or moved are left out.
     """
     if not isinstance(before, Map):
         msg = f"before must be a map, not {type(before).__name__}"
@@ -120,45 +121,24 @@ def compare(
         if len(placed.faces) == 0:
             msg = f"{name} has no surface: its mesh has 0 triangles. Fit it with more scans of the place"
             raise ValueError(msg)
-    alignment = align(earlier, later) if align_frames else unaligned()
+    alignment = align(earlier, later) if align_frames else Alignment()
     later = later.at(alignment.T_before_after)
-    sides = (
-        _Side.of(earlier, later, alignment),
-        _Side.of(later, earlier, alignment),
+    sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
+    errors = errors_of(sides)
+    log_odds = [side.log_odds(errors) for side in sides]
+    share = share_of_changes(np.concatenate([absent for absent, _ in log_odds]))
+    gone, appeared = (
+        _changed(side, *odds, share, kind)
+        for side, odds, kind in zip(sides, log_odds, (GONE, APPEARED), strict=True)
     )
-    errors = errors_of([side.beside for side in sides])
-    found = [side.beside.absence(errors) for side in sides]
-    share = share_of_changes(np.concatenate([absence.absent for absence in found]))
-    told = [
-        side.kinds(absence, share, kind)
-        for side, absence, kind in zip(sides, found, (GONE, APPEARED), strict=True)
-    ]
-    _check_common(sides, [kinds for kinds, _, _ in told], errors, alignment)
+    _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
-    changes = [np.full(len(side.vertices), np.nan) for side in sides]
     if differences is not None and differences.other_units is None:
-        changed = np.concatenate(
-            [side.vertices[kinds > SAME] for side, (kinds, _, _) in zip(sides, told, strict=True)]
-        )
-        kinds, probability, moved_m = told[1]
-        same = kinds == SAME
-        changes[1], repainted = differences.apart_from(changed).probability(sides[1].vertices, same)
-        told[1] = (
-            np.where(repainted > _PROBABLE, REPAINTED, kinds).astype(np.int8),
-            np.where(same, np.maximum(probability, repainted), probability),
-            moved_m,
-        )
-    before_surface, after_surface = (
-        _inside(
-            corners,
-            ChangedSurface(
-                side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m.astype(np.float32),
-                change.astype(np.float32),
-            ),
-        )
-        for side, (kinds, probability, moved_m), change in zip(sides, told, changes, strict=True)
-    )  # fmt: skip
-    return _summed(before_surface, after_surface, alignment, share, errors, differences)
+        changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
+        appeared = _repainted(appeared, differences.apart_from(np.concatenate(changed)))
+    surfaces = [surface if corners is None else _inside(corners, surface) for surface in (gone, appeared)]
+    report = _report(surfaces, alignment, share, errors, differences)
+    return Changes(surfaces[0], surfaces[1], alignment.T_before_after, report)
 
 
 def _quick(config: FitConfig) -> FitConfig:
@@ -176,51 +156,60 @@ def _quick(config: FitConfig) -> FitConfig:
     )
 
 
-@dataclass(frozen=True)
-class _Side:
-    """The surface of one map, beside the other map."""
-
-    vertices: Floats
-    faces: NDArray[np.int32]
-    own_map: PlacedMap
-    other_map: PlacedMap
-    beside: Beside
-
-    @classmethod
-    def of(cls, own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> _Side:
-        vertices = own_map.to_common(own_map.vertices)
-        own = own_map.told(vertices)
-        other = other_map.told(vertices, own.normals)
-        sigma_m = np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals))
-        return cls(
-            vertices, own_map.faces, own_map, other_map, Beside.of(own, other, other_map.leaf_m, sigma_m)
-        )
-
-    def kinds(self, absence: Absence, share: float, lost: int) -> tuple[NDArray[np.int8], Floats, Floats]:
-        """(V,) kinds, probabilities and movements. `lost`: what a surface is that the other map has not."""
-        own, other = self.beside.own, self.beside.other
-        absent = own.confidence * posterior(absence.absent, share)
-        elsewhere = own.confidence * posterior(absence.shifted, share)
-        parallel = self.beside.parallel
-        shifted = np.where(parallel, other.confidence * elsewhere, 0.0)
-        seen = np.isfinite(other.distance_m)
-        behind = seen & (other.distance_m < 0)
-        kinds = np.where(seen, SAME, UNSEEN).astype(np.int8)
-        # What lies deep behind the other surface is hidden by it.
-        kinds[behind & ~parallel & (elsewhere > _PROBABLE)] = UNSEEN
-        kinds[~behind & (absent > _PROBABLE)] = lost
-        # A surface that is elsewhere is more than one that is not here. Before the other one, rays must have passed, too.
-        kinds[(shifted > _PROBABLE) & (behind | (seen & (absent > _PROBABLE)))] = MOVED
-        probability = np.where(kinds == MOVED, np.maximum(shifted, np.where(behind, 0, absent)), absent)
-        # Along the normal: the earlier surface moved to where the later one is.
-        towards = -other.distance_m if lost == GONE else other.distance_m
-        return kinds, probability, np.where(kinds == MOVED, towards, np.nan)
+def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
+    """The surface of one map, with the evidence of both."""
+    vertices = own_map.to_common(own_map.vertices)
+    own = own_map.evidence(vertices)
+    other = other_map.evidence(vertices, own.normals)
+    own_sigma_m = np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals))
+    sigma_m = np.hypot(own_sigma_m, other.sigma_m)
+    return Side(vertices, own_map.faces, own, other, sigma_m, REACH_CELLS * other_map.leaf_m)
 
 
-def _inside(box: Floats | None, surface: ChangedSurface) -> ChangedSurface:
-    """The triangles in a box (2, 3), world of the earlier map, m. None: all."""
-    if box is None:
-        return surface
+def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
+    """Kinds, probabilities and movements by log odds (V,). `lost`: the kind of a surface that the other map has not."""
+    own, other = side.own, side.other
+    gone = own.confidence * posterior(absent, share)
+    elsewhere = own.confidence * posterior(shifted, share)
+    parallel = side.parallel
+    moved = np.where(parallel, other.confidence * elsewhere, 0.0)
+    seen = np.isfinite(other.distance_m)
+    behind = seen & (other.distance_m < 0)
+    kinds = np.where(seen, SAME, UNSEEN).astype(np.int8)
+    # What lies deep behind the other surface is hidden by it.
+    kinds[behind & ~parallel & (elsewhere > _PROBABLE)] = UNSEEN
+    kinds[~behind & (gone > _PROBABLE)] = lost
+    # A surface that is elsewhere is more than one that is not here. In front of the other one, rays must have passed, too.
+    kinds[(moved > _PROBABLE) & (behind | (seen & (gone > _PROBABLE)))] = MOVED
+    probability = np.where(kinds == MOVED, np.maximum(moved, np.where(behind, 0, gone)), gone)
+    # Along the normal: the earlier surface moved to where the later one is.
+    towards = -other.distance_m if lost == GONE else other.distance_m
+    return ChangedSurface(
+        side.vertices,
+        side.faces,
+        kinds,
+        probability.astype(np.float32),
+        np.where(kinds == MOVED, towards, np.nan).astype(np.float32),
+        np.full(len(kinds), np.nan, np.float32),
+    )
+
+
+def _repainted(surface: ChangedSurface, differences: Differences) -> ChangedSurface:
+    """The later surface, with what changed its reflectance alone."""
+    same = surface.kind == SAME
+    change, probability = differences.probability(surface.vertices, same)
+    return replace(
+        surface,
+        kind=np.where(probability > _PROBABLE, REPAINTED, surface.kind).astype(np.int8),
+        probability=np.where(
+            same, np.maximum(surface.probability, probability.astype(np.float32)), surface.probability
+        ),
+        intensity_change=change.astype(np.float32),
+    )
+
+
+def _inside(box: Floats, surface: ChangedSurface) -> ChangedSurface:
+    """The triangles in a box (2, 3), world of the earlier map, m."""
     within = ((surface.vertices >= box[0]) & (surface.vertices <= box[1])).all(axis=1)
     used, faces = renumbered(len(within), surface.faces[within[surface.faces].all(axis=1)])
     of_vertices = {name: values[used] for name, values in vars(surface).items() if name != "faces"}
@@ -228,24 +217,23 @@ def _inside(box: Floats | None, surface: ChangedSurface) -> ChangedSurface:
 
 
 def _check_common(
-    sides: Sequence[_Side], kinds: Sequence[NDArray[np.int8]], errors: Errors, alignment: Alignment
+    sides: Sequence[Side], kinds: Sequence[NDArray[np.int8]], errors: Errors, alignment: Alignment
 ) -> None:
-    """Raises a ValueError if the maps do not fit together.
+    """Raise a ValueError if the maps do not fit together.
 
-    Maps in wrong frames agree about the ground and a level floor, so level and steep surfaces are judged each for themselves;
+    Maps in wrong frames agree about the ground and a level floor, so level and steep surfaces are judged separately;
     and on both sides, since a place may be cleared.
     """
     if all((of_side == UNSEEN).all() for of_side in kinds):
         msg = f"the maps have no surface in common: they are of other places, or in other frames. {alignment.words}"
         raise ValueError(msg)
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
-    levels = [np.abs(side.beside.own.normals[:, 2]) >= _LEVEL for side in sides]
+    levels = [np.abs(side.own.normals[:, 2]) >= _LEVEL for side in sides]
     for name, chosen in (("level", levels), ("steep", [~level for level in levels])):
-        changed = [int((mask & (of_side > SAME)).sum()) for mask, of_side in zip(chosen, kinds, strict=True)]
-        agree = [
-            int((mask & side.beside.agree(errors, _AGREEING_SIGMAS) & (of_side == SAME)).sum())
-            for side, mask, of_side in zip(sides, chosen, kinds, strict=True)
-        ]
+        changed, agree = [], []
+        for side, mask, of_side in zip(sides, chosen, kinds, strict=True):
+            changed.append(int((mask & (of_side > SAME)).sum()))
+            agree.append(int((mask & side.agree(errors, _AGREEING_SIGMAS) & (of_side == SAME)).sum()))
         if sum(changed) > _MOST_CHANGED * seen and all(a > b for a, b in zip(changed, agree, strict=True)):
             shares = [f"{a / (a + b):.0%}" for a, b in zip(changed, agree, strict=True)]
             msg = (
@@ -256,13 +244,17 @@ def _check_common(
             raise ValueError(msg)
 
 
-def _summed(
-    before: ChangedSurface, after: ChangedSurface, alignment: Alignment, share: float, errors: Errors,
+def _report(
+    surfaces: Sequence[ChangedSurface],
+    alignment: Alignment,
+    share: float,
+    errors: Errors,
     differences: Differences | None,
-) -> Changes:  # fmt: skip
+) -> dict[str, Any]:
+    """See :attr:`Changes.report`."""
     areas = dict.fromkeys((NAMES[kind] for kind in CHANGED), 0.0)
     compared = 0.0
-    for surface in (before, after):
+    for surface in surfaces:
         of_faces, face_m2 = surface.of_faces()
         compared += float(face_m2[of_faces != UNSEEN].sum())
         for kind in CHANGED:
@@ -270,7 +262,7 @@ def _summed(
     words, offset = "Reflectance was not compared: a map has no intensities, or they share no view.", None
     if differences is not None:
         words, offset = differences.words, None if differences.other_units else differences.offset
-    report = {
+    return {
         "alignment": alignment.words,
         "areas_m2": areas,
         "compared_m2": compared,
@@ -280,4 +272,3 @@ def _summed(
         "reflectance": words,
         "intensity_offset": offset,
     }
-    return Changes(before, after, alignment.T_before_after, report)

@@ -1,35 +1,131 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How probable it is that a place changed, from what two maps tell of it.
+"""How probable it is that a place changed, from the evidence of two maps.
 
 Every probability here is Bayes' rule for two explanations, nothing changed or something did. The share of what
-changed is unknown, too. It is found from all places together (empirical Bayes, Efron 2010): so where nothing changed, chance alone
-makes few changes.
+changed is unknown, too. It is estimated from all places together (empirical Bayes, Efron 2010): so where nothing changed,
+chance alone makes few changes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 from scipy.special import betaln, expit, gammaln, stdtr
 
-from radarsdf.changes.placed import Floats, Told
+from radarsdf.map.map import Map
+from radarsdf.products import turned
+
+Floats = NDArray[np.float64]
 
 REACH_CELLS = 2.0
 """A field knows distances about so far from its surface: returns scatter into the next cells."""
-_LEAST_SHARE, _MOST_SHARE = 1e-6, 0.5
-_ROUNDS, _SETTLED = 50, 1e-4  # of the share
-# Returns of a scan in cells side by side have causes in common: so many of them count once. Chosen on facade, hall and
-# forest of seed 31.
-_CELLS_PER_SCAN = 2.0
 PARALLEL = np.cos(np.pi / 4)
 """Least cosine between normals of surfaces that are about parallel: one that moved still is."""
+_BLOCK_M = 32.0  # cells are looked up in blocks, so that few are in memory
+# Behind a surface: so far, the 27 cells hardly reach the side from which it is seen.
+_BEHIND_CELLS = 1.5
+_CELLS_ALONG_RAY = 3.0  # of the 27 near a place that one ray crosses, on average about
+_LEAST_SHARE, _MOST_SHARE = 1e-6, 0.5
+_ROUNDS, _SETTLED = 50, 1e-4  # of the share
+# Returns of a scan in adjacent cells have causes in common: so many of them count once. Chosen on facade, hall and
+# forest of seed 31.
+_CELLS_PER_SCAN = 2.0
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
-_MOST_DISTANCES = 5_000  # that tell both, evenly spread
+_MOST_DISTANCES = 5_000  # evenly spread, for both
+
+
+@dataclass(frozen=True)
+class PlaceEvidence:
+    """Surface, hits and free space of a map at N places."""
+
+    distance_m: Floats
+    """(N,) from the surface along its normal, positive in free space. NaN where it was not observed."""
+    normals: Floats  # (N, 3) of that surface, towards free space, in the common frame
+    sigma_m: Floats  # (N,) standard error of the surface's position. NaN where there are no returns.
+    confidence: Floats  # (N,) probability of a surface there
+    hits: Floats  # (N,) scans with returns in the 27 leaf cells near the place, added up over the cells
+    passes: Floats
+    """(N,) scans with rays through the 27 cells near a place behind the surface, likewise, a ray counted once. Rays that graze a
+    surface pass in front of it, and do not tell that it is not there."""
+
+
+@dataclass(frozen=True)
+class PlacedMap:
+    """A map, and where it lies in the common frame."""
+
+    radar_map: Map
+    T_common_map: Floats  # (4, 4) from the map's world to the common frame, m
+    vertices: Floats  # (V, 3) of the mesh that the map keeps by default, in leaf cells; world of the map, m
+    faces: NDArray[np.int32]  # (F, 3) rows of vertices
+    normals: Floats  # (V, 3) of the mesh, towards free space
+    sigma_m: Floats  # (V,) standard errors of the vertices, m
+
+    @classmethod
+    def of(cls, radar_map: Map) -> PlacedMap:
+        """A map whose world is the common frame."""
+        mesh = radar_map.mesh(radar_map.config.leaf_size_m, progress=False)
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+        normals = np.asarray(mesh.vertex_normals, np.float64)
+        sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
+        return cls(radar_map, np.eye(4), vertices, faces, normals, sigma_m)
+
+    def at(self, T_common_map: Floats) -> PlacedMap:
+        """The map in another place (4, 4)."""
+        return replace(self, T_common_map=T_common_map)
+
+    @property
+    def leaf_m(self) -> float:
+        """Edge of a leaf cell, m."""
+        return self.radar_map.config.leaf_size_m
+
+    def to_own(self, x: Floats) -> Floats:
+        """Places (N, 3) of the common frame in the world of the map."""
+        return turned(x - self.T_common_map[:3, 3], self.T_common_map[:3, :3].T)
+
+    def to_common(self, x: Floats) -> Floats:
+        """Places (N, 3) of the map's world in the common frame."""
+        return turned(x, self.T_common_map[:3, :3]) + self.T_common_map[:3, 3]
+
+    def evidence(self, x: Floats, facing: Floats | None = None) -> PlaceEvidence:
+        """At places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
+        own = self.to_own(x)
+        evidence, sigma_m, confidence = self.radar_map.surface_at(torch.from_numpy(np.ascontiguousarray(own)))
+        distance_m, normals = self.radar_map.tangent_planes(own)
+        normals = turned(normals, self.T_common_map[:3, :3])
+        behind = x - _BEHIND_CELLS * self.leaf_m * np.nan_to_num(normals if facing is None else facing)
+        return PlaceEvidence(
+            distance_m,
+            normals,
+            sigma_m.double().numpy(),
+            confidence.double().numpy(),
+            evidence.detections.numpy().astype(np.float64),
+            self._passes(self.to_own(behind)),
+        )
+
+    def _passes(self, own: Floats) -> Floats:
+        """(N,) see :attr:`PlaceEvidence.passes`, of places (N, 3), world of the map, m."""
+        found = np.zeros(len(own))
+        leaf_m = self.leaf_m
+        blocks = np.floor(own / _BLOCK_M).astype(np.int64)
+        order = np.lexsort(blocks.T)
+        edges = np.flatnonzero((np.diff(blocks[order], axis=0) != 0).any(axis=1)) + 1
+        for rows in np.split(order, edges):
+            if len(rows) == 0:
+                continue
+            x = own[rows]
+            cells = self.radar_map.cells_round(x.min(axis=0) - 2 * leaf_m, x.max(axis=0) + 2 * leaf_m)
+            # The core counts up to seven scans for a cell: counts up to 63 tell no more (bench/history/changes.md).
+            near = 27 * uniform_filter(cells.passed.astype(np.float32), 3, mode="constant")
+            places = np.floor((x - cells.corner) / leaf_m).astype(np.int64)
+            found[rows] = np.rint(near[tuple(places.T)]) / _CELLS_ALONG_RAY
+        return found
 
 
 @dataclass(frozen=True)
@@ -39,10 +135,8 @@ class Errors:
     At edges, in corners and at ghosts both maps are worse than their uncertainty says, so some distances are far off.
     """
 
-    freedom: float
-    """Degrees of freedom. Few: some distances are far larger than the others."""
-    scale: float
-    """By how much they are larger than the standard errors say."""
+    freedom: float  # degrees of freedom. Few: some distances are far larger than the others.
+    scale: float  # by how much they are larger than the standard errors say
 
     @classmethod
     def of(cls, distance_m: Floats, sigma_m: Floats, reach_m: Floats) -> Errors:
@@ -67,7 +161,7 @@ class Errors:
         return found
 
     def log_spread(self, distance_m: Floats, sigma_m: Floats, lower_m: float, upper_m: float) -> Floats:
-        """The same of a surface that lies anywhere in [lower_m, upper_m]."""
+        """:meth:`log_density` for a surface that lies anywhere in [lower_m, upper_m]."""
         width_m = self.scale * sigma_m
         inside = stdtr(self.freedom, (upper_m - distance_m) / width_m)
         inside -= stdtr(self.freedom, (lower_m - distance_m) / width_m)
@@ -77,52 +171,40 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Absence:
-    """Whether a surface of one map is in the other."""
+class Side:
+    """The surface of one map, with the evidence of both maps at its vertices."""
 
-    absent: Floats
-    """(N,) logarithm of how much more likely it is that rays saw through the place than that the surface is still there."""
-    shifted: Floats
-    """(N,) the same of a surface that is elsewhere along its normal, to either side. -inf where none was observed."""
-
-
-@dataclass(frozen=True)
-class Beside:
-    """Places on the surface of one map, beside another map."""
-
-    own: Told
-    other: Told
-    sigma_m: Floats
-    """(N,) standard error of the distance between both surfaces, with that of the alignment, m."""
-    reach_m: float
-    """So far from its surface the other map knows distances, m."""
-
-    @classmethod
-    def of(cls, own: Told, other: Told, other_leaf_m: float, own_sigma_m: Floats) -> Beside:
-        """`own_sigma_m` (N,): errors of the own surface, with those of the alignment, m."""
-        return cls(own, other, np.hypot(own_sigma_m, other.sigma_m), REACH_CELLS * other_leaf_m)
+    vertices: Floats  # (V, 3) common frame, m
+    faces: NDArray[np.int32]  # (F, 3) rows of vertices
+    own: PlaceEvidence
+    other: PlaceEvidence
+    sigma_m: (
+        Floats  # (V,) standard error of the distance between both surfaces, with that of the alignment, m
+    )
+    reach_m: float  # So far from its surface the other map knows distances, m
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """(N,) whether the distance is known."""
+        """(V,) whether the distance is known."""
         return np.isfinite(self.other.distance_m) & np.isfinite(self.sigma_m)
 
     @property
     def parallel(self) -> NDArray[np.bool_]:
-        """(N,) whether the other map's surface is about parallel."""
+        """(V,) whether the other map's surface is about parallel."""
         mask: NDArray[np.bool_] = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
         return mask
 
     def agree(self, errors: Errors, sigmas: float) -> NDArray[np.bool_]:
-        """(N,) whether the other map has the surface, to within so many of its standard errors."""
+        """(V,) whether the other map has the surface, to within so many of its standard errors."""
         return self.parallel & (np.abs(self.other.distance_m) <= sigmas * errors.scale * self.sigma_m)
 
     def distances(self) -> tuple[Floats, Floats]:
         """(K,) distances that are known, and their standard errors, m."""
         return self.other.distance_m[self.observed], self.sigma_m[self.observed]
 
-    def absence(self, errors: Errors) -> Absence:
-        """Whether the surface is in the other map."""
+    def log_odds(self, errors: Errors) -> tuple[Floats, Floats]:
+        """Logarithms (V,) of how much more likely the evidence is if the surface is absent from the other map than if it is still
+        there; and if it is elsewhere along its normal, to either side, -inf where that was not observed."""
         observed, reach_m = self.observed, self.reach_m
         distance_m, sigma_m = self.distances()
         same = errors.log_density(distance_m, sigma_m)
@@ -130,10 +212,10 @@ class Beside:
         shifted = np.full(len(absent), -np.inf)
         shifted[observed] = errors.log_spread(distance_m, sigma_m, -reach_m, reach_m) - same
         absent[observed] += errors.log_spread(distance_m, sigma_m, 0.0, reach_m) - same
-        return Absence(absent, shifted)
+        return absent, shifted
 
 
-def errors_of(sides: Sequence[Beside]) -> Errors:
+def errors_of(sides: Sequence[Side]) -> Errors:
     """The errors of the distances between two maps."""
     known = [side.distances() for side in sides]
     reaches_m = [np.full(len(found[0]), side.reach_m) for side, found in zip(sides, known, strict=True)]
@@ -141,8 +223,8 @@ def errors_of(sides: Sequence[Beside]) -> Errors:
     return Errors.of(distance_m, sigma_m, np.concatenate(reaches_m))
 
 
-def _passed(own: Told, other: Told) -> Floats:
-    """(N,) logarithm of how much more likely rays of the other map are if it is no longer there.
+def _passed(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
+    """(N,) logarithm of how much more likely rays of the other map are if the surface is no longer there.
 
     Of all scans whose rays came to a place, some have returns there, and others passed behind it. If nothing changed, that
     share is the one that the own map shows: few of a thin fence. If the surface is gone, it is another one (beta-binomial).
@@ -166,7 +248,7 @@ def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Flo
 
 
 def share_of_changes(log_odds: Floats) -> float:
-    """The share of places that changed, which makes what was seen of all of them most likely."""
+    """The share of places that changed that makes the evidence of all of them most likely."""
     share = 0.01
     if len(log_odds) == 0:
         return _LEAST_SHARE

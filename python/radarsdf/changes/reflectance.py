@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How strong echoes are on two days, at places and from views that both drives had."""
+"""Mean intensities on two days, at places and from views that both drives had."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.changes.placed import Floats, PlacedMap
-from radarsdf.changes.probability import odds_of_differences, posterior, share_of_changes
+from radarsdf.changes.probability import (
+    Floats,
+    PlacedMap,
+    odds_of_differences,
+    posterior,
+    share_of_changes,
+)
 from radarsdf.products import turned
 from radarsdf.returns.echoes import PLACE_CELLS, EchoesAt, rows_of_views
 
@@ -24,19 +29,16 @@ _FEWEST_VIEWS = 10
 class _Means:
     """Numbers at places, each with a variance."""
 
-    points: Floats
-    """(K, 3) common frame, m."""
-    values: Floats
-    """(K,) sensor units."""
-    variances: Floats
-    """(K,) by how many returns they are means of."""
+    points: Floats  # (K, 3) common frame, m
+    values: Floats  # (K,) sensor units
+    variances: Floats  # (K,) by how many returns they are means of
 
     def select(self, chosen: NDArray[np.bool_]) -> _Means:
         """Some (K,) of them."""
         return _Means(self.points[chosen], self.values[chosen], self.variances[chosen])
 
-    def round(self, x: Floats, reach_m: float) -> _Round:
-        """What those within reach of places (V, 3) tell."""
+    def near(self, x: Floats, reach_m: float) -> _Near:
+        """The means within reach of places (V, 3)."""
         tree = cKDTree(self.points)
         near = cKDTree(x).sparse_distance_matrix(tree, reach_m, output_type="coo_matrix")
 
@@ -49,7 +51,7 @@ class _Means:
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = total(weights * self.values) / weight
             chi2 = total(weights * self.values**2) - weight * mean**2
-            return _Round(
+            return _Near(
                 mean,
                 1 / np.sqrt(weight),
                 np.nan_to_num(chi2),
@@ -57,33 +59,24 @@ class _Means:
             )
 
 
-class _Round(NamedTuple):
-    """Of means round V places."""
+class _Near(NamedTuple):
+    """Statistics of the means near V places."""
 
-    mean: Floats
-    """(V,) weighted by their variances. NaN where there are none."""
-    sigma: Floats
-    """(V,) its standard error, if nothing but the numbers of returns made them differ."""
-    chi2: Floats
-    """(V,) by how much they differ: squares over variances."""
-    freedom: Floats
-    """(V,) how much that would be then."""
+    mean: Floats  # (V,) weighted by their variances. NaN where there are none.
+    sigma: Floats  # (V,) its standard error, if nothing but the numbers of returns made them differ
+    chi2: Floats  # (V,) their squared deviations over their variances
+    freedom: Floats  # (V,) its expectation then: degrees of freedom
 
 
 @dataclass(frozen=True)
 class Differences:
     """Differences of mean intensities between two days, each at one place from one view."""
 
-    between: _Means
-    """Later less earlier, without `offset`."""
-    within: list[_Means]
-    """Of each day, what its own map leaves of the intensities."""
-    offset: float
-    """By so much more all returns are stronger, sensor units."""
-    reach_m: float
-    """Means that are so close to a place tell of it, m."""
-    width: float
-    """Of the range of intensities, sensor units."""
+    between: _Means  # later less earlier, without `offset`
+    within: list[_Means]  # of each day, what its own map leaves of the intensities
+    offset: float  # by so much more all returns are stronger, sensor units
+    reach_m: float  # means that are so close to a place belong to it, m
+    width: float  # of the range of intensities, sensor units
     other_units: float | None
     """How many times as widely the later intensities spread, if the two days are in different units. None: they are not."""
 
@@ -150,14 +143,14 @@ class Differences:
         return replace(self, between=self.between.select(away_m > self.reach_m))
 
     def probability(self, x: Floats, counting: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        """(V,) difference round places (V, 3), and how probable it is that the reflectance there changed.
+        """(V,) difference near places (V, 3), and the probability that the reflectance there changed.
 
         Only the places that are `counting` (V,) may have changed. Where views of one place differ by more than their numbers of
         returns explain, on one day or in how far they changed, errors are as much larger (Birge's ratio): at edges, near
         mirrors, in thickets. What is repainted changes alike from all views.
         """
-        between = self.between.round(x, self.reach_m)
-        days = [means.round(x, self.reach_m) for means in self.within]
+        between = self.between.near(x, self.reach_m)
+        days = [means.near(x, self.reach_m) for means in self.within]
         chi2, freedom = (np.sum([getattr(day, name) for day in days], axis=0) for name in ("chi2", "freedom"))
         known = counting & np.isfinite(between.mean)
         changed = np.zeros(len(x))

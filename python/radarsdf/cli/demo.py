@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
         raise ValueError(msg)
     config = config_of(options)
 
-    import radarsdf.map.meshing  # here and not by the first mesh: the printed times are without imports
+    import radarsdf.map.mesh  # here and not by the first mesh: the printed times are without imports
     from radarsdf import fit
     from radarsdf.cli.held_out import add_intensity_errors
     from radarsdf.cli.saving import save_map

@@ -51,8 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Make the grid, write its files, draw it."""
     from radarsdf.extras import require
-    from radarsdf.grids.files import check_arrays_path, check_grid_path, save_arrays
-    from radarsdf.grids.flat import check_flat_path
+    from radarsdf.grids.files import check_arrays_path, check_flat_path, check_grid_path
+    from radarsdf.grids.grid import save_arrays
+    from radarsdf.grids.occupancy import grid as grid_of
     from radarsdf.io.files import check_outputs
 
     flat = [path for path in options.out if path.suffix == ".yaml"]
@@ -70,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
     check_outputs(outputs, [options.map])
     radar_map = load_map(options.map)
     box = box_of(options)
-    grid = radar_map.grid(radar_map.extent if box is None else box, options.voxel)
+    grid = grid_of(radar_map, radar_map.extent if box is None else box, options.voxel)
     low, high = options.heights
     for path in whole:
         grid.save(path)

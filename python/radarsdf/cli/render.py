@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from radarsdf.map.views import View
+    from radarsdf.map.view import View
 
 _SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.io.clouds.writing import write_cloud
     from radarsdf.io.files import check_outputs
     from radarsdf.io.npz import write_scans
-    from radarsdf.map.views import scans_of_views
+    from radarsdf.map.view import scans_of_views
     from radarsdf.render.figures import save_view_picture
 
     suffix = options.out.suffix.lower()

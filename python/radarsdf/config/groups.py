@@ -75,7 +75,7 @@ class ReturnsConfig:
     up to 1 % more error of intensities."""
 
     passages: bool = True
-    """Whether the map keeps which cells rays passed, for :meth:`radarsdf.Map.grid` and :func:`radarsdf.compare`. It takes
+    """Whether the map keeps which cells rays passed, for :func:`radarsdf.grid` and :func:`radarsdf.compare`. It takes
     about 1 µs of a processor for each return, and 0.3 kB for each block of 8 × 8 × 8 leaf cells that rays went through."""
 
     def __post_init__(self) -> None:

@@ -8,7 +8,6 @@ The functions take meshes and arrays, not maps, so they measure the results of o
 
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 
-from ._report import format_metrics
 from .calibration import (
     CALIBRATION_PROTOCOL,
     ConfidenceMetrics,
@@ -17,7 +16,14 @@ from .calibration import (
     uncertainty_metrics,
 )
 from .intensity import INTENSITY_PROTOCOL, IntensityMetrics, KNNIntensity, holdout, intensity_metrics
-from .surface import PROTOCOL, SurfaceMetrics, adjacent_angles, gamma_from_moments, surface_metrics
+from .surface import (
+    PROTOCOL,
+    SurfaceMetrics,
+    adjacent_angles,
+    format_metrics,
+    gamma_from_moments,
+    surface_metrics,
+)
 from .trajectory import TRAJECTORY_PROTOCOL, TrajectoryMetrics, trajectory_metrics
 
 __all__ = [

@@ -65,7 +65,7 @@ class ConfidenceMetrics(TypedDict):
 def uncertainty_metrics(
     error_m: ArrayLike, uncertainty_m: ArrayLike, *, bins: int = 20
 ) -> UncertaintyMetrics:
-    """Compare errors with the standard errors that were predicted for them.
+    """Compare errors with their predicted standard errors.
 
     Parameters
     ----------
@@ -103,11 +103,8 @@ def uncertainty_metrics(
 
     Notes
     -----
-    Points of equal uncertainty share their mean squared error before they are put into bins. So the order of the points
-    does not matter.
-
-    Neighbouring points of a surface have much the same error. So numbers from one surface scatter more than those of
-    as many independent errors would.
+    Points of equal uncertainty share their mean squared error, so the order of the points does not matter. Neighbouring points
+    of a surface have correlated errors, so numbers of one surface scatter more than those of independent errors.
 
     Examples
     --------
@@ -165,7 +162,7 @@ def uncertainty_metrics(
 
 
 def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike, *, bins: int = 10) -> ConfidenceMetrics:
-    """Compare confidences in a surface with the share of them that is right.
+    """Compare confidences in a surface with the share of true surface.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ class IntensityMetrics(TypedDict):
 
 
 def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMetrics:
-    """Compare predicted with measured intensities.
+    """Compute the errors of predicted intensities.
 
     Parameters
     ----------
@@ -50,8 +50,7 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
     Raises
     ------
     ValueError
-        If the shapes differ, there is no return, or a value is not finite. Every return needs a prediction: a method
-        that leaves out difficult returns would look better than it is.
+        If the shapes differ, there is no return, or a value is not finite: every return needs a prediction.
     TypeError
         If the values are not real numbers.
     """
@@ -75,10 +74,7 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
 
 
 def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Split scans into training scans and held-out scans.
-
-    In ascending order, scans 0, `every`, 2 · `every`, … are held out. The paper holds out every tenth scan and does
-    not say which is the first.
+    """Split scans into training and held-out ones: in ascending order, scans 0, `every`, 2 · `every`, … are held out.
 
     Parameters
     ----------
@@ -143,8 +139,7 @@ class KNNIntensity:
     candidates, k : int
         Sizes of the two selections, 1 ≤ k ≤ candidates.
     distance_scale_m, angle_scale_rad : float
-        Noise of the returns: differences far below these values do not change a weight, so no single return takes all
-        the weight.
+        Noise of the returns: smaller differences hardly change a weight.
     num_threads : int
         Threads of the search; 0 means as many as PyTorch uses.
 
@@ -155,10 +150,8 @@ class KNNIntensity:
 
     Notes
     -----
-    The paper gives neither the numbers nor the weights, and no numbers are right for all scenes. On real drives the
-    intensity fluctuates from scan to scan, so an average over the nearest returns counts more than a similar view: 8 of
-    8 or 16 of 16. Where the view decides, as in the simulated scenes, 16 of 128 or 256 have a fifth less error than the
-    defaults. So compare with :meth:`chosen`, which finds the numbers of a scene.
+    The paper gives neither `k`, `candidates` nor the weights, and none are right for all scenes: on real drives 8 of 8 or
+    16 of 16, on the simulated scenes 16 of 128 or 256. So compare with :meth:`chosen`.
 
     Examples
     --------
@@ -200,8 +193,10 @@ class KNNIntensity:
         self._directions, self._values = directions, values
         self._origin = points.mean(axis=0)
         self._tree = cKDTree(points - self._origin)
-        self._candidates = min(candidates, len(points))
-        self._k = min(k, len(points))
+        self.candidates = min(candidates, len(points))
+        """Number of returns that are nearest in space, of which `k` are chosen; at most the number of returns."""
+        self.k = min(k, len(points))
+        """Number of returns whose intensities are averaged."""
         self._scales = distance_scale_m, angle_scale_rad
         self._num_threads = whole_number(num_threads, "num_threads", 0)
 
@@ -223,25 +218,23 @@ class KNNIntensity:
 
         Every `every`-th training scan is held out once more, and predicted from the others. The least mean absolute
         error decides between k = 1, 2, 4, … 32 of k, 2 k, 4 k, … 256 candidates; of equal ones the first. The result
-        then predicts from all training scans. The same arguments give the same result.
+        predicts from all training scans.
 
         Parameters
         ----------
         points_world, sensor_positions, intensities, distance_scale_m, angle_scale_rad, num_threads
             As for the class. Give the training scans only: a choice that sees the evaluation is not fair.
         scans : (N,) array_like
-            Scan number of each return, integers. Whole scans are held out: a return's neighbours within its own scan
-            share its view and much of its noise, and would always seem right.
+            Scan number of each return, integers. Whole scans are held out, since returns of one scan share view and noise.
         every : int
             Distance between held-out scans, at least 2; see :func:`holdout`.
         max_queries : int
-            Of the held-out returns, at most so many are predicted, evenly spread. It limits the time to seconds.
+            Held-out returns that are predicted at most, evenly spread.
 
         Returns
         -------
         KNNIntensity
-            With the numbers in `candidates` and `k`. Of a single scan none can be held out: it has the defaults of the
-            class.
+            Of a single scan none can be held out: it has the defaults of the class.
 
         Raises
         ------
@@ -250,14 +243,10 @@ class KNNIntensity:
 
         Notes
         -----
-        On three simulated scenes and five real drives the choice has at most 0.6 % more error than the best of these
-        numbers for the evaluation itself.
+        On three simulated scenes and five real drives the error is at most 0.6 % above that of the best choice.
         """
         make = partial(
-            cls,
-            distance_scale_m=distance_scale_m,
-            angle_scale_rad=angle_scale_rad,
-            num_threads=num_threads,
+            cls, distance_scale_m=distance_scale_m, angle_scale_rad=angle_scale_rad, num_threads=num_threads
         )
         whole = make(points_world, sensor_positions, intensities)
         refuse_masked(scans, "scans")
@@ -274,24 +263,9 @@ class KNNIntensity:
         sensors = np.broadcast_to(real_array(sensor_positions, "sensor positions"), points.shape)
         asked = np.flatnonzero(test)
         asked = asked[np.linspace(0, len(asked) - 1, min(max_queries, len(asked))).astype(np.int64)]
-        inner = make(
-            points[~test],
-            sensors[~test],
-            whole._values[~test],
-            candidates=_MAX_CANDIDATES,
-        )
+        inner = make(points[~test], sensors[~test], whole._values[~test], candidates=_MAX_CANDIDATES)
         k, candidates = inner._best(points[asked] - inner._origin, directions[asked], whole._values[asked])
         return make(points_world, sensor_positions, intensities, candidates=candidates, k=k)
-
-    @property
-    def candidates(self) -> int:
-        """Number of returns that are nearest in space, of which `k` are chosen; at most the number of returns."""
-        return self._candidates
-
-    @property
-    def k(self) -> int:
-        """Number of returns whose intensities are averaged."""
-        return self._k
 
     def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> NDArray[np.float64]:
         """Predict the intensity of returns.
@@ -317,8 +291,8 @@ class KNNIntensity:
         predicted = np.zeros(len(points))
         for part in self._parts(len(points)):
             angle, weight, values = self._nearest(points[part] - self._origin, directions[part])
-            if self._k < self._candidates:
-                closest = np.argpartition(angle, self._k - 1, axis=1)[:, : self._k]
+            if self.k < self.candidates:
+                closest = np.argpartition(angle, self.k - 1, axis=1)[:, : self.k]
                 weight, values = (np.take_along_axis(a, closest, axis=1) for a in (weight, values))
             predicted[part] = (weight * values).sum(axis=1) / weight.sum(axis=1)
         return predicted
@@ -327,7 +301,7 @@ class KNNIntensity:
         self, points: NDArray[np.float64], directions: NDArray[np.float64], measured: NDArray[np.float64]
     ) -> tuple[int, int]:
         """The `k` and the `candidates`, of those that this search has, with the least error at these returns."""
-        sizes = [2**i for i in range(_MAX_CANDIDATES.bit_length()) if 2**i <= self._candidates]
+        sizes = [2**i for i in range(_MAX_CANDIDATES.bit_length()) if 2**i <= self.candidates]
         errors = {(k, size): 0.0 for size in sizes for k in _KS if k <= size}
         for part in self._parts(len(points)):
             angle, weight, values = self._nearest(points[part], directions[part])
@@ -343,14 +317,14 @@ class KNNIntensity:
         return min(errors, key=lambda setting: errors[setting])
 
     def _parts(self, queries: int) -> Iterator[slice]:
-        step = max(1, _CHUNK // self._candidates)
+        step = max(1, _CHUNK // self.candidates)
         return (slice(start, start + step) for start in range(0, queries, step))
 
     def _nearest(
         self, points: NDArray[np.float64], directions: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Angle, weight and intensity of the candidates of each point, the nearest first, each (M, candidates)."""
-        ranks = np.arange(1, self._candidates + 1)  # with k=1 as a number, the result would lose a dimension
+        ranks = np.arange(1, self.candidates + 1)  # with k=1 as a number, the result would lose a dimension
         workers = resolve_num_threads(self._num_threads)
         distance, index = self._tree.query(points, k=ranks, workers=workers)
         chord = np.linalg.norm(self._directions[index] - directions[:, None], axis=2)

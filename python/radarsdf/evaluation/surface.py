@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Errors of a mesh against lidar points: accuracy, completion, F-score and smoothness."""
+"""Errors of a mesh against lidar points: accuracy, completion, F-score and smoothness; metrics as text."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,8 @@ from scipy.spatial import cKDTree
 from radarsdf._core import cell_keys
 from radarsdf.checks import check_box, positions, positive, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
+
+from .intensity import IntensityMetrics
 
 if TYPE_CHECKING:
     import trimesh
@@ -66,7 +68,7 @@ def surface_metrics(
     truncation_m: float = 2.0,
     num_threads: int = 0,
 ) -> SurfaceMetrics:
-    """Measure a mesh against ground-truth points by the paper's definitions.
+    """Compute the errors of a mesh against ground-truth points by the paper's definitions.
 
     Parameters
     ----------
@@ -95,9 +97,9 @@ def surface_metrics(
     Returns
     -------
     SurfaceMetrics
-        - `accuracy_error_m`: mean distance from a mesh sample to the ground truth, over the samples within `outlier_m`.
-          None if there are none. `accuracy_ratio`: share *of these* below `threshold_m`, 0 if there are none.
-          `outlier_ratio`: share of the samples that were left out.
+        - `accuracy_error_m`: mean distance from a mesh sample to the ground truth, over the samples within `outlier_m`;
+          None without any. `accuracy_ratio`: share *of these* below `threshold_m`, 0 without any. `outlier_ratio`:
+          share of the samples that were left out.
         - `completion_error_m`: mean truncated distance from a ground-truth point to the nearest mesh sample.
           `completion_ratio`: share below `threshold_m`.
         - `f_score`: harmonic mean of `accuracy_ratio` and `completion_ratio`, as in the paper. It does not punish
@@ -116,9 +118,6 @@ def surface_metrics(
 
     Notes
     -----
-    Memory is bounded: besides mesh and ground truth, there is one block of samples and its search tree at a time,
-    200 MB in all for 400,000 triangles and 300,000 points.
-
     The completion measures distances to samples, not to triangles. Even a perfect mesh has a completion error of half
     the spacing of the samples, 0.5 · sqrt(area / samples): 5 mm for 1e7 samples on 1000 m². Compare meshes at equal
     `samples`.
@@ -127,6 +126,7 @@ def surface_metrics(
     positive(threshold_m, "threshold_m")
     positive(outlier_m, "outlier_m")
     positive(truncation_m, "truncation_m")
+    seed, num_threads = whole_number(seed, "seed", 0), whole_number(num_threads, "num_threads", 0)
     corners = None if box is None else check_box(box)
     points = _in_box(positions(ground_truth, "ground_truth"), corners)
     if len(points) == 0:
@@ -141,15 +141,13 @@ def surface_metrics(
     if corners is not None:
         corners = corners - origin
 
-    workers = resolve_num_threads(whole_number(num_threads, "num_threads", 0))
+    workers = resolve_num_threads(num_threads)
     reach = max(outlier_m, threshold_m)
     tree = cKDTree(points)
     completion = np.full(len(points), float(truncation_m))
     total = kept = right_kept = right = 0
     kept_sum = 0.0
-    for block in _sample_blocks(
-        vertices, faces, corners, samples, np.random.default_rng(whole_number(seed, "seed", 0))
-    ):
+    for block in _sample_blocks(vertices, faces, corners, samples, np.random.default_rng(seed)):
         # The search finds distances strictly below its bound, and a sample at outlier_m exactly is an inlier.
         distance, _ = tree.query(block, distance_upper_bound=np.nextafter(reach, np.inf), workers=workers)
         inliers = distance[distance <= outlier_m]
@@ -238,16 +236,63 @@ def gamma_from_moments(angles_rad: ArrayLike) -> tuple[float | None, float | Non
 
     Notes
     -----
-    The paper does not name its estimator. In all twelve rows of its table shape = mean² / variance within rounding, so
-    its distribution begins at zero.
-    Maximum likelihood is not used: it needs the mean logarithm of the angles, which one angle of zero makes undefined,
-    and on flat walls rounding errors of 1e-8 rad would decide the shape.
+    The paper does not name its estimator, but in all twelve rows of its table shape = mean² / variance within rounding.
+    Maximum likelihood needs the mean logarithm of the angles, which an angle of zero makes undefined.
     """
     angles = real_array(angles_rad, "angles_rad")
     if angles.size == 0:
         return None, None, None
     mean, variance = float(angles.mean()), float(angles.var())
     return (mean**2 / variance if variance > _ANGLE_NOISE_RAD**2 else None), mean, variance
+
+
+def format_metrics(metrics: SurfaceMetrics | IntensityMetrics) -> str:
+    """Format metrics as a few aligned lines of text.
+
+    Parameters
+    ----------
+    metrics : SurfaceMetrics or IntensityMetrics
+        Result of `surface_metrics` or `intensity_metrics`.
+
+    Returns
+    -------
+    str
+        Lines without a trailing newline. Surface errors are in centimetres and ratios in percent, as in the paper's
+        tables; intensity errors are in sensor units.
+
+    Examples
+    --------
+    >>> from radarsdf.evaluation import intensity_metrics
+    >>> print(format_metrics(intensity_metrics([60.0, 70.0], [61.0, 68.0])))
+    intensity error  mean 1.50  median 1.50  (2 returns, radarsdf-intensity-1)
+    """
+    if "mae" in metrics:
+        i = cast("IntensityMetrics", metrics)
+        count = f"({i['num_returns']} returns, {i['protocol']})"
+        return f"intensity error  mean {i['mae']:.2f}  median {i['medae']:.2f}  {count}"
+    s = metrics
+    shape, mean = _number(s["gamma_shape"], ""), _number(s["gamma_mean"], " rad", digits=3)
+    variance = _number(s["gamma_variance"], " rad²", digits=3)
+    of = f"{s['num_mesh_samples']} mesh samples and {s['num_ground_truth']} ground-truth points"
+    rows = {
+        "accuracy": f"error {_number(s['accuracy_error_m'], ' cm', 100)}  ratio {_percent(s['accuracy_ratio'])}"
+        f"  outliers beyond {s['outlier_m']:g} m {_percent(s['outlier_ratio'])}",
+        "completion": f"error {_number(s['completion_error_m'], ' cm', 100)}"
+        f"  ratio {_percent(s['completion_ratio'])}",
+        "F-score": f"{_percent(s['f_score'])}  with nothing discarded {_percent(s['f_score_all'])}"
+        f" (precision {_percent(s['precision'])})",
+        "angles": f"gamma shape {shape}  mean {mean}  variance {variance}",
+        "protocol": f"{s['protocol']}  threshold {s['threshold_m']:g} m  {of} ({s['ground_truth_sha256'][:12]})",
+    }
+    return "\n".join(f"{name:<12}{text}" for name, text in rows.items())
+
+
+def _number(value: float | None, unit: str, factor: float = 1.0, digits: int = 2) -> str:
+    return "undefined" if value is None else f"{value * factor:.{digits}f}{unit}"
+
+
+def _percent(ratio: float) -> str:
+    return _number(ratio, " %", 100)
 
 
 def _harmonic_mean(a: float, b: float) -> float:
@@ -286,7 +331,7 @@ def _sample_blocks(
     samples: int,
     rng: np.random.Generator,
 ) -> Iterator[_Points]:
-    """Samples drawn uniformly by area, in blocks of neighbouring triangles, so that searches stay in cache."""
+    """Samples uniform by area, in blocks of neighbouring triangles, so that searches stay in cache."""
     if corners is not None and len(faces):
         x = vertices[faces]
         faces = faces[((x.max(axis=1) >= corners[0]) & (x.min(axis=1) <= corners[1])).all(axis=1)]
@@ -297,7 +342,7 @@ def _sample_blocks(
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if area.sum() == 0:
         return
-    # The number of samples on each triangle, distributed as if the samples were drawn one by one.
+    # Samples on each triangle, distributed as if they were drawn one by one.
     last = np.cumsum(rng.multinomial(samples, area / area.sum()))
     for start in range(0, samples, _CHUNK):
         index = np.searchsorted(last, np.arange(start, min(start + _CHUNK, samples)), side="right")

@@ -19,7 +19,7 @@ TRAJECTORY_PROTOCOL = "radarsdf-trajectory-1"
 Alignment = Literal["positions", "poses", "first", "none"]
 
 _ALIGNMENTS = ("positions", "poses", "first", "none")
-_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)  # of the way, where it is shorter than KITTI's
+_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)  # of the length, where it is shorter than KITTI's
 _KITTI_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 
 
@@ -46,7 +46,7 @@ def trajectory_metrics(
     align: Alignment = "positions",
     lengths_m: ArrayLike | None = None,
 ) -> TrajectoryMetrics:
-    """Errors of poses.
+    """Compute the errors of a trajectory against the true one.
 
     Parameters
     ----------
@@ -57,15 +57,15 @@ def trajectory_metrics(
         mean position and mean rotation, the first pose, or nothing. Positions on a straight line leave the rotation about it
         open; "poses" does not.
     lengths_m : (K,) array_like, optional
-        Of the parts of the way for relative errors. By default those of KITTI, 100 to 800 m, or for a way of less than 800 m
-        10, 20, 30, 40 and 50 % of it.
+        Of the segments for relative errors, m. By default those of KITTI, 100 to 800 m, or for a trajectory of less than 800 m
+        10, 20, 30, 40 and 50 % of its length.
 
     Returns
     -------
     TrajectoryMetrics
         ``absolute_m`` and ``absolute_rad``, root mean square over the scans; ``step_m`` and ``step_rad``, root mean square
-        of the motion from each scan to the next; ``relative_ratio`` and ``relative_rad_per_m``, mean error of parts of the way
-        over their length, from each scan on; ``length_m`` of the true way.
+        of the motion from each scan to the next; ``relative_ratio`` and ``relative_rad_per_m``, mean error of the segments that
+        begin at each scan, over their length; ``length_m`` of the true trajectory.
 
     Raises
     ------
@@ -96,14 +96,14 @@ def trajectory_metrics(
     at = _brought(found, true, align)
     true_steps = steps(true)
     off = between(true_steps, steps(found))
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])
-    lengths = _lengths(way[-1], lengths_m)
-    ratio, rad_per_m = _relative(found, true, way, lengths)
+    distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])
+    lengths = _lengths(distance_m[-1], lengths_m)
+    ratio, rad_per_m = _relative(found, true, distance_m, lengths)
     return TrajectoryMetrics(
         protocol=TRAJECTORY_PROTOCOL,
         align=align,
         num_poses=len(true),
-        length_m=float(way[-1]),
+        length_m=float(distance_m[-1]),
         absolute_m=_rms(np.linalg.norm((at - true)[:, :3, 3], axis=1)),
         absolute_rad=_rms(turned_by(at, true)),
         step_m=_rms(np.linalg.norm(off[:, :3, 3], axis=1)),
@@ -128,20 +128,22 @@ def _brought(poses: Floats, true: Floats, align: Alignment) -> Floats:
     return found
 
 
-def _lengths(way_m: float, lengths_m: ArrayLike | None) -> Floats:
+def _lengths(length_m: float, lengths_m: ArrayLike | None) -> Floats:
     if lengths_m is None:
-        return np.array(_KITTI_M) if way_m >= _KITTI_M[-1] else way_m * np.array(_SHARES)
+        return np.array(_KITTI_M) if length_m >= _KITTI_M[-1] else length_m * np.array(_SHARES)
     return np.array(
         [positive(length, "lengths_m") for length in np.atleast_1d(real_array(lengths_m, "lengths_m"))]
     )
 
 
-def _relative(poses: Floats, true: Floats, way: Floats, lengths: Floats) -> tuple[float | None, float | None]:
-    """Mean errors of translation, m/m, and rotation, rad/m, of all parts of these lengths."""
+def _relative(
+    poses: Floats, true: Floats, distance_m: Floats, lengths: Floats
+) -> tuple[float | None, float | None]:
+    """Mean errors of translation, m/m, and rotation, rad/m, of all segments of these lengths."""
     ratios, angles = [], []
     for length in lengths[lengths > 0]:
-        last = np.searchsorted(way, way + length)
-        first = np.flatnonzero(last < len(way))
+        last = np.searchsorted(distance_m, distance_m + length)
+        first = np.flatnonzero(last < len(distance_m))
         last = last[first]
         off = between(between(true[first], true[last]), between(poses[first], poses[last]))
         ratios.append(np.linalg.norm(off[:, :3, 3], axis=1) / length)

@@ -1,21 +1,21 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Heights of the ground in a grid, and where wheels can go."""
+"""Grids in two dimensions: heights of the ground, where wheels can go, and what ROS's map_server reads."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from os import PathLike
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from radarsdf.checks import number
+from radarsdf.grids.files import write_map_server
 from radarsdf.settings import settings
-
-if TYPE_CHECKING:
-    from radarsdf.grids.grid import Grid
 
 LETHAL = 100
 """Cost of a column that no wheel can enter, as in ROS."""
@@ -25,7 +25,7 @@ _Metres = Annotated[float, Field(gt=0, le=100)]
 
 @settings
 class Wheels:
-    """What a vehicle can do."""
+    """Limits of a vehicle, of which costs are shares."""
 
     max_slope_rad: Annotated[float, Field(gt=0, lt=1.5)] = 0.35
     """The steepest ground that it climbs, rad."""
@@ -37,29 +37,78 @@ class Wheels:
 
 @dataclass(frozen=True)
 class Costmap:
-    """Columns of a grid. NaN, and a cost of -1, where the ground is unknown."""
+    """Ground and costs in the columns of a grid. NaN, and a cost of -1, where the ground is unknown."""
 
     height_m: NDArray[np.float32]
     """(X, Y) height of the ground, world, m: the lowest surface with room for the vehicle above it."""
     slope_rad: NDArray[np.float32]
-    """(X, Y) of a plane through the heights of a column and the eight round it."""
+    """(X, Y) of a plane through the heights of a column and its eight neighbours."""
     step_m: NDArray[np.float32]
     """(X, Y) largest difference of height from that plane among them, m."""
     clearance_m: NDArray[np.float32]
-    """(X, Y) from the ground to what is occupied above it, m. Infinite where nothing is."""
+    """(X, Y) from the ground to the first occupied voxel above it, m. Infinite where there is none."""
     cost: NDArray[np.int8]
     """(X, Y) 0 to 99, the larger of the shares of the slope and of the step that the vehicle can do; 100 where one of
     them or the clearance is too much for it, -1: unknown."""
 
 
-def costmap(grid: Grid, wheels: Wheels) -> Costmap:
+@dataclass(frozen=True)
+class FlatGrid:
+    """Occupied, free and unknown columns of a grid."""
+
+    origin: NDArray[np.float64]
+    """(2,) lower corner of column (0, 0), world, m."""
+    cell_size: float
+    """Edge of a column, m."""
+    state: NDArray[np.int8]
+    """(X, Y) -1: unknown, 0: free, 1: occupied."""
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the grid as ROS's map_server reads it.
+
+        Parameters
+        ----------
+        path : path-like
+            ``NAME.yaml``. The image is written next to it, as ``NAME.pgm``.
+
+        Raises
+        ------
+        ValueError
+            For another suffix.
+        OSError
+            If a file cannot be written.
+        """
+        write_map_server(path, self.state, self.origin, self.cell_size)
+
+
+class Columns(NamedTuple):
+    """What is read of a grid, arrays (X, Y, Z)."""
+
+    origin: NDArray[np.float64]  # (3,) world, m
+    voxel_size: float  # m
+    occupied: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    distance_m: NDArray[np.float32]
+
+    @property
+    def z(self) -> NDArray[np.float64]:
+        """(Z,) heights of the voxels' centres, world, m."""
+        return np.asarray(self.origin[2] + (np.arange(self.occupied.shape[2]) + 0.5) * self.voxel_size)
+
+    @property
+    def top_m(self) -> float:
+        """Upper border, world, m."""
+        return float(self.origin[2] + self.occupied.shape[2] * self.voxel_size)
+
+
+def costmap(columns: Columns, wheels: Wheels) -> Costmap:
     """See :meth:`Grid.costmap`."""
-    height, clearance = ground(grid)
+    height, clearance = _ground(columns)
     # A column of walls alone has no ground, but nothing can stand there.
-    blocked = np.isnan(height) & grid.occupied.any(axis=2)
+    blocked = np.isnan(height) & columns.occupied.any(axis=2)
     with np.errstate(invalid="ignore"):
         blocked |= clearance < wheels.clearance_m
-    slope, step = _planes(height, grid.voxel_size)
+    slope, step = _planes(height, columns.voxel_size)
     effort = np.fmax(slope / wheels.max_slope_rad, step / wheels.max_step_m)
     cost = np.full(height.shape, -1, np.int8)
     known = np.isfinite(effort)
@@ -68,16 +117,45 @@ def costmap(grid: Grid, wheels: Wheels) -> Costmap:
     return Costmap(height, slope, step, clearance, cost)
 
 
-def ground(grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def flat_grid(columns: Columns, lower_m: float, upper_m: float) -> FlatGrid:
+    """See :meth:`Grid.flat`."""
+    lower_m, upper_m = number(lower_m, "lower_m"), number(upper_m, "upper_m")
+    if lower_m >= upper_m:
+        msg = f"upper_m must be above lower_m, {lower_m}, not {upper_m}"
+        raise ValueError(msg)
+    height, _ = _ground(columns)
+    if not np.isfinite(height).any():
+        msg = (
+            f"no column of the grid shows ground between z = {columns.origin[2]:.2f} and {columns.top_m:.2f} m: choose a box "
+            "that reaches from below the ground to two voxels or more above it"
+        )
+        raise ValueError(msg)
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
+
+    nearest = distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True)
+    base = height[tuple(nearest)]
+    above = columns.z - base[..., None]
+    half = columns.voxel_size / 2
+    # Whole voxels: one that only reaches into the heights from below may be of the ground.
+    between = (above - half >= lower_m) & (above - half < upper_m)
+    occupied = (columns.occupied & between).any(axis=2)
+    free = np.where(between, columns.free, True).all(axis=2) & between.any(axis=2)
+    # A column whose heights reach out of the box is free only as far as the box is known.
+    free &= base + upper_m <= columns.top_m + half
+    state = np.full(height.shape, -1, np.int8)
+    state[free], state[occupied] = 0, 1
+    return FlatGrid(columns.origin[:2].copy(), columns.voxel_size, state)
+
+
+def _ground(columns: Columns) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Heights of the ground (X, Y), world, m, and the room above it, m. NaN in columns without.
 
     The ground of a column is the lowest surface on which the signed distance rises upwards. Its height is where the
-    distance is zero, by the two voxels above and below: finer than a voxel.
+    distance is zero, interpolated between the voxels above and below.
     """
-    size = grid.voxel_size
-    z = grid.origin[2] + (np.arange(grid.shape[2]) + 0.5) * size
+    size, z = columns.voxel_size, columns.z
     # Above the uppermost voxels nothing is known.
-    lower, occupied = grid.distance_m, np.pad(grid.occupied, ((0, 0), (0, 0), (0, 1)))
+    lower, occupied = columns.distance_m, np.pad(columns.occupied, ((0, 0), (0, 0), (0, 1)))
     upper = np.concatenate([lower[..., 1:], np.full_like(lower[..., :1], np.nan)], axis=2)
     with np.errstate(invalid="ignore"):
         up = (lower <= 0) & (upper > 0) & (occupied[..., :-1] | occupied[..., 1:])
@@ -86,9 +164,9 @@ def ground(grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     first = up.argmax(axis=2)
     share = np.take_along_axis(share, first[..., None], 2)[..., 0]
     height = np.where(found, z[first] + share * size, np.nan).astype(np.float32)
-    # What is occupied above: not the voxels of the ground itself, which are one or two.
-    above = np.arange(grid.shape[2]) > np.asarray(first + 2)[..., None]
-    hanging: NDArray[np.bool_] = grid.occupied & above & found[..., None]
+    # Not the voxels of the ground itself, which are one or two.
+    above = np.arange(len(z)) > np.asarray(first + 2)[..., None]
+    hanging: NDArray[np.bool_] = columns.occupied & above & found[..., None]
     lowest = hanging.argmax(axis=2)
     room = np.where(hanging.any(axis=2), z[lowest] - size / 2 - height, np.inf)
     clearance = np.where(found, room, np.nan).astype(np.float32)
@@ -96,7 +174,7 @@ def ground(grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Slope and largest residual of a plane through each column and the eight round it. NaN with fewer than three."""
+    """Slope and largest residual of a plane through each column and its eight neighbours. NaN with fewer than three."""
     padded = np.pad(height.astype(np.float64), 1, constant_values=np.nan)
     x, y = height.shape
     shifts = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]

@@ -10,7 +10,7 @@ import threading
 import weakref
 from collections.abc import Hashable, Mapping
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -331,18 +331,20 @@ class LiveMap:
             live._follower.place(scan_id, scan)
         return live
 
-    def mesh(
-        self,
-        *,
-        min_confidence: float | None = None,
-        max_uncertainty: float | None = None,
-        min_component_triangles: int | None = None,
-    ) -> trimesh.Trimesh:
+    def mesh(self, **limits: Any) -> trimesh.Trimesh:
         """The surface as triangles, in voxels of the size of leaf cells. Only what changed is made anew.
 
-        The arguments and the result are those of :meth:`Map.mesh`. The mesh is empty if there is no surface.
+        Parameters
+        ----------
+        **limits
+            `min_confidence`, `max_uncertainty` and `min_component_triangles` of :meth:`Map.mesh`.
+
+        Returns
+        -------
+        trimesh.Trimesh
+            As of :meth:`Map.mesh`. It is empty if there is no surface.
         """
-        from radarsdf.map.meshing import Limits  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.map.threshold import Limits  # noqa: PLC0415 - only a mesh needs it
 
         with self._reading:
             num_threads = resolve_num_threads(self._state.config.num_threads)
@@ -355,8 +357,7 @@ class LiveMap:
                 self._state.forget_surface()
                 raise
         voxel_m = found.scene.config.leaf_size_m
-        limits = Limits.of(voxel_m, min_confidence, max_uncertainty, min_component_triangles)
-        return found.surface.mesh(found.scene.origin, limits, found.leaf_cells)
+        return found.surface.mesh(found.scene.origin, Limits.of(voxel_m, **limits), found.leaf_cells)
 
     def map(self) -> RadarMap:
         """What is known now, as a map that does not grow: the quick fit of all scans, smoothed. Intensities are in closed form.

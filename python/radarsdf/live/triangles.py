@@ -15,8 +15,8 @@ from radarsdf.live.regions import REGION_CELLS, RegionTable, regions_round
 from radarsdf.live.rows import Keys
 from radarsdf.map import queries
 from radarsdf.map.contents import WholeMap
-from radarsdf.map.isosurface import extract_cells, sparse_lattice
-from radarsdf.map.meshing import Surface, local
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.mesh import Surface, local
 from radarsdf.map.threshold import areas_round
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks

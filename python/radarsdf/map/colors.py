@@ -21,7 +21,7 @@ NEUTRAL = (190, 196, 204)  # light grey, for surfaces without a value
 
 
 def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
-    """Colours of a perceptually uniform colour map, from dark indigo at `low` to bright yellow at `high`.
+    """Colours of a perceptually uniform map, from dark indigo at `low` to bright yellow at `high`.
 
     Parameters
     ----------

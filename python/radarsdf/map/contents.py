@@ -23,14 +23,11 @@ from radarsdf.returns.sensor import Sensor
 
 @dataclass(frozen=True)
 class WholeMap:
-    """What is known of the whole map, on which evidence depends besides the returns at a place."""
+    """What evidence at a place depends on besides the returns there: properties of the whole map."""
 
-    origin: NDArray[np.float64]
-    """(3,) origin of the local frame in world coordinates, m."""
+    origin: NDArray[np.float64]  # (3,) origin of the local frame in world coordinates, m
     config: FitConfig
-    """Settings of the fit."""
-    rough_share: float
-    """Share of the returns that lie on no thin surface, in [0, 1]."""
+    rough_share: float  # Clutter ratio: share of the returns that lie on no thin surface, in [0, 1]
     returns_per_cell: float
     """Mean number of returns in the cells of surfels that hold any; see :meth:`Surfels.returns_per_cell`."""
 
@@ -39,20 +36,16 @@ class WholeMap:
 class MapContents(WholeMap):
     """The parts of a map."""
 
-    field: Field
-    """The learnt field, in the local frame."""
+    field: Field  # in the local frame
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
     reflectance: Reflectance | None
-    """Intensities in closed form, or what the network leaves of them. None: the network alone answers, or there are
-    no intensities."""
-    evidence: Evidence
-    """What the returns tell of each leaf cell."""
-    sensor: Sensor
-    """The radar, as the scans of the fit show it."""
+    """Intensities in closed form, or what the network leaves of them. None: the network alone, or no intensities."""
+    evidence: Evidence  # of each leaf cell
+    sensor: Sensor  # the radar, estimated from the scans of the fit
     report: dict[str, Any]
     """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
     passages: Passages = dataclasses.field(default_factory=Passages.none)
-    """What rays passed. Empty if the map keeps none."""
+    """Free-space crossings. Empty if the map keeps none."""
     echoes: Echoes = dataclasses.field(default_factory=Echoes.none)
-    """How strong the returns were. Empty if the map keeps no passages, or was fitted without intensities."""
+    """View statistics of intensity. Empty if the map keeps no passages, or was fitted without intensities."""

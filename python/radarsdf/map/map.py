@@ -1,48 +1,109 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What every map answers, whatever it is made of."""
+"""The questions that every map answers, and what each kind of map implements for them."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from functools import partial
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import check_pose, instance
+from radarsdf.checks import MAX_POSITION_M, check_pose, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries
-from radarsdf.map.parts import MapParts
-from radarsdf.map.positions import as_positions
+from radarsdf.map.contents import MapContents
+from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.sensor import Sensor
 
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.grids.grid import Grid
-    from radarsdf.map.views import View
+    from radarsdf.map.view import View, ViewedMap
 
 
-GRID_VOXEL_M = 0.2
-# More likely than not; and passed seven times as often as what is behind a surface.
-OCCUPIED_FROM, FREE_TO = 0.5, 0.125
+class MapParts(ABC):
+    """What each kind of map implements, at positions that were checked, and what grids and comparisons read."""
+
+    @abstractmethod
+    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
+        """Free space and returns in the leaf cells that overlap a box of two corners (3,), world, m."""
+
+    @abstractmethod
+    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+        """The evidence of a surface at positions (N, 3), world, m."""
+
+    @abstractmethod
+    def echoes(self) -> EchoesAt:
+        """View statistics of intensity. Empty without intensities, or without ``returns.passages``."""
+
+    @property
+    @abstractmethod
+    def _contents_of_any(self) -> MapContents:
+        """The parts of the map, or of one of its tiles, for what all have in common."""
+
+    @cached_property
+    def passage_odds(self) -> NDArray[np.float64]:
+        """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
+        return queries.passage_odds(self._contents_of_any)
+
+    @abstractmethod
+    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
+        """:meth:`Map.sdf` at positions (N, 3), world, m: (N,)."""
+
+    @abstractmethod
+    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
+        """:meth:`Map.gradient` there, (N, 3)."""
+
+    @abstractmethod
+    def _observed(self, world: Tensor) -> Tensor:
+        """:meth:`Map.observed` there, (N,) bool."""
+
+    @abstractmethod
+    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
+        """:meth:`Map.intensity` there, (N,), for sensors at (N, 3)."""
+
+    @abstractmethod
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
+        """:meth:`Map.mesh` without intensities. `wanted`: its arguments but for the viewpoint."""
+
+    @abstractmethod
+    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
+        """What views from a position (3,), world, m, need of the map within a range. It is held for the next view."""
+
+    def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
+        return self._sdf(world, False), self._gradient(world, False)
+
+    def tangent_planes(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The surface near positions (N, 3), world, m, as planes: signed distances (N,), m, and unit normals (N, 3)."""
+        sdf, gradient = (values.double().numpy() for values in self.plane_at(torch.from_numpy(x)))
+        length = np.linalg.norm(gradient, axis=1)
+        # Along grazing rays the field is longer than the distance, and its gradient is as much longer than 1.
+        return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
+
+    def surface_at(self, world: Tensor) -> tuple[queries.EvidenceAt, Tensor, Tensor]:
+        """:meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
+        evidence, contents = self.evidence_at(world), self._contents_of_any
+        return evidence, queries.uncertainty(contents, evidence), queries.confidence(contents, evidence)
 
 
 class Map(MapParts):
-    """A surface and its reflectance: what :class:`RadarMap` and :class:`TiledMap` have in common.
+    """A surface and its reflectance: the interface of :class:`RadarMap` and :class:`TiledMap`.
 
-    Queries take world coordinates, m, as NumPy arrays or CPU tensors. Results are of the same kind: float64
-    for float64 coordinates and lists, otherwise float32. Coordinates are converted to the local frame in
-    float64, so large ones such as UTM lose no precision. Positions of another shape than (N, 3) are a ValueError. Several
-    threads may query a map at once. A map can be pickled for other processes.
+    Queries take world coordinates, m, as array_like or CPU tensors of shape (N, 3), and return the same kind: float64 for
+    float64 input and lists, float32 otherwise. Coordinates are converted to the local frame in float64, so large
+    ones such as UTM lose no precision. Several threads may query a map at once, and a map can be pickled.
 
-    A map knows the cells near returns, see :meth:`observed`. Elsewhere, in free space too, and at positions that are
-    not finite, the signed distance, gradient and intensity are NaN. Where there are no returns round a position, the
+    A map knows the leaf cells near returns, see :meth:`observed`. Elsewhere, free space included, and at positions that are
+    not finite, the signed distance, its gradient and the intensity are NaN. Without returns near a position, the
     uncertainty is NaN and the confidence 0.
     """
 
@@ -55,20 +116,26 @@ class Map(MapParts):
 
         Parameters
         ----------
-        x : (N, 3) array or tensor
+        x : (N, 3) array_like or Tensor
             World, m.
         extrapolate : bool
-            Whether to answer where nothing was observed, too: with what the field happens to be there. Neither its
-            sign nor its size means anything then.
+            Whether to evaluate the field where nothing was observed, too. Neither its sign nor its size means anything there.
 
         Returns
         -------
-        (N,) array or tensor
-            Signed distance, m, positive in free space and zero on the surface. NaN where `x` is not :meth:`observed`, or not
-            finite: free space far from surfaces is not told from the unknown. It is learnt along the sensor's rays. So it is
-            longer than the shortest distance where rays meet the surface at a flat angle.
+        (N,) ndarray or Tensor
+            Signed distance, m: positive in free space, zero on the surface, negative behind it. NaN where `x` was not
+            :meth:`observed`, or is not finite. It is learnt along the sensor's rays, so it exceeds the Euclidean distance where
+            they meet the surface at a grazing angle.
+
+        Raises
+        ------
+        ValueError
+            If `x` is not (N, 3).
+        TypeError
+            If `x` are not real numbers, or are a tensor on another device.
         """
-        world, answer = as_positions(x)
+        world, answer = _as_positions(x)
         return answer(self._sdf(world, extrapolate))
 
     @overload
@@ -76,12 +143,27 @@ class Map(MapParts):
     @overload
     def gradient(self, x: ArrayLike, *, extrapolate: bool = False) -> NDArray[Any]: ...
     def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
-        """Gradient of :meth:`sdf` at x (N, 3), world, m: (N, 3), towards free space.
+        """Gradient of the signed distance.
 
-        Its length is about 1 where rays met the surface at a right angle, and more where they met it at a
-        flat angle. It is NaN where :meth:`sdf` is, and `extrapolate` does the same.
+        Parameters
+        ----------
+        x : (N, 3) array_like or Tensor
+            World, m.
+        extrapolate : bool
+            As for :meth:`sdf`.
+
+        Returns
+        -------
+        (N, 3) ndarray or Tensor
+            Derivatives along x, y and z of the world, pointing to free space. The norm is about 1 where rays met the surface at a
+            right angle, and larger where they grazed it. NaN where :meth:`sdf` is.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As for :meth:`sdf`.
         """
-        world, answer = as_positions(x)
+        world, answer = _as_positions(x)
         return answer(self._gradient(world, extrapolate))
 
     @overload
@@ -89,12 +171,27 @@ class Map(MapParts):
     @overload
     def observed(self, x: ArrayLike) -> NDArray[np.bool_]: ...
     def observed(self, x: Any) -> Any:
-        """Whether x (N, 3), world, m, is in a leaf cell of the map, or on its border: (N,) bool.
+        """Whether positions lie in a leaf cell of the map, or on its border.
 
-        These are the cells near returns, and those that bridge a small gap between two of them. Where it is False,
-        :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN. A position that is not finite was not observed.
+        Leaf cells are those near returns, and those that bridge a small gap between two of them.
+
+        Parameters
+        ----------
+        x : (N, 3) array_like or Tensor
+            World, m.
+
+        Returns
+        -------
+        (N,) ndarray of bool or Tensor
+            Where it is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN. False for positions that are not
+            finite.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As for :meth:`sdf`.
         """
-        world, answer = as_positions(x)
+        world, answer = _as_positions(x)
         return answer(self._observed(world))
 
     @overload
@@ -102,52 +199,63 @@ class Map(MapParts):
     @overload
     def uncertainty(self, x: ArrayLike) -> NDArray[Any]: ...
     def uncertainty(self, x: Any) -> Any:
-        """Standard error of the surface's position at points, from the noise of the returns round them.
+        """Standard error of the surface's position, from the noise of the returns near each position.
 
         Parameters
         ----------
-        x : (N, 3) array or tensor
+        x : (N, 3) array_like or Tensor
             World, m.
 
         Returns
         -------
-        (N,) array or tensor
-            (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells round the point, interpolated between cells, and a floor that
-            no number of returns makes smaller, added in quadrature; m. The noise σ of a return is that along the beam and
-            across it together; see ``report["noise"]``. It grows with the range, so that far returns tell less than near
-            ones. The floor is 0.05 leaf cells, and up to 1.1 more where much of the returns lies on no thin surface
-            (:attr:`rough_share`). NaN where there are no returns in the cells round `x`, and where it is not finite. Errors
-            of the poses count if ``returns.pose_sigma_m`` and ``pose_sigma_rad`` in the :class:`FitConfig` state them.
+        (N,) ndarray or Tensor
+            (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells near `x`, interpolated between cells, and a floor added in
+            quadrature, m. σ is the noise of a return along and across the beam, see ``report["noise"]``: it grows with the
+            range. The floor, which no number of returns reduces, is 0.05 leaf cells, and up to 1.1 more the higher the clutter
+            ratio (:attr:`rough_share`). NaN where there are no returns near `x`, or `x` is not finite. Errors of the poses
+            count if ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of the :class:`FitConfig` state them.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As for :meth:`sdf`.
         """
-        world, answer = as_positions(x)
-        return answer(self._uncertainty(world))
+        world, answer = _as_positions(x)
+        return answer(self.surface_at(world)[1])
 
     @overload
     def confidence(self, x: Tensor) -> Tensor: ...
     @overload
     def confidence(self, x: ArrayLike) -> NDArray[Any]: ...
     def confidence(self, x: Any) -> Any:
-        """Probability that there is a surface at points, from the returns round them and the scans that looked there.
+        """Probability that there is a surface, from the returns near each position and the scans that reached it.
 
         Parameters
         ----------
-        x : (N, 3) array or tensor
+        x : (N, 3) array_like or Tensor
             World, m.
 
         Returns
         -------
-        (N,) array or tensor
-            Probability that a true surface is within the edge of a leaf cell, in [0, 1]. 0 where there are no
-            returns in the cells round `x`, and where it is not finite. It is a logistic function of how precisely the returns agree (:meth:`uncertainty` without its floor), of
-            how many returns a surface would have more, given the scans that looked there, in deviations of chance, and of
-            the share of the map's returns that lie on no thin surface, and of how many returns lie together; at most the
-            share of a normal distribution of the error of a surface that bends little within a leaf cell's edge. It was
-            fitted to simulated places of twelve kinds and to five real drives, whole, of every sixth scan, and of their
-            beginning. Measured on kinds that had no part in it, the worst tenth is mostly within 0.1 to 0.3 of the share
-            of true surface.
+        (N,) ndarray or Tensor
+            Probability, in [0, 1], that a true surface is within the edge of a leaf cell. 0 where there are no returns near `x`,
+            or `x` is not finite.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As for :meth:`sdf`.
+
+        Notes
+        -----
+        A logistic function of the precision of the returns (:meth:`uncertainty` without its floor), of how many returns are
+        missing, in standard deviations, given the scans that reached the place, of the map's clutter ratio, and of its number
+        of returns in a cell. It is at most the share of position errors within a leaf cell's edge, for a surface that bends
+        little. It was fitted to simulated places of twelve kinds and to five real drives; on kinds that had no part in it, the
+        worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
         """
-        world, answer = as_positions(x)
-        return answer(self._confidence(world))
+        world, answer = _as_positions(x)
+        return answer(self.surface_at(world)[2])
 
     @overload
     def intensity(self, x: Tensor, sensor_positions: Tensor, *, extrapolate: bool = False) -> Tensor: ...
@@ -156,36 +264,38 @@ class Map(MapParts):
         self, x: ArrayLike, sensor_positions: ArrayLike, *, extrapolate: bool = False
     ) -> NDArray[Any]: ...
     def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
-        """Predicts the intensity of the return that a sensor gets from each point.
+        """Intensity of the return that a sensor would get from each position.
 
-        From closer or farther than the returns of the fit, it is that at the end of their ranges.
+        At ranges outside of those of the fit, it is that of the nearest range of the fit.
 
         Parameters
         ----------
-        x : (N, 3) array or tensor
+        x : (N, 3) array_like or Tensor
             World, m.
-        sensor_positions : (N, 3) or (3,) array or tensor
+        sensor_positions : (N, 3) or (3,) array_like or Tensor
             World, m.
         extrapolate : bool
-            Whether to answer where nothing was observed, too. It serves to compare with all returns of a scan that the
-            map has not seen, of which some are where it knows nothing.
+            Whether to predict where nothing was observed, too, for instance to compare with all returns of a
+            held-out scan.
 
         Returns
         -------
-        (N,) array or tensor
-            Intensity, sensor units, as given to the fit. NaN where `x` is not :meth:`observed`, and where a position is
+        (N,) ndarray or Tensor
+            Intensity, sensor units, as given to the fit. NaN where `x` was not :meth:`observed`, and where a position is
             not finite.
 
         Raises
         ------
         ValueError
             If the map has no intensities, or for wrong shapes.
+        TypeError
+            As for :meth:`sdf`.
         """
         if not self.has_intensity:
             msg = "this map was fitted without intensities"
             raise ValueError(msg)
-        world, answer = as_positions(x)
-        sensors, _ = as_positions(sensor_positions, rows=len(world))
+        world, answer = _as_positions(x)
+        sensors, _ = _as_positions(sensor_positions, rows=len(world))
         return answer(self._intensity(world, sensors, extrapolate))
 
     def mesh(
@@ -199,7 +309,7 @@ class Map(MapParts):
         min_component_triangles: int | None = None,
         progress: bool | None = None,
     ) -> trimesh.Trimesh:
-        """Extracts the surface as triangles, by marching cubes in the leaf cells of the map.
+        """Extract the surface as triangles, by marching cubes in the leaf cells of the map.
 
         Parameters
         ----------
@@ -208,32 +318,31 @@ class Map(MapParts):
         box : (2, 3) array_like, optional
             Lower and upper corner, world, m. Only voxels with their centre inside are meshed.
         viewpoint : (3,) array_like, optional
-            Sensor position, world, m. The vertices then carry the intensity predicted for it, in sensor
-            units, as ``mesh.vertex_attributes["intensity"]``, and colours from dark (low) to bright (high).
+            Sensor position, world, m, for which intensities are predicted at the vertices.
         min_confidence : float, optional
-            In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out. Default: that at which the F-score
-            of the observed surface is expected to be highest. Precision is the mean confidence of what is kept. What can
-            be covered is less than all: some of it was hit by chance by no scan, and of some the position is too
-            uncertain. The less that is, the more is kept. 0: all is kept (3QFP).
+            In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out. Default: the value at which the
+            F-score of the observed surface is expected to be highest. 0 keeps all (3QFP).
         max_uncertainty : float, optional
-            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. Default: there is no limit;
+            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. Default: no limit;
             what is uncertain is improbable, too.
         min_component_triangles : int, optional
             Components of fewer triangles are then left out. Default: 30 in voxels of up to 0.1 m, and fewer in larger
             ones, 15 at 0.2 m (3QFP: 300, which on sparse scans costs ten points of completion).
         progress : bool, optional
-            Whether to show a progress bar. By default only on a terminal.
+            Whether to show a progress bar. Default: only on a terminal.
 
         Returns
         -------
         trimesh.Trimesh
-            World frame, m. Triangles and vertex normals face free space. The mesh is empty if there is no surface. The
-            vertices have their :meth:`confidence` as ``mesh.vertex_attributes["confidence"]``, and their :meth:`uncertainty`
-            as ``"uncertainty_m"``. In ``mesh.metadata``, `leaf_cells` is the number of leaf cells, and `leaf_cells_searched`
-            of those in which the surface can be; `min_confidence` is what was kept from, `expected_precision` the share of
-            it that is expected to be true, `coverage_of_observed` the share of the surface that returns lie on that it is
-            expected to cover, and `whole_precision` and `whole_coverage_of_observed` are those if all were kept. What no ray
-            reached is not in them: of all that is there, the mesh may cover far less.
+            World frame, m. Triangles and vertex normals face free space. The mesh is empty if there is no surface.
+
+            - ``vertex_attributes``: `confidence` and `uncertainty_m`, (V,) float32. With a viewpoint also `intensity`,
+              sensor units, and the vertices have its colours, from dark (low) to bright (high).
+            - ``metadata``: `leaf_cells` of the map, and `leaf_cells_searched`, in which the surface can be;
+              `min_confidence` that was applied; `expected_precision`, the share of the mesh that is expected to be true;
+              `coverage_of_observed`, the share of the surface that returns lie on that it is expected to cover;
+              `whole_precision` and `whole_coverage_of_observed`, the same if all were kept. Surface that no ray reached is in
+              none of them: of all that is there, the mesh may cover far less.
 
         Raises
         ------
@@ -255,61 +364,22 @@ class Map(MapParts):
     def _mesh_seen_from(
         self, viewpoint: ArrayLike | None, voxel_size: float, **wanted: Any
     ) -> trimesh.Trimesh:
-        """What :meth:`mesh` answers; `wanted`: arguments of `_surface_mesh`."""
-        from radarsdf.map.meshing import mesh_seen_from  # noqa: PLC0415 - trimesh is slow to import
+        """:meth:`mesh`; `wanted`: arguments of `_surface_mesh`."""
+        from radarsdf.map.mesh import with_intensities  # noqa: PLC0415 - trimesh is slow to import
 
-        return mesh_seen_from(self, viewpoint, partial(self._surface_mesh, voxel_size, **wanted))
-
-    def grid(
-        self,
-        box: ArrayLike,
-        voxel_size: float = GRID_VOXEL_M,
-        *,
-        occupied_from: float = OCCUPIED_FROM,
-        free_to: float = FREE_TO,
-    ) -> Grid:
-        """What is occupied, free and unknown in the voxels of a box, for planners.
-
-        A voxel is occupied where a surface probably is: by its signed distance, with :meth:`uncertainty` and
-        :meth:`confidence`. It is free only where rays passed it on the way to their returns, where no return is in it, and
-        where all that is round it is known, too: next to the unknown there may be a surface that was not seen. Nor is it
-        free where the surface of a neighbour may reach into it, by :meth:`uncertainty` and :meth:`confidence`. All else is
-        unknown. How much rays tell is asked of the map itself: how often they pass what is behind its surfaces.
-
-        What a radar does not see is not free. It sees nothing in its blind cone, outside of its field of view, nor nearer
-        than its minimum range (``returns.min_range_m``): the ground under the sensor is unknown until it drove on. Smooth
-        ground sends nothing back at flat angles and stays unknown. Glass and thin wires may send nothing back and be
-        called free if rays to what is behind them passed often. Rays to ghosts do not count where they were found to be
-        such; those that were not found may free a place behind a mirror.
-
-        Parameters
-        ----------
-        box : (2, 3) array_like
-            Lower and upper corner, world, m. The grid covers the box, extended to multiples of `voxel_size` in the world: grids
-            of adjacent boxes fit together.
-        voxel_size : float
-            Edge of a voxel, m. Below that of a leaf cell, voxels are not better known. Above it, a voxel is occupied if a
-            part of it is, and free only if it is throughout.
-        occupied_from, free_to : float
-            From which probability of a surface on a voxel is occupied, and up to which it may be free; ascending, in
-            (0, 1). By default, scans must have passed it seven times as often as what is behind surfaces.
-
-        Returns
-        -------
-        Grid
-            Few places on true surfaces are called free: ``bench/history/grids.md`` says how many, on simulated places of
-            all kinds.
-
-        Raises
-        ------
-        ValueError
-            If an argument is out of range, or the fit did not keep what rays passed (``returns.passages``).
-        MemoryError
-            If the box has more than 2²⁸ voxels.
-        """
-        from radarsdf.map.gridding import make_grid  # noqa: PLC0415 - as above
-
-        return make_grid(self, box, voxel_size, occupied_from, free_to)
+        if viewpoint is None:
+            return self._surface_mesh(voxel_size, **wanted)
+        scale = self.intensity_scale
+        if scale is None:
+            msg = "a viewpoint needs a map with intensities; this one was fitted without"
+            raise ValueError(msg)
+        sensor_position = real_array(viewpoint, "viewpoint")
+        if sensor_position.shape != (3,) or not (np.abs(sensor_position) <= MAX_POSITION_M).all():
+            msg = f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m"
+            raise ValueError(msg)
+        mesh = self._surface_mesh(voxel_size, **wanted)
+        vertices = np.array(mesh.vertices, np.float64)
+        return with_intensities(mesh, self.intensity(vertices, sensor_position, extrapolate=True), scale)
 
     def render(
         self,
@@ -320,21 +390,21 @@ class Map(MapParts):
         noise: bool = False,
         seed: int | np.random.Generator = 0,
     ) -> View:
-        """The returns that a radar would get from a pose, and what each of its beams first meets.
+        """Predict the scan that a radar would get from a pose, and what each of its beams first meets.
 
         Beams are traced to the surface that :meth:`mesh` keeps by default. Returns come from patches of the field's
-        surface, most from those that answered often to the scans that looked there, and few from those that are
-        hidden. They are the likeliest scan, not a random one: spread evenly, and on the surface.
+        surface: most from those that often had returns in the scans that reached them, few from hidden ones. They are the
+        likeliest scan, not a random one: spread evenly, and on the surface.
 
         Parameters
         ----------
         T_world_sensor : (4, 4) array_like
             Pose of the sensor, m. Its frame: x forward, y left, z up.
         sensor : Sensor, optional
-            The radar. Default: that of the scans of the fit, :attr:`sensor`.
+            The radar. Default: :attr:`sensor`, estimated from the scans of the fit.
         returns : float, optional
-            Number of returns before those below the sensor's threshold are left out; at most as many as the surface in
-            view has patches. Default: what the sensor gives. More returns show more of what it can see.
+            Number of returns before those below the sensor's threshold are left out; at most one for each patch of surface in
+            view. Default: the sensor's number. More returns show more of what it can see.
         noise : bool
             Whether the returns have the sensor's noise in range, azimuth and elevation.
         seed : int or numpy.random.Generator
@@ -344,16 +414,18 @@ class Map(MapParts):
         -------
         View
             The first call for a map prepares its surface, which takes about a second for each million leaf cells. Of a
-            map in tiles, that within the sensor's range is held until a view needs others.
+            map in tiles, the part within the sensor's range is held until a view needs another one.
 
         Raises
         ------
         ValueError
             If the pose is not a rigid transform, or a number is out of range.
+        TypeError
+            If `sensor` is no :class:`Sensor`.
         MemoryError
-            If the view would take more memory than there is. At most 10^6 beams are traced, and a patch has one return.
+            If the view would take more memory than there is. At most 10^6 beams are traced.
         """
-        from radarsdf.map.views import view_from  # noqa: PLC0415 - as above
+        from radarsdf.map.view import view_from  # noqa: PLC0415 - trimesh is slow to import
 
         pose = check_pose(T_world_sensor, "T_world_sensor")
         sensor = self.sensor if sensor is None else instance(sensor, Sensor, "sensor")
@@ -362,30 +434,38 @@ class Map(MapParts):
 
     @abstractmethod
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes the map to a safetensors file. After :func:`radarsdf.load`, all results have the same bits.
+        """Write the map to a safetensors file. After :func:`radarsdf.load`, all results have the same bits.
 
-        An old file is replaced only once the new one is complete. An OSError says why it cannot be written.
+        Parameters
+        ----------
+        path : path-like
+            An old file is replaced only once the new one is complete.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
         """
 
     @property
-    @abstractmethod
     def config(self) -> FitConfig:
         """Settings of the fit."""
+        return self._contents_of_any.config
 
     @property
-    @abstractmethod
     def report(self) -> dict[str, Any]:
-        """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method it did not run."""
+        """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
+        return self._contents_of_any.report
 
     @property
-    @abstractmethod
     def sensor(self) -> Sensor:
-        """The radar, as the scans of the fit show it."""
+        """The radar, estimated from the scans of the fit."""
+        return self._contents_of_any.sensor
 
     @property
-    @abstractmethod
     def intensity_scale(self) -> IntensityScale | None:
         """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
+        return self._contents_of_any.intensity_scale
 
     @property
     def has_intensity(self) -> bool:
@@ -393,9 +473,9 @@ class Map(MapParts):
         return self.intensity_scale is not None
 
     @property
-    @abstractmethod
     def rough_share(self) -> float:
-        """Share of the returns that lie on no thin surface, in [0, 1]: clutter, vegetation, rough ground."""
+        """Clutter ratio: share of the returns that lie on no thin surface, in [0, 1]."""
+        return self._contents_of_any.rough_share
 
     @property
     @abstractmethod
@@ -416,3 +496,37 @@ class Map(MapParts):
     @abstractmethod
     def file_bytes(self) -> int:
         """Size of the file that :meth:`save` writes, without the names of its arrays: less than 4 kB; bytes."""
+
+
+def _as_positions(x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
+    """`x` as a tensor (N, 3), and a function that gives results the kind and precision of `x`.
+
+    With `rows`, a single position (3,) is repeated so many times.
+    """
+    is_tensor = isinstance(x, Tensor)
+    if is_tensor and (x.device.type != "cpu" or x.layout != torch.strided):
+        msg = f"positions must be a dense tensor on the CPU, not {x.layout} on {x.device}"
+        raise TypeError(msg)
+    # Read-only arrays are copied, because PyTorch warns of them.
+    world = (
+        x.detach()
+        if is_tensor
+        else torch.from_numpy(np.require(real_array(x, "positions"), requirements=["C", "W"]))
+    )
+    dtype = x.dtype if is_tensor else getattr(x, "dtype", None)
+    if rows is not None and world.shape == (3,):
+        world = world.expand(rows, 3)
+    if world.is_complex():
+        msg = "positions must be real numbers"
+        raise TypeError(msg)
+    if world.ndim != 2 or world.shape[1] != 3 or (rows is not None and len(world) != rows):
+        msg = f"positions must have shape (N, 3), not {tuple(world.shape)}"
+        raise ValueError(msg)
+
+    def answer(result: Tensor) -> Any:
+        if result.dtype != torch.bool:
+            keep_double = dtype in (torch.float64, np.dtype(np.float64), None)
+            result = result.double() if keep_double else result.float()
+        return result if is_tensor else result.numpy()
+
+    return world, answer

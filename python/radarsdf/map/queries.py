@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Queries of a map at points (N, 3) float32, local frame, m."""
+"""What a map knows at positions (N, 3) float32, local frame, m. All calls of the field are here."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -19,11 +20,19 @@ from tqdm import tqdm
 from radarsdf._core import CellBlocks
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.progress import hides_bar
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
+from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN, lattice_of
 from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence
+from radarsdf.returns.passages import MOST_SCANS
 from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
-# From this share of rough returns on, the errors are those of a rough scene.
+VOXEL_M = 0.1
+"""Default edge of a mesh's voxels, m."""
+INWARD = 1e-3
+"""How far points on the border of a map are moved into it, edges of a cell."""
+_CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
+_MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
+
+# From this clutter ratio on, the errors are those of a rough scene.
 # Measured: 0 to 0.07 on simulated scenes without much clutter, 0.27 to 0.44 on five real drives.
 _ROUGH_SHARE = 0.27
 # The part of the uncertainty that repetition does not shrink, leaf cells: in smooth scenes, and what rough ones add.
@@ -31,33 +40,27 @@ _ROUGH_SHARE = 0.27
 # intervals with 0.00 to 0.03 m on smooth simulated scenes, and with 0.20 to 0.29 m on the drives.
 _FLOOR_CELLS = 0.05
 _ROUGH_FLOOR_CELLS = 1.1
-# Found by `python -m bench.paper.one_probability`: the logit of the confidence, and that of the covering, are the first number, and
-# the others times the columns of `terms`.
+# Fitted by `python -m bench.paper.one_probability`: intercept and coefficients of `terms` in the logits of the confidence
+# and of the coverage.
 _CONFIDENCE = (3.29, -1.25, -0.87, -3.77, -3.50)
 _COVERING = (-0.21, -0.79, -1.47, -2.68, -2.46)
-_CROWDED_RETURNS = 4.0  # so many in a cell have half of the effect that any number has
-_BEND_CELLS = 2.0  # second difference of a distance whose slope turns from -1 to 1; so much distances may bend that are smoothed
-_LEAST_LOGIT = -80.0  # what was seen is not impossible: float32 has this probability
-# At least so many of the scans that looked at a surface have a return in one of its cells.
-_DETECTION_RATE = 1 / 36
-_SMOOTH = 0.5  # deviations of chance: a few more detections than needed are a little more evidence
-# Defaults of a mesh.
-VOXEL_M = 0.1
-_PIECE_TRIANGLES = 30  # of the smallest piece that is kept, in voxels of that edge
-INWARD = 1e-3  # how far points on the border of a map are moved into it, edges of a cell
-_CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
-_MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
-
-
-def piece_triangles(voxel_m: float) -> int:
-    """Triangles of the smallest piece that a mesh keeps in voxels of this edge, m: in larger voxels fewer, of more area."""
-    return round(_PIECE_TRIANGLES * min(1.0, VOXEL_M / voxel_m))
+_CROWDED_RETURNS = 4.0  # returns in a cell that have half of the effect that any number has
+_BEND_CELLS = 2.0  # bending allowed by the smoothness term, leaf cells: a slope turns from -1 to 1
+_LEAST_LOGIT = -80.0  # what was observed is not impossible: float32 has this probability
+_DETECTION_RATE = (
+    1 / 36
+)  # least share of the scans that reach a surface that have a return in one of its cells
+_SMOOTH = 0.5  # standard deviations: a few more hits than needed are a little more evidence
+_ODDS_CELLS = 50_000  # evenly spread leaf cells that calibrate how much free-space crossings tell
 
 
 @torch.inference_mode(mode=False)  # gradients, of which normals are made, need ordinary tensors
 def to_local(contents: WholeMap, world: Tensor) -> Tensor:
     """World positions (N, 3), m, in the local frame, float32. The origin is subtracted in float64."""
     return (world.double() - torch.from_numpy(contents.origin)).float()
+
+
+# The field
 
 
 def signed_distance(
@@ -79,9 +82,95 @@ def gradient(contents: MapContents, points: Tensor) -> Tensor:
     return evaluate(of_chunk, points)
 
 
+@torch.inference_mode(mode=False)
+def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
+    """(N,) intensity, sensor units, of the returns of sensors (N, 3), local frame, m, from the points."""
+    scale, field = contents.intensity_scale, contents.field
+    assert scale is not None
+
+    def of_chunk(chunk: Tensor) -> Tensor:
+        positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
+        ranges_m = rays.norm(dim=1)
+        directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
+        # Nothing tells how the intensity continues beyond the ranges of the returns: a regression would extrapolate.
+        ranges_m = ranges_m.clamp(*contents.sensor.range_m)
+        closed, share = contents.reflectance, 1.0
+        unit = torch.zeros_like(ranges_m)
+        if closed is not None:
+            unit += torch.from_numpy(closed.at(positions.numpy(), directions.numpy(), ranges_m.numpy(), 1))
+            share = closed.network_share
+        if share > 0:
+            unit += share * field.intensity(field.geometry(positions), directions, ranges_m)
+        # The closed form is not limited to what was measured.
+        return scale.to_sensor(unit if closed is None else unit.clamp(0, 1))
+
+    return evaluate(of_chunk, torch.cat([points, sensors], 1))
+
+
 def occupied(contents: MapContents, points: Tensor) -> Tensor:
     """(N,) bool, whether each point lies in an occupied leaf cell."""
     return evaluate(contents.field.cells.occupied, points)
+
+
+def leaf_keys(contents: MapContents) -> NDArray[np.uint64]:
+    """(C,) Morton keys of the leaf cells, ascending."""
+    return contents.field.cells.table.leaf_keys()
+
+
+def leaf_cells(contents: MapContents) -> NDArray[np.int32]:
+    """(C, 3) leaf cells, counted from the origin."""
+    return contents.field.cells.table.leaf_cells()
+
+
+def vertex_distances(
+    contents: MapContents, progress: bool | None
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    """Vertices of the leaf cells (V, 3), rows of them for each cell (C, 8), and signed distances (V,), m.
+
+    For a field that depends on the feature of the vertex alone: it needs no interpolation, and is fast.
+    """
+    field = contents.field
+    vertices, cell_vertices = field.cells.table.leaf_vertices()
+    distances_m: NDArray[np.float32] = evaluate(
+        lambda features: field.sdf_network([features])[0] * field.sigma_m,
+        field.cells.features.detach(),
+        description="mesh",
+        progress=progress,
+    ).numpy()
+    return vertices, cell_vertices, distances_m
+
+
+@torch.inference_mode(mode=False)
+def evaluate(
+    function: Callable[[Tensor], Tensor],
+    points: Tensor,
+    *,
+    description: str = "",
+    progress: bool | None = False,
+) -> Tensor:
+    """function(points) without gradients, in chunks, on as many threads as PyTorch uses."""
+
+    def without_gradients(chunk: Tensor) -> Tensor:
+        with torch.no_grad():
+            return function(chunk)
+
+    chunks = torch.split(points, _CHUNK) if len(points) > _CHUNK else (points,)
+    if len(chunks) == 1:
+        start_vector_library()  # the first queries may come from several threads at once
+        return without_gradients(points)
+    with Workers() as workers:
+        results = workers.map(without_gradients, chunks)
+        return torch.cat(
+            list(tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress)))
+        )
+
+
+# Where the map was observed
+
+
+def observed(contents: MapContents, points: Tensor) -> Tensor:
+    """(N,) bool, whether each point lies in an occupied leaf cell, or on its border."""
+    return into_cells(contents, points)[1]
 
 
 @torch.inference_mode(mode=False)
@@ -114,17 +203,12 @@ def into_cells(
     return points, inside
 
 
-def observed(contents: MapContents, points: Tensor) -> Tensor:
-    """(N,) bool, whether each point lies in an occupied leaf cell, or on its border."""
-    return into_cells(contents, points)[1]
-
-
-def answers_at(
+def where_observed(
     contents: MapContents, function: Callable[..., Tensor], points: Tensor, *others: Tensor, extrapolate: bool
 ) -> Tensor:
-    """function(contents, points, *others) where the points (N, 3) were observed and the others are finite. NaN elsewhere.
+    """function(contents, points, *others) where the points (N, 3) were observed and the others are finite; NaN elsewhere.
 
-    `extrapolate`: whether it is enough that the points are finite, too.
+    `extrapolate`: points that are finite are enough.
     """
     points, known = into_cells(contents, points)
     if extrapolate:
@@ -136,7 +220,7 @@ def answers_at(
 
 @torch.inference_mode(mode=False)
 def where(known: Tensor, *inputs: Tensor, function: Callable[..., Tensor]) -> Tensor:
-    """function(*inputs) of the rows that are `known` (N,), NaN in others. What is unknown does not reach the function."""
+    """function(*inputs) of the rows that are `known` (N,), NaN in others, which the function does not get."""
     if bool(known.all()):
         return function(*inputs)
     found = function(*(rows[known] for rows in inputs))
@@ -145,21 +229,20 @@ def where(known: Tensor, *inputs: Tensor, function: Callable[..., Tensor]) -> Te
     return result
 
 
+# Evidence of a surface
+
+
 class EvidenceAt(NamedTuple):
     """Evidence of a surface at N points, interpolated between the centres of leaf cells. 0 without cells."""
 
-    information: Tensor
-    """(N,) sum of 1 / variance over the returns round each point, m⁻²."""
-    detections: Tensor
-    """(N,) scans with returns round it."""
-    looks: Tensor
-    """(N,) scans that looked there."""
+    information: Tensor  # (N,) sum of 1 / variance over the returns near each point, m⁻²
+    detections: Tensor  # (N,) scans with returns there
+    looks: Tensor  # (N,) scans whose rays reach there
 
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
     """The evidence at each point."""
-    table = contents.field.cells.table
-    return interpolated(contents.evidence, table.leaf_keys(), table.leaf_size_m, points)
+    return interpolated(contents.evidence, leaf_keys(contents), contents.config.leaf_size_m, points)
 
 
 def interpolated(
@@ -198,18 +281,16 @@ def confidence(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 
 
 class Probabilities(NamedTuple):
-    """What the evidence at N points says of a surface there, float64. 0 where there are no returns, or next to that."""
+    """Probabilities of a surface at N points, float64. 0, or next to it, where there are no returns."""
 
-    confidence: Tensor
-    """(N,) see :func:`confidence`."""
+    confidence: Tensor  # (N,) see :func:`confidence`
     covering: Tensor
-    """(N,) the truth that the surface covers first, if surface is taken as its confidence falls, over its area. Only ratios count."""
-    reach: Tensor
-    """(N,) share of a normal distribution of the position's error within a leaf cell's edge."""
+    """(N,) true surface that is newly covered there over its area, if surface is taken as its confidence falls. Only ratios count."""
+    reach: Tensor  # (N,) share of a normal distribution of the position's error within a leaf cell's edge
 
 
 def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
-    """All three of each point."""
+    """Logistic functions of :func:`terms`."""
     start_vector_library()
     columns = terms(contents, evidence)
     true, covering = (
@@ -225,8 +306,8 @@ def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
 
 
 def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
-    """(N, 5) float64, of which logits are made: 1, the logarithm of the error in leaf cells, how many returns of a surface are
-    missing there, in deviations of chance, how rough the map is, and how crowded its returns are. Infinite without returns.
+    """(N, 5) float64 regressors: 1, the logarithm of the error in leaf cells, how many returns of a surface are missing
+    there, in standard deviations, how rough the map is, and how crowded its returns are. Infinite without returns.
 
     The last two are bounded: a map that is rougher or more crowded than any that was learnt from must not lose all surface.
     """
@@ -243,66 +324,62 @@ def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 
 
 def _smoothed(error_cells: Tensor) -> Tensor:
-    """(N,) standard errors of a surface that bends little, leaf cells, where the returns round a place alone give `error_cells`.
+    """(N,) standard errors of a surface that bends little, leaf cells; `error_cells`: of the returns near each place alone.
 
-    A thin plate whose second differences have the deviation b cells, and returns of the density ρ, variances⁻¹ a cell:
-    1 / (8 √(ρ / b²)) is the variance. Where these tell more, its neighbours add nothing.
+    A thin plate whose second differences have the standard deviation b cells, and returns of the density ρ, variances⁻¹ a
+    cell: 1 / (8 √(ρ / b²)) is the variance. Where the returns alone are better, its neighbours add nothing.
     """
     density = 1 / (CELLS_OF_SURFACE * error_cells.square())
     return error_cells.minimum((_BEND_CELLS / (8 * density.sqrt())).sqrt())
 
 
-@torch.inference_mode(mode=False)
-def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
-    """(N,) intensity, sensor units, of the return that each sensor gets from its point.
+# Free space
 
-    `sensors` (N, 3): sensor positions, local frame, m.
+
+@dataclass(frozen=True)
+class CellsInBox:
+    """Rays and returns in the leaf cells of a box, arrays of leaf cells."""
+
+    corner: NDArray[np.float64]  # (3,) lower corner of the first cell, world, m
+    passed: NDArray[np.uint8]  # number of scans with a ray through the cell, up to 7
+    returns: NDArray[np.bool_]  # whether there are returns in it
+    observed: NDArray[np.bool_]  # whether it is a leaf cell of the map
+
+
+def dense_cells(
+    contents: MapContents, lower: NDArray[np.int64], shape: tuple[int, int, int]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
+    """`passed`, `returns` and `observed` of the leaf cells from `lower` (3,) on, counted from the origin of a map."""
+    passed, returns = contents.passages.dense(lower, shape)
+    cells = lattice_of(leaf_keys(contents)) - lower
+    inside = ((cells >= 0) & (cells < shape)).all(axis=1)
+    observed = np.zeros(shape, bool)
+    observed[tuple(cells[inside].T)] = True
+    return passed, returns, observed
+
+
+def passage_odds(contents: MapContents) -> NDArray[np.float64]:
+    """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it.
+
+    Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells by their noise, and
+    on the way to false returns.
     """
-    scale, field = contents.intensity_scale, contents.field
-    assert scale is not None
+    cells = lattice_of(leaf_keys(contents))
+    cells = cells[:: max(1, len(cells) // _ODDS_CELLS)]
+    leaf_m = contents.config.leaf_size_m
+    centres = torch.from_numpy(((cells + 0.5) * leaf_m).astype(np.float32))
+    distances_m = signed_distance(contents, centres).numpy()
+    # Along grazing rays the field is longer than the distance, and where returns are noisy shorter; so is its gradient.
+    edge = leaf_m * np.linalg.norm(gradient(contents, centres).numpy(), axis=1)
+    weights = confidence(contents, evidence(contents, centres)).numpy().astype(np.float64)
+    passed = contents.passages.at(cells)
 
-    def of_chunk(chunk: Tensor) -> Tensor:
-        positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
-        ranges_m = rays.norm(dim=1)
-        directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
-        # How the intensity goes on beyond the ranges of the returns, nothing tells. A regression would take it to an end.
-        ranges_m = ranges_m.clamp(*contents.sensor.range_m)
-        closed, share = contents.reflectance, 1.0
-        unit = torch.zeros_like(ranges_m)
-        if closed is not None:
-            unit += torch.from_numpy(closed.at(positions.numpy(), directions.numpy(), ranges_m.numpy(), 1))
-            share = closed.network_share
-        if share > 0:
-            unit += share * field.intensity(field.geometry(positions), directions, ranges_m)
-        # The closed form knows no limits, and what is beyond those of the training was never measured.
-        return scale.to_sensor(unit if closed is None else unit.clamp(0, 1))
+    def shares(side: NDArray[np.bool_]) -> NDArray[np.float64]:
+        counts = np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1
+        found: NDArray[np.float64] = counts / counts.sum()
+        return found
 
-    return evaluate(of_chunk, torch.cat([points, sensors], 1))
-
-
-@torch.inference_mode(mode=False)
-def evaluate(
-    function: Callable[[Tensor], Tensor],
-    points: Tensor,
-    *,
-    description: str = "",
-    progress: bool | None = False,
-) -> Tensor:
-    """function(points) without gradients, in chunks, on as many threads as PyTorch uses.
-
-    `progress`: whether to show a progress bar with this `description`. None: only on a terminal.
-    """
-
-    def without_gradients(chunk: Tensor) -> Tensor:
-        with torch.no_grad():
-            return function(chunk)
-
-    chunks = torch.split(points, _CHUNK) if len(points) > _CHUNK else (points,)
-    if len(chunks) == 1:
-        start_vector_library()  # the first queries may come from several threads at once
-        return without_gradients(points)
-    with Workers() as workers:
-        results = workers.map(without_gradients, chunks)
-        return torch.cat(
-            list(tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress)))
-        )
+    odds = shares(distances_m < -edge) / shares(distances_m > edge)
+    # More crossings never make a cell less free: chance is smoothed away from the end on.
+    falling: NDArray[np.float64] = np.minimum.accumulate(odds)
+    return falling

@@ -13,27 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
 from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.sensor import Sensor
 
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.map.gridding import CellsInBox
-    from radarsdf.map.traced_surface import TracedSurface
-    from radarsdf.map.views import ViewedMap
+    from radarsdf.map.view import TracedSurface, ViewedMap
 
 
 class RadarMap(Map):
-    """A fitted map in one file, made by :func:`radarsdf.fit` or :func:`radarsdf.load`. :class:`Map` says what it answers."""
+    """A fitted map in one file, made by :func:`radarsdf.fit` or :func:`radarsdf.load`. See :class:`Map` for its queries."""
 
     def __init__(self, contents: MapContents) -> None:
         self._contents = contents
@@ -46,72 +41,40 @@ class RadarMap(Map):
         return _from_pickle, storage.to_pickle(self._contents)
 
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._answers_at(queries.signed_distance, world, extrapolate=extrapolate)
+        return self._where_observed(queries.signed_distance, world, extrapolate=extrapolate)
 
     def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._answers_at(queries.gradient, world, extrapolate=extrapolate)
+        return self._where_observed(queries.gradient, world, extrapolate=extrapolate)
 
     def _observed(self, world: Tensor) -> Tensor:
         return queries.observed(self._contents, queries.to_local(self._contents, world))
 
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
-        return self._answers_at(queries.intensity, world, sensors, extrapolate=extrapolate)
+        return self._where_observed(queries.intensity, world, sensors, extrapolate=extrapolate)
 
     @property
     def _contents_of_any(self) -> MapContents:
         return self._contents
 
-    def _answers_at(self, query: Callable[..., Tensor], *positions: Tensor, extrapolate: bool) -> Tensor:
-        local = (queries.to_local(self._contents, given) for given in positions)
-        return queries.answers_at(self._contents, query, *local, extrapolate=extrapolate)
+    def _where_observed(self, query: Callable[..., Tensor], *positions: Tensor, extrapolate: bool) -> Tensor:
+        local = (queries.to_local(self._contents, world) for world in positions)
+        return queries.where_observed(self._contents, query, *local, extrapolate=extrapolate)
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
-        from radarsdf.map.meshing import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.map.mesh import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
 
         return extract_mesh(self._contents, voxel_size, **wanted)
 
-    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellsInBox:
-        from radarsdf.map.gridding import CellsInBox, dense_cells  # noqa: PLC0415 - it imports trimesh, which is slow
-
+    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
         leaf_m = self.config.leaf_size_m
         first = np.floor((lower - self.origin) / leaf_m).astype(np.int64)
         count = np.floor((upper - self.origin) / leaf_m).astype(np.int64) - first + 1
         x, y, z = count.tolist()
-        return CellsInBox(self.origin + first * leaf_m, *dense_cells(self._contents, first, (x, y, z)))
+        cells = queries.dense_cells(self._contents, first, (x, y, z))
+        return queries.CellsInBox(self.origin + first * leaf_m, *cells)
 
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
         return queries.evidence(self._contents, queries.to_local(self._contents, world))
-
-    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - it is of all
-        from radarsdf.map.views import ViewedMap  # noqa: PLC0415 - as above
-
-        return ViewedMap.of(self._contents, self._traced)
-
-    @cached_property
-    def _traced(self) -> TracedSurface:
-        """The surface as rays meet it."""
-        from radarsdf.map.traced_surface import TracedSurface  # noqa: PLC0415 - as above
-
-        return TracedSurface.of(self._contents)
-
-    def save(self, path: str | PathLike[str]) -> None:
-        storage.save_contents(self._contents, path)
-
-    @property
-    def config(self) -> FitConfig:
-        return self._contents.config
-
-    @property
-    def report(self) -> dict[str, Any]:
-        return self._contents.report
-
-    @property
-    def sensor(self) -> Sensor:
-        return self._contents.sensor
-
-    @property
-    def intensity_scale(self) -> IntensityScale | None:
-        return self._contents.intensity_scale
 
     def echoes(self) -> EchoesAt:
         scale = self.intensity_scale
@@ -119,9 +82,20 @@ class RadarMap(Map):
             self.origin, *((0, 1) if scale is None else (scale.low, scale.high))
         )
 
-    @property
-    def rough_share(self) -> float:
-        return self._contents.rough_share
+    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - it is of all
+        from radarsdf.map.view import ViewedMap  # noqa: PLC0415 - trimesh is slow to import
+
+        return ViewedMap.of(self._contents, self._traced)
+
+    @cached_property
+    def _traced(self) -> TracedSurface:
+        """The surface as rays meet it."""
+        from radarsdf.map.view import TracedSurface  # noqa: PLC0415 - trimesh is slow to import
+
+        return TracedSurface.of(self._contents)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        storage.save_contents(self._contents, path)
 
     @property
     def origin(self) -> NDArray[np.float64]:
@@ -129,7 +103,7 @@ class RadarMap(Map):
 
     @property
     def extent(self) -> NDArray[np.float64]:
-        cells = lattice_of(self.field.cells.table.leaf_keys())
+        cells = lattice_of(queries.leaf_keys(self._contents))
         corners = np.stack([cells.min(axis=0), cells.max(axis=0) + 1])
         return corners * self.config.leaf_size_m + self.origin
 
@@ -143,12 +117,12 @@ class RadarMap(Map):
 
     @property
     def nbytes(self) -> int:
-        """Size of features and networks, bytes. 3QFP calls this the size of the map."""
+        """Size of features and networks, bytes: 3QFP's size of the map."""
         return sum(p.numel() * p.element_size() for p in self.field.parameters())
 
     @property
     def evidence(self) -> Evidence:
-        """What the returns tell of each leaf cell, in the order of the cells' keys."""
+        """Evidence of a surface in each leaf cell, in the order of the cells' keys."""
         return self._contents.evidence
 
     @property
@@ -158,25 +132,7 @@ class RadarMap(Map):
 
 
 def load_file(path: str | PathLike[str]) -> RadarMap:
-    """Reads a map that :meth:`Map.save` wrote. Nothing in the file is executed.
-
-    Parameters
-    ----------
-    path : path-like
-        A file written by this version.
-
-    Returns
-    -------
-    RadarMap
-        Its results have the same bits as those of the map that was saved.
-
-    Raises
-    ------
-    ValueError
-        If the file is not a radarsdf map, is damaged, or comes from another version.
-    OSError
-        If it cannot be read.
-    """
+    """Read the file of a map; see :func:`radarsdf.load`. Nothing in it is executed."""
     return RadarMap(storage.load_contents(path))
 
 

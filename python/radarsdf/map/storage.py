@@ -1,21 +1,24 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Writes and reads a map as one safetensors file, and as a pickle."""
+"""A map as one safetensors file, and as a pickle."""
 
 from __future__ import annotations
 
 import json
 import math
 from os import PathLike
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import Field as Limited
 from safetensors import SafetensorError
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 from torch import Tensor
+from typing_extensions import TypedDict
 
 from radarsdf._core import FEATURE_DIM
 from radarsdf.config.fit_config import FitConfig
@@ -24,12 +27,13 @@ from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.contents import MapContents
-from radarsdf.map.fit_report import checked_report
+from radarsdf.map.queries import leaf_keys
 from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.passages import Passages
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
+from radarsdf.settings import by_name, first_wrong
 
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 11
@@ -59,17 +63,12 @@ _PARTS = {
 }
 
 
+class _OtherFileError(ValueError):
+    """The file is of another program, or of another version of the format."""
+
+
 def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
-    """Writes a map to one file. An old file at `path` is replaced only once the new one is complete.
-
-    If the process is killed meanwhile, a hidden file ``.NAME.`` with 16 hexadecimal digits may stay beside
-    it.
-
-    Raises
-    ------
-    ValueError
-        If a number of the map is not finite. :func:`load_contents` would refuse the file.
-    """
+    """Write a map to one file, whole or not at all. A ValueError if a number is not finite: it could not be loaded."""
     tensors, description = parts_of(contents)
     for name, tensor in tensors.items():
         if not tensor.isfinite().all():
@@ -82,6 +81,38 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
         "description": json.dumps(description),
     }
     write_whole(path, tensor_bytes(tensors, metadata))
+
+
+@torch.inference_mode(mode=False)  # or the map could not give gradients
+def load_contents(path: str | PathLike[str]) -> MapContents:
+    """Read the file of a map. A ValueError if it is damaged, of another program or of another version."""
+    check_regular_file(path)
+    try:
+        with open_tensors(path) as file:
+            metadata = file.metadata
+            _check_format(metadata, path)
+            # Copied, because the tensors are views of the file, which may be changed or removed.
+            tensors = {name: file.array(name).clone() for name in file.names}
+        return _build(tensors, json.loads(metadata["description"]))
+    except (OSError, _OtherFileError):
+        raise
+    except SafetensorError as error:
+        raise _damaged(path) from error
+    except Exception as error:  # damaged files raise exceptions of many kinds
+        msg = f"{path} is not a whole radarsdf map: {error}"
+        raise ValueError(msg) from error
+
+
+def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
+    """(C,) Morton keys of the leaf cells of a map, ascending. Nothing else of its file is read or checked."""
+    try:
+        with open_tensors(path, "np") as file:
+            keys: NDArray[Any] = file.array("leaf_keys")
+    except (SafetensorError, ValueError) as error:
+        raise _damaged(path) from error
+    if keys.dtype != np.int64 or keys.ndim != 1 or not (np.diff(keys, prepend=-1) > 0).all():
+        raise _damaged(path)
+    return keys.astype(np.uint64)
 
 
 def file_bytes(contents: MapContents) -> int:
@@ -110,8 +141,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     }
     tensors[_FEATURES] = _without_empty_columns(tensors[_FEATURES])
     tensors["origin"] = torch.from_numpy(contents.origin)
-    # Morton keys have 63 bits, so they fit into int64, which all readers of safetensors have.
-    tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
+    tensors["leaf_keys"] = torch.from_numpy(leaf_keys(contents).astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
     tensors |= _tensors_of("passages", contents.passages)
     tensors |= _tensors_of("echoes", contents.echoes)
@@ -131,6 +161,68 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
 
 
+def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
+    """The inverse of :func:`parts_of`. Raises an error of some kind if parts do not fit together."""
+    config = FitConfig.from_dict(description["config"])
+    origin = _taken(tensors, "origin", torch.float64, (3,))
+    keys = tensors.pop("leaf_keys")
+    _check(keys.ndim == 1 and keys.dtype == torch.int64, "leaf_keys is not one key for each leaf cell")
+    evidence = {name: _taken(tensors, name, dtype, keys.shape) for name, dtype in _EVIDENCE.items()}
+    _check((evidence["information"] >= 0).all(), "information is negative")
+    passages = Passages(**_arrays_of("passages", tensors))
+    passages.check()
+    echoes = Echoes(**_arrays_of("echoes", tensors), sigma=float(description["echo_sigma"]))
+    echoes.check(config.leaf_size_m)
+    limits = description["intensity_scale"]
+    scale = None if limits is None else IntensityScale.between(limits)
+    share, reflectance = description["network_share"], None
+    if share is not None:
+        share = _in_range("network_share", share, 1)
+        arrays = _arrays_of("reflectance", tensors)
+        reflectance = Reflectance(config.leaf_size_m, **arrays, network_share=share)
+        reflectance.check()
+    # One of the two must answer for intensities, and without them neither can.
+    trained = scale is not None and config.trains_intensity
+    _check(
+        (trained or reflectance is not None) == (scale is not None),
+        "what answers for intensities is missing, or there are none",
+    )
+    return MapContents(
+        field=_field_of(tensors, keys.numpy().astype(np.uint64), config, trained),
+        origin=origin.numpy(),
+        intensity_scale=scale,
+        reflectance=reflectance,
+        config=config,
+        report=checked_report(description["report"]),
+        evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
+        passages=passages,
+        echoes=echoes,
+        rough_share=_in_range("rough_share", description["rough_share"], 1),
+        returns_per_cell=_in_range("returns_per_cell", description["returns_per_cell"], math.inf),
+        sensor=Sensor.from_dict(description["sensor"]),
+    )
+
+
+def _field_of(
+    tensors: dict[str, Tensor], keys: NDArray[np.uint64], config: FitConfig, with_intensity: bool
+) -> Field:
+    """The field with these leaf cells, of all tensors that are left."""
+    # A damaged description could ask for networks of any size. So the number of layers is limited, and the
+    # field is made without memory: it only serves to check the shapes of the tensors.
+    layers = len(config.networks.sdf_hidden + config.networks.intensity_hidden)
+    _check(layers <= len(tensors), "there are fewer tensors than layers")
+    with torch.device("meta"):
+        field = Field(keys, config, with_intensity=with_intensity)
+    for name, tensor in tensors.items():
+        finite = tensor.dtype == torch.float32 and tensor.isfinite().all()
+        _check(finite, f"{name} holds something other than finite float32 numbers")
+    state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
+    state[_FEATURES.removeprefix("field.")] = _with_empty_columns(tensors[_FEATURES])
+    field.load_state_dict(state, assign=True)  # raises a RuntimeError for wrong names or shapes
+    field.requires_grad_(False)
+    return field
+
+
 def _without_empty_columns(features: Tensor) -> Tensor:
     """Without columns of zeros at the end: a quick map uses one of eight, and its file is a quarter as large."""
     used = torch.nonzero((features != 0).any(dim=0))
@@ -138,10 +230,9 @@ def _without_empty_columns(features: Tensor) -> Tensor:
 
 
 def _with_empty_columns(features: Tensor) -> Tensor:
-    """What :func:`_without_empty_columns` left out is zero."""
-    if features.ndim != 2 or features.shape[1] > FEATURE_DIM:
-        msg = f"the features are not up to {FEATURE_DIM} numbers for each vertex"
-        raise ValueError(msg)
+    """The inverse of :func:`_without_empty_columns`."""
+    fits = features.ndim == 2 and features.shape[1] <= FEATURE_DIM
+    _check(fits, f"the features are not up to {FEATURE_DIM} numbers for each vertex")
     if features.shape[1] == FEATURE_DIM:
         return features
     return torch.cat([features, features.new_zeros(len(features), FEATURE_DIM - features.shape[1])], 1)
@@ -156,7 +247,7 @@ def _tensors_of(part: str, owner: Passages | Echoes | Reflectance) -> dict[str, 
 
 
 def _arrays_of(part: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    """Takes the arrays of a part from the tensors. Raises a ValueError if one is of another type, or is not finite."""
+    """Takes the arrays of a part from the tensors."""
     arrays = {}
     for name, (dtype, dimensions) in _PARTS[part].items():
         tensor = tensors.pop(f"{part}.{name}")
@@ -168,62 +259,35 @@ def _arrays_of(part: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
     return arrays
 
 
-def _reflectance_of(tensors: dict[str, Tensor], leaf_size_m: float, network_share: float) -> Reflectance:
-    if not 0 <= network_share <= 1:
-        msg = f"network_share must be in [0, 1], not {network_share}"
-        raise ValueError(msg)
-    arrays = _arrays_of("reflectance", tensors)
-    reflectance = Reflectance(leaf_size_m, **arrays, network_share=network_share)
-    reflectance.check()
-    return reflectance
+def _taken(
+    tensors: dict[str, Tensor], name: str, dtype: torch.dtype, shape: torch.Size | tuple[int, ...]
+) -> Tensor:
+    """Takes a tensor of this type and shape, of finite numbers."""
+    tensor = tensors.pop(name)
+    fits = tensor.shape == shape and tensor.dtype == dtype and tensor.isfinite().all()
+    _check(fits, f"{name} is not {tuple(shape)} finite numbers, {dtype}")
+    return tensor
 
 
-@torch.inference_mode(mode=False)  # or the map could not give gradients
-def load_contents(path: str | PathLike[str]) -> MapContents:
-    """Reads the file of a map. Nothing in the file is executed.
-
-    Raises
-    ------
-    ValueError
-        If the file is not a radarsdf map, is damaged, or is of another version of the format.
-    OSError
-        If the file cannot be read.
-    """
-    check_regular_file(path)
-    try:
-        with open_tensors(path) as file:
-            metadata = file.metadata
-            _check_format(metadata, path)
-            # Copied, because the tensors are views of the file, which may be changed or removed.
-            tensors = {name: file.array(name).clone() for name in file.names}
-        return _build(tensors, json.loads(metadata["description"]))
-    except (OSError, _OtherFileError):
-        raise
-    except SafetensorError as error:
-        raise _damaged(path) from error
-    except Exception as error:  # damaged files raise exceptions of many kinds
-        msg = f"{path} is not a whole radarsdf map: {error}"
-        raise ValueError(msg) from error
+def _in_range(name: str, value: Any, highest: float) -> float:
+    found = float(value)
+    _check(0 <= found <= highest and found < math.inf, f"{name} must be in [0, {highest:g}], not {value}")
+    return found
 
 
-def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
-    """(C,) Morton keys of the leaf cells of a map, ascending. Nothing else of its file is read or checked.
+def _check(fits: Any, text: str) -> None:
+    if not fits:
+        raise ValueError(text)
 
-    Raises
-    ------
-    ValueError
-        If the file has none.
-    OSError
-        If it cannot be read.
-    """
-    try:
-        with open_tensors(path, "np") as file:
-            keys: NDArray[Any] = file.array("leaf_keys")
-    except (SafetensorError, ValueError) as error:
-        raise _damaged(path) from error
-    if keys.dtype != np.int64 or keys.ndim != 1 or not (np.diff(keys, prepend=-1) > 0).all():
-        raise _damaged(path)
-    return keys.astype(np.uint64)
+
+def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
+    if metadata.get("format") != FORMAT:
+        msg = f"{path} is not a radarsdf map"
+        raise _OtherFileError(msg)
+    version = metadata.get("format_version", "")
+    if version != str(FORMAT_VERSION):
+        msg = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}"
+        raise _OtherFileError(msg)
 
 
 def _damaged(path: str | PathLike[str]) -> ValueError:
@@ -232,90 +296,86 @@ def _damaged(path: str | PathLike[str]) -> ValueError:
     )
 
 
-class _OtherFileError(ValueError):
-    """The file is of another program, or of another version of the format."""
+# The report of a fit
+
+_Count = Annotated[int, Limited(ge=0, le=2**53)]
+_Finite = Annotated[float, Limited(ge=0, allow_inf_nan=False)]
+_Position = Annotated[
+    list[Annotated[float, Limited(allow_inf_nan=False)]], Limited(min_length=3, max_length=3)
+]
+_MOST_SECONDS = 1e12
 
 
-def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
-    if metadata.get("format") != FORMAT:
-        msg = f"{path} is not a radarsdf map"
-        raise _OtherFileError(msg)
-    version = metadata.get("format_version", "")
-    if not version.isdecimal() or len(version) > 9 or int(version) != FORMAT_VERSION:
-        msg = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}"
-        raise _OtherFileError(msg)
+class _Noise(TypedDict):
+    range_m: _Finite
+    azimuth_rad: _Finite
+    elevation_rad: _Finite
 
 
-def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
-    config = FitConfig.from_dict(description["config"])
-    origin = tensors.pop("origin")
-    if origin.shape != (3,) or origin.dtype != torch.float64 or not origin.isfinite().all():
-        msg = "the origin is not three finite numbers"
-        raise ValueError(msg)
-    leaf_keys = tensors.pop("leaf_keys")
-    if leaf_keys.ndim != 1 or leaf_keys.dtype != torch.int64:
-        msg = "leaf_keys is not one key for each leaf cell"
-        raise ValueError(msg)
-    evidence = {name: tensors.pop(name) for name in _EVIDENCE}
-    for name, tensor in evidence.items():
-        if tensor.shape != leaf_keys.shape or tensor.dtype != _EVIDENCE[name]:
-            msg = f"{name} is not one number for each leaf cell"
+class _History(TypedDict):
+    iterations: list[_Count]
+    losses: list[float]  # of a fit that diverged, not all are finite
+    seconds: list[_Finite]
+
+
+class _Poses(TypedDict):
+    """What :func:`radarsdf.poses.way.way_of` writes."""
+
+    verdict: str
+    improved: bool | None
+    step_m: _Finite | None
+    step_rad: _Finite | None
+    scans: list[_Count]
+    before: list[_Position] | None
+    after: list[_Position]
+    sigma_m: list[_Finite]
+    sigma_rad: list[_Finite]
+
+
+class _Report(TypedDict, total=False):
+    """What :func:`radarsdf.fitting.steps.fit_rays` writes, and :func:`radarsdf.tiles.tile_fit.fit_tile`."""
+
+    __pydantic_config__ = ConfigDict(strict=True, extra="allow")  # type: ignore[misc]
+
+    scans: _Count
+    returns: _Count
+    returns_used: _Count
+    ghosts: _Count
+    movers: _Count
+    wild_intensities: _Count
+    noise: _Noise
+    leaf_cells: _Count
+    vertices: _Count
+    iterations: dict[str, _Count]
+    iterations_done: dict[str, _Count]
+    losses: dict[str, float]
+    loss_history: dict[str, _History]
+    skipped: list[str]
+    skipped_s: list[Annotated[float, Limited(allow_inf_nan=False)] | None]
+    plan: str
+    poses: _Poses
+
+
+_REPORT: TypeAdapter[Any] = TypeAdapter(_Report)
+
+
+def checked_report(report: Any) -> dict[str, Any]:
+    """The report of a fit, from JSON: what others rely on has its type. Other names that end in ``_s`` are seconds."""
+    try:
+        checked: dict[str, Any] = _REPORT.validate_python(by_name(report, "the report"))
+    except ValidationError as error:
+        raise ValueError(first_wrong(error, "report.")) from None
+    for name in checked.keys() - {"skipped_s"}:
+        value = checked[name]
+        if name.endswith("_s") and not (isinstance(value, float) and 0 <= value < _MOST_SECONDS):
+            msg = f"report.{name:.50} must be seconds, not {value!r:.50}"
             raise ValueError(msg)
-    if not (evidence["information"].isfinite() & (evidence["information"] >= 0)).all():
-        msg = "information holds something other than finite numbers of at least 0"
-        raise ValueError(msg)
-    passages = Passages(**_arrays_of("passages", tensors))
-    passages.check()
-    echoes = Echoes(**_arrays_of("echoes", tensors), sigma=float(description["echo_sigma"]))
-    echoes.check(config.leaf_size_m)
-    scale = None
-    if description["intensity_scale"] is not None:
-        scale = IntensityScale.between(description["intensity_scale"])
-    rough_share = float(description["rough_share"])
-    if not 0 <= rough_share <= 1:
-        msg = f"rough_share must be in [0, 1], not {rough_share}"
-        raise ValueError(msg)
-    returns_per_cell = float(description["returns_per_cell"])
-    if not 0 <= returns_per_cell < math.inf:
-        msg = f"returns_per_cell must be finite and at least 0, not {returns_per_cell}"
-        raise ValueError(msg)
-    share = description["network_share"]
-    reflectance = None if share is None else _reflectance_of(tensors, config.leaf_size_m, float(share))
-    # One of the two must answer for intensities, and without them neither can.
-    trained = scale is not None and config.trains_intensity
-    if (trained or reflectance is not None) != (scale is not None):
-        msg = "what answers for intensities is missing, or there are none"
-        raise ValueError(msg)
-    # A damaged description could ask for networks of any size. So the number of layers is limited, and the
-    # field is made without memory: it only serves to check the shapes of the tensors.
-    if len(config.networks.sdf_hidden + config.networks.intensity_hidden) > len(tensors):
-        msg = "there are fewer tensors than layers"
-        raise ValueError(msg)
-    with torch.device("meta"):
-        field = Field(
-            leaf_keys.numpy().astype(np.uint64),
-            config,
-            with_intensity=trained,
-        )
-    state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
-    for name, tensor in state.items():
-        if tensor.dtype != torch.float32 or not tensor.isfinite().all():
-            msg = f"{name} holds something other than finite float32 numbers"
-            raise ValueError(msg)
-    state[_FEATURES.removeprefix("field.")] = _with_empty_columns(tensors[_FEATURES])
-    field.load_state_dict(state, assign=True)  # raises a RuntimeError for wrong names or shapes
-    field.requires_grad_(False)
-    return MapContents(
-        field=field,
-        origin=origin.numpy(),
-        intensity_scale=scale,
-        reflectance=reflectance,
-        config=config,
-        report=checked_report(description["report"]),
-        evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
-        passages=passages,
-        echoes=echoes,
-        rough_share=rough_share,
-        returns_per_cell=returns_per_cell,
-        sensor=Sensor.from_dict(description["sensor"]),
-    )
+    poses = [value for value in checked.get("poses", {}).values() if isinstance(value, list)]
+    histories = [list(history.values()) for history in checked.get("loss_history", {}).values()]
+    skipped = [checked.get("skipped", []), checked.get("skipped_s", [])]
+    together = all(len({len(column) for column in columns}) == 1 for columns in [skipped, *histories])
+    if poses:
+        together &= len({len(column) for column in poses}) == 1 and len(poses[0]) > 0
+    known = checked.get("iterations_done", {}).keys() <= checked.get("iterations", {}).keys()
+    _check(together and known, "parts of the report do not fit together")
+    return checked

@@ -1,22 +1,96 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From which confidence on a mesh keeps a surface: where the F-score that is expected of the observed surface is highest."""
+"""Which triangles a mesh keeps: its limits, and the confidence at which the expected F-score is highest."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, astuple, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import number, whole_number
+from radarsdf.map.queries import VOXEL_M
+
 Floats = NDArray[np.float64]
 
-_PARTS = 1000  # of the confidences from 0 to 1
+_BINS = 1000  # of the confidences from 0 to 1
 _SCALARS = 3
-TALLY_NUMBERS = 3 * _PARTS + _SCALARS
+TALLY_NUMBERS = 3 * _BINS + _SCALARS
 """Numbers of a :class:`Tally`."""
+_COMPONENT_TRIANGLES = 30  # of the smallest component that is kept, in voxels of VOXEL_M
+
+
+class Limit(NamedTuple):
+    """A limit of a mesh on its vertices: an argument of `Map.mesh`. A triangle is kept if its three vertices are within it."""
+
+    column: str  # attribute of `Surface` that is compared, (V,)
+    keeps: Callable[[NDArray[np.float32], float], NDArray[np.bool_]]  # which of its values are within, (V,)
+    lowest: float
+    highest: float
+    default: float | None  # None: `Tally.threshold` finds it from the whole surface
+
+
+LIMITS = {
+    "max_uncertainty": Limit(
+        "uncertainty_m",
+        lambda values, limit: np.nan_to_num(values, nan=np.inf) <= limit,
+        lowest=0.0,
+        highest=math.inf,
+        default=math.inf,
+    ),
+    "min_confidence": Limit(
+        "confidence",
+        lambda values, limit: values >= limit,
+        lowest=0.0,
+        highest=1.0,
+        default=None,
+    ),
+}
+
+TriangleLimits = dict[str, float]
+"""Values of limits, by the names of `LIMITS`, that do not depend on the rest of the surface: a tile applies these alone."""
+
+
+class Limits(NamedTuple):
+    """All limits of a mesh; see :meth:`Map.mesh`."""
+
+    min_confidence: float | None  # None: that of the highest expected F-score
+    of_triangles: TriangleLimits
+    min_component_triangles: int
+
+    @classmethod
+    def of(
+        cls, voxel_m: float, *, min_component_triangles: int | None = None, **given: float | None
+    ) -> Limits:
+        """The arguments of :meth:`Map.mesh`, checked, with defaults filled in."""
+        if unknown := given.keys() - LIMITS.keys():
+            msg = f"a mesh has no limit {', '.join(sorted(unknown))}"
+            raise TypeError(msg)
+        found = {name: _checked(name, given.get(name)) for name in LIMITS}
+        min_confidence = found.pop("min_confidence")
+        if min_component_triangles is None:
+            # In larger voxels fewer, of more area.
+            min_component_triangles = round(_COMPONENT_TRIANGLES * min(1.0, VOXEL_M / voxel_m))
+        return cls(
+            min_confidence,
+            {name: value for name, value in found.items() if value is not None},
+            whole_number(min_component_triangles, "min_component_triangles", 0),
+        )
+
+
+def _checked(name: str, value: float | None) -> float | None:
+    limit = LIMITS[name]
+    if value is None:
+        return limit.default
+    value = number(value, name)
+    if not limit.lowest <= value <= limit.highest:
+        msg = f"{name} must be in [{limit.lowest:g}, {limit.highest:g}], not {value}"
+        raise ValueError(msg)
+    return value
 
 
 @dataclass(frozen=True)
@@ -42,7 +116,7 @@ class Threshold:
 
     @property
     def metadata(self) -> dict[str, float]:
-        """What a mesh says of it."""
+        """For the ``metadata`` of a mesh."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -55,44 +129,29 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Tally:
-    """The surface of a map, added up by its confidence. Sums of parts of a map, such as tiles, are those of the whole."""
+    """Area of a map's surface by confidence. Sums over parts of a map, such as tiles, are those of the whole."""
 
-    area_m2: Floats
-    """(B,) of the surface in each of B equal parts of the confidences from 0 to 1."""
-    true_m2: Floats
-    """(B,) how much of it is expected to be true."""
+    area_m2: Floats  # (B,) of the surface in each of B equal bins of the confidence from 0 to 1
+    true_m2: Floats  # (B,) expected true area of it
     covering: Floats
-    """(B,) the truth that it is expected to cover first, if surface is taken as its confidence falls. Only ratios count: what one
+    """(B,) true surface that is newly covered, if surface is taken as its confidence falls. Only ratios count: what one
     place covers is learnt up to a factor."""
-    existing_m2: float
-    """True surface that was seen, whether or not it is known well enough where it is."""
-    once_m2: float
-    """How much of the surface that is expected to be true has a return of one scan in one cell."""
-    twice_m2: float
-    """… of two."""
+    existing_m2: float  # Expected true surface, whether or not its position is known well enough
+    once_m2: float  # Expected true surface that has a return of one scan in one cell
+    twice_m2: float  # … of two
 
     @classmethod
     def of(
         cls, area_m2: Floats, confidence: Floats, covering: Floats, reach: Floats, detections: Floats
     ) -> Tally:
-        """Of a surface by its vertices.
-
-        Parameters
-        ----------
-        area_m2 : (V,) float64
-            By :func:`areas_round`, m².
-        confidence, covering, reach : (V,) float64
-            By :func:`queries.probabilities`.
-        detections : (V,) float64
-            Scans with returns round each vertex.
-        """
+        """Of a surface by its vertices: areas by :func:`areas_round`, and numbers of :mod:`queries`, (V,) each."""
         true_m2 = confidence * area_m2
-        parts = np.minimum((confidence * _PARTS).astype(np.int64), _PARTS - 1)
+        bins = np.minimum((confidence * _BINS).astype(np.int64), _BINS - 1)
         existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
         scans = np.round(detections)
 
         def by_confidence(values: Floats) -> Floats:
-            return np.bincount(parts, values, _PARTS).astype(np.float64)
+            return np.bincount(bins, values, _BINS).astype(np.float64)
 
         return cls(
             by_confidence(area_m2),
@@ -104,18 +163,18 @@ class Tally:
         )
 
     def sums(self) -> Floats:
-        """(TALLY_NUMBERS,) all numbers, which may be added to those of other parts of a map. :meth:`of_sums` is the inverse."""
+        """(TALLY_NUMBERS,) all numbers, which may be added to those of other parts of a map."""
         return np.concatenate([np.atleast_1d(values) for values in astuple(self)])
 
     @classmethod
     def of_sums(cls, sums: Floats) -> Tally:
-        """The tally with these numbers (TALLY_NUMBERS,)."""
-        area_m2, true_m2, covering = sums[:-_SCALARS].reshape(-1, _PARTS)
+        """The inverse of :meth:`sums`."""
+        area_m2, true_m2, covering = sums[:-_SCALARS].reshape(-1, _BINS)
         existing_m2, once_m2, twice_m2 = sums[-_SCALARS:].tolist()
         return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)
 
     def threshold(self, min_confidence: float | None = None) -> Threshold:
-        """That of the highest F-score expected of the observed surface, or what is expected of a given one."""
+        """The threshold of the highest expected F-score, or the expectations at a given one."""
         kept_m2, true_m2, covering = (
             np.cumsum(values[::-1])[::-1] for values in (self.area_m2, self.true_m2, self.covering)
         )
@@ -125,19 +184,19 @@ class Tally:
             total = precision + self.reachable * coverage
             # Over twice the reachable share, which is the same for all: if nothing can be reached, all is kept.
             f_score = np.divide(precision * coverage, total, out=np.zeros_like(total), where=total > 0)
-            part = int(np.flatnonzero(f_score == f_score.max())[-1]) if f_score.any() else 0
-            min_confidence = part / _PARTS
+            row = int(np.flatnonzero(f_score == f_score.max())[-1]) if f_score.any() else 0
+            min_confidence = row / _BINS
         else:
-            part = min(round(min_confidence * _PARTS), _PARTS - 1)
+            row = min(round(min_confidence * _BINS), _BINS - 1)
         coverage = self.reachable * coverage
-        expected = (precision[part], coverage[part], precision[0], coverage[0])
+        expected = (precision[row], coverage[row], precision[0], coverage[0])
         return Threshold(min_confidence, *map(float, expected))
 
     @property
     def reachable(self) -> float:
-        """Share of the observed surface that can be covered: that has returns, and lies near enough to where it was found.
+        """Share of the observed surface that can be covered: it has returns, and lies near enough to where it was found.
 
-        Of the surface that these scans could have hit, at least once² / (2 · twice) has no return: the estimate of Chao for
+        Of the surface that these scans could have hit, at least once² / (2 · twice) has no return: Chao's estimate of
         species that no sample has. Surface that no ray reaches leaves no trace in these counts.
         """
         true_m2 = float(self.true_m2.sum())
@@ -148,13 +207,13 @@ class Tally:
 
 
 def across_triangles(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, Floats]:
-    """(F, 3) vectors across triangles (F, 3), twice as long as their areas, and (F,) these lengths, m²."""
+    """(F, 3) normals of triangles (F, 3), twice as long as their areas, and (F,) these lengths, m²."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return across, np.sqrt(np.einsum("ni,ni->n", across, across))
 
 
 def areas_round(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
-    """(V,) a third of the area of the triangles (F, 3) round each vertex (V, 3), m, in m²."""
+    """(V,) a third of the area of the triangles (F, 3) at each vertex (V, 3), m, in m²."""
     thirds = np.repeat(across_triangles(vertices, faces)[1] / 6, 3)
     return np.bincount(faces.ravel(), thirds, len(vertices)).astype(np.float64)

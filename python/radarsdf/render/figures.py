@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from radarsdf.extras import require
 from radarsdf.grids.grid import Grid
 from radarsdf.io.files import write_whole
-from radarsdf.map.views import View
+from radarsdf.map.view import View
 
 _UNKNOWN = "#d0d0d0"
 _TRAJECTORY_COLORS = ("#d95f02", "#1b6ca8", "#2a7f3f", "#8e44ad")

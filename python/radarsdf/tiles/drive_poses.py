@@ -20,7 +20,7 @@ from radarsdf.io.imu import Imu
 from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.io.poses.writing import write_poses
 from radarsdf.io.scans import Scan
-from radarsdf.map.fit_report import checked_report
+from radarsdf.map.storage import checked_report
 from radarsdf.poses.posed import Posed
 from radarsdf.poses.windows import find_in_windows, refine_in_windows
 from radarsdf.tiles.input_digest import InputDigest

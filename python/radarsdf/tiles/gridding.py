@@ -9,7 +9,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.map.gridding import CellsInBox, dense_cells
+from radarsdf.map.queries import CellsInBox, dense_cells
 from radarsdf.returns.echoes import EchoesAt
 from radarsdf.tiles.blend import TileBlend
 

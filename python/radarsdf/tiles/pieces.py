@@ -18,10 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
-from radarsdf.map.isosurface import extract_cells, sparse_lattice
-from radarsdf.map.meshing import Surface, TriangleLimits, renumbered
-from radarsdf.map.threshold import TALLY_NUMBERS
-from radarsdf.map.voxels import crossed
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.mesh import Surface, crossed, renumbered
+from radarsdf.map.threshold import TALLY_NUMBERS, TriangleLimits
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
@@ -44,14 +43,14 @@ class PieceSettings:
 
     def to_json(self) -> str:
         """For arguments of tasks. :meth:`from_json` is its inverse."""
-        return json.dumps(asdict(self) | {"limits": self.limits._asdict()})
+        return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> PieceSettings:
         """The settings that :meth:`to_json` wrote."""
         values: dict[str, Any] = json.loads(text)
-        box, limits = values.pop("box"), TriangleLimits(**values.pop("limits"))
-        return cls(box=None if box is None else tuple(map(tuple, box)), limits=limits, **values)
+        box = values.pop("box")
+        return cls(box=None if box is None else tuple(map(tuple, box)), **values)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import write_whole
 from radarsdf.io.tensors import open_tensors
 from radarsdf.map.contents import MapContents
-from radarsdf.map.fit_report import checked_report
-from radarsdf.map.storage import load_contents
+from radarsdf.map.storage import checked_report, load_contents
 from radarsdf.tiles.plan import Plan, TilePlan, failure_path, map_path
 from radarsdf.tiles.ray_files import read_rays
 

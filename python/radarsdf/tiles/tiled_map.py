@@ -30,9 +30,9 @@ from radarsdf.tiles.tile_fit import report_of
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.map.gridding import CellsInBox
+    from radarsdf.map.queries import CellsInBox
     from radarsdf.map.threshold import Threshold
-    from radarsdf.map.views import ViewedMap
+    from radarsdf.map.view import ViewedMap
     from radarsdf.tiles.grid import Tile
 
 _Floats = NDArray[np.float64]
@@ -126,13 +126,11 @@ class TiledMap(TileBlend, Map):
         *,
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
-        min_confidence: float | None = None,
-        max_uncertainty: float | None = None,
-        min_component_triangles: int | None = None,
         executor: Executor | None = None,
         progress: bool | None = None,
+        **limits: Any,
     ) -> trimesh.Trimesh:
-        """Extracts the surface, without gaps or doubled triangles between tiles; see :meth:`Map.mesh`.
+        """Extracts the surface, without gaps or doubled triangles between tiles; arguments are those of :meth:`Map.mesh`.
 
         Each tile is a task for the `executor`. `voxel_size` must divide the leaf cell's edge. :meth:`export` writes a mesh
         that does not fit into memory.
@@ -141,11 +139,9 @@ class TiledMap(TileBlend, Map):
             viewpoint,
             voxel_size,
             box=box,
-            min_confidence=min_confidence,
-            max_uncertainty=max_uncertainty,
-            min_component_triangles=min_component_triangles,
             executor=executor,
             progress=progress,
+            **limits,
         )
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from radarsdf.budget.estimate import check_views
 from radarsdf.map import queries
-from radarsdf.map.meshing import Limits, Surface, TriangleLimits
-from radarsdf.map.traced_surface import TracedSurface
-from radarsdf.map.views import ViewedMap
+from radarsdf.map.mesh import Surface
+from radarsdf.map.threshold import Limits
+from radarsdf.map.view import TracedSurface, ViewedMap
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.pieces import PieceSettings, piece_of
@@ -44,7 +44,7 @@ def viewed_tiles(
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(config.max_memory_bytes, cells=cells)
     origin = config.lattice.position(city.plan.origin_cells(tiles[0]))
-    everything = PieceSettings(1, None, TriangleLimits())
+    everything = PieceSettings(1, None, {})
     pieces = [piece_of(city, tile, everything) for tile in tiles]
     before = np.cumsum([0, *[len(piece.vertices) for piece in pieces]])
     together = np.concatenate([piece.vertices for piece in pieces])

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from radarsdf.map.isosurface import mesh_components
-from radarsdf.map.meshing import renumbered, with_all
+from radarsdf.map.marching_cubes import mesh_components
+from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import TALLY_NUMBERS, Tally
 from radarsdf.tiles.pieces import Piece, tally_sums
 

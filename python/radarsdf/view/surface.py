@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import whole_number
-from radarsdf.map.meshing import renumbered, with_all
+from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Threshold
 from radarsdf.view.glb import lightness_of
 

@@ -10,10 +10,9 @@ import pickle
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.map.views import _spread
-from radarsdf.returns.noise import SensorNoise
+from radarsdf.map.view import _spread
 
-from .test_meshing import moved, surface_distance
+from .test_mesh import moved, surface_distance
 
 POSE = np.eye(4)
 POSE[:3, 3] = 1.3, 0.4, 1.5
@@ -50,15 +49,6 @@ def test_beams_meet_the_first_surface(view):
     # Nothing behind the wall, nor under the ground.
     assert places[:, 0].max() < 20.3
     assert places[:, 2].min() > -0.3
-
-
-def test_intensities_are_those_of_the_map(sharp_map, view):
-    if not sharp_map.has_intensity:
-        assert view.intensities is None
-        return
-    expected = sharp_map.intensity(view.world_points, POSE[:3, 3])
-    np.testing.assert_allclose(view.intensities, expected, atol=0.2)
-    assert (view.intensities >= sharp_map.sensor.threshold(view.ranges_m) - 1e-3).all()
 
 
 def test_the_pose_moves_the_returns_not_the_map(sharp_map):
@@ -99,14 +89,6 @@ def test_more_returns_are_denser(sharp_map, view):
     assert len(sharp_map.render(POSE, returns=0)) == 0
 
 
-def test_places_are_spread_as_if_they_were_listed():
-    expected = np.random.default_rng(0).uniform(0.5, 1, 3000)
-    sums = np.cumsum(expected)
-    for count in (1, 7, 100, 1500):  # no row expects more than one
-        places = (np.arange(count) + 0.5) * sums[-1] / count
-        np.testing.assert_array_equal(_spread(expected, count), np.searchsorted(sums, places))
-
-
 def test_places_that_one_row_would_have_several_of_go_to_others():
     rng = np.random.default_rng(1)
     expected = rng.exponential(size=3000) ** 6 * rng.integers(0, 2, 3000)
@@ -118,21 +100,6 @@ def test_places_that_one_row_would_have_several_of_go_to_others():
     assert likelier.mean() > 0.6
     assert len(_spread(expected, 10**8)) > 0.9 * np.count_nonzero(expected)
     assert len(_spread(np.zeros(5), 3)) == len(_spread(np.zeros(0), 3)) == len(_spread(expected, 0)) == 0
-
-
-def test_a_huge_sensor_takes_no_more_than_the_map_has(sharp_map, monkeypatch):
-    everywhere = dataclasses.replace(
-        sharp_map.sensor,
-        azimuth_rad=(-3.1, 3.1),
-        elevation_rad=(-1.5, 1.5),
-        returns_per_scan=1e7,
-        noise=SensorNoise(1e-9, 1e-9, 1e-9),
-    )
-    all_patches = sharp_map.render(POSE, everywhere, returns=1e8)
-    assert len(all_patches) <= len(sharp_map._traced.centres)
-    assert all_patches.beam_ranges_m.size <= 1_000_000
-    monkeypatch.setattr("radarsdf.map.views._BLOCK", 100)
-    np.testing.assert_array_equal(sharp_map.render(POSE, everywhere, returns=1e8).points, all_patches.points)
 
 
 def test_memory_that_is_not_there_is_said_before_the_work(sharp_map, monkeypatch):
@@ -154,13 +121,6 @@ def test_noise_only_if_asked_and_from_its_own_generator(sharp_map, view):
     assert not np.array_equal(sharp_map.render(POSE, noise=True, seed=2).points, noisy.points)
     errors_m = noisy.ranges_m - view.ranges_m
     assert errors_m.std() == pytest.approx(sharp_map.sensor.noise.range_m, rel=0.3)
-
-
-def test_views_are_scans(view):
-    scans = view.scans
-    assert len(scans) == 1
-    np.testing.assert_array_equal(scans.points[0], view.points)
-    np.testing.assert_array_equal(scans.poses[0], POSE)
 
 
 def test_pickled_and_saved_maps_see_the_same(sharp_map, view, tmp_path):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The returns that a radar would get from a pose never driven."""
+"""Predicted scans: the returns that a radar would get from a pose, and what its beams meet."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf._core import cell_keys
+from radarsdf._core import SurfaceTracer, cell_keys
 from radarsdf.budget.estimate import check_views
 from radarsdf.checks import flag, number, whole_number
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
-from radarsdf.map.traced_surface import TracedSurface
+from radarsdf.map.mesh import Surface
+from radarsdf.map.threshold import Limits, across_triangles
 from radarsdf.products import turned
 from radarsdf.returns.sensor import Sensor
+from radarsdf.threads import resolve_num_threads
 
 _Floats = NDArray[np.float64]
 
 # The density of returns on the surface is rate^a · cosine^b / range^c, times d where the patch is hidden: (a, b, c, d) in
 # smooth scenes and in rough ones. Beams are spread by angle, so in smooth scenes a patch gets as many as it is wide. A
-# real radar sees much behind surfaces, and answers come from few places. Chosen with `python -m bench.paper novel-views`.
+# real radar sees much behind surfaces, and returns come from few places. Chosen with `python -m bench.paper novel-views`.
 _SMOOTH = np.array([1.0, 1.0, 2.0, 0.01])
 _ROUGH = np.array([2.2, 0.3, 1.0, 0.65])
 _HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden
@@ -34,13 +36,16 @@ _MIN_COSINE = 0.05
 _MIN_BEAM_RAD = 2e-3
 _MAX_BEAMS = 1_000_000
 _MOST_PLACES = 1 << 40
-_BLOCK = 1 << 20  # patches that are looked at together
+_BLOCK = 1 << 20  # patches that are tested at a time
 _ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
+# Prior of the detection rate, in scans: with few scans that reached a patch, it is uncertain.
+_LOOKS_BEFORE = 2.0
+_DETECTIONS_BEFORE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a radar would get from one pose: N returns, and what each of its E · A beams first meets."""
+    """The scan predicted for one pose: N returns, and what each of the E · A beams first meets."""
 
     T_world_sensor: _Floats
     """(4, 4) m."""
@@ -76,12 +81,12 @@ class View:
 
     @property
     def scans(self) -> Scans:
-        """The returns as scans of one scan, which the writers of :mod:`radarsdf.io` take."""
+        """The returns as :class:`radarsdf.io.Scans` of one scan, for the writers of :mod:`radarsdf.io`."""
         return scans_of_views([self])
 
 
 def scans_of_views(views: Iterable[View]) -> Scans:
-    """The returns of views, one scan each. Of each view nothing else is kept."""
+    """The returns of views, one scan each."""
     kept = [(view.points, view.T_world_sensor, view.intensities) for view in views]
     values = [intensities for _, _, intensities in kept if intensities is not None]
     return Scans(
@@ -92,19 +97,64 @@ def scans_of_views(views: Iterable[View]) -> Scans:
 
 
 @dataclass(frozen=True, eq=False)
+class TracedSurface:
+    """The surface of a map as rays meet it, and patches that may have returns. It is made once for a map."""
+
+    tracer: SurfaceTracer  # of the triangles that the mesh keeps by default, local frame
+    centres: _Floats  # (P, 3) patches: middles of all triangles where the field crosses zero, local frame, m
+    normals: _Floats  # (P, 3) unit vectors towards free space
+    areas_m2: _Floats  # (P,) of the patches
+    rates: _Floats  # (P,) detection rate: share of the scans that reached a patch that have a return there
+
+    @classmethod
+    def of(cls, contents: MapContents) -> TracedSurface:
+        """The surface in voxels of a leaf cell's size, which is finer than the noise of a radar."""
+        voxel_m = contents.config.leaf_size_m
+        check_views(contents.config.max_memory_bytes, cells=len(contents.evidence.looks))
+        return cls.of_surface(
+            Surface.of(contents, voxel_m),
+            Limits.of(voxel_m),
+            lambda points: queries.evidence(contents, torch.from_numpy(points.astype(np.float32))),
+        )
+
+    @classmethod
+    def of_surface(
+        cls,
+        surface: Surface,
+        limits: Limits,
+        evidence_at: Callable[[_Floats], queries.EvidenceAt],
+    ) -> TracedSurface:
+        """All triangles are patches; rays meet those within `limits`. `evidence_at`: of points (N, 3), local frame, m."""
+        across, twice_m2 = across_triangles(surface.vertices, surface.faces)
+        centres = surface.vertices[surface.faces].mean(axis=1)
+        evidence = evidence_at(centres)
+        rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
+        faces = np.ascontiguousarray(surface.faces[surface.kept(limits)])
+        return cls(
+            SurfaceTracer(surface.vertices, faces, resolve_num_threads(0)),
+            centres,
+            across / np.maximum(twice_m2, 1e-12)[:, None],
+            twice_m2 / 2,
+            rates.astype(np.float64),
+        )
+
+    def ranges(self, origin: _Floats, directions: _Floats, max_range_m: float) -> NDArray[np.float32]:
+        """(N,) where rays from `origin` (3,) in unit `directions` (N, 3) first meet the mesh, local frame, m; inf: nowhere."""
+        rows = np.ascontiguousarray(directions, np.float32)
+        found, _ = self.tracer.first_hits(origin.tolist(), rows, max_range_m, False, resolve_num_threads(0))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
 class ViewedMap:
     """What views of a map need of it."""
 
-    surface: TracedSurface
-    """What beams meet, local frame."""
-    origin: _Floats
-    """(3,) of the local frame, world, m."""
-    roughness: float
-    """See :func:`radarsdf.map.queries.roughness`."""
+    surface: TracedSurface  # what beams meet, local frame
+    origin: _Floats  # (3,) of the local frame, world, m
+    roughness: float  # See :func:`radarsdf.map.queries.roughness`
     intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None
     """Intensities (N,) of returns from points (N, 3) to a sensor (3,), local frame, m. None: the map has none."""
-    max_memory_bytes: int | None
-    """What views may take. None: what the system has left."""
+    max_memory_bytes: int | None  # what views may take. None: what the system has left.
 
     @classmethod
     def of(cls, contents: MapContents, surface: TracedSurface) -> ViewedMap:
@@ -128,7 +178,7 @@ class ViewedMap:
 def view_from(
     viewed: ViewedMap, pose: _Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
 ) -> View:
-    """See :meth:`Map.render`. `pose`: (4, 4) T_world_sensor, m."""
+    """:meth:`Map.render` at a `pose` (4, 4), T_world_sensor, m."""
     surface = viewed.surface
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
     if not 0 <= wanted <= 1e8:
@@ -137,7 +187,7 @@ def view_from(
     azimuth, elevation = _beams(sensor)
     check_views(viewed.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation))
     position = pose[:3, 3] - viewed.origin
-    chosen = _answers(surface, pose[:3, :3], position, sensor, round(wanted), viewed.roughness)
+    chosen = _patches(surface, pose[:3, :3], position, sensor, round(wanted), viewed.roughness)
     points = turned(surface.centres[chosen] - position, pose[:3, :3].T)
     intensities = None
     if viewed.intensity is not None:
@@ -162,10 +212,10 @@ def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
         return ranges_m, np.arctan2(y, x), np.arcsin(z / ranges_m)
 
 
-def _answers(
+def _patches(
     surface: TracedSurface, R: _Floats, position: _Floats, sensor: Sensor, count: int, roughness: float
 ) -> NDArray[np.int64]:
-    """The patches that answer: `count` rows, spread evenly as the returns that are expected of each."""
+    """Rows of the patches that have a return: `count`, spread evenly by the number that is expected of each."""
     rows = np.concatenate(
         [
             first + _in_view(surface.centres[first : first + _BLOCK], R, position, sensor)
@@ -180,12 +230,12 @@ def _answers(
     to_patch = surface.centres[rows] - position
     ranges_m = np.sqrt(np.einsum("ni,ni->n", to_patch, to_patch))
     to_patch /= ranges_m[:, None]
-    first = surface.first_hits(position, to_patch, float(sensor.range_m[1]))
+    first_m = surface.ranges(position, to_patch, float(sensor.range_m[1]))
     cosine = np.abs(np.einsum("ni,ni->n", surface.normals[rows], to_patch))
     rate_power, cosine_power, range_power, hidden = _SMOOTH + roughness * (_ROUGH - _SMOOTH)
     expected = surface.areas_m2[rows] * surface.rates[rows] ** rate_power
     expected *= np.maximum(cosine, _MIN_COSINE) ** cosine_power / ranges_m**range_power
-    expected *= np.where(ranges_m > first.ranges_m + _HIDDEN_M, hidden, 1.0)
+    expected *= np.where(ranges_m > first_m + _HIDDEN_M, hidden, 1.0)
     return rows[_spread(expected, count)]
 
 
@@ -260,10 +310,10 @@ def _first_surface(
     shape = (len(elevation), len(azimuth))
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
     directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)
-    hits = viewed.surface.first_hits(position, directions, float(sensor.range_m[1]))
-    met = np.isfinite(hits.ranges_m) & (hits.ranges_m >= sensor.range_m[0])
-    ranges_m = np.where(met, hits.ranges_m, np.float32(np.nan))
-    places = position + directions[met] * hits.ranges_m[met, None]
+    ranges_m = viewed.surface.ranges(position, directions, float(sensor.range_m[1]))
+    met = np.isfinite(ranges_m) & (ranges_m >= sensor.range_m[0])
+    places = position + directions[met] * ranges_m[met, None]
+    ranges_m = np.where(met, ranges_m, np.float32(np.nan))
     if viewed.intensity is None:
         return ranges_m.reshape(shape), None
     intensities = np.full(len(ranges_m), np.nan, np.float32)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 
 import numpy as np
 import pytest
@@ -13,9 +12,9 @@ import radarsdf
 import torch
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents
-from radarsdf.map.isosurface import mesh_components
+from radarsdf.map.marching_cubes import mesh_components
+from radarsdf.map.mesh import _corner_distances, _voxels_of, crossed
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.map.voxels import _corner_distances, _smooth_in_cells, _voxels_of, crossed
 from scipy.spatial import KDTree
 
 from ..conftest import ground_and_wall
@@ -77,19 +76,6 @@ def test_vertices_lie_on_the_surface(mesh):
     assert np.quantile(surface_distance(centres), 0.9) < 0.1
 
 
-def test_the_surface_is_all_there(mesh):
-    x, y = np.meshgrid(np.arange(9, 19, 0.25), np.arange(-5, 5, 0.25))
-    y_wall, z_wall = np.meshgrid(np.arange(-5, 5, 0.25), np.arange(0.8, 3.5, 0.25))
-    truth = np.concatenate(
-        [
-            np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1),
-            np.stack([20 + 0 * y_wall.ravel(), y_wall.ravel(), z_wall.ravel()], 1),
-        ]
-    )
-    nearest_m, _ = KDTree(mesh.vertices).query(truth)
-    assert np.mean(nearest_m < 0.15) > 0.97
-
-
 def test_triangles_face_free_space(mesh):
     x, _, z = mesh.triangles_center.T
     ground, wall = inside(mesh) & (x < 19), inside(mesh) & (z > 1)
@@ -98,24 +84,6 @@ def test_triangles_face_free_space(mesh):
     assert np.average(mesh.face_normals[ground, 2] > 0.7, weights=area[ground]) > 0.95
     assert np.average(mesh.face_normals[wall, 0] < -0.7, weights=area[wall]) > 0.95
     np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1, atol=1e-6)
-
-
-@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
-def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, mesh_of, voxel_size):
-    mesh = mesh_of(voxel_size)
-    assert len(mesh.faces) > 0
-    # Vertices may lie on the very border, the middle of a triangle does not.
-    assert sharp_map.observed(mesh.triangles_center).mean() > 0.9999
-    towards_middle = np.repeat(mesh.triangles_center, 3, axis=0) - mesh.triangles.reshape(-1, 3)
-    assert sharp_map.observed(mesh.triangles.reshape(-1, 3) + 0.01 * towards_middle).mean() > 0.999
-
-
-@pytest.mark.parametrize("voxel_size", [0.07, 0.13, 0.19])
-def test_small_voxels_have_their_centres_in_the_map(sharp_map, mesh_of, voxel_size):
-    local = mesh_of(voxel_size).triangles_center - sharp_map.origin  # each in the middle of one voxel's
-    centres = (np.floor(local / voxel_size) + 0.5) * voxel_size
-    occupied = sharp_map.field.cells.occupied(torch.from_numpy(centres.astype(np.float32)))
-    assert occupied.float().mean() > 0.9999
 
 
 @pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.15, 0.2, 0.3])
@@ -166,22 +134,6 @@ def test_meshes_are_open_only_where_the_occupied_region_ends(sharp_map):
                 sides.append(tuple(np.floor(point).astype(int).tolist()) in voxels)
             borders.append(sides[0] != sides[1])
         assert any(borders)
-
-
-def test_two_meshes_of_one_map_are_the_same_bits(sharp_map):
-    meshes = [sharp_map.mesh(0.1) for _ in range(6)]
-    for mesh in meshes[1:]:
-        np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
-        np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
-
-
-@pytest.mark.parametrize("voxel_size", [0.1, 0.15])
-def test_small_parts_give_the_same_bits(sharp_map, mesh_of, voxel_size, monkeypatch):
-    whole = mesh_of(voxel_size)
-    monkeypatch.setattr("radarsdf.map.voxels._PART", 1 << 12)  # of a large map, as many parts
-    parts = sharp_map.mesh(voxel_size)
-    np.testing.assert_array_equal(parts.vertices, whole.vertices)
-    np.testing.assert_array_equal(parts.faces, whole.faces)
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -248,80 +200,12 @@ def test_a_viewpoint_gives_intensities_and_colours(sharp_map, mesh):
     assert "intensity" not in mesh.vertex_attributes
 
 
-def test_a_mesh_survives_its_file(sharp_map, tmp_path):
-    import trimesh  # noqa: PLC0415
-
-    seen = sharp_map.mesh(0.2, viewpoint=SENSOR)
-    seen.export(tmp_path / "mesh.ply")
-    back = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
-    np.testing.assert_array_equal(back.faces, seen.faces)
-    np.testing.assert_allclose(back.vertices, seen.vertices, atol=1e-5)
-    np.testing.assert_array_equal(back.visual.vertex_colors, seen.visual.vertex_colors)
-    assert b"intensity" in (tmp_path / "mesh.ply").read_bytes()[:1000]
-
-
 @pytest.mark.parametrize("viewpoint", [None, SENSOR])
 def test_where_there_is_no_surface_the_mesh_is_empty(sharp_map, viewpoint):
     empty = sharp_map.mesh(box=[[500, 500, 500], [501, 501, 501]], viewpoint=viewpoint)
     assert len(empty.vertices) == len(empty.faces) == 0
     none = sharp_map.mesh(0.2, viewpoint=viewpoint, min_component_triangles=10**9)
     assert len(none.vertices) == len(none.faces) == 0
-
-
-@pytest.mark.parametrize("voxel_size", [0, -0.1, np.nan, np.inf])
-def test_voxel_sizes_that_make_no_sense(sharp_map, voxel_size):
-    with pytest.raises(ValueError, match="voxel_size must be positive"):
-        sharp_map.mesh(voxel_size)
-
-
-@pytest.mark.parametrize(
-    "box",
-    [
-        [[0, 0, 0]],
-        [0, 0, 0, 1, 1, 1],
-        [[1, 0, 0], [0, 1, 1]],
-        [[0, 0, 0], [0, 1, 1]],
-        [[np.nan] * 3, [1] * 3],
-    ],
-)
-def test_boxes_that_make_no_sense(sharp_map, box):
-    with pytest.raises(ValueError, match="box must be"):
-        sharp_map.mesh(box=box)
-
-
-@pytest.mark.parametrize("viewpoint", [[1, 2], [[1, 2, 3]], [np.nan, 0, 0], 3.0])
-def test_viewpoints_that_make_no_sense(sharp_map, viewpoint):
-    with pytest.raises(ValueError, match="viewpoint must be one position"):
-        sharp_map.mesh(0.2, viewpoint=viewpoint)
-
-
-def test_a_viewpoint_needs_intensities(scene):
-    config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
-    bare = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
-    with pytest.raises(ValueError, match="fitted without"):
-        bare.mesh(viewpoint=SENSOR)
-
-
-def lattice(radar_map, voxel_size):
-    voxels = occupied_voxels(radar_map, voxel_size)
-    return radarsdf.map.isosurface.sparse_lattice(voxels)
-
-
-@pytest.mark.parametrize("voxel_size", [0.05, 0.1, 0.2])
-def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
-    voxels, corners, voxel_corners = lattice(sharp_map, voxel_size)
-    values = _corner_distances(sharp_map._contents, voxel_size, voxels, corners, voxel_corners, False)
-    some = np.random.default_rng(0).permutation(len(voxels))[:10_000]
-    voxel_corners = voxel_corners[some]
-    centres = (voxels[some] + 0.5) * voxel_size
-    inner = corners[voxel_corners] * voxel_size
-    inner = inner + 0.01 * (centres[:, None] - inner)
-    nearby = sharp_map.sdf(inner.reshape(-1, 3) + sharp_map.origin).reshape(-1, 8)
-    jump = np.abs(values[voxel_corners] - nearby)
-    # Every voxel sees at its corners what the map says just inside of it. Without features the distance would be
-    # that of free space, decimetres off.
-    assert np.quantile(jump, 0.999) < 0.02
-    assert sharp_map.field.cells.occupied(torch.from_numpy(inner.reshape(-1, 3).astype(np.float32))).all()
 
 
 # Voxels that do not divide the cells are moved otherwise at the border: there, a few vertices differ.
@@ -335,53 +219,12 @@ def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
     mesh = mesh_of(voxel_size)
     assert mesh.metadata["leaf_cells_searched"] == len(searched)
     assert mesh.metadata["leaf_cells"] == len(cells)
-    monkeypatch.setattr("radarsdf.map.voxels.crossed", lambda cells, *_: cells)
+    monkeypatch.setattr("radarsdf.map.mesh.crossed", lambda cells, *_: cells)
     whole = sharp_map.mesh(voxel_size)
     assert len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-4 if voxel_size in (0.05, 0.1) else 1e-3)
     distance_m, _ = KDTree(mesh.vertices).query(whole.vertices)
     even = voxel_size in (0.05, 0.1)
     assert np.quantile(distance_m, 0.9999 if even else 0.998) < 1e-4  # other batches, other rounding
-
-
-def test_cells_are_skipped_only_where_the_encoding_is_smooth():
-    assert _smooth_in_cells(radarsdf.FitConfig())
-    assert _smooth_in_cells(radarsdf.FitConfig(encoding={"fourier_count": 0}))
-    assert not _smooth_in_cells(radarsdf.FitConfig.paper())  # its finest wavelength is 2.5 cm
-
-
-def names(lattice):
-    """A number for each row of lattice coordinates (..., 3): NumPy compares numbers many times as fast as rows."""
-    x, y, z = np.moveaxis(np.asarray(lattice).astype(np.int64) + 2**20, -1, 0)
-    return x << 42 | y << 21 | z
-
-
-def test_occupied_voxels_fill_the_cells(sharp_map):
-    cells = names(sharp_map.field.cells.table.leaf_cells())
-    for parts in (1, 2, 4):
-        voxels = occupied_voxels(sharp_map, LEAF_M / parts)
-        assert len(np.unique(names(voxels))) == len(cells) * parts**3
-        np.testing.assert_array_equal(np.unique(names(voxels // parts)), np.sort(cells))
-
-
-@pytest.mark.parametrize("voxel_size", [0.07, 0.15, 0.3, 0.45])
-def test_uneven_voxels_cover_the_cells_and_little_more(sharp_map, voxel_size):
-    cells = sharp_map.field.cells.table.leaf_cells()
-    voxels = occupied_voxels(sharp_map, voxel_size)
-    voxels = voxels[np.unique(names(voxels), return_index=True)[1]]
-    # The middle of each cell is covered; a hair to either side, as it may lie on a face between two voxels.
-    middle = (cells + 0.5) * LEAF_M / voxel_size
-    covered = np.zeros(len(cells), bool)
-    for side in itertools.product((-1e-6, 1e-6), repeat=3):
-        covered |= np.isin(names(np.floor(middle + side)), names(voxels))
-    assert covered.all()
-    # Each voxel overlaps some occupied cell.
-    low = np.floor(voxels * voxel_size / LEAF_M + 1e-6).astype(int)
-    high = np.ceil((voxels + 1) * voxel_size / LEAF_M - 1e-6).astype(int)
-    overlaps = np.zeros(len(voxels), bool)
-    for step in itertools.product(range((high - low).max()), repeat=3):
-        cell = low + step
-        overlaps |= (cell < high).all(axis=1) & np.isin(names(cell), names(cells))
-    assert overlaps.all()
 
 
 def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path):
@@ -394,13 +237,26 @@ def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path)
     assert b"property float confidence" in (tmp_path / "mesh.ply").read_bytes()[:1000]
 
 
-def test_less_confident_triangles_are_cut(sharp_map):
-    all_of_it = {"max_uncertainty": np.inf, "min_component_triangles": 0}
-    confidence = sharp_map.mesh(min_confidence=0, **all_of_it).vertex_attributes["confidence"]
-    half = float(np.median(confidence))
-    cut = sharp_map.mesh(min_confidence=half, **all_of_it)
-    assert 0 < len(cut.vertices) < len(confidence)
-    assert cut.vertex_attributes["confidence"].min() >= half
-    for wrong in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match="min_confidence"):
-            sharp_map.mesh(min_confidence=wrong)
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        *(("voxel_size", size) for size in (0, np.nan, 1e13)),
+        *(("box", box) for box in ([[0, 0, 0]], [[1, 0, 0], [0, 1, 1]], [[0, 0, 0], [1e13] * 3])),
+        *(("viewpoint", place) for place in ([1, 2], [np.nan, 0, 0], [1e13, 0, 0])),
+        *(("min_confidence", limit) for limit in (-0.1, 1.1, np.nan)),
+        *(("max_uncertainty", limit) for limit in (-0.1, np.nan)),
+        ("min_component_triangles", -1),
+    ],
+)
+def test_wrong_arguments_are_refused_by_name(sharp_map, name, wrong):
+    with pytest.raises(ValueError, match=name):
+        sharp_map.mesh(**{name: wrong})
+
+
+def test_without_intensities_there_is_no_viewpoint(scene):
+    bare = radarsdf.fit(scene.points, scene.poses, config=radarsdf.FitConfig.quick(), progress=False)
+    assert not bare.has_intensity
+    with pytest.raises(ValueError, match="without"):
+        bare.mesh(viewpoint=SENSOR)
+    with pytest.raises(ValueError, match="without intensities"):
+        bare.intensity(SENSOR[None], SENSOR)

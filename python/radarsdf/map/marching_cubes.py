@@ -1,28 +1,32 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Triangle meshes of the level sets of sampled fields, by marching cubes.
+"""Triangle meshes of the level sets of sampled fields, by marching cubes; of tensors with gradients.
 
 A cell here is a cube of eight neighbouring samples: a voxel of marching cubes. Its corners are in C order:
 corner ``4 * dx + 2 * dy + dz`` is at ``(dx, dy, dz)`` from the lower one. Results do not depend on the number
 of threads.
+
+A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of its length.
+It moves along this edge when a or b changes, and depends on no other sample. Triangles have no gradient: they
+change only where a sample changes its sign.
 """
 
 from __future__ import annotations
 
-from typing import TypeAlias, overload
+from typing import Any, TypeAlias, overload
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from radarsdf import _core
 from radarsdf.checks import real_array, refuse_masked
-from radarsdf.map import differentiable_isosurface
 
 Mesh: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int32]]
 TensorMesh: TypeAlias = tuple[Tensor, Tensor]
-
-__all__ = ["extract_cells", "marching_cubes", "mesh_components", "sparse_lattice"]
+_SMALL_INTEGERS = 2  # bytes: float32 holds all of them
 
 
 @overload
@@ -35,8 +39,6 @@ def marching_cubes(
     mask: ArrayLike | None = None,
     num_threads: int = 0,
 ) -> TensorMesh: ...
-
-
 @overload
 def marching_cubes(
     volume: ArrayLike,
@@ -47,8 +49,6 @@ def marching_cubes(
     mask: ArrayLike | None = None,
     num_threads: int = 0,
 ) -> Mesh: ...
-
-
 def marching_cubes(
     volume: ArrayLike | Tensor,
     level: float = 0.0,
@@ -136,101 +136,53 @@ def marching_cubes(
         msg = f"volume must have three axes, not {len(shape)}"
         raise ValueError(msg)
     usable = None if mask is None else _as_mask(mask, shape)
-    placement = _as_placement(spacing, origin, shape)
-    if isinstance(samples, Tensor):
-        samples = differentiable_isosurface.as_samples(samples, "volume")
-        return differentiable_isosurface.volume_mesh(
-            samples, usable, *placement, _as_level(level), num_threads
-        )
-    return _core.marching_cubes_dense(samples, usable, *placement, _as_level(level), num_threads)
+    step, start = _as_placement(spacing, origin, shape)
+    iso = _as_level(level)
+    rest = usable, step, start, iso, num_threads
+    if not isinstance(samples, Tensor):
+        return _core.marching_cubes_dense(samples, *rest)
+    samples = _as_float_tensor(samples)
+    if samples.requires_grad and torch.is_grad_enabled():
+        mesh: TensorMesh = _MarchingCubes.apply(samples, *rest)  # type: ignore[no-untyped-call]
+        return mesh
+    vertices, faces = _core.marching_cubes_dense(samples.detach().numpy(), *rest)
+    return torch.from_numpy(vertices), torch.from_numpy(faces)
 
 
-@overload
-def extract_cells(
-    corners: ArrayLike,
-    values: Tensor,
-    cells: ArrayLike,
-    level: float = 0.0,
-    *,
-    spacing: ArrayLike = ...,
-    origin: ArrayLike = ...,
-    num_threads: int = 0,
-) -> TensorMesh: ...
-
-
-@overload
 def extract_cells(
     corners: ArrayLike,
     values: ArrayLike,
     cells: ArrayLike,
     level: float = 0.0,
     *,
-    spacing: ArrayLike = ...,
-    origin: ArrayLike = ...,
-    num_threads: int = 0,
-) -> Mesh: ...
-
-
-def extract_cells(
-    corners: ArrayLike,
-    values: ArrayLike | Tensor,
-    cells: ArrayLike,
-    level: float = 0.0,
-    *,
     spacing: ArrayLike = (1.0, 1.0, 1.0),
     origin: ArrayLike = (0.0, 0.0, 0.0),
     num_threads: int = 0,
-) -> Mesh | TensorMesh:
-    """Triangulate the surface on which a field crosses a level, in some cells of a lattice.
-
-    The mesh is that of `marching_cubes` on a volume in which these cells are in use, with vertices and faces
-    in another order. Time and memory are proportional to the numbers of cells and corners. The vertices of a
-    tensor's mesh can be differentiated by `values`, as for `marching_cubes`.
+) -> Mesh:
+    """:func:`marching_cubes` in some cells of a lattice. Time and memory are proportional to their number.
 
     Parameters
     ----------
-    corners : array_like of int32, shape (K, 3)
+    corners : (K, 3) array_like of int32
         Lattice coordinates. None may occur twice.
-    values : array_like or Tensor, shape (K,)
-        The field at the corners, with types as for `marching_cubes`. Cells with a NaN corner are left out.
-    cells : array_like of int32, shape (M, 8)
-        Rows of `corners` for each cell, in C order, as `sparse_lattice` gives them. No cell may occur twice.
+    values : (K,) array_like
+        The field at the corners. Cells with a NaN corner are left out.
+    cells : (M, 8) array_like of int32
+        Rows of `corners` for each cell, as :func:`sparse_lattice` gives them. No cell may occur twice.
     level, spacing, origin, num_threads
-        As for `marching_cubes`; `origin` is the position of lattice point (0, 0, 0).
+        As for :func:`marching_cubes`; `origin` is the position of lattice point (0, 0, 0).
 
     Returns
     -------
-    vertices : ndarray of float64, shape (V, 3)
-        Positions in world units. A Tensor if `values` are one.
-    faces : ndarray of int32, shape (F, 3)
-        Rows of `vertices`, counter-clockwise seen from the positive side. A Tensor if `values` are one.
-
-    Raises
-    ------
-    TypeError
-        If `values` are not real, or `corners` or `cells` not integers.
-    ValueError
-        If a shape does not fit, or a cell refers to a corner that does not exist.
-
-    Examples
-    --------
-    >>> _, corners, cells = sparse_lattice([[0, 0, 0]])
-    >>> vertices, faces = extract_cells(corners, [1.0, -1, -1, -1, -1, -1, -1, -1], cells)
-    >>> vertices.sum(axis=0).tolist(), faces.shape
-    ([0.5, 0.5, 0.5], (1, 3))
+    vertices : (V, 3) ndarray of float64
+    faces : (F, 3) ndarray of int32
+        Those of :func:`marching_cubes`, in another order.
     """
     corners = _as_int32(corners, "corners")
     furthest = max(-float(corners.min(initial=0)), float(corners.max(initial=0))) + 1
-    rest = (
-        _as_int32(cells, "cells"),
-        *_as_placement(spacing, origin, (furthest,) * 3),
-        _as_level(level),
-        num_threads,
-    )
-    if isinstance(values, Tensor):
-        samples = differentiable_isosurface.as_samples(values, "values")
-        return differentiable_isosurface.cells_mesh(corners, samples, *rest)
-    return _core.marching_cubes_sparse(corners, _as_samples(values, "values"), *rest)
+    placement = _as_placement(spacing, origin, (furthest,) * 3)
+    samples, rows = _as_samples(values, "values"), _as_int32(cells, "cells")
+    return _core.marching_cubes_sparse(corners, samples, rows, *placement, _as_level(level), num_threads)
 
 
 def sparse_lattice(
@@ -240,69 +192,79 @@ def sparse_lattice(
 
     Parameters
     ----------
-    cells : array_like of int32, shape (M, 3)
-        Lattice coordinates of the lower corners of the cells, in any order. Cells may be repeated.
-    num_threads : int
-        0: as many as OpenMP uses.
+    cells : (M, 3) array_like of int32
+        Lattice coordinates of the lower corners of the cells, in any order, with repetitions.
 
     Returns
     -------
-    unique_cells : ndarray of int32, shape (M', 3)
+    unique_cells : (M', 3) ndarray of int32
         The different rows of `cells`, sorted by x, then y, then z.
-    corners : ndarray of int32, shape (K, 3)
+    corners : (K, 3) ndarray of int32
         Lattice coordinates of all their corners, without repetitions, sorted likewise.
-    cell_corners : ndarray of int32, shape (M', 8)
+    cell_corners : (M', 8) ndarray of int32
         Rows of `corners` for each cell, in C order.
-
-    Raises
-    ------
-    TypeError
-        If `cells` are not integers.
-    ValueError
-        If the shape does not fit, or the bounding box of the cells has more than 2^63 cells.
-
-    Examples
-    --------
-    >>> unique_cells, corners, cell_corners = sparse_lattice([[0, 0, 1], [0, 0, 0], [0, 0, 1]])
-    >>> unique_cells.tolist(), corners.shape
-    ([[0, 0, 0], [0, 0, 1]], (12, 3))
-    >>> corners[cell_corners[1, 0]].tolist()
-    [0, 0, 1]
     """
     return _core.sparse_lattice(_as_int32(cells, "cells"), num_threads)
 
 
 def mesh_components(faces: ArrayLike, num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Label the connected components of a mesh. Faces are connected if they share a vertex.
-
-    Parameters
-    ----------
-    faces : array_like of int32, shape (F, 3)
-        Rows of the vertices.
-    num_vertices : int
-        Number of vertices.
+    """Connected components of faces (F, 3), which share vertices.
 
     Returns
     -------
-    labels : ndarray of int32, shape (F,)
-        Component of each face; components are numbered in the order of their first faces.
-    sizes : ndarray of int64, shape (C,)
+    labels : (F,) ndarray of int32
+        Component of each face, numbered in the order of their first faces.
+    sizes : (C,) ndarray of int64
         Number of faces of each component.
-
-    Raises
-    ------
-    TypeError
-        If `faces` are not integers.
-    ValueError
-        If the shape does not fit, or a face refers to a vertex that does not exist.
-
-    Examples
-    --------
-    >>> labels, sizes = mesh_components([[0, 1, 2], [3, 4, 5], [2, 1, 6]], 7)
-    >>> labels.tolist(), sizes.tolist()
-    ([0, 1, 0], [2, 1])
     """
     return _core.mesh_components(_as_int32(faces, "faces"), num_vertices)
+
+
+class _MarchingCubes(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        samples: Tensor,
+        mask: NDArray[np.bool_] | None,
+        spacing: list[float],
+        origin: list[float],
+        level: float,
+        num_threads: int,
+    ) -> TensorMesh:
+        vertices, faces, edges = map(
+            torch.from_numpy,
+            _core.marching_cubes_dense_with_edges(
+                samples.detach().numpy(), mask, spacing, origin, level, num_threads
+            ),
+        )
+        ctx.save_for_backward(samples, edges)
+        ctx.placement = spacing, level, num_threads
+        ctx.mark_non_differentiable(faces)
+        ctx.set_materialize_grads(False)  # or the faces' gradient would be zeros of their size
+        return vertices, faces
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, vertices_grad: Tensor | None, _: Tensor | None) -> tuple[Tensor | None, ...]:
+        if vertices_grad is None:
+            return (None,) * 6
+        samples, edges = (saved.detach().numpy() for saved in ctx.saved_tensors)
+        spacing, level, num_threads = ctx.placement
+        # The core fills it. NumPy asks for huge pages, as PyTorch does not.
+        grad = np.empty(samples.shape, samples.dtype)
+        upstream = vertices_grad.contiguous().numpy()
+        _core.marching_cubes_dense_backward(samples, edges, upstream, spacing, level, grad, num_threads)
+        return torch.from_numpy(grad), *(None,) * 5
+
+
+def _as_float_tensor(volume: Tensor) -> Tensor:
+    """`volume` in C order as float32 or float64, whichever would be taken of an array of this type."""
+    kind = volume.dtype
+    if kind.is_complex:
+        msg = f"volume must be real numbers, not {kind}"
+        raise TypeError(msg)
+    small = kind.is_floating_point or kind.itemsize <= _SMALL_INTEGERS
+    return volume.to(torch.float32 if small and kind != torch.float64 else torch.float64).contiguous()
 
 
 def _as_samples(values: ArrayLike, name: str) -> NDArray[np.float32] | NDArray[np.float64]:

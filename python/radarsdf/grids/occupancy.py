@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Makes a grid of a map: occupied where a surface probably is, free only where rays passed."""
+"""The grid of a map: occupied where a surface probably is, free only where rays passed."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,99 +13,72 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.grids.grid import FREE, OCCUPIED, UNKNOWN, Grid
-from radarsdf.map import queries
-from radarsdf.map.contents import MapContents
-from radarsdf.returns.cells import lattice_of
-from radarsdf.returns.passages import MOST_SCANS
-
-if TYPE_CHECKING:
-    from radarsdf.map.map import Map
+from radarsdf.map.map import Map
 
 _MAX_VOXELS = 2**28  # 15 bytes each
 # Half of what a cube covers across a plane through its centre, in edges: the mean over all directions of the plane.
 _HALF_WIDTH = 0.75
 _SIGMAS_95 = 1.96
-_ODDS_CELLS = 50_000  # of a map are asked, evenly spread: how often rays pass what is solid
 
 
-@dataclass(frozen=True)
-class CellsInBox:
-    """What rays and returns tell of the leaf cells in a box, arrays of leaf cells."""
-
-    corner: NDArray[np.float64]
-    """(3,) lower corner of the first cell, world, m."""
-    passed: NDArray[np.uint8]
-    """Number of scans with a ray through the cell, up to 7."""
-    returns: NDArray[np.bool_]
-    """Whether there are returns in it."""
-    observed: NDArray[np.bool_]
-    """Whether it is a leaf cell of the map."""
-
-
-def dense_cells(
-    contents: MapContents, lower: NDArray[np.int64], shape: tuple[int, int, int]
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Passed, returns and observed of leaf cells from `lower` on, counted from the origin of a map."""
-    passed, returns = contents.passages.dense(lower, shape)
-    cells = lattice_of(contents.field.cells.table.leaf_keys()) - lower
-    inside = ((cells >= 0) & (cells < shape)).all(axis=1)
-    observed = np.zeros(shape, bool)
-    observed[tuple(cells[inside].T)] = True
-    return passed, returns, observed
-
-
-def passage_odds(contents: MapContents) -> NDArray[np.float64]:
-    """(8,) how much more often so many scans pass a leaf cell behind a surface than one before it.
-
-    By the map itself: cells of which the returns say on which side of a surface they are. Rays pass solid cells by their
-    noise, and on the way to false returns.
-    """
-    cells = lattice_of(contents.field.cells.table.leaf_keys())
-    cells = cells[:: max(1, len(cells) // _ODDS_CELLS)]
-    leaf_m = contents.config.leaf_size_m
-    centres = torch.from_numpy(((cells + 0.5) * leaf_m).astype(np.float32))
-    distances_m = queries.signed_distance(contents, centres).numpy()
-    # Along flat rays the field is longer than the distance, and where returns are noisy it is shorter; so is its gradient.
-    edge = leaf_m * np.linalg.norm(queries.gradient(contents, centres).numpy(), axis=1)
-    confidence = queries.confidence(contents, queries.evidence(contents, centres)).numpy()
-    passed = contents.passages.at(cells)
-
-    def shares(side: NDArray[np.bool_]) -> NDArray[np.float64]:
-        counts = np.bincount(passed[side], confidence[side].astype(np.float64), MOST_SCANS + 1) + 1
-        found: NDArray[np.float64] = counts / counts.sum()
-        return found
-
-    # More scans that passed never make a cell less free: chance is smoothed away from the end on.
-    odds = shares(distances_m < -edge) / shares(distances_m > edge)
-    falling: NDArray[np.float64] = np.minimum.accumulate(odds)
-    return falling
-
-
-def check_passages(radar_map: Map, name: str) -> None:
-    """Raises a ValueError if a map does not keep what rays passed. `name`: by which the message calls it."""
-    if not radar_map.config.returns.passages:
-        msg = f"{name} does not keep what rays passed: fit it with returns.passages, which FitConfig() has and quick() has not"
-        raise ValueError(msg)
-
-
-def plane_at(radar_map: Map, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The surface round positions (N, 3), world, m, as planes: signed distances (N,), m, and normals (N, 3), towards free space.
-
-    Along flat rays the field is longer than the distance, and its gradient is as much longer than 1.
-    """
-    sdf, gradient = (values.double().numpy() for values in radar_map.plane_at(torch.from_numpy(x)))
-    length = np.linalg.norm(gradient, axis=1)
-    return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
-
-
-def make_grid(
+def grid(
     radar_map: Map,
     box: ArrayLike,
-    voxel_size: float,
-    occupied_from: float,
-    free_to: float,
+    voxel_size: float = 0.2,
+    *,
+    occupied_from: float = 0.5,
+    free_to: float = 0.125,
 ) -> Grid:
-    """See :meth:`Map.grid`."""
+    """Classify the voxels of a box as occupied, free or unknown, for planners.
+
+    A voxel is occupied where a surface probably is: by its signed distance, with :meth:`Map.uncertainty` and
+    :meth:`Map.confidence`. It is free only where rays passed on the way to their returns, where no return is in it, where
+    all its neighbours are known, since an unseen surface may be next to the unknown, and where no surface of a neighbour may
+    reach into it. All else is unknown. How much rays tell is calibrated on the map itself: how often they pass what is
+    behind its surfaces.
+
+    What a radar does not see is not free. It sees nothing in its blind cone, outside of its field of view, nor nearer
+    than its minimum range (``returns.min_range_m``): the ground under the sensor is unknown until it drove on. Smooth
+    ground sends nothing back at grazing angles and stays unknown. Glass and thin wires may send nothing back and be
+    called free if rays to what is behind them passed often. Rays to ghosts count only where these were not recognised; they may
+    free a place behind a mirror.
+
+    Parameters
+    ----------
+    radar_map : Map
+        Fitted with ``returns.passages``, which :class:`FitConfig` has and ``quick()`` has not.
+    box : (2, 3) array_like
+        Lower and upper corner, world, m. The grid covers the box, extended to multiples of `voxel_size` in the world: grids
+        of adjacent boxes fit together.
+    voxel_size : float
+        Edge of a voxel, m. Below that of a leaf cell, voxels are not better known. Above it, a voxel is occupied if a
+        part of it is, and free only if it is throughout.
+    occupied_from, free_to : float
+        From which probability of a surface on a voxel is occupied, and up to which it may be free; ascending, in
+        (0, 1). By default, scans must have passed it seven times as often as what is behind surfaces.
+
+    Returns
+    -------
+    Grid
+        Few places on true surfaces are called free: ``bench/history/grids.md`` says how many, on simulated places of
+        all kinds.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range, or the map was fitted without ``returns.passages``.
+    MemoryError
+        If the box has more than 2²⁸ voxels.
+
+    Examples
+    --------
+    >>> import radarsdf
+    >>> drive = radarsdf.simulate.wall(frames=4)
+    >>> config = radarsdf.FitConfig.quick(returns={"passages": True})
+    >>> radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
+    >>> radarsdf.grid(radar_map, [[0, -1, 0], [2, 1, 1]], 0.5).shape
+    (4, 4, 2)
+    """
     check_passages(radar_map, "this map")
     corners = check_box(box)
     size = positive(voxel_size, "voxel_size")
@@ -118,18 +90,33 @@ def make_grid(
     # Whole multiples of the voxel, as octrees have them; 1e-6 voxels are rounding.
     first = np.floor(corners[0] / size + 1e-6)
     counts = np.maximum(1, np.ceil(corners[1] / size - 1e-6) - first)
-    if np.prod(counts) * parts**3 > _MAX_VOXELS:
-        msg = f"the box has {np.prod(counts) * parts**3:.3g} voxels: at most {_MAX_VOXELS} fit; take a smaller one, or larger voxels"
+    voxels = np.prod(counts) * parts**3
+    if voxels > _MAX_VOXELS:
+        msg = f"the box has {voxels:.3g} voxels: at most {_MAX_VOXELS} fit; take a smaller one, or larger voxels"
         raise MemoryError(msg)
     shape = tuple((counts.astype(np.int64) * parts).tolist())
     fine = _fine_grid(radar_map, first * size, size / parts, shape, occupied_from, free_to)
     return fine if parts == 1 else _coarser(fine, parts)
 
 
+def check_passages(radar_map: Map, name: str) -> None:
+    """Raise a ValueError if a map, called `name` in it, has no free-space crossings."""
+    if not radar_map.config.returns.passages:
+        msg = f"{name} does not keep what rays passed: fit it with returns.passages, which FitConfig() has and quick() has not"
+        raise ValueError(msg)
+
+
 def _fine_grid(
-    radar_map: Map, lower: NDArray[np.float64], size: float, shape: tuple[int, ...],
-    occupied_from: float, free_to: float,
-) -> Grid:  # fmt: skip
+    radar_map: Map,
+    lower: NDArray[np.float64],
+    size: float,
+    shape: tuple[int, ...],
+    occupied_from: float,
+    free_to: float,
+) -> Grid:
+    """The grid from a corner (3,), world, m, in voxels that are at most as large as leaf cells."""
+    from scipy.ndimage import binary_erosion  # noqa: PLC0415 - slow to import
+
     leaf_m = radar_map.config.leaf_size_m
     upper = lower + np.array(shape) * size
     cells = radar_map.cells_round(lower - leaf_m, upper + leaf_m)
@@ -140,7 +127,7 @@ def _fine_grid(
     )
     passed, observed = cells.passed[places], cells.observed[places]
     # An unseen surface lies where what rays passed ends. So next to the unknown, nothing is free.
-    enclosed = _eroded(known)[places] & ~cells.returns[places]
+    enclosed = binary_erosion(known, np.ones((3, 3, 3)))[places] & ~cells.returns[places]
     odds = radar_map.passage_odds
     probability = np.where(passed > 0, (odds / (1 + odds)).astype(np.float32)[passed], np.float32(np.nan))
     free = enclosed & (passed > 0) & (probability <= free_to)
@@ -152,7 +139,7 @@ def _fine_grid(
         x = np.stack([centres[axis][rows[axis]] for axis in range(3)], 1)
         surface = _Planes.of(radar_map, x)
         distance_m[rows] = surface.distance_m
-        # Where the map has it: how far it may be off is said by `position_error_m`, or rough surfaces would be nowhere.
+        # Where the map has it; its error is in `position_error_m`, or rough surfaces would be nowhere.
         of_surface = np.where(_crossed(distance_m, _HALF_WIDTH * size)[rows], surface.confidence, 0)
         is_there = of_surface >= occupied_from
         occupied[rows] = is_there
@@ -171,21 +158,17 @@ def _fine_grid(
 
 @dataclass(frozen=True)
 class _Planes:
-    """The surface as the map has it round N positions: a plane each, of which the distance is known with an error."""
+    """The surface near N positions: a plane each, whose distance has an error."""
 
-    distance_m: NDArray[np.float32]
-    """(N,) signed distance of the position from the surface, m. NaN: unknown."""
-    normals: NDArray[np.float64]
-    """(N, 3) unit vectors to where distances grow."""
-    sigma_m: NDArray[np.float64]
-    """(N,) standard error of the distance, m."""
-    confidence: NDArray[np.float64]
-    """(N,) probability that there is a surface."""
+    distance_m: NDArray[np.float32]  # (N,) signed distance of the position from the surface, m. NaN: unknown.
+    normals: NDArray[np.float64]  # (N, 3) unit vectors to where distances grow
+    sigma_m: NDArray[np.float64]  # (N,) standard error of the distance, m
+    confidence: NDArray[np.float64]  # (N,) probability that there is a surface
 
     @classmethod
     def of(cls, radar_map: Map, x: NDArray[np.float64]) -> _Planes:
         """The planes at positions (N, 3), world, m."""
-        distance_m, normals = plane_at(radar_map, x)
+        distance_m, normals = radar_map.tangent_planes(x)
         unknown = np.isnan(distance_m)
         sigma_m = np.nan_to_num(radar_map.uncertainty(x), nan=radar_map.config.leaf_size_m).astype(np.float64)
         return cls(
@@ -240,17 +223,6 @@ def _crossed(distance_m: NDArray[np.float32], reach_m: float) -> NDArray[np.bool
             a, b = ((*(slice(None),) * axis, part) for part in (here, other))
             crossed = (before[a] & behind[b]) | (behind[a] & before[b])
             found[a] |= crossed & ((away_m[a] <= reach_m) | (away_m[a] <= away_m[b]))
-    return found
-
-
-def _eroded(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells that are known and whose 26 neighbours are. Those on the border of the array are not."""
-    found = known.copy()
-    for axis in range(3):
-        along = np.moveaxis(found, axis, 0)
-        both = along[1:-1] & along[2:] & along[:-2]
-        along[0], along[-1] = False, False
-        along[1:-1] = both
     return found
 
 
