@@ -9,8 +9,8 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from radarsdf.io.files import origin_path
 from radarsdf.io.meshes import MESH_SUFFIXES, read_mesh, write_mesh
-from radarsdf.io.origin import origin_path
 
 UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Safetensors files with a checksum of each array: how they are written and opened."""
+"""Safetensors files with a checksum of each array."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CHECKSUM = "crc32"
 
 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
-    """A safetensors file with checksums of its arrays and of `metadata`, which :func:`open_tensors` compares."""
+    """A safetensors file with checksums of its arrays and of `metadata`."""
     whole = {name: tensor.contiguous() for name, tensor in tensors.items()}
     checksums = {f"{_CHECKSUM} {name}": _checksum_of(tensor) for name, tensor in whole.items()}
     described = {**metadata, **checksums}
@@ -32,7 +32,7 @@ def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> 
 
 
 class TensorFile:
-    """An open safetensors file; `file` is what ``safetensors.safe_open`` gives. Older files have no checksums."""
+    """An open safetensors file, as ``safetensors.safe_open`` opens it. Older files have no checksums."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -56,13 +56,7 @@ class TensorFile:
 
 @contextmanager
 def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[TensorFile]:
-    """A safetensors file, whose arrays are read as they are asked for.
-
-    Yields
-    ------
-    TensorFile
-        Its arrays are of this `framework`, as ``safetensors.safe_open`` has it.
-    """
+    """A safetensors file whose arrays, of this `framework`, are read as they are asked for."""
     with in_utf8(path) as readable, safe_open(readable, framework=framework) as file:
         yield TensorFile(file)
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from radarsdf.io.bags.files import Topic, by_record, read_messages, topics_with
 from radarsdf.io.bags.messages import IMU, Header, ImuMessage
-from radarsdf.io.bags.poses import static_between
+from radarsdf.io.bags.tf import transforms_in
 from radarsdf.io.imu import Imu
-from radarsdf.io.sources import Request
+from radarsdf.io.recordings import Request
 
 __all__ = ["imu_in_bags", "imu_topic"]
 
@@ -70,7 +70,7 @@ def imu_in_bags(
     table = table[finite]
     has_force = np.isfinite(table).all() and table[:, 3:].any()
     R_sensor_imu = request.R_sensor_imu
-    if R_sensor_imu is None and first is not None:
-        T_imu_sensor = static_between(paths, first.frame, sensor_frame, request)
+    if R_sensor_imu is None and first is not None and first.frame:
+        T_imu_sensor = transforms_in(paths, request).fixed(first.frame, sensor_frame)
         R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
     return Imu(times_s[finite], table[:, :3], table[:, 3:] if has_force else None, R_sensor_imu)

@@ -19,20 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 _POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_RADAR_RETURN = np.dtype(
-    [(n, "<f4") for n in ("range", "azimuth", "elevation", "doppler_velocity", "amplitude")]
-)
-_ARS548_ANGLES_TO_RATE = [
-    (n, "f4") for n in ("elevation", "elevation_std", "range", "range_std", "range_rate", "range_rate_std")
-]
-_ARS548_IDENTITY = [("id", "u2"), ("existence", "u1"), ("class", "u1"), ("multi", "u1"), ("object", "u2"), ("ambiguity", "u1")]  # fmt: skip
+_RADAR_RETURN = [(n, "f4") for n in ("range", "azimuth", "elevation", "doppler_velocity", "amplitude")]
 _ARS548_RETURN = [
-    *((n, "f4") for n in ("azimuth", "azimuth_std")), ("flags", "u1"), *_ARS548_ANGLES_TO_RATE, ("rcs", "i1"),
-    *_ARS548_IDENTITY, ("sort_index", "u2"),
+    *((n, "f4") for n in ("azimuth", "azimuth_std")), ("flags", "u1"),
+    *((n, "f4") for n in ("elevation", "elevation_std", "range", "range_std", "range_rate", "range_rate_std")),
+    ("rcs", "i1"), ("id", "u2"), ("existence", "u1"), ("class", "u1"), ("multi", "u1"), ("object", "u2"),
+    ("ambiguity", "u1"), ("sort_index", "u2"),
 ]  # fmt: skip
 """As the radar sends it, and ars548_messages has it."""
 _NEBULA_RETURN = [(n, "V8" if n == "flags" else kind) for n, kind in _ARS548_RETURN[:-1]]
 _ARS548_LIST_BYTES, _ARS548_RETURNS_AT, _ARS548_COUNT_AT, _ARS548_MAX = 35336, 101, 35309, 800
+_TI_POINT = [("point_id", "H"), *((n, "f") for n in ("x", "y", "z", "range", "velocity")), ("doppler_bin", "H"),
+             ("bearing", "f"), ("intensity", "f")]  # fmt: skip
 _CDR_HEADER = 4
 _MAX_CDR_PADDING = 7
 _NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
@@ -80,7 +78,7 @@ class ImuMessage:
 
 
 class _Cursor:
-    """Reads the fields of a message, one after another: of ROS 1, or of ROS 2 (CDR), where they are aligned."""
+    """Reads the fields of a message one after another: of ROS 1, or of ROS 2 (CDR), where they are aligned."""
 
     def __init__(self, raw: bytes | memoryview, cdr: bool) -> None:
         self.raw = memoryview(raw)
@@ -103,11 +101,10 @@ class _Cursor:
         text = bytes(self._bytes(self.take("I")))
         return (text[:-1] if self.cdr else text).decode("utf-8", "replace")
 
-    def array(self, dtype: Any, count: int, alignment: int) -> NDArray[Any]:
-        dtype = np.dtype(dtype)
-        if count:
-            self._align(alignment)
-        return np.frombuffer(self._bytes(count * dtype.itemsize), dtype)
+    def floats(self) -> NDArray[np.float32]:
+        """A sequence."""
+        count = self.take("I")
+        return np.frombuffer(self._bytes(4 * count), "<f4")
 
     def doubles(self, count: int) -> tuple[float, ...]:
         self._align(8)
@@ -183,17 +180,18 @@ def _point_cloud2(cursor: _Cursor) -> CloudMessage:
         if count <= 1 and name:  # 0 is what some drivers write for 1
             columns.setdefault(name, (offset, (">" if big_endian else "<") + kind))
 
+    record = np.dtype(
+        {
+            "names": list(columns),
+            "formats": [kind for _, kind in columns.values()],
+            "offsets": [offset for offset, _ in columns.values()],
+            "itemsize": point_step,
+        }
+    )
+
     def read() -> dict[str, NDArray[Any]]:
         if not height * width:
             return {name: np.zeros(0, kind) for name, (_, kind) in columns.items()}
-        record = np.dtype(
-            {
-                "names": list(columns),
-                "formats": [kind for _, kind in columns.values()],
-                "offsets": [offset for offset, _ in columns.values()],
-                "itemsize": point_step,
-            }
-        )
         # One view of the message: no loop over points, and no copy.
         cloud: NDArray[Any] = np.ndarray((height, width), record, data, strides=(row_step, point_step))
         return {name: cloud[name].reshape(-1) for name in columns}
@@ -203,11 +201,10 @@ def _point_cloud2(cursor: _Cursor) -> CloudMessage:
 
 def _point_cloud(cursor: _Cursor) -> CloudMessage:
     header = cursor.header()
-    xyz = cursor.array("<f4", 3 * cursor.take("I"), 4).reshape(-1, 3)
-    columns = dict(zip("xyz", xyz.T, strict=True))
+    xyz = cursor.records([(axis, "f4") for axis in "xyz"], cursor.take("I"))
+    columns: dict[str, NDArray[Any]] = {axis: xyz[axis] for axis in "xyz"}
     for _ in range(cursor.take("I")):
-        name = cursor.string()
-        values = cursor.array("<f4", cursor.take("I"), 4)
+        name, values = cursor.string(), cursor.floats()
         if len(values) == len(xyz):
             columns.setdefault(name, values)
     return CloudMessage(header, lambda: columns)
@@ -215,21 +212,17 @@ def _point_cloud(cursor: _Cursor) -> CloudMessage:
 
 def _radar_scan(cursor: _Cursor) -> CloudMessage:
     header = cursor.header()
-    returns = cursor.array(_RADAR_RETURN, cursor.take("I"), 4)
-    return CloudMessage(header, lambda: {name: returns[name] for name in _RADAR_RETURN.names or ()})
+    returns = cursor.records(_RADAR_RETURN, cursor.take("I"))
+    return CloudMessage(header, lambda: {name: returns[name] for name, _ in _RADAR_RETURN})
 
 
 def _ti_radar_scan(cursor: _Cursor) -> CloudMessage:
     """One point a message."""
     header = cursor.header()
-    point_id = cursor.take("H")
-    x, y, z, _range, velocity = (cursor.take("f") for _ in range(5))
-    cursor.take("H")  # doppler_bin
-    cursor.take("f")  # bearing
-    intensity = cursor.take("f")
-    values = {"x": x, "y": y, "z": z, "velocity": velocity, "intensity": intensity}
+    fields = {name: cursor.take(kind) for name, kind in _TI_POINT}
+    used = ("x", "y", "z", "velocity", "intensity")
     return CloudMessage(
-        header, lambda: {n: np.array([v], np.float32) for n, v in values.items()}, int(point_id)
+        header, lambda: {name: np.array([fields[name]], np.float32) for name in used}, fields["point_id"]
     )
 
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 from functools import cache, partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +21,15 @@ from numpy.typing import NDArray
 from radarsdf.io.bags.files import Topic, bags_in, by_record, is_bag, read_messages, topics_of, topics_with
 from radarsdf.io.bags.imu import imu_in_bags, imu_topic
 from radarsdf.io.bags.messages import CLOUD_TYPES, PACKETS, POINT_A_MESSAGE, CloudMessage
-from radarsdf.io.bags.poses import FindPoses, attached, poses_in_bags, transforms_of
+from radarsdf.io.bags.poses import attached, poses_in_bags
+from radarsdf.io.bags.tf import transforms_in
 from radarsdf.io.clouds.fields import Fields
-from radarsdf.io.clouds.reading import Columns
 from radarsdf.io.imu import Imu
-from radarsdf.io.poses.reading import UNPOSED, ScanPoses, StampedPoses, poses_of
+from radarsdf.io.ply import Columns
+from radarsdf.io.poses.files import poses_of
+from radarsdf.io.poses.trajectory import UNPOSED, ScanPoses, StampedPoses
+from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
 from radarsdf.io.scans import Notes, Scans
-from radarsdf.io.sources import RawScan, Request, posed, scan_poses
 
 __all__ = ["bags_in", "is_bag", "read_bags"]
 
@@ -80,7 +81,6 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         return np.array([raw.time_s for raw in raw_scans()], np.float64)
 
     poses = request.poses
-    find: Any
     if poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses))):
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name), scan_times_s)
@@ -104,18 +104,20 @@ def _given(
     frames: list[str],
     raw_scans: Callable[[], Iterator[RawScan]],
     request: Request,
-) -> ScanPoses | FindPoses:
+) -> FindPoses:
     """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
     if isinstance(poses, np.ndarray):
         numbered = len(topics) == 1 and topics[0].message_type != POINT_A_MESSAGE
         count = topics[0].count if numbered else sum(1 for _ in raw_scans())
-        return scan_poses(poses, count, None, request.extrinsic, request)[0]
+        numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
+        return lambda _: numbered_poses
     if poses is UNPOSED:
         if len(frames) > 1:
             listed = ", ".join(frames)
             request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
-        return ScanPoses(poses, np.eye(4), request.max_gap_s)
-    return attached(poses, frames[0], cache(lambda: transforms_of(paths, request)), request)
+        unposed = ScanPoses(poses, np.eye(4), request.max_gap_s)
+        return lambda _: unposed
+    return attached(poses, frames[0], cache(lambda: transforms_in(paths, request)), request)
 
 
 def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) -> list[Topic]:
@@ -204,25 +206,24 @@ def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request
 
 def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
     """Scans of messages of one point each. A scan begins where the number of the point does not grow, or after a pause."""
-    points: list[CloudMessage] = []
+    scan: list[CloudMessage] = []
     last, last_s, start_s, number = -1, 0.0, 0.0, 0
+    name = ""
     for message in read_messages(paths, {topic.name}, request.notes):
         cloud: CloudMessage = message.content
-        point_id = -1 if cloud.point_id is None else cloud.point_id
-        if points and (point_id <= last or message.recorded_s > last_s + _PAUSE_S):
-            yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}", topic)
-            points, number = [], number + 1
-        if not points:
+        assert cloud.point_id is not None
+        if scan and (cloud.point_id <= last or message.recorded_s > last_s + _PAUSE_S):
+            yield RawScan(partial(_joined, scan), start_s, name, scan[0].header.frame, topic.name)
+            scan, number = [], number + 1
+        if not scan:
             start_s = message.recorded_s if recorded else cloud.header.stamp_s
-        points.append(cloud)
-        last, last_s = point_id, message.recorded_s
-    if points:
-        yield _joined(points, start_s, f"{paths[-1]}: scan {number} of {topic.name}", topic)
+            name = f"{message.bag}: scan {number} of {topic.name}"
+        scan.append(cloud)
+        last, last_s = cloud.point_id, message.recorded_s
+    if scan:
+        yield RawScan(partial(_joined, scan), start_s, name, scan[0].header.frame, topic.name)
 
 
-def _joined(points: list[CloudMessage], time_s: float, name: str, topic: Topic) -> RawScan:
-    def columns() -> Columns:
-        rows = [point.columns() for point in points]
-        return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}
-
-    return RawScan(columns, time_s, name, points[0].header.frame, topic.name)
+def _joined(points: list[CloudMessage]) -> Columns:
+    rows = [point.columns() for point in points]
+    return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}

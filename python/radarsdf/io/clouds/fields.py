@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the fields of a radar's point cloud mean: one table of the dialects, and the reading of a cloud by it."""
+"""What the fields of a radar's point cloud mean: a table of dialects, and the returns of a scan by it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.scans import Notes, Scan
-from radarsdf.io.units import SCALES, are_degrees, without_unit
+from radarsdf.io.text import SCALES, are_degrees, without_unit
 
 ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
          "sigma_range", "sigma_azimuth", "sigma_elevation")  # fmt: skip
@@ -22,6 +22,7 @@ ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
 _SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
+_NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ DIALECTS = (
     Dialect("View-of-Delft", "v_r", "rcs"),
     Dialect("TJ4DRadSet", "v_r", "power"),
 )  # fmt: skip
-"""The twelve dialects. A cloud is read by the one of which it has the most fields, all of them."""
+"""A cloud is read by the dialect of which it has the most fields, all of them."""
 
 _ALIASES: dict[str, tuple[str, ...]] = {
     # For clouds of no dialect: the first name that a cloud has, without what separates words. Files of ours come first.
@@ -99,33 +100,27 @@ def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
     return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
 
 
-@dataclass(frozen=True)
-class Cloud:
-    """The returns of one scan of a file, by what they mean."""
-
-    points: NDArray[Any]
-    """(N, 3) sensor frame, m. float64 if the file has it, else float32."""
-    intensities: NDArray[np.float32] | None
-    doppler_mps: NDArray[np.float32] | None
-    sigma: NDArray[np.float32] | None
-    dropped: int
-    """Returns that were left out, since a coordinate or the intensity was not finite."""
-
-    @classmethod
-    def of_finite(cls, points: NDArray[Any], intensities: Any, doppler_mps: Any, sigma: Any) -> Cloud:
-        """The returns whose coordinates and intensity are finite, with their Doppler and deviations."""
-        # All at once first: that is usual, and row by row takes twenty times as long.
-        if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
-            return cls(points, intensities, doppler_mps, sigma, 0)
+def finite_scan(
+    points: NDArray[Any],
+    T_world_sensor: NDArray[np.float64],
+    intensities: NDArray[Any] | None,
+    doppler_mps: NDArray[Any] | None,
+    time_s: float | None,
+    sigma: NDArray[Any] | None,
+    notes: Notes,
+) -> Scan:
+    """The returns whose coordinates and intensity are finite. The others are counted."""
+    # All at once first: that is usual, and row by row takes twenty times as long.
+    if not (np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all())):
         finite = np.isfinite(points).all(axis=1)
         if intensities is not None:
             finite &= np.isfinite(intensities)
-        kept = [None if array is None else array[finite] for array in (intensities, doppler_mps, sigma)]
-        return cls(points[finite], kept[0], kept[1], kept[2], int((~finite).sum()))
-
-    def scan(self, T_world_sensor: NDArray[np.float64], time_s: float | None) -> Scan:
-        """These returns with the pose and the time of the scan."""
-        return Scan(self.points, T_world_sensor, self.intensities, self.doppler_mps, time_s, self.sigma)
+        notes.count(_NOT_FINITE, int((~finite).sum()))
+        points = points[finite]
+        intensities, doppler_mps, sigma = (
+            None if array is None else array[finite] for array in (intensities, doppler_mps, sigma)
+        )
+    return Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma)
 
 
 @dataclass(frozen=True)
@@ -180,9 +175,10 @@ class Fields:
         """Whether positions are of range and angles."""
         return not set(_XYZ) <= set(self.names)
 
-    def place(self, columns: Mapping[str, NDArray[Any]]) -> bool:
-        """Whether a cloud has the fields of the positions."""
-        return {self.names[role] for role in (_POLAR if self.polar else _XYZ)} <= set(columns)
+    @property
+    def position_names(self) -> set[str]:
+        """The fields of the positions."""
+        return {self.names[role] for role in (_POLAR if self.polar else _XYZ)}
 
     def judged(self, clouds: Iterable[Mapping[str, NDArray[Any]]], notes: Notes) -> Fields:
         """These fields with the unit of their angles: of their names, or else by the numbers in some clouds."""
@@ -216,8 +212,15 @@ class Fields:
                 f"fields that are not used: {', '.join(unused)}; fields={{role: name}} or --field chooses others"
             )
 
-    def read(self, columns: Mapping[str, NDArray[Any]], what: str) -> Cloud:
-        """The cloud in these columns, (N,) each, without returns that are not finite."""
+    def scan(
+        self,
+        columns: Mapping[str, NDArray[Any]],
+        what: str,
+        T_world_sensor: NDArray[np.float64],
+        time_s: float | None,
+        notes: Notes,
+    ) -> Scan:
+        """The finite returns in the columns, (N,) each, of the cloud `what`."""
         for name in self.names.values():
             if name not in columns:
                 msg = f"{what} lacks the field {name}, which other scans have: it has {', '.join(columns)}"
@@ -225,20 +228,15 @@ class Fields:
             if columns[name].dtype.kind not in "biuf":
                 msg = f"{what}: the field {name} holds no numbers"
                 raise ValueError(msg)
-        with np.errstate(over="ignore"):  # too large a number becomes infinite, and is dropped
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is dropped
+            points, sigma = self.points(columns), self._sigma(columns)
             intensities, doppler_mps = (self._column(columns, role) for role in ("intensity", "doppler"))
-            sigma = self._sigma(columns)
-        return Cloud.of_finite(self._positions(columns), intensities, doppler_mps, sigma)
+        return finite_scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma, notes)
 
-    def check_no_more(self, others: Fields, what: str, first: str) -> None:
-        """Raises a ValueError if the cloud `what` has a role that these fields, of the cloud `first`, leave out."""
-        for role in ("intensity", "doppler", *_SIGMA):
-            if role in others.names and role not in self.names:
-                msg = (
-                    f"{what} has the field {others.names[role]} for {role}, which {first} lacks: leave it out of all scans "
-                    f"by fields={{{role!r}: None}}"
-                )
-                raise ValueError(msg)
+    def missing_role(self, others: Fields) -> str | None:
+        """A role that `others` have for more than positions, and these fields leave out."""
+        roles = ("intensity", "doppler", *_SIGMA)
+        return next((role for role in roles if role in others.names and role not in self.names), None)
 
     def _column(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[np.float32] | None:
         if role not in self.names:
@@ -254,8 +252,9 @@ class Fields:
         values = columns[self.names[role]]
         return values if scale is None else values * np.float64(scale)
 
-    def _positions(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        if set(_XYZ) <= set(self.names):
+    def points(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """(N, 3) sensor frame, m: float64 if the file has it or else float32."""
+        if not self.polar:
             parts = [self._values(columns, axis) for axis in _XYZ]
             dtype = np.float64 if any(part.dtype.itemsize > 4 for part in parts) else np.float32
             points = np.zeros((len(parts[0]), 3), dtype)
@@ -263,9 +262,8 @@ class Fields:
                 points[:, axis] = part
             return points
         ranges, azimuth, elevation = (self._values(columns, role).astype(np.float64) for role in _POLAR)
-        with np.errstate(invalid="ignore"):  # what is not finite is dropped later
-            flat = ranges * np.cos(elevation)
-            xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
+        flat = ranges * np.cos(elevation)
+        xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
         return np.stack(xyz, axis=1).astype(np.float32)
 
     def _sigma(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32] | None:

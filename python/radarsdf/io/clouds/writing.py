@@ -16,9 +16,8 @@ from tqdm import tqdm
 
 from radarsdf.checks import path_of
 from radarsdf.io.clouds.las import las_writer
-from radarsdf.io.files import whole_file
-from radarsdf.io.origin import origin_for, write_origin
-from radarsdf.io.records import ply_header, records
+from radarsdf.io.files import origin_for, whole_file, write_origin
+from radarsdf.io.ply import ply_header, records
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.progress import hides_bar
 
@@ -30,7 +29,7 @@ Rows = Iterator[NDArray[Any]]
 
 
 class CloudWritten(NamedTuple):
-    """What :func:`write_cloud` wrote."""
+    """Size and origin of a cloud that was written."""
 
     returns: int
     """Number of returns."""
