@@ -284,17 +284,3 @@ def test_a_day_without_a_calibration_of_the_ars548(ars548):
     with pytest.raises(ValueError, match="full_trajs"):
         read(ars548)
     check(read(ars548, POSES), POSES @ T_XT32_ARS548)
-
-
-@pytest.mark.parametrize(
-    ("inside", "name"),
-    [
-        ("radar/1606417097528152.png", "Boreas.*measures no heights"),
-        ("radar_tesseract/tesseract_00033.mat", "K-Radar.*tensors of power"),
-    ],
-)
-def test_what_cannot_be_mapped_is_refused_by_a_sentence(tmp_path, inside, name):
-    (tmp_path / inside).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / inside).touch()
-    with pytest.raises(ValueError, match=f"looks like {name}.*Returns in 3D with poses are needed"):
-        read(tmp_path)

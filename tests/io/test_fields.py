@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The dialects of radar fields: each is recognised, whatever its case and order, and can be overridden."""
+"""What fields of radars mean: by their names, whatever their case and order, by their units, or by choice."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.clouds.fields import DIALECTS, Fields
+from radarsdf.io.clouds.fields import Fields
 from radarsdf.io.scans import Notes
 
 from .test_folders import write_pcd
@@ -37,26 +37,31 @@ def scan_of(fields, columns):
     return fields.scan(columns, "the scan", np.eye(4), None, Notes())
 
 
+ROLES = {
+    "Sensrad Hugin": ("doppler", "power"),
+    "Oculii Eagle": ("doppler", "power"),
+    "ARS548, nebula": ("range_rate", "rcs"),
+    "ARS548, SNAIL-Radar": ("doppler", "intensity"),
+    "ARS548, HKUST RIO": ("velocity", "rcs"),
+    "smartmicro": ("radial_speed", "power"),
+    "TI ti_mmwave": ("velocity", "intensity"),
+    "TI reve": ("v_doppler_mps", "snr_db"),
+    "radar_msgs/RadarScan": ("doppler_velocity", "amplitude"),
+    "View-of-Delft": ("v_r", "rcs"),
+    "TJ4DRadSet": ("v_r", "power"),
+}
+
+
 @pytest.mark.parametrize("name", CLOUDS)
-def test_dialects(name):
+def test_fields_of_sensors(name):
     for names in (CLOUDS[name], CLOUDS[name][::-1], [n.upper() for n in CLOUDS[name]]):
-        fields = Fields.of(names)
-        assert fields.dialect.name == name
-        by_role = {role: field.lower() for role, field in fields.names.items()}
-        assert by_role["doppler"] == fields.dialect.doppler
-        assert by_role["intensity"] == fields.dialect.intensity
-        assert ("sigma_range" in by_role) == (fields.dialect.sigma is not None)
+        by_role = {role: field.lower() for role, field in Fields.of(names).names.items()}
+        assert (by_role["doppler"], by_role["intensity"]) == ROLES[name]
+        assert ("sigma_range" in by_role) == (name in ("Oculii Eagle",) or name.startswith("ARS548"))
 
 
-def test_there_are_twelve_dialects():
-    # One has the fields of another: as channels of another kind of message.
-    assert set(CLOUDS) | {"Oculii, NTU4DRadLM"} == {dialect.name for dialect in DIALECTS}
-    assert len(DIALECTS) == 12
-
-
-def test_fields_of_no_dialect():
+def test_fields_of_no_sensor():
     fields = Fields.of(["z", "y", "x", "SNR"])
-    assert fields.dialect is None
     assert fields.names == {"x": "x", "y": "y", "z": "z", "intensity": "SNR"}
     assert Fields.of(["x", "y", "z"]).names.keys() == set("xyz")
 

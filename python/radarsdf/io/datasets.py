@@ -192,33 +192,10 @@ DATASETS = (
 )
 """The data sets. The first that fits a folder reads it."""
 
-# What cannot be mapped by returns in 3D, by what is in its folders, and why.
-_NAVTECH = "its radar turns in a plane and measures no heights"
-_REFUSED: tuple[tuple[str, tuple[str, ...], str], ...] = (
-    ("Boreas", ("applanix", "radar/*.png"), _NAVTECH),
-    ("Oxford Radar RobotCar", ("radar.timestamps",), _NAVTECH),
-    ("MulRan", ("sensor_data/radar", "polar/*.png"), _NAVTECH),
-    ("K-Radar", ("radar_tesseract", "radar_zyx_cube"), "it has tensors of power, no returns"),
-    ("RaDelft", ("RadarCubes", "radar_cubes"), "it has cubes of power, no returns"),
-)
-
 
 def find(folder: Path) -> Dataset | None:
-    """The data set whose shape a folder has; None if it has none.
-
-    Raises
-    ------
-    ValueError
-        If it is of a data set that cannot be read, with the reason.
-    """
-    for dataset in DATASETS:
-        if dataset.fits(folder):
-            return dataset
-    for name, marks, why in _REFUSED:
-        if any(next(folder.glob(mark), None) is not None for mark in marks):
-            msg = f"{folder} looks like {name}, which cannot be mapped: {why}. Returns in 3D with poses are needed"
-            raise ValueError(msg)
-    return None
+    """The data set whose shape a folder has; None if it has none."""
+    return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
 
 
 def _of_files(

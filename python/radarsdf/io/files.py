@@ -11,7 +11,6 @@ import secrets
 import socket
 import stat
 import sys
-import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -43,25 +42,12 @@ def check_regular_file(path: str | PathLike[str]) -> None:
 @contextmanager
 def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> Iterator[None]:
     """Turns a ValueError, or one of these errors, in its block into a ValueError that names the file: it is not `what`."""
+    kinds: tuple[type[Exception], ...] = (ValueError, *errors)
     try:
         yield
-    except (ValueError, *errors) as error:
+    except kinds as error:
         msg = f"{path} is not {what}: {error}"
         raise ValueError(msg) from error
-
-
-@contextmanager
-def in_utf8(path: str | PathLike[str]) -> Iterator[Path]:
-    """`path`, or a temporary link to it for libraries that take UTF-8 only: names on Linux are any bytes."""
-    try:
-        os.fspath(path).encode()
-    except UnicodeEncodeError:
-        with tempfile.TemporaryDirectory(prefix="radarsdf_") as folder:
-            link = Path(folder) / f"link{Path(path).suffix.encode(errors='ignore').decode()}"
-            link.symlink_to(os.path.abspath(path))  # noqa: PTH100 - a link in the path stays as it is
-            yield link
-    else:
-        yield Path(path)
 
 
 def check_outputs(

@@ -197,8 +197,12 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[
     """Raises a ValueError unless the wanted arrays are there, each of its type and shape. A length of None is any."""
     for name, (dtype, *shape) in wanted.items():
         array = arrays.get(name)
-        fits = array is not None and array.dtype == dtype and array.ndim == len(shape)
-        if fits and all(n in (None, m) for n, m in zip(shape, np.shape(array), strict=True)):
+        if (
+            array is not None
+            and array.dtype == dtype
+            and array.ndim == len(shape)
+            and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+        ):
             continue
         msg = f"{name} is missing, or of another type or shape"
         raise ValueError(msg)

@@ -203,17 +203,17 @@ class Scans:
     @property
     def intensities(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
-        return self._loaded()["intensities"]
+        return self._optional("intensities")
 
     @property
     def doppler_mps(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), m/s: see `Scan.doppler_mps`. None if there is none."""
-        return self._loaded()["doppler_mps"]
+        return self._optional("doppler_mps")
 
     @property
     def sigmas(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i, 3), m, rad, rad: see `Scan.sigma`. None if there are none."""
-        return self._loaded()["sigmas"]
+        return self._optional("sigmas")
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
@@ -260,9 +260,7 @@ class Scans:
         return scans
 
     def _scan(self, arrays: dict[str, Any], i: int) -> Scan:
-        points, intensities, doppler_mps, sigma = (
-            None if arrays[name] is None else arrays[name][i] for name in _ARRAYS
-        )
+        points, intensities, doppler_mps, sigma = (arrays[n] and arrays[n][i] for n in _ARRAYS)
         time_s = None if self._times_s is None else float(self._times_s[i])
         return Scan(points, self.poses[i], intensities, doppler_mps, time_s, sigma)
 
@@ -288,6 +286,10 @@ class Scans:
         if self._poses is None and self._source is not None:
             for _ in self._read():
                 pass
+
+    def _optional(self, name: str) -> list[NDArray[Any]] | None:
+        arrays: list[NDArray[Any]] | None = self._loaded()[name]
+        return arrays
 
     def _loaded(self) -> dict[str, Any]:
         """The arrays of all scans, which are read from their files at the first call."""

@@ -16,8 +16,6 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from radarsdf.io.files import in_utf8
-
 # CRC-32 finds each error of up to 32 bits in a row, and misses one of 4e9 others. One core reads 3.4 GB/s with it, with
 # SHA-256 1.5 and blake2b 0.6; maps load at 0.06 to 0.12 GB/s, of which checksums take 4 to 8 %.
 _CHECKSUM = "crc32"
@@ -57,7 +55,7 @@ class TensorFile:
 @contextmanager
 def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[TensorFile]:
     """A safetensors file whose arrays, of this `framework`, are read as they are asked for."""
-    with in_utf8(path) as readable, safe_open(readable, framework=framework) as file:
+    with safe_open(path, framework=framework) as file:
         yield TensorFile(file)
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from radarsdf.extras import require
 from radarsdf.io.bags.messages import read_message
-from radarsdf.io.files import check_regular_file, in_utf8
+from radarsdf.io.files import check_regular_file
 from radarsdf.io.scans import Notes
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -161,23 +161,22 @@ def _opened(path: Path) -> Iterator[Any]:
     require("rosbags", what=f"{path}: bags are read by")
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
 
-    with in_utf8(path) as readable:  # which SQLite needs
-        try:
-            if path.suffix.lower() == _ROS1_SUFFIX:
-                reader: Any = rosbag1.Reader(readable)
+    try:
+        if path.suffix.lower() == _ROS1_SUFFIX:
+            reader: Any = rosbag1.Reader(path)
+            reader.open()
+        else:
+            reader = rosbag2.Reader(path)
+            with _any_mcap():
                 reader.open()
-            else:
-                reader = rosbag2.Reader(readable)
-                with _any_mcap():
-                    reader.open()
-        except PermissionError:
-            raise
-        except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
-            raise _damaged(path, error) from error
-        try:
-            yield reader
-        finally:
-            reader.close()
+    except PermissionError:
+        raise
+    except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
+        raise _damaged(path, error) from error
+    try:
+        yield reader
+    finally:
+        reader.close()
 
 
 @contextmanager

@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_RADAR_RETURN = [(n, "f4") for n in ("range", "azimuth", "elevation", "doppler_velocity", "amplitude")]
+_RADAR_RETURN = [
+    (n, "f4") for n in ("range", "azimuth_rad", "elevation_rad", "doppler_velocity", "amplitude")
+]
 _ARS548_RETURN = [
     *((n, "f4") for n in ("azimuth", "azimuth_std")), ("flags", "u1"),
     *((n, "f4") for n in ("elevation", "elevation_std", "range", "range_std", "range_rate", "range_rate_std")),
@@ -269,8 +271,16 @@ def _ars548_columns(
     each before its deviation. Azimuth is positive to the left, elevation upwards."""
     if invalid is None:
         invalid = np.unpackbits(returns["flags"][:, None], axis=1, bitorder="little").astype(bool)
-    names = ("range", "azimuth", "elevation", "range_rate")
-    columns = {n: np.where(invalid[:, 2 * i], np.nan, returns[n]) for i, n in enumerate(names)}
+    values = {
+        "range": "range",
+        "azimuth_rad": "azimuth",
+        "elevation_rad": "elevation",
+        "range_rate": "range_rate",
+    }
+    columns = {
+        name: np.where(invalid[:, 2 * i], np.nan, returns[field])
+        for i, (name, field) in enumerate(values.items())
+    }
     return columns | {n: returns[n] for n in ("rcs", "range_std", "azimuth_std", "elevation_std")}
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the fields of a radar's point cloud mean: a table of dialects, and the returns of a scan by it."""
+"""What the fields of a radar's point cloud mean: a table of names, and the returns of a scan by it."""
 
 from __future__ import annotations
 
@@ -25,43 +25,8 @@ _SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
 _NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 
 
-@dataclass(frozen=True)
-class Dialect:
-    """How one kind of sensor or data set names its fields. Case does not matter."""
-
-    name: str
-    doppler: str
-    intensity: str
-    sigma: tuple[str, str, str] | None = None
-    """Standard deviations of range, azimuth and elevation."""
-    sigma_in_degrees: bool = False
-    polar: bool = False
-    """Whether positions are range, azimuth and elevation, m and rad, not x, y and z."""
-    note: str = ""
-    """What a user must know of the numbers, one sentence."""
-
-
-DIALECTS = (
-    Dialect("Sensrad Hugin", "doppler", "power"),
-    Dialect("Oculii Eagle", "doppler", "power", ("rangeaccu", "aziaccu", "eleaccu"), sigma_in_degrees=True),
-    Dialect("Oculii, NTU4DRadLM", "doppler", "power"),  # a sensor_msgs/PointCloud with channels
-    Dialect("ARS548, nebula", "range_rate", "rcs", ("range_std", "azimuth_std", "elevation_std")),
-    Dialect(
-        "ARS548, SNAIL-Radar", "doppler", "intensity", ("range_std", "azimuth_std", "elevation_std"),
-        note="the intensities of ARS548 clouds with these fields are RCS + 128",
-    ),
-    Dialect("ARS548, HKUST RIO", "velocity", "rcs", ("rangestd", "azimuthstd", "elevationstd"), polar=True),
-    Dialect("smartmicro", "radial_speed", "power"),
-    Dialect("TI ti_mmwave", "velocity", "intensity"),  # of ti_mmwave_rospkg/RadarScan too
-    Dialect("TI reve", "v_doppler_mps", "snr_db"),
-    Dialect("radar_msgs/RadarScan", "doppler_velocity", "amplitude", polar=True),
-    Dialect("View-of-Delft", "v_r", "rcs"),
-    Dialect("TJ4DRadSet", "v_r", "power"),
-)  # fmt: skip
-"""A cloud is read by the dialect of which it has the most fields, all of them."""
-
 _ALIASES: dict[str, tuple[str, ...]] = {
-    # For clouds of no dialect: the first name that a cloud has, without what separates words. Files of ours come first.
+    # The first name that a cloud has counts. Files of ours come first.
     "intensity": ("power", "intensity", "rcs", "snr", "snrdb", "amplitude", "reflectivity", "reflectance", "magnitude",
                   "rssi", "signalpower", "signalstrength"),
     "doppler": ("doppler", "velocity", "dopplervelocity", "vdopplermps", "radialspeed", "radialvelocity", "rangerate",
@@ -70,10 +35,16 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "range": ("range", "distance", "r", "rng", "dist", "radius", "slantrange"),
     "azimuth": ("azimuth", "azimuthangle", "az", "azi", "azim", "angleazimuth"),
     "elevation": ("elevation", "elevationangle", "el", "ele", "elev", "angleelevation"),
-    "sigma_range": ("sigmarange", "rangestd"),
-    "sigma_azimuth": ("sigmaazimuth", "azimuthstd"),
-    "sigma_elevation": ("sigmaelevation", "elevationstd"),
+    "sigma_range": ("sigmarange", "rangestd", "rangeaccu"),
+    "sigma_azimuth": ("sigmaazimuth", "azimuthstd", "aziaccu"),
+    "sigma_elevation": ("sigmaelevation", "elevationstd", "eleaccu"),
 }  # fmt: skip
+"""Names that sensors, drivers and data sets give to a role, in lower case and without what separates words.
+
+Of Sensrad Hugin, Oculii Eagle, Continental ARS548 (nebula, SNAIL-Radar, HKUST RIO), smartmicro, TI mmWave (ti_mmwave,
+reve), radar_msgs, View-of-Delft, TJ4DRadSet, and others.
+"""
+_SNAIL_ARS548 = {"x", "doppler", "intensity", "range_std", "azimuth_std", "elevation_std"}
 
 COLUMNS: dict[int, tuple[str, ...]] = {
     3: ("x", "y", "z"),
@@ -129,8 +100,6 @@ class Fields:
 
     names: dict[str, str]
     """Field by role, of `ROLES`."""
-    dialect: Dialect | None = None
-    """The dialect that was recognised."""
     in_degrees: bool = False
     """Whether angles whose names have no unit are in degrees."""
 
@@ -145,14 +114,11 @@ class Fields:
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
         # AzimuthAngle, azimuth_angle and Azimuth Angle are one name.
-        squeezed = {re.sub(r"[\W_]+", "", name): lower[name] for name in reversed(lower)}
+        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
-        dialect = _dialect(lower)
-        if dialect is not None:
-            found = {role: lower[name] for role, name in _roles(dialect).items()}
         for role, aliases in ({axis: (axis,) for axis in _XYZ} | _ALIASES).items():
             name = next((squeezed[alias] for alias in aliases if alias in squeezed), None)
-            if role not in found and name is not None and name not in found.values():
+            if name is not None and name not in found.values():
                 found[role] = name
         for role, field in (overrides or {}).items():
             if role not in ROLES:
@@ -168,7 +134,7 @@ class Fields:
             if {"theta", "phi"} & set(lower):
                 msg += "; theta and phi have several meanings: name the azimuth and the elevation above the horizon"
             raise ValueError(msg)
-        return cls(found, dialect)
+        return cls(found)
 
     @property
     def polar(self) -> bool:
@@ -191,7 +157,7 @@ class Fields:
         named = next((role for role, unit in units.items() if unit), None)
         in_degrees = are_degrees(azimuth, elevation, units[named] if named else "")
         by = f"as {named} is by its name" if named else "by their numbers"
-        if in_degrees or (self.dialect is None and not named):
+        if in_degrees or not named:
             notes.add(
                 f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
                 "names such as azimuth_deg or azimuth_rad decide"
@@ -200,8 +166,8 @@ class Fields:
 
     def note_use(self, names: Iterable[str], notes: Notes, *, chosen: bool) -> None:
         """Notes what to know of the numbers, and which fields are not used, unless a user has chosen some."""
-        if self.dialect is not None and self.dialect.note:
-            notes.add(self.dialect.note)
+        if {name.lower() for name in names} >= _SNAIL_ARS548:
+            notes.add("the intensities of ARS548 clouds with these fields are RCS + 128")
         if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
             notes.add(
                 f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
@@ -270,7 +236,7 @@ class Fields:
         if not set(_SIGMA) <= set(self.names):
             return None
         sigma = np.stack([self._values(columns, role) for role in _SIGMA], axis=1).astype(np.float32)
-        if self.dialect is not None and self.dialect.sigma_in_degrees:
+        if _squeezed(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
             sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
         return sigma
 
@@ -280,18 +246,8 @@ def plain_name(name: str) -> tuple[str, str]:
     return without_unit(name.lower().removeprefix("scalar_"))
 
 
-def _roles(dialect: Dialect) -> dict[str, str]:
-    """Field by role."""
-    position = _POLAR if dialect.polar else _XYZ
-    roles = {role: role for role in position} | {"doppler": dialect.doppler, "intensity": dialect.intensity}
-    return roles | dict(zip(_SIGMA, dialect.sigma or (), strict=False))
-
-
-def _dialect(lower: Mapping[str, str]) -> Dialect | None:
-    """The dialect with the most fields among those of which the cloud has all. Polar ones only without x, y and z."""
-    polar = not set(_XYZ) <= set(lower)
-    fitting = [d for d in DIALECTS if set(_roles(d).values()) <= set(lower) and d.polar == polar]
-    return max(fitting, key=lambda dialect: len(_roles(dialect)), default=None)
+def _squeezed(name: str) -> str:
+    return re.sub(r"[\W_]+", "", name.lower())
 
 
 def _field(field: Any, names: list[str], lower: Mapping[str, str], role: str, what: str) -> str:
