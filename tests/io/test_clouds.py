@@ -178,14 +178,6 @@ HALF = np.sqrt(0.5)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
-def test_pcd_comments_of_any_encoding(tmp_path, encoding):
-    write_pcd(tmp_path / "a.pcd", COLUMNS)
-    data = (tmp_path / "a.pcd").read_bytes()
-    (tmp_path / "a.pcd").write_bytes("# Straße\n".encode(encoding) + data)
-    check(tmp_path / "a.pcd")
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
 def test_ply_comments_of_any_encoding(tmp_path, encoding):
     box = trimesh.creation.box()
     for mesh in (box, trimesh.PointCloud(box.vertices)):
@@ -274,12 +266,3 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     (tmp_path / "a.bag").touch()
     with pytest.raises(ImportError, match=r'pip install "rosbags>=0\.11"'):
         read(tmp_path / "a.bag")
-
-
-def test_other_files(tmp_path):
-    (tmp_path / "a.doc").touch()
-    with pytest.raises(ValueError, match="no file of points: those end in"):
-        read_columns(tmp_path / "a.doc")
-    (tmp_path / "a.csv").touch()
-    with pytest.raises(ValueError, match="holds no points"):
-        read_points(tmp_path / "a.csv")

@@ -127,23 +127,6 @@ def test_ground_truth(posed, kind):
     assert_array_equal(truth, points)
 
 
-def test_what_is_left_out(posed):
-    nan = np.nan
-    for time_s, xyz, power in (
-        (-0.1, [[9, 9, 9]], [1]),
-        (0.5, [[9, 9, 9]], [1]),
-        (0.1, [], []),
-        (0.2, [[nan, 8, 9], [7, 8, 9], [1, 1, 1]], [1, 2, nan]),
-    ):
-        write_pcd(
-            posed / "radar" / stamp(time_s), radar_cloud(xyz, doppler=np.zeros(len(power)), power=power)
-        )
-    scans = read(posed)
-    assert [len(p) for p in scans.points] == [2, 1, 1]
-    assert_array_equal(scans.points[1], [[7, 8, 9]])
-    assert_array_equal(scans.intensities[1], [2])
-
-
 @pytest.mark.parametrize("text", ["1 0 0 0\n0 1 0 0\n0 0 1 0\n", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"])
 def test_damaged_mounting(posed, text):
     (posed / "base_T_radar.txt").write_text(text)
@@ -188,13 +171,6 @@ def test_snail_radar(snail):
     forward_left_up = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     angle = np.arccos((np.trace(scans.poses[0, :3, :3].T @ forward_left_up) - 1) / 2)
     assert np.deg2rad(1) < angle < np.deg2rad(3)
-
-
-def test_snail_radar_with_a_calibration_of_its_own(snail):
-    (snail / "body_T_oculii.txt").write_text("1 0 0 1\n0 1 0 2\n0 0 1 3\n0 0 0 1\n")
-    poses = read(snail).poses
-    # 1 m forward, 2 m left and 3 m up of the lidar: to the north, the west and up.
-    assert_allclose(poses[0], pose(UTM + [-2, 1, 3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]), rtol=0, atol=1e-5)
 
 
 def test_snail_radar_lidar_points_move_with_their_own_time(snail):

@@ -64,9 +64,3 @@ def test_ply_keeps_attributes_colours_and_faces(tmp_path):
     assert b"property double x" in header
     confidence = read.metadata["_ply_raw"]["vertex"]["data"]["confidence"].ravel()
     np.testing.assert_array_equal(confidence, mesh.vertex_attributes["confidence"])
-
-
-def test_other_formats_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"can be written as \.ply"):
-        write_mesh(tmp_path / "mesh.dae", sphere())
-    assert list(tmp_path.iterdir()) == []

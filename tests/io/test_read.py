@@ -61,15 +61,6 @@ def test_reading_is_lazy_and_damaged_scans_are_left_out(tmp_path):
     assert "scan_5.pcd is not a whole .pcd file" in note
 
 
-def test_a_file_without_positions_is_no_scan(tmp_path):
-    for i, text in enumerate(("class,count\n1,2\n", "x,y,z\n1,2,3\n", "a,b\n1,2\n", "x,y,z\n4,5,6\n")):
-        (tmp_path / f"{i}.csv").write_text(text)
-    scans = read(tmp_path, POSES[:4])
-    assert_array_equal(scans.poses, POSES[[1, 3]])
-    assert scans.notes[0].startswith("2 scans left out")
-    assert "0.csv" in scans.notes[0]
-
-
 def test_scans_of_bad_poses_are_left_out(tmp_path):
     poses = POSES.copy()
     poses[3, 0, 0] = np.nan

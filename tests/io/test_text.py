@@ -53,16 +53,6 @@ def test_the_same_numbers_in_all_layouts(tmp_path, layout, encoding):
         assert_array_equal(trajectory.positions, TUM[:, 1:4])
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("separator", [",", ";"])
-def test_names_of_columns(tmp_path, encoding, separator):
-    text = separator.join(["x", "y", "z", "power"]) + "\r\n" + table(ROWS, separator, end="\r\n")
-    (tmp_path / "a.csv").write_bytes(text.encode(encoding))
-    columns = read_columns(tmp_path / "a.csv")
-    assert list(columns) == ["x", "y", "z", "power"]
-    assert_array_equal(np.transpose(list(columns.values())), ROWS)
-
-
 def test_a_calibration_and_settings_with_a_byte_order_mark(tmp_path):
     matrix = " ".join(map(str, np.eye(4)[:3].ravel()))
     (tmp_path / "calib.txt").write_text(f"Tr: {matrix}\n", "utf-8-sig")
@@ -105,14 +95,6 @@ def test_labels_are_a_column_that_is_not_used(tmp_path):
     scans = read(tmp_path / "a.csv", [np.eye(4)])
     assert_array_equal(scans.points[0], [[1, 2, 3], [4, 5, 6]])
     assert "not used: class;" in scans.notes[0]
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
-def test_comments_of_any_encoding(tmp_path, encoding):
-    (tmp_path / "a.csv").write_bytes("# Straße\nx,y,z\n5,0,0\n".encode(encoding))
-    (tmp_path / "p.tum").write_bytes("# Größe\n1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n".encode(encoding))
-    assert read_columns(tmp_path / "a.csv")["x"].tolist() == [5]
-    assert read_poses(tmp_path / "p.tum", Notes()).times_s.tolist() == [1, 2]
 
 
 def test_rows_of_numbers_may_have_names_and_a_comma_at_their_end(tmp_path):
