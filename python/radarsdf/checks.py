@@ -173,7 +173,7 @@ def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.fl
 def usable_poses(
     poses: ArrayLike, num_scans: int | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """:func:`check_poses`, but the poses that :func:`rigid_poses` marks as damaged are interpolated.
+    """:func:`check_poses`, but a minority of poses that are not rigid transforms is replaced by interpolation.
 
     Returns
     -------
@@ -185,10 +185,12 @@ def usable_poses(
     Raises
     ------
     ValueError
-        If the shape is wrong, or as :func:`rigid_poses` raises.
+        If the shape is wrong, or half of the poses or more are not rigid transforms.
     """
     T_world_sensor = pose_matrices(poses, num_scans)
-    rigid = rigid_poses(T_world_sensor)
+    rigid = are_rigid(T_world_sensor)
+    if 2 * np.count_nonzero(~rigid) >= max(len(rigid), 1):
+        return check_poses(T_world_sensor), rigid
     if not rigid.all():
         given, known = np.arange(len(rigid)), np.flatnonzero(rigid)
         at = np.clip(given, known[0], known[-1])
@@ -200,21 +202,6 @@ def usable_poses(
             filled[:, axis, 3] = np.interp(at, known, T_world_sensor[known, axis, 3])
         T_world_sensor = np.where(rigid[:, None, None], T_world_sensor, filled)
     return T_world_sensor, rigid
-
-
-def rigid_poses(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Mask (F,) of the poses (F, 4, 4) that are rigid transforms; the others are damaged.
-
-    Raises a ValueError that names the first that is not, if there are poses but none is rigid, or if half or more of
-    those that are known are not: poses of another meaning. Not known are those with NaN or without a rotation.
-    """
-    rigid = are_rigid(poses)
-    known = np.isfinite(poses).all(axis=(1, 2)) & poses[:, :3, :3].any(axis=(1, 2))
-    if len(rigid) and (not rigid.any() or 2 * np.count_nonzero(known & ~rigid) >= np.count_nonzero(known)):
-        first = int(np.argmax((known if known.any() else True) & ~rigid))
-        msg = f"pose {first} is not a rigid transform ({_RIGID})"
-        raise ValueError(msg)
-    return rigid
 
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -125,7 +125,8 @@ def cloud_files(folder: Path) -> list[Path]:
                 continue
             kinds.setdefault("text" if suffix in TEXT_SUFFIXES else suffix, []).append(path)
         if kinds:
-            return sorted(max(kinds.values(), key=len), key=natural)
+            most = max(kinds.values(), key=len)
+            return sorted(most, key=natural)
     return []
 
 
@@ -230,10 +231,12 @@ def _split(
     if time is not None and table[time].dtype.kind in "iuf":
         scale = SCALES.get(without_unit(time)[1], 1.0)
         times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
-    # Numbers of scans are rows of the poses where some scans are empty.
-    some_empty = isinstance(poses, np.ndarray) and len(poses) > len(values)
-    if some_empty and 0 <= values[0] <= values[-1] < len(poses):
-        poses = poses[values.astype(np.int64)]
+    if (
+        isinstance(poses, np.ndarray)
+        and len(values) < len(poses)
+        and 0 <= values[0] <= values[-1] < len(poses)
+    ):
+        poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
     return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
 
 

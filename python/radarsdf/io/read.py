@@ -59,36 +59,36 @@ def read(
 
         - our ``.npz`` (see :func:`read_scans`);
         - a folder with a file a scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
-          file, whose column such as frame or scan_id splits it into scans. Files are read in natural order, or in the order
+          file, which a column such as frame or scan_id splits into scans. Files are read in natural order, or in the order
           of the times in their names. Ground truth is ``lidar.pcd`` or ``lidar.ply`` in the folder;
         - a folder of a data set that :mod:`radarsdf.io.datasets` knows by its shape;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
-        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.files.read_poses`: TUM, KITTI, 4 x 4 matrices,
-        or a table that names its columns. By default what the data set says, or the ``.npz`` has; in a folder, a file of
-        `radarsdf.io.poses.files.POSE_FILES`, or the ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`.
-        `radarsdf.io.UNPOSED` reads scans that have none.
+        (F, 4, 4) T_world_sensor, m, or a file: TUM, KITTI, 4 x 4 matrices, or a table that names its columns. By default
+        those of the data set or the ``.npz``; in a folder, a file such as ``poses.txt`` or ``poses.tum``, or the
+        ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
     topic : str or sequence of str, optional
-        In a bag, the topics of the scans, which are merged in the order of their times. By default the radar's, if there is
-        one. Each message has the pose of the frame that its header names.
+        In a bag, the topics of the scans, merged in the order of their times. By default the radar's, if there is one.
+        Each message has the pose of the frame in its header.
     pose_topic : str, optional
         In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one that covers the times
         of the scans; what was passed over is noted. Goals, plans and initial poses never count.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
-        The rotation from the axes of the IMU to those of the radar. By default that of the file, or in a bag that of the
-        static transforms.
+        Rotation from the axes of the IMU to those of the radar. By default that of the file, or of the static transforms of
+        a bag.
     world_frame : str, optional
         With poses of TF, the frame of the world. By default the root of its tree.
     stamps : {"header", "record"}, optional
         In a bag, the time of a scan: of its header, or when it was recorded. By default of the header, unless its stamps
         are zero or stand still.
     fields : mapping, optional
-        Field of the file by role, if the table of :mod:`radarsdf.io.clouds.fields` is wrong: ``{"intensity": "Power"}``. Numbers
-        mean columns, None leaves a role out. Roles are those of `radarsdf.io.clouds.fields.ROLES`.
+        Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. Numbers mean columns,
+        None leaves a role out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth
+        and sigma_elevation.
     columns : int or sequence of str, optional
         Of files without names of columns: how many a point has, or their names. By default the content of several files
         decides for ``.bin``.
@@ -100,19 +100,19 @@ def read(
     Returns
     -------
     Scans
-        They are read while they are iterated, in memory bounded by a scan; see :class:`Scans`. Points keep the precision
-        of the file; intensities, Doppler and deviations are float32.
+        They are read while they are iterated, in memory bounded by a scan. Points keep the precision of the file;
+        intensities, Doppler and deviations are float32.
 
     Raises
     ------
     NoPoses
         If scans have no poses: a ValueError.
     ValueError
-        If files are damaged or do not fit together, something is missing, or a choice is not clear.
+        If files are damaged or do not fit together, something is missing, or a choice is ambiguous.
     OSError
         If a file cannot be read.
     ImportError
-        If it takes a library that is not installed; the message says which.
+        If a library is not installed; the message names it.
 
     Examples
     --------
@@ -209,11 +209,11 @@ def _npz(path: Path, request: Request) -> Scans:
     def source() -> Iterator[Scan]:
         for number, scan in enumerate(scans):
             pose = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
-            if matched is None and not np.isfinite(pose).all():
-                notes.count("scans left out: their poses are not finite", 1, f"scan {number}")
-                continue
             if pose is None:
                 notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s), 1)
+                continue
+            if not np.isfinite(pose).all():
+                notes.count("scans left out: their poses are not finite", 1, f"scan {number}")
                 continue
             arrays = scan.intensities, scan.doppler_mps, scan.time_s, scan.sigma
             finite = finite_scan(scan.points, pose, *arrays, notes)
