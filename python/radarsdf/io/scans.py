@@ -156,14 +156,8 @@ class Scans:
     ) -> Scans:
         """Scans that are read while they are iterated.
 
-        Parameters
-        ----------
-        source : callable
-            Returns a new iterator over the scans, which have at least one return each.
-        notes : Notes
-            Takes what the source assumes and leaves out.
-        ground_truth, imu : callable
-            Read the ground truth and the IMU, once, when they are asked for.
+        `source` returns a new iterator over them, each with at least one return, and `notes` take what it assumes. The
+        ground truth and the IMU are read once, when they are asked for.
         """
         scans = cls([], np.zeros((0, 4, 4)))
         scans._source, scans._notes = source, notes

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ _HEADER_BYTES, _COUNT_AT, _RECORD_BYTES = 227, 100, 54  # of the least header, a
 
 
 def read_las(path: Path) -> dict[str, NDArray[Any]]:
-    """The columns (N,) of a file by their names. Those of radars that :func:`las_writer` wrote have the names as there."""
+    """The columns (N,) of a file by their names. Those of radars that :func:`write_las` wrote have the names as there."""
     laspy = require("laspy", what=f"{path}: LAS and LAZ files are read by")
     size = path.stat().st_size
     with path.open("rb") as raw:  # laspy would count to four billion
@@ -50,25 +51,17 @@ def read_las(path: Path) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def las_writer(compressed: bool) -> Callable[[Any, Iterator[NDArray[Any]]], int]:
-    """A function that writes records, an array a scan, to an open file, and gives their number."""
-
-    def write(file: Any, rows: Iterator[NDArray[Any]]) -> int:
-        laspy = require("laspy", what="LAS and LAZ files are written by")
-        count, writer = 0, None
-        try:
-            for part in rows:
-                if writer is None:
-                    header = _header(laspy, part)
-                    writer = laspy.open(file, mode="w", header=header, closefd=False, do_compress=compressed)
-                writer.write_points(_points(laspy, part, header))
-                count += len(part)
-        finally:
-            if writer is not None:
-                writer.close()
-        return count
-
-    return write
+def write_las(file: Any, rows: Iterator[NDArray[Any]], *, compressed: bool) -> int:
+    """Writes records, an array a scan, to an open file, and returns their number."""
+    laspy = require("laspy", what="LAS and LAZ files are written by")
+    first = next(rows)
+    header = _header(laspy, first)
+    count = 0
+    with laspy.open(file, mode="w", header=header, closefd=False, do_compress=compressed) as writer:
+        for part in itertools.chain([first], rows):
+            writer.write_points(_points(laspy, part, header))
+            count += len(part)
+    return count
 
 
 def _extra(part: NDArray[Any]) -> dict[str, str]:

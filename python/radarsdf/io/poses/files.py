@@ -208,10 +208,7 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike 
 
 
 def _pose_columns(names: list[str]) -> dict[str, int] | None:
-    """Column by role: time, sec, nsec, x, y, z, qx, qy, qz, qw, roll, pitch, yaw; None if the names are no pose's.
-
-    Names are those of EuRoC, evo, ``rostopic echo -p``, exports of bags, and others like them.
-    """
+    """Column by role: time, sec, nsec, x, y, z, qx, qy, qz, qw, roll, pitch, yaw; None if the names are no pose's."""
     found: dict[str, int] = {}
     for column, name in enumerate(names):
         words = re.sub(r"[\W_]+", " ", without_unit(name)[0]).strip()
