@@ -15,9 +15,9 @@ from radarsdf import FitConfig
 from radarsdf.checks import check_box
 from radarsdf.evaluation import holdout
 from radarsdf.io import read
-from radarsdf.io.datasets.snail_radar import is_snail_radar
 from radarsdf.io.npz import read_scans
 from radarsdf.io.scans import Scans
+from radarsdf.io.snail_radar import is_snail_radar
 from radarsdf.returns.rays import prepare
 from radarsdf.simulate import KINDS, SCENES, Simulation
 from scipy.spatial import cKDTree

@@ -19,10 +19,10 @@ import numpy as np
 import radarsdf
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.io import read
-from radarsdf.io.ground_truth import read_ground_truth
-from radarsdf.io.meshes import read_mesh
+from radarsdf.io.meshes import read_ground_truth, read_mesh
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.trajectory import read_table, trajectory_of
+from radarsdf.io.poses.trajectory import trajectory_of
+from radarsdf.io.text import read_numbers
 from tqdm import tqdm
 
 from bench.paper.report import markdown
@@ -63,7 +63,7 @@ def _scans(path: Path) -> None:
 
 
 def _trajectory(path: Path) -> None:
-    trajectory = trajectory_of(read_table(path, 8), str(path))
+    trajectory = trajectory_of(read_numbers(path, 8), str(path))
     assert len(trajectory.times_s) == len(trajectory.positions) == len(trajectory.rotations) >= 2
 
 

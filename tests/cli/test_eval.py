@@ -11,8 +11,7 @@ import pytest
 import trimesh
 from radarsdf.evaluation import KNNIntensity
 from radarsdf.io.clouds.writing import write_cloud
-from radarsdf.io.ground_truth import read_ground_truth
-from radarsdf.io.meshes import write_mesh
+from radarsdf.io.meshes import read_ground_truth, write_mesh
 from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.io.scans import Scans
 

@@ -24,17 +24,13 @@ def write_demo(folder: Path) -> None:
 
 
 def write_recordings(folder: Path) -> None:
-    """A drive as a folder of PCD, as KITTI has it, and as bags of ROS 2; and the broken ones."""
+    """A drive as a folder of PCD, as KITTI has it in millimetres, and as a bag of ROS 2, whole and cut off."""
     drive = radarsdf.simulate.hugin(frames=_FRAMES)
     _pcd(folder / "drive", drive)
     _tum(folder / "drive.tum", drive.poses)
-    _tum(folder / "inverted.tum", np.linalg.inv(drive.poses))
-    _kitti(folder / "kitti", drive, 1.0)
     _kitti(folder / "kitti_mm", drive, 1000.0)
-    for kind in ("mcap", "sqlite3"):
-        _bag(folder / f"drive_{kind}", drive, kind)
-        _cut_off(folder / f"drive_{kind}", folder / f"cut_{kind}")
-    _bag(folder / "no_tf", drive, "mcap", transforms=False)
+    _bag(folder / "drive_mcap", drive)
+    _cut_off(folder / "drive_mcap", folder / "cut_mcap")
 
 
 def _pcd(folder, drive):
@@ -79,19 +75,17 @@ def _kitti(folder, drive, scale):
     (folder / "times.txt").write_text(times + "\n", encoding="utf-8")
 
 
-def _bag(path, drive, kind, *, transforms=True):
+def _bag(path, drive):
     from bench.reading.bag_writing import BagWriter  # noqa: PLC0415 - it needs rosbags, an extra
 
     T_base_radar = np.eye(4)
     T_base_radar[:3, 3] = [1.0, 0.0, 0.5]
-    with BagWriter(path, kind) as bag:
-        if transforms:
-            bag.write("/tf_static", bag.transforms(START_S, {("base_link", "radar"): T_base_radar}), START_S)
+    with BagWriter(path, "mcap") as bag:
+        bag.write("/tf_static", bag.transforms(START_S, {("base_link", "radar"): T_base_radar}), START_S)
         for i, (points, values) in enumerate(zip(drive.points, drive.intensities, strict=True)):
             now = START_S + i * _STEP_S
-            if transforms:
-                T_odom_base = drive.poses[i] @ np.linalg.inv(T_base_radar)
-                bag.write("/tf", bag.transforms(now, {("odom", "base_link"): T_odom_base}), now)
+            T_odom_base = drive.poses[i] @ np.linalg.inv(T_base_radar)
+            bag.write("/tf", bag.transforms(now, {("odom", "base_link"): T_odom_base}), now)
             x, y, z = points.T
             bag.write("/radar/points", bag.cloud2(now, {"x": x, "y": y, "z": z, "power": values}), now)
 

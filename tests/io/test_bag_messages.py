@@ -133,20 +133,6 @@ def test_an_ars548_as_it_was_recorded():
     assert_allclose(scan.sigma, np.stack(sigma, axis=1), rtol=1e-5)
 
 
-def test_the_cloud_of_an_oculii_driver(tmp_path):
-    """Its points have angles and range, too, in degrees or not."""
-    floats = ("x", "y", "z", "alpha", "beta", "range", "doppler", "power", "recoveredSpeed")
-    cloud = {name: np.array([1.0 + i], np.float32) for i, name in enumerate(floats)}
-    cloud |= {name: np.ones(1, np.uint16) for name in ("dotFlags", "denoiseFlag", "historyFrameFlag")}
-    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
-        odometry(bag)
-        bag.write("/oculii_radar/point_cloud", bag.cloud2(START_S, cloud, "oculii"), START_S)
-        bag.write("/velodyne_points", bag.cloud2(START_S, {axis: np.zeros(1) for axis in "xyz"}), START_S)
-    (scan,) = read(tmp_path / "a.bag")
-    assert scan.points.tolist() == [[1, 2, 3]]
-    assert (scan.doppler_mps[0], scan.intensities[0]) == (7, 8)
-
-
 @pytest.mark.parametrize("cloud", ["lidar", "radar by name", "radar by its Doppler"])
 def test_a_lidar_does_not_stand_for_a_radar_that_cannot_be_read(tmp_path, cloud):
     topic = "/radar/points" if cloud == "radar by name" else "/points"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from radarsdf.io.clouds.reading import read_columns, read_points
 from radarsdf.io.clouds.writing import CLOUD_OUT_SUFFIXES, write_cloud
-from radarsdf.io.origin import origin_path
+from radarsdf.io.files import origin_path
 from radarsdf.io.scans import Notes, Scan, Scans
 
 UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
@@ -88,14 +88,6 @@ def test_columns_that_scans_lack(tmp_path):
     )
 
 
-def test_las_has_times_and_no_colours(tmp_path):
-    laspy = pytest.importorskip("laspy", reason="the extra las is not installed")
-    write_cloud(tmp_path / "cloud.las", lazily(np.zeros(3))[0])
-    names = set(laspy.read(tmp_path / "cloud.las").point_format.dimension_names)
-    assert "gps_time" in names
-    assert not names & {"red", "green", "blue", "nir"}  # viewers would draw all points black
-
-
 def test_an_origin_of_an_older_file_does_not_stay(tmp_path):
     path = tmp_path / "cloud.pcd"
     write_cloud(path, lazily(UTM_M)[0])
@@ -121,16 +113,3 @@ def test_a_source_that_fails_leaves_the_old_file(tmp_path, suffix):
     assert error.value.filename == "scan.pcd"
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
     assert path.read_bytes() == b"old"
-
-
-def test_a_damaged_origin_is_said(tmp_path):
-    path = tmp_path / "cloud.pcd"
-    write_cloud(path, lazily(UTM_M)[0])
-    origin_path(path).write_text('{"origin": [1, 2]}')
-    with pytest.raises(ValueError, match="does not hold the origin"):
-        read_points(path)
-
-
-def test_other_endings_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"can be written as \.ply"):
-        write_cloud(tmp_path / "cloud.xyz", lazily(np.zeros(3))[0])

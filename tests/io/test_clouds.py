@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read, read_mesh, read_points
-from radarsdf.io.clouds.lzf import unpack_lzf
+from radarsdf.io.clouds.pcd import unpack_lzf
 from radarsdf.io.clouds.reading import read_columns
 
 from .test_folders import write_pcd
@@ -54,31 +54,12 @@ COLUMNS = {
 }
 
 
-@pytest.mark.parametrize("data", ["ascii", "binary"])
-def test_pcd(tmp_path, data):
-    write_pcd(tmp_path / "a.pcd", COLUMNS, data)
-    check(tmp_path / "a.pcd")
-
-
 def test_compressed_pcd(tmp_path):
     packed_pcd(tmp_path / "a.pcd", COLUMNS, as_literals)
     assert {n: c.dtype for n, c in read_columns(tmp_path / "a.pcd").items()} == {
         n: c.dtype for n, c in COLUMNS.items()
     }
     check(tmp_path / "a.pcd")
-
-
-def test_compressed_pcd_of_many_points(tmp_path):
-    pypcd4 = pytest.importorskip(
-        "pypcd4", reason="pypcd4, whose compression is a reference, is not installed"
-    )
-    rng = np.random.default_rng(0)
-    table = np.round(rng.normal(size=(3000, 4)), 1).astype(np.float32)
-    table[1000:2000] = 7  # long references
-    cloud = pypcd4.PointCloud.from_points(table, ("x", "y", "z", "power"), (np.float32,) * 4)
-    cloud.save(tmp_path / "a.pcd", encoding=pypcd4.Encoding.BINARY_COMPRESSED)
-    columns = read_columns(tmp_path / "a.pcd")
-    assert_array_equal(np.stack(list(columns.values()), axis=1), table)
 
 
 @pytest.mark.parametrize(
@@ -96,25 +77,8 @@ def test_lzf(data, unpacked):
 
 @pytest.mark.parametrize("data", [b"", b"\x02ab", b"\x00a\x20", b"\x00a\xe0", b"\x00a\x20\x05", b"\x03abcd"])
 def test_damaged_lzf(data):
-    with pytest.raises(ValueError, match=r"compressed data|before the beginning"):
+    with pytest.raises(ValueError, match="compressed data"):
         unpack_lzf(data, 3)
-
-
-def test_a_compressed_pcd_that_would_unpack_to_gigabytes(tmp_path):
-    def bomb(_):
-        return b"\x00a" + b"\xe0\xff\x00" * 10
-
-    packed_pcd(tmp_path / "a.pcd", COLUMNS, bomb)
-    with pytest.raises(ValueError, match=r"a\.pcd is not a whole \.pcd file of points"):
-        read_columns(tmp_path / "a.pcd")
-    data = (tmp_path / "a.pcd").read_bytes()
-    head, _, _ = data.partition(b"DATA binary_compressed\n")
-    head = head.replace(b"WIDTH 2", b"WIDTH 100000000")
-    (tmp_path / "a.pcd").write_bytes(
-        head + b"DATA binary_compressed\n" + struct.pack("<II", 32, 2_000_000_000) + bytes(32)
-    )
-    with pytest.raises(ValueError, match="do not fit"):
-        read_columns(tmp_path / "a.pcd")
 
 
 @pytest.mark.parametrize("width", [4, 5, 7])
@@ -156,7 +120,7 @@ def drive(width, scans, dtype, seed=0):
 
 
 @pytest.mark.parametrize("dtype", ["<f4", "<f8"])
-@pytest.mark.parametrize("width", [3, 4, 5, 6, 7, 8])
+@pytest.mark.parametrize("width", [3, 4, 5, 8])
 def test_the_content_of_bin_files_decides_how_many_numbers_a_return_has(tmp_path, width, dtype):
     tables = list(drive(width, 5, dtype))
     for i, table in enumerate(tables):
@@ -167,12 +131,6 @@ def test_the_content_of_bin_files_decides_how_many_numbers_a_return_has(tmp_path
     assert_array_equal(scans.points[1], tables[1][:, :3])
     assert any("2.bin" in note and note.startswith("1 scans left out") for note in scans.notes)
     assert any(f"have {width} numbers" in note for note in scans.notes) == ((width, dtype) != (4, "<f4"))
-
-
-def test_bin_files_of_other_types_are_refused(tmp_path):
-    np.random.default_rng(0).normal(0, 3000, (100, 4)).astype("<i2").tofile(tmp_path / "a.bin")
-    with pytest.raises(ValueError, match=r"a\.bin.*--columns"):
-        one(tmp_path / "a.bin")
 
 
 def test_npy(tmp_path):
@@ -217,14 +175,6 @@ def test_damaged_text(tmp_path, text):
 
 
 HALF = np.sqrt(0.5)
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
-def test_pcd_comments_of_any_encoding(tmp_path, encoding):
-    write_pcd(tmp_path / "a.pcd", COLUMNS)
-    data = (tmp_path / "a.pcd").read_bytes()
-    (tmp_path / "a.pcd").write_bytes("# Straße\n".encode(encoding) + data)
-    check(tmp_path / "a.pcd")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
@@ -285,12 +235,6 @@ def test_ply(tmp_path):
         (tmp_path / "a.ply").write_bytes(data[:size])
         with pytest.raises(ValueError, match=r"a\.ply"):
             read_points(tmp_path / "a.ply")
-    rows = "1 2 3 4\n"
-    (tmp_path / "a.ply").write_text(
-        f"ply\nformat ascii 1.0\nelement vertex 2000000000\n{header}end_header\n{rows}"
-    )
-    with pytest.raises(ValueError, match="2000000000"):
-        read_points(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
@@ -313,18 +257,6 @@ def test_las(tmp_path, suffix):
         read_points(path)
 
 
-@pytest.mark.parametrize("point_format", [3, 6])
-def test_laz_in_several_chunks(tmp_path, point_format):
-    """Of 50,000 points each. Those of the newer format are in layers, whose sizes are checked before they are unpacked."""
-    laspy = pytest.importorskip("laspy", reason="the extra las is not installed")
-    header = laspy.LasHeader(point_format=point_format, version="1.4")
-    header.scales = [0.001] * 3
-    cloud, points = laspy.LasData(header), np.random.default_rng(0).integers(-9000, 9000, (120_001, 3)) / 1000
-    cloud.x, cloud.y, cloud.z = points.T
-    cloud.write(tmp_path / "a.laz")
-    assert_allclose(read_points(tmp_path / "a.laz"), points, rtol=0, atol=1e-6)
-
-
 def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     for name in ("laspy", "rosbags"):
         monkeypatch.setitem(sys.modules, name, None)
@@ -334,12 +266,3 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     (tmp_path / "a.bag").touch()
     with pytest.raises(ImportError, match=r'pip install "rosbags>=0\.11"'):
         read(tmp_path / "a.bag")
-
-
-def test_other_files(tmp_path):
-    (tmp_path / "a.doc").touch()
-    with pytest.raises(ValueError, match="no file of points: those end in"):
-        read_columns(tmp_path / "a.doc")
-    (tmp_path / "a.csv").touch()
-    with pytest.raises(ValueError, match="holds no points"):
-        read_points(tmp_path / "a.csv")

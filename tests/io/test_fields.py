@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The dialects of radar fields: each is recognised, whatever its case and order, and can be overridden."""
+"""What fields of radars mean: by their names, whatever their case and order, by their units, or by choice."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.clouds.fields import DIALECTS, Fields
+from radarsdf.io.clouds.fields import Fields
 from radarsdf.io.scans import Notes
 
 from .test_folders import write_pcd
@@ -33,26 +33,35 @@ CLOUDS = {
 }  # fmt: skip
 
 
+def scan_of(fields, columns):
+    return fields.scan(columns, "the scan", np.eye(4), None, Notes())
+
+
+ROLES = {
+    "Sensrad Hugin": ("doppler", "power"),
+    "Oculii Eagle": ("doppler", "power"),
+    "ARS548, nebula": ("range_rate", "rcs"),
+    "ARS548, SNAIL-Radar": ("doppler", "intensity"),
+    "ARS548, HKUST RIO": ("velocity", "rcs"),
+    "smartmicro": ("radial_speed", "power"),
+    "TI ti_mmwave": ("velocity", "intensity"),
+    "TI reve": ("v_doppler_mps", "snr_db"),
+    "radar_msgs/RadarScan": ("doppler_velocity", "amplitude"),
+    "View-of-Delft": ("v_r", "rcs"),
+    "TJ4DRadSet": ("v_r", "power"),
+}
+
+
 @pytest.mark.parametrize("name", CLOUDS)
-def test_dialects(name):
+def test_fields_of_sensors(name):
     for names in (CLOUDS[name], CLOUDS[name][::-1], [n.upper() for n in CLOUDS[name]]):
-        fields = Fields.of(names)
-        assert fields.dialect.name == name
-        by_role = {role: field.lower() for role, field in fields.names.items()}
-        assert by_role["doppler"] == fields.dialect.doppler
-        assert by_role["intensity"] == fields.dialect.intensity
-        assert ("sigma_range" in by_role) == (fields.dialect.sigma is not None)
+        by_role = {role: field.lower() for role, field in Fields.of(names).names.items()}
+        assert (by_role["doppler"], by_role["intensity"]) == ROLES[name]
+        assert ("sigma_range" in by_role) == (name in ("Oculii Eagle",) or name.startswith("ARS548"))
 
 
-def test_there_are_twelve_dialects():
-    # One has the fields of another: as channels of another kind of message.
-    assert set(CLOUDS) | {"Oculii, NTU4DRadLM"} == {dialect.name for dialect in DIALECTS}
-    assert len(DIALECTS) == 12
-
-
-def test_fields_of_no_dialect():
+def test_fields_of_no_sensor():
     fields = Fields.of(["z", "y", "x", "SNR"])
-    assert fields.dialect is None
     assert fields.names == {"x": "x", "y": "y", "z": "z", "intensity": "SNR"}
     assert Fields.of(["x", "y", "z"]).names.keys() == set("xyz")
 
@@ -80,36 +89,36 @@ def test_polar_clouds():
         "doppler_velocity": np.array([-1.0, 2, 3, 4]),
         "amplitude": np.array([50.0, 60, 70, 80]),
     }
-    cloud = Fields.of(list(columns)).read(columns, "the scan")
+    cloud = scan_of(Fields.of(list(columns)), columns)
     assert_allclose(cloud.points, [[10, 0, 0], [0, 10, 0], [0, 0, 10]], atol=1e-6)  # forward, left, up
     assert_array_equal(cloud.doppler_mps, [-1, 2, 3])
     assert_array_equal(cloud.intensities, [50, 60, 70])
-    assert cloud.dropped == 1
+    assert len(cloud) == 3  # the one that is not finite is left out
 
 
 def test_deviations():
     ones = np.ones(2)
     names = CLOUDS["Oculii Eagle"]
-    cloud = Fields.of(names).read(dict.fromkeys(names, ones), "the scan")
+    cloud = scan_of(Fields.of(names), dict.fromkeys(names, ones))
     assert_allclose(
         cloud.sigma, [[1, np.deg2rad(1), np.deg2rad(1)]] * 2, rtol=1e-6
     )  # in degrees, like its angles
     names = CLOUDS["ARS548, nebula"]
-    assert_array_equal(Fields.of(names).read(dict.fromkeys(names, ones), "the scan").sigma, np.ones((2, 3)))
+    assert_array_equal(scan_of(Fields.of(names), dict.fromkeys(names, ones)).sigma, np.ones((2, 3)))
 
 
 def test_precision_is_that_of_the_file():
     for dtype in (np.float32, np.float64):
         columns = {name: np.array([245821.25], dtype) for name in "xyz"}
-        assert Fields.of(list(columns)).read(columns, "the scan").points.dtype == dtype
+        assert scan_of(Fields.of(list(columns)), columns).points.dtype == dtype
 
 
 def test_a_later_scan_without_a_field():
     fields = Fields.of(["x", "y", "z", "power"])
-    with pytest.raises(ValueError, match="b lacks the field power, which other scans have: it has x, y, z"):
-        fields.read({name: np.zeros(1) for name in "xyz"}, "b")
-    with pytest.raises(ValueError, match="b: the field power holds no numbers"):
-        fields.read({name: np.zeros(1) for name in "xyz"} | {"power": np.array(["a"])}, "b")
+    with pytest.raises(ValueError, match="the scan lacks the field power"):
+        scan_of(fields, {name: np.zeros(1) for name in "xyz"})
+    with pytest.raises(ValueError, match="the scan: the field power holds no numbers"):
+        scan_of(fields, {name: np.zeros(1) for name in "xyz"} | {"power": np.array(["a"])})
 
 
 def test_what_must_be_known_of_the_numbers(tmp_path):
@@ -128,7 +137,7 @@ def polar(text):
     names, *rows = [line.split() for line in text.splitlines()]
     columns = dict(zip(names, np.array(rows, np.float64).T, strict=True))
     notes = Notes()
-    return Fields.of(names).judged([columns], notes).read(columns, "a").points, notes.lines
+    return scan_of(Fields.of(names).judged([columns], notes), columns).points, notes.lines
 
 
 LEFT = np.array([[1, 1, 0]]) * 10 / np.sqrt(2)

@@ -9,8 +9,8 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from radarsdf.io.files import origin_path
 from radarsdf.io.meshes import MESH_SUFFIXES, read_mesh, write_mesh
-from radarsdf.io.origin import origin_path
 
 UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
 
@@ -64,9 +64,3 @@ def test_ply_keeps_attributes_colours_and_faces(tmp_path):
     assert b"property double x" in header
     confidence = read.metadata["_ply_raw"]["vertex"]["data"]["confidence"].ravel()
     np.testing.assert_array_equal(confidence, mesh.vertex_attributes["confidence"])
-
-
-def test_other_formats_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"can be written as \.ply"):
-        write_mesh(tmp_path / "mesh.dae", sphere())
-    assert list(tmp_path.iterdir()) == []

@@ -9,7 +9,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-import radarsdf
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import Scan, Scans, read, write_poses, write_scans
 
@@ -47,22 +46,6 @@ def test_a_folder_in_natural_order(tmp_path):
     assert scans.notes == []
 
 
-def test_it_is_what_scans_always_were(tmp_path):
-    scans = read(clouds(tmp_path), POSES)
-    assert [len(p) for p in scans.points] == list(range(1, 12))
-    assert_array_equal(scans.poses, POSES)
-    assert_array_equal(scans.intensities[3], [0, 1, 2, 3])
-    assert_array_equal(scans.doppler_mps[3], -3)
-    assert scans.times_s is None
-    assert scans.sigmas is None
-    assert scans.ground_truth is None
-    assert [len(p) for p in scans.select(np.array([4, 2])).points] == [5, 3]
-    write_scans(tmp_path / "scans.npz", scans)
-    again = read(tmp_path / "scans.npz")
-    assert [len(s) for s in again] == list(range(1, 12))
-    assert_array_equal(np.concatenate(again.doppler_mps), np.concatenate(scans.doppler_mps))
-
-
 def test_reading_is_lazy_and_damaged_scans_are_left_out(tmp_path):
     clouds(tmp_path)
     whole = (tmp_path / "scan_7.pcd").read_bytes()
@@ -76,15 +59,6 @@ def test_reading_is_lazy_and_damaged_scans_are_left_out(tmp_path):
     (note,) = scans.notes
     assert note.startswith("3 scans left out")
     assert "scan_5.pcd is not a whole .pcd file" in note
-
-
-def test_a_file_without_positions_is_no_scan(tmp_path):
-    for i, text in enumerate(("class,count\n1,2\n", "x,y,z\n1,2,3\n", "a,b\n1,2\n", "x,y,z\n4,5,6\n")):
-        (tmp_path / f"{i}.csv").write_text(text)
-    scans = read(tmp_path, POSES[:4])
-    assert_array_equal(scans.poses, POSES[[1, 3]])
-    assert scans.notes[0].startswith("2 scans left out")
-    assert "0.csv" in scans.notes[0]
 
 
 def test_scans_of_bad_poses_are_left_out(tmp_path):
@@ -112,21 +86,6 @@ def test_memory_is_that_of_a_scan(tmp_path):
     assert peak < 6e6  # of 24 MB in all
 
 
-def test_fit_takes_scans_as_they_are(tmp_path):
-    rng = np.random.default_rng(0)
-    for i in range(3):
-        wall = np.column_stack([np.full(300, 8.0), rng.uniform(-3, 3, 300), rng.uniform(-1, 1, 300)])
-        np.save(tmp_path / f"{i}.npy", np.column_stack([wall, rng.uniform(50, 60, 300)]))
-    scans = read(tmp_path, POSES[:3])
-    config = radarsdf.FitConfig(training={"sdf_iterations": 5, "intensity_iterations": 5}, num_threads=1)
-    one = radarsdf.fit(scans, config=config)
-    other = radarsdf.fit(scans.points, scans.poses, scans.intensities, config=config)
-    x = np.array([[7.0, 2, 3], [8.5, 2, 3]])
-    assert_array_equal(one.sdf(x), other.sdf(x))
-    with pytest.raises(ValueError, match="poses are missing"):
-        radarsdf.fit(scans.points)
-
-
 def test_times_in_names_and_tum_poses(tmp_path):
     clouds(tmp_path / "radar", 3, "cloud_1700000000.{}.pcd")
     rows = ["1700000000.0 0 0 0 0 0 0 1", "1700000000.2 2 0 0 0 0 0.70710678 0.70710678"]
@@ -141,7 +100,6 @@ def test_times_in_names_and_tum_poses(tmp_path):
     ("name", "time_s"),
     [
         ("1700000000123.pcd", 1700000000.123),
-        ("1700000000123456.pcd", 1700000000.123456),
         ("1700000000123456789.pcd", 1700000000.123456789),
         ("1700000000_123456789.pcd", 1700000000.123456789),
         ("1700000000.pcd", 1700000000),
@@ -226,15 +184,6 @@ def test_extrinsic(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             read(tmp_path, POSES[:2], extrinsic=wrong)
-
-
-def test_ground_truth(tmp_path):
-    clouds(tmp_path, 2)
-    assert read(tmp_path, POSES[:2], ground_truth=[[1.0, 2, 3]]).ground_truth.tolist() == [[1, 2, 3]]
-    np.save(tmp_path / "lidar.npy", np.ones((4, 3)))
-    assert read(tmp_path, POSES[:2], ground_truth=tmp_path / "lidar.npy").ground_truth.shape == (4, 3)
-    write_pcd(tmp_path / "lidar.pcd", radar_cloud(np.zeros((5, 3))))
-    assert read(tmp_path, POSES[:2]).ground_truth.shape == (5, 3)
 
 
 def test_sentences(tmp_path):

@@ -4,15 +4,12 @@
 
 from __future__ import annotations
 
-import subprocess
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 
 from ..conftest import recorded_file
-from ..warm_python import warm_python
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
@@ -47,13 +44,3 @@ def test_its_way_out_without_poses():
         read(bag)
     with pytest.raises(ValueError, match="are both of one clock"):
         list(read(bag, poses, stamps="header"))
-
-
-def test_it_is_said_on_standard_error_by_default():
-    bag, poses = bag_and_poses()
-    code = "import sys; from radarsdf.io import read; print(sum(map(len, read(*sys.argv[1:]))))"
-    done = subprocess.run(
-        [*warm_python(), "-c", code, str(bag), str(poses)], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "10403\n"
-    assert done.stderr.splitlines()[0].startswith("the header stamps of /ti_mmwave/radar_scan_pcl are zero")

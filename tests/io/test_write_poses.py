@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, NoPoses, write_poses
-from radarsdf.io.poses.reading import read_poses
+from radarsdf.io.poses.files import read_poses
 from radarsdf.io.scans import Notes
 
 from ..poses.drift import trajectory

@@ -74,7 +74,7 @@ def test_a_file_system_without_locks_is_said(tmp_path, monkeypatch):
     def without(_):
         raise OSError(errno.ENOSYS, "Function not implemented")
 
-    monkeypatch.setattr("radarsdf.io.locking._lock", without)
+    monkeypatch.setattr("radarsdf.io.files._lock", without)
     with pytest.warns(RuntimeWarning, match=r"cannot be locked \(Function not implemented\)"):
         assert plan(tmp_path / "city").tiles
 

@@ -57,8 +57,8 @@ def _convert_mesh(options: argparse.Namespace, results: Results) -> None:
 def _convert_scans(options: argparse.Namespace, results: Results) -> None:
     from radarsdf.io.clouds.reading import CLOUD_SUFFIXES
     from radarsdf.io.clouds.writing import check_cloud_path, write_cloud
+    from radarsdf.io.files import origin_path
     from radarsdf.io.npz import write_scans
-    from radarsdf.io.origin import origin_path
 
     suffix = options.out.suffix.lower()
     if suffix != ".npz":

@@ -51,8 +51,7 @@ def run(options: argparse.Namespace) -> None:
     from radarsdf.cli.held_out import add_intensity_errors
     from radarsdf.evaluation import format_metrics, holdout, surface_metrics
     from radarsdf.io.files import check_regular_file
-    from radarsdf.io.ground_truth import read_ground_truth
-    from radarsdf.io.meshes import read_mesh
+    from radarsdf.io.meshes import read_ground_truth, read_mesh
 
     radar_map = load_map(options.what) if is_map(options.what) else None
     if radar_map is None:

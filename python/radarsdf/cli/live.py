@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
     """Replay the scans, say how the map kept up, and write it."""
     from radarsdf.checks import not_negative
     from radarsdf.io.files import check_outputs
-    from radarsdf.io.poses.writing import check_pose_suffix, check_pose_times, write_poses
+    from radarsdf.io.poses.files import check_pose_suffix, check_pose_times, write_poses
 
     config = config_of(options)
     rate = not_negative(options.rate, "--rate")
@@ -101,7 +101,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _read(options: argparse.Namespace) -> tuple[Scans, bool]:
     """The scans, and whether their poses are to be used."""
-    from radarsdf.io.poses.reading import UNPOSED, NoPoses
+    from radarsdf.io.poses.trajectory import UNPOSED, NoPoses
 
     if not options.find:
         with contextlib.suppress(NoPoses):

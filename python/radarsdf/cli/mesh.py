@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> None:
 
 def say_mesh(results: Results, mesh: trimesh.Trimesh, path: Path, origin: NDArray[np.float64] | None) -> None:
     """Say what was written, and where its origin is, if it has one of its own."""
-    from radarsdf.io.origin import origin_path
+    from radarsdf.io.files import origin_path
 
     vertices, triangles = len(mesh.vertices), len(mesh.faces)
     results.add(

@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> None:
     """Refine the poses of the scans, or find them, and write them."""
     from radarsdf.io.files import check_outputs
     from radarsdf.io.npz import write_scans
-    from radarsdf.io.poses.writing import check_pose_suffix, write_poses
+    from radarsdf.io.poses.files import check_pose_suffix, write_poses
 
     config = config_of(options)
     as_scans = options.out.suffix.lower() == ".npz"
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _following(options: argparse.Namespace, as_scans: bool) -> str:
     """The command to run next: a fit with these poses."""
-    from radarsdf.io.datasets.folders import BASE_T_RADAR
+    from radarsdf.io.folders import BASE_T_RADAR
 
     target = ["-o", options.out.stem + MAP_SUFFIX]
     if as_scans:

@@ -17,7 +17,7 @@ from radarsdf.cli.scans_in import scans_of
 
 if TYPE_CHECKING:
     from radarsdf import FitConfig
-    from radarsdf.io.poses.reading import NoPoses
+    from radarsdf.io.poses.trajectory import NoPoses
     from radarsdf.io.scans import Scans
     from radarsdf.poses.posed import Posed
 
@@ -32,7 +32,7 @@ def scans_and_poses(
     out: Path | None = None,
 ) -> tuple[Scans, Posed]:
     """The scans of a command, those of the longest piece if there are several. Their poses are refined, if that is wanted, or found, if there are none or `find` says so. `out`: the file of poses that the command writes."""
-    from radarsdf.io.poses.writing import check_pose_times
+    from radarsdf.io.poses.files import check_pose_times
     from radarsdf.poses.posed import Posed
 
     scans, missing = scans_or_unposed(options, find=find)
@@ -46,7 +46,7 @@ def scans_and_poses(
 
 def scans_or_unposed(options: argparse.Namespace, *, find: bool = False) -> tuple[Scans, NoPoses | None]:
     """The scans of a command, and why they have no poses. `find`: theirs are not used."""
-    from radarsdf.io.poses.reading import UNPOSED, NoPoses
+    from radarsdf.io.poses.trajectory import UNPOSED, NoPoses
 
     if find:
         return scans_of(options, UNPOSED), None
@@ -59,7 +59,7 @@ def scans_or_unposed(options: argparse.Namespace, *, find: bool = False) -> tupl
 @contextmanager
 def finding(options: argparse.Namespace, missing: NoPoses | None) -> Iterator[None]:
     """A block in which poses are found. If they are `missing`, that is said, or why they cannot be found."""
-    from radarsdf.io.poses.reading import NoPoses
+    from radarsdf.io.poses.trajectory import NoPoses
 
     try:
         yield

@@ -148,7 +148,7 @@ def _rotation(quaternion: list[float]) -> Any:
 def _poses_of_file(path: Path) -> NDArray[np.float64]:
     import numpy as np
 
-    from radarsdf.io.poses.reading import read_poses
+    from radarsdf.io.poses.files import read_poses
     from radarsdf.io.poses.trajectory import Trajectory
     from radarsdf.io.scans import Notes
 

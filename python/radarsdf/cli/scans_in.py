@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from radarsdf.io.poses.reading import StampedPoses
+    from radarsdf.io.poses.trajectory import StampedPoses
     from radarsdf.io.scans import Scans
 
 
@@ -126,10 +126,10 @@ def scans_of(options: argparse.Namespace, poses: StampedPoses | None = None) -> 
 
 def _matrix(path: Path | None, size: int, what: str) -> Any:
     """What a file holds, if there is one. `what` it should be is said if it is no square of this size."""
-    from radarsdf.io.poses.trajectory import read_table
+    from radarsdf.io.text import read_numbers
 
     try:
-        return None if path is None else read_table(path, size)
+        return None if path is None else read_numbers(path, size)
     except ValueError as error:
         msg = f"{path} is no {what}"
         raise ValueError(msg) from error

@@ -1,33 +1,37 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Checks of files before they are read, and the one way in which files are written."""
+"""Files that are written whole or not at all, locks of folders, and the origin of files in a local frame."""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import secrets
+import socket
 import stat
-import tempfile
+import sys
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
-from radarsdf.checks import path_of
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.checks import path_of, positions
 
 _MAX_NAME_BYTES = 255  # of nearly all file systems
-_MAX_PART_OF_NAME = (
-    50  # characters, of at most four bytes: the temporary name must not be longer than the limit
-)
+_MAX_STEM = 50  # characters of at most four bytes: the temporary name must not be longer than the limit
+_MAX_FLOAT32_M = 1000.0  # further from the origin, float32 resolves less than 0.06 mm
+_LOCK_FLAGS = ("O_CREAT", "O_RDWR", "O_BINARY", "O_NOFOLLOW", "O_NONBLOCK")  # as far as the system has them
+_LOCKED = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 
 def check_regular_file(path: str | PathLike[str]) -> None:
-    """Raises unless `path` is a regular file that can be read.
-
-    Pipes and devices are refused: reading them could block forever, or never end.
-    """
+    """Raises unless `path` can be opened and is no pipe or device: reading those could block or never end."""
     if not Path(path).is_dir() and not stat.S_ISREG(Path(path).stat().st_mode):
         msg = f"{path} is not a regular file"
         raise ValueError(msg)
@@ -36,40 +40,22 @@ def check_regular_file(path: str | PathLike[str]) -> None:
 
 
 @contextmanager
-def in_utf8(path: str | PathLike[str]) -> Iterator[Path]:
-    """A path in UTF-8 to a file or folder, for libraries that take no others: the names of Linux are any bytes.
-
-    Yields
-    ------
-    Path
-        `path` itself if it can be, or else a link to it with the same suffix, which is removed.
-    """
+def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> Iterator[None]:
+    """Turns a ValueError, or one of these errors, in its block into a ValueError that names the file: it is not `what`."""
+    kinds: tuple[type[Exception], ...] = (ValueError, *errors)
     try:
-        os.fspath(path).encode()
-    except UnicodeEncodeError:
-        with tempfile.TemporaryDirectory(prefix="radarsdf_") as folder:
-            link = Path(folder) / f"link{Path(path).suffix.encode(errors='ignore').decode()}"
-            link.symlink_to(os.path.abspath(path))  # noqa: PTH100 - a link in the path stays as it is
-            yield link
-    else:
-        yield Path(path)
-
-
-def are_numbers(words: list[str]) -> bool:
-    """Whether words of a text file are numbers, and so no header."""
-    try:
-        [float(word) for word in words]
-    except ValueError:
-        return False
-    return True
+        yield
+    except kinds as error:
+        msg = f"{path} is not {what}: {error}"
+        raise ValueError(msg) from error
 
 
 def check_outputs(
     outputs: Iterable[str | PathLike[str] | None], inputs: Iterable[str | PathLike[str] | None] = ()
 ) -> None:
-    """Raises unless each output can be written, and is neither an input nor another output. To be called before the work.
+    """Raises unless each output can be written, and is neither an input nor another output.
 
-    A path that is None is ignored. Links are followed.
+    To be called before the work. Paths that are None are ignored; links are followed.
     """
     taken = {os.path.realpath(path): path for path in inputs if path is not None}
     for path in outputs:
@@ -80,8 +66,8 @@ def check_outputs(
             msg = f"{path} is the same file as {taken[target]}, which would be lost: give another name"
             raise ValueError(msg)
         taken[target] = path
-        _check_target(Path(target), path)
-        descriptor, temporary = _open_beside(Path(target))
+        _mode_to_keep(Path(target), path)
+        descriptor, temporary = _open_temporary(Path(target))
         os.close(descriptor)
         temporary.unlink()
 
@@ -94,19 +80,14 @@ def write_whole(path: str | PathLike[str], data: bytes) -> None:
 
 @contextmanager
 def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
-    """A file that is written whole or not at all: an old one at `path` is replaced once the new one is on the disk.
+    """A file open for writing that replaces the one at `path` only once it is on the disk.
 
-    A link is followed, and the old file's permissions stay. A process that is killed while it writes may leave a hidden
-    file in the same folder, named `.NAME.` and 16 hexadecimal digits.
-
-    Yields
-    ------
-    file
-        Open for writing, and empty. If the block raises, it is removed, and the old file is as before.
+    If the block raises, the old file is as before. A link is followed, and the old file's permissions stay. A killed
+    process may leave a hidden file `.NAME.` and 16 hexadecimal digits in the same folder.
     """
     target = Path(os.path.realpath(path_of(path, "path")))
-    mode = _check_target(target, path)
-    descriptor, temporary = _open_beside(target)
+    mode = _mode_to_keep(target, path)
+    descriptor, temporary = _open_temporary(target)
     try:
         with os.fdopen(descriptor, "wb") as file:
             yield file
@@ -115,19 +96,20 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
         if mode is not None:
             temporary.chmod(mode)
         temporary.replace(target)
-    except OSError as error:
-        _remove(temporary)
-        if error.errno is None:  # not of the system: its message is all there is
-            raise
-        if error.filename not in (None, str(temporary)):  # of a file that the block reads
-            raise
-        raise OSError(error.errno, error.strerror, str(path)) from error  # a full disk names no file
-    except BaseException:
-        _remove(temporary)
+    except BaseException as error:
+        with suppress(OSError):  # its folder may be gone, or the disk; the first error says so
+            temporary.unlink()
+        # A full disk names no file. An error without a number is not the system's, one with another file is the block's.
+        if (
+            isinstance(error, OSError)
+            and error.errno is not None
+            and error.filename in (None, str(temporary))
+        ):
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 
-def _check_target(target: Path, named: str | PathLike[str]) -> int | None:
+def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
     """Permissions of the file that would be replaced; None if there is none."""
     try:
         mode = target.stat().st_mode
@@ -141,24 +123,99 @@ def _check_target(target: Path, named: str | PathLike[str]) -> int | None:
     return stat.S_IMODE(mode)
 
 
-def _open_beside(target: Path) -> tuple[int, Path]:
-    """A new file in the same folder, since only within a file system does a rename replace at once."""
+def _open_temporary(target: Path) -> tuple[int, Path]:
+    """A new file in the folder of `target`: only within a file system does a rename replace at once."""
     if len(os.fsencode(target.name)) > _MAX_NAME_BYTES:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
-    temporary = target.with_name(f".{target.name[:_MAX_PART_OF_NAME]}.{secrets.token_hex(8)}")
+    temporary = target.with_name(f".{target.name[:_MAX_STEM]}.{secrets.token_hex(8)}")
     # Not tempfile: only the owner may read its files, and the rename would keep that.
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
         return os.open(temporary, flags, 0o666), temporary
     except FileNotFoundError as error:
-        why = (
-            "nothing can be written here" if target.parent.is_dir() else f"there is no folder {target.parent}"
-        )
+        folder = target.parent
+        why = "nothing can be written here" if folder.is_dir() else f"there is no folder {folder}"
         raise FileNotFoundError(error.errno, why, str(target)) from error
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(target)) from error
 
 
-def _remove(temporary: Path) -> None:
-    with suppress(OSError):  # its folder may be gone, or the disk; the first error says so
-        temporary.unlink()
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock(descriptor: int) -> None:
+        # A byte far beyond the text: nobody could read what is locked.
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        os.lseek(descriptor, 0, os.SEEK_SET)
+
+else:
+
+    def _lock(descriptor: int) -> None:
+        import fcntl  # noqa: PLC0415 (a system without it can do all but plan tiles)
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def take_lock(path: Path, use: str) -> int:
+    """The descriptor of a file that nobody else has locked; closing it, or the end of the process, unlocks it.
+
+    The file stays, since another process may be about to lock it. `use` says what its folder is locked for, as a
+    participle. Raises a BlockingIOError that names the holder if it is locked, an OSError if it cannot be written.
+    """
+    descriptor = os.open(path, sum(getattr(os, flag, 0) for flag in _LOCK_FLAGS), 0o666)
+    try:
+        try:
+            _lock(descriptor)
+        except OSError as error:
+            if error.errno in _LOCKED:
+                text = path.read_text(errors="replace")[:100]
+                holder = text if text and text.isprintable() else "another process"  # empty for a moment
+                msg = f"{path.parent} is being {use} by {holder}: wait until that is done, or give another folder"
+                raise BlockingIOError(msg) from error
+            # Not all file systems of clusters have locks.
+            words = f"{path.parent} cannot be locked ({error.strerror}): let nobody else use it meanwhile"
+            warnings.warn(words, RuntimeWarning, stacklevel=3)
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+# Formats of float32 resolve half a metre at UTM coordinates. What is far from the world's origin is written to them in a
+# local frame: the world axes, with an origin subtracted that NAME.origin.json states.
+
+
+def origin_path(path: str | PathLike[str]) -> Path:
+    """Where the origin of the local frame of a file is written."""
+    return Path(path).with_name(Path(path).name + ".origin.json")
+
+
+def origin_for(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """(3,) origin to subtract from points (N, 3), m, for float32; None where they are near enough to 0."""
+    if np.abs(points).max(initial=0.0) <= _MAX_FLOAT32_M:
+        return None
+    origin: NDArray[np.float64] = np.round(points.mean(axis=0))
+    return origin
+
+
+def write_origin(path: str | PathLike[str], origin: NDArray[np.float64] | None) -> None:
+    """Writes the origin of a file; None removes the one of an older file."""
+    if origin is None:
+        origin_path(path).unlink(missing_ok=True)
+        return
+    described = {"origin": origin.tolist(), "unit": "m", "frame": "world = local + origin"}
+    write_whole(origin_path(path), json.dumps(described).encode())
+
+
+def origin_of(path: str | PathLike[str]) -> NDArray[np.float64] | None:
+    """(3,) the origin of a file in a local frame, world, m. None if none is written next to it."""
+    file = origin_path(path)
+    if not file.is_file():
+        return None
+    with reading(file, "the origin of a local frame", TypeError, KeyError, RecursionError):
+        described = json.loads(file.read_text(encoding="utf-8"))
+        origin: NDArray[np.float64] = positions([described["origin"]], "origin")[0]
+        return origin

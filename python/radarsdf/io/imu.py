@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What an inertial measurement unit (IMU) measured beside the scans."""
+"""Measurements of an inertial measurement unit (IMU)."""
 
 from __future__ import annotations
 
@@ -36,18 +36,16 @@ class Imu:
 
     def __post_init__(self) -> None:
         """Checks the arrays."""
-        times_s = _checked(self.times_s, "times_s", None)
-        if (np.diff(times_s) < 0).any():
+        count = np.shape(self.times_s)[:1]
+        shapes = {"times_s": count, "angular_velocity": (*count, 3), "specific_force": (*count, 3)}
+        for name, shape in shapes.items():
+            if (values := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _checked(values, name, shape))
+        if (np.diff(self.times_s) < 0).any():
             msg = "times_s of an IMU must ascend"
             raise ValueError(msg)
-        checked = {"times_s": times_s}
-        for name in ("angular_velocity", "specific_force"):
-            if getattr(self, name) is not None:
-                checked[name] = _checked(getattr(self, name), name, len(times_s))
         if self.R_sensor_imu is not None:
-            checked["R_sensor_imu"] = checked_rotation(self.R_sensor_imu)
-        for name, array in checked.items():
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, "R_sensor_imu", checked_rotation(self.R_sensor_imu))
 
     def __len__(self) -> int:
         """Number of measurements."""
@@ -57,10 +55,10 @@ class Imu:
 def checked_rotation(R_sensor_imu: ArrayLike) -> FloatArray:
     """`R_sensor_imu` as a rotation (3, 3); of a rigid transform (4, 4), its rotation."""
     matrix: FloatArray = real_array(R_sensor_imu, "R_sensor_imu")
-    whole = np.eye(4)
     if matrix.shape not in ((3, 3), (4, 4)):
         msg = f"R_sensor_imu must be a rotation (3, 3), not {matrix.shape}"
         raise ValueError(msg)
+    whole = np.eye(4)
     whole[:3, :3] = matrix[:3, :3]
     try:
         return check_pose(whole, "R_sensor_imu")[:3, :3]
@@ -69,10 +67,10 @@ def checked_rotation(R_sensor_imu: ArrayLike) -> FloatArray:
         raise ValueError(msg) from error
 
 
-def _checked(values: Any, name: str, rows: int | None) -> FloatArray:
+def _checked(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
     array: FloatArray = real_array(values, name)
-    shape = array.shape[:1] if rows is None else (rows, 3)
-    if array.shape != shape or array.ndim == 0 or len(array) == 0 or not np.isfinite(array).all():
-        msg = f"{name} of an IMU must be finite numbers of shape {'(G,)' if rows is None else shape}, not {array.shape}"
+    if array.shape != shape or array.size == 0 or not np.isfinite(array).all():
+        expected = "(G,)" if name == "times_s" else shape
+        msg = f"{name} of an IMU must be finite numbers of shape {expected}, not {array.shape}"
         raise ValueError(msg)
     return array

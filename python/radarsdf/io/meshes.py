@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Meshes to files, in double precision where the format has it."""
+"""Meshes in files, in double precision where the format has it, and ground truth from files of any kind."""
 
 from __future__ import annotations
 
-import io
-import re
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import path_of
+from radarsdf.checks import path_of, positions
 from radarsdf.interrupts import whole_import
-from radarsdf.io.files import check_regular_file, write_whole
-from radarsdf.io.origin import origin_for, origin_of, write_origin
-from radarsdf.io.records import Columns, face_records, ply_header, records, without_ply_comments
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
+from radarsdf.io.files import check_regular_file, origin_for, origin_of, write_origin, write_whole
+from radarsdf.io.npz import arrays_of
+from radarsdf.io.ply import Columns, face_records, has_faces, ply_bytes, ply_header, records
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,19 +24,17 @@ if TYPE_CHECKING:
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
 _T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
-
-_FACES = re.compile(rb"element\s+face\s+0*[1-9]")
-_HEADER_BYTES = 1 << 16
+_TRUTH_ARRAYS = ("lidar_points", "points", "xyz", "arr_0")  # of which the first that a file has counts
+_SAMPLES = 1_000_000  # on a surface: a triangle of a building may be 20 m long
 
 
 def holds_mesh(path: str | PathLike[str]) -> bool:
     """Whether a file is a mesh, by its ending; of PLY, which may be a cloud too, by its header."""
     file = Path(path)
     suffix = file.suffix.lower()
-    if suffix != ".ply" or not file.is_file():
-        return suffix in MESH_SUFFIXES and suffix != ".ply" and not file.is_dir()
-    with file.open("rb") as opened:
-        return _FACES.search(opened.read(_HEADER_BYTES).partition(b"end_header")[0]) is not None
+    if suffix == ".ply":
+        return file.is_file() and has_faces(file)
+    return suffix in MESH_SUFFIXES and not file.is_dir()
 
 
 def check_mesh_path(path: str | PathLike[str]) -> None:
@@ -126,7 +123,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
         import trimesh  # noqa: PLC0415 - takes long
     try:
         ply = file.suffix.lower() == ".ply"
-        source: Any = io.BytesIO(without_ply_comments(file.read_bytes())) if ply else file
+        source: Any = ply_bytes(file) if ply else file
         mesh: Any = trimesh.load_mesh(source, file_type="ply" if ply else None, process=False)
     except OSError:
         raise
@@ -144,6 +141,53 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
         return mesh
     msg = f"{path} is not one mesh"
     raise ValueError(msg)
+
+
+def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
+    """Reads points of a lidar, or draws points evenly on the triangles of a surface.
+
+    Parameters
+    ----------
+    path : path-like
+        A file for :func:`read_points`; ``.npz`` with an array (M, 3) of one of the names lidar_points, points, xyz and
+        arr_0; or a mesh, in PLY, OBJ, OFF, STL or GLB.
+
+    Returns
+    -------
+    ndarray
+        (M, 3) float64, world frame, m. The same file gives the same points.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged, of another kind, or holds no points.
+    OSError
+        If it cannot be read.
+    ImportError
+        If it takes a library that is not installed; the message says which.
+    """
+    file = Path(path)
+    suffix = file.suffix.lower()
+    if holds_mesh(file):
+        mesh = read_mesh(file)
+        if not mesh.area > 0:  # NaN too
+            msg = f"{path} has no surface"
+            raise ValueError(msg)
+        # By area, in the order of the triangles: a triangle has points wherever it is large.
+        samples: Any = mesh.sample(_SAMPLES, return_index=True, seed=0)
+        return np.asarray(samples[0], np.float64)
+    if suffix == ".npz":
+        arrays = arrays_of(file, _TRUTH_ARRAYS)
+        if not arrays:
+            msg = f"{path} has no ground truth: it lacks an array {' or '.join(_TRUTH_ARRAYS)}"
+            raise ValueError(msg)
+        name, points = next(iter(arrays.items()))
+        return positions(points, f"{path}: {name}")
+    if suffix not in CLOUD_SUFFIXES:
+        kinds = dict.fromkeys((*CLOUD_SUFFIXES, ".npz", *MESH_SUFFIXES))
+        msg = f"{path} is no ground truth: that is a file that ends in {', '.join(kinds)}"
+        raise ValueError(msg)
+    return read_points(file)
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:

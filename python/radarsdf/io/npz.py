@@ -15,25 +15,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import instance, path_of
-from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
-from radarsdf.io.unpacking import check_unpacked
+
+# Measurements are mostly noise and compress by a factor of 2 to 5. Some kilobytes could unpack to gigabytes.
+_MAX_COMPRESSION = 100
+_ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are unpacked at any compression
 
 _IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu
-_ARRAYS = (
-    "points",
-    "frame",
-    "poses",
-    "intensity",
-    "static",
-    "lidar_points",
-    "doppler",
-    "times",
-    "sigma",
-    "simulated",
-    *_IMU,
-)
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "points": ("N", 3),
+    "frame": ("N",),
+    "poses": ("F", 4, 4),
+    "intensity": ("N",),
+    "static": ("N",),
+    "doppler": ("N",),
+    "times": ("F",),
+    "sigma": ("N", 3),
+    "lidar_points": ("M", 3),
+}
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:
@@ -72,37 +73,17 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     if path_of(path, "path").suffix != ".npz":
         msg = f"{path} is not an .npz file: only .npz files of scans can be read"
         raise ValueError(msg)
-    arrays = arrays_of(path, _ARRAYS)
+    arrays = arrays_of(path, (*_SHAPES, "simulated", *_IMU))
     if missing := sorted({"points", "frame", "poses"} - set(arrays)):
         msg = f"{path} lacks the arrays {', '.join(missing)}"
         raise ValueError(msg)
-    points, frame, poses = arrays["points"], arrays["frame"], arrays["poses"]
-    count, num_poses = points.shape[:1], poses.shape[:1]
-    for name, shape in {
-        "points": (*count, 3), "poses": (*num_poses, 4, 4), "frame": count, "intensity": count, "static": count,
-        "doppler": count, "times": num_poses, "sigma": (*count, 3),
-    }.items():  # fmt: skip
-        if name in arrays and arrays[name].shape != shape:
-            msg = f"{path}: {name} must have shape {shape}, not {arrays[name].shape}"
-            raise ValueError(msg)
-    truth = arrays.get("lidar_points", points)
-    if truth.ndim != 2 or truth.shape[1] != 3:
-        msg = f"{path}: lidar_points must have shape (M, 3), not {truth.shape}"
-        raise ValueError(msg)
-    for name, array in arrays.items():
-        if array.dtype.kind not in ("biuf" if name == "static" else "iuf"):
-            msg = f"{path}: {name} must be real numbers, not {array.dtype}"
-            raise ValueError(msg)
-    imu = _imu(arrays, path)
-    if (frame != np.floor(frame)).any():
-        msg = f"{path}: frame must hold row numbers of poses"
-        raise ValueError(msg)
-    if len(frame) and not 0 <= frame.min() <= frame.max() < len(poses):
-        msg = f"{path}: frame must lie in [0, {len(poses)})"
-        raise ValueError(msg)
-    used = arrays.get("static", np.ones(len(frame), bool)).astype(bool)
-    frame = frame.astype(np.int64)
-    order = np.flatnonzero(used)
+    with reading(path, "a file of scans"):
+        _check_scans(arrays)
+        times_s, rates, *others = (arrays.get(name) for name in _IMU)
+        imu = None if times_s is None or rates is None else Imu(times_s, rates, *others)
+    points, poses = arrays["points"], arrays["poses"]
+    frame = arrays["frame"].astype(np.int64)
+    order = np.flatnonzero(arrays["static"]) if "static" in arrays else np.arange(len(frame))
     order = order[np.argsort(frame[order], kind="stable")]
     frames, first = np.unique(frame[order], return_index=True)
     rows = np.split(order, first)[1:]  # the part before the first scan is empty
@@ -123,86 +104,26 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     )
 
 
-def _imu(arrays: dict[str, NDArray[Any]], path: str | PathLike[str]) -> Imu | None:
-    """What the file has of an IMU; None without times or rates."""
-    times_s, rates, *others = (arrays.get(name) for name in _IMU)
-    if times_s is None or rates is None:
-        return None
-    try:
-        return Imu(times_s, rates, *others)
-    except ValueError as error:
-        msg = f"{path}: {error}"
-        raise ValueError(msg) from error
-
-
-def array_in(path: Path) -> NDArray[Any]:
-    """The array of an ``.npy`` file, as a memory map: a header that claims more than the file holds is refused."""
-    check_regular_file(path)
-    try:
-        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        msg = f"{path} is not a whole .npy file: {error}"
-        raise ValueError(msg) from error
-    return array
-
-
-def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """The arrays of an ``.npz`` file that have these names, in this order. Raises as :func:`read_scans`."""
-    check_regular_file(path)
-    try:
-        return _arrays(Path(path), names)
-    except zipfile.BadZipFile as error:
-        msg = f"{path} is not a whole .npz file: it is cut off, damaged, or of another kind"
-        raise ValueError(msg) from error
-    except Exception as error:  # damaged files raise exceptions of many kinds, among them OSError
-        msg = f"{path} is not a whole .npz file: {error}"
-        raise ValueError(msg) from error
-
-
-def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[Any, ...]]) -> None:
-    """Raises a ValueError unless the wanted arrays are there, each of its type and shape. A length of None is any."""
-    for name, (dtype, *shape) in wanted.items():
-        array = arrays.get(name)
-        fits = array is not None and array.dtype == dtype and array.ndim == len(shape)
-        if (
-            array is None
-            or not fits
-            or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True))
-        ):
-            msg = f"{name} is missing, or of another type or shape"
-            raise ValueError(msg)
-
-
-def write_arrays(
-    path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
-) -> None:
-    """Writes the ``.npz`` that :func:`arrays_of` reads, whole or not at all."""
+def _check_scans(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raises a ValueError unless the arrays fit together."""
     for name, array in arrays.items():
-        if np.asarray(array).dtype.hasobject:
-            msg = f"{name} has objects of Python, which are not written"
+        if array.dtype.kind not in ("biuf" if name == "static" else "iuf"):
+            msg = f"{name} must be real numbers, not {array.dtype}"
             raise ValueError(msg)
-    file = io.BytesIO()
-    save: Callable[..., None] = np.savez_compressed if compressed else np.savez
-    save(file, **arrays)
-    write_whole(path, file.getvalue())
-
-
-def holds_scans(path: str | PathLike[str]) -> bool:
-    """Whether an ``.npz`` file has poses. Raises as :func:`read_scans`."""
-    return bool(arrays_of(path, ["poses"]))
-
-
-def _arrays(path: Path, wanted: Iterable[str]) -> dict[str, NDArray[Any]]:
-    with zipfile.ZipFile(path) as file:
-        names = file.namelist()
-        members = {name: file.getinfo(f"{name}.npy") for name in wanted if f"{name}.npy" in names}
-        unpacked = sum(member.file_size for member in members.values())
-        check_unpacked(unpacked, path.stat().st_size, "its arrays")
-        arrays = {}
-        for name, member in members.items():
-            with file.open(member) as stream:
-                arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
-        return arrays
+    known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
+    for name, (first, *rest) in _SHAPES.items():
+        shape = arrays[name].shape if name in arrays else None
+        expected = (*known.get(str(first), (shape or ("M",))[:1]), *rest)
+        if shape not in (None, expected):
+            msg = f"{name} must have shape {expected}, not {shape}"
+            raise ValueError(msg)
+    frame, num_poses = arrays["frame"], len(arrays["poses"])
+    if (frame != np.floor(frame)).any():
+        msg = "frame must hold row numbers of poses"
+        raise ValueError(msg)
+    if len(frame) and not 0 <= frame.min() <= frame.max() < num_poses:
+        msg = f"frame must lie in [0, {num_poses})"
+        raise ValueError(msg)
 
 
 def write_scans(path: str | PathLike[str], scans: Scans) -> None:
@@ -221,25 +142,81 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
         If the file cannot be written.
     """
     instance(scans, Scans, "scans")
-    arrays: dict[str, NDArray[Any]] = {
+    arrays: dict[str, NDArray[Any] | None] = {
         "points": np.concatenate(scans.points),
         "frame": np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points]),
         "poses": scans.poses,
+        "intensity": None if scans.intensities is None else np.concatenate(scans.intensities),
+        "doppler": None if scans.doppler_mps is None else np.concatenate(scans.doppler_mps),
+        "sigma": None if scans.sigmas is None else np.concatenate(scans.sigmas),
+        "times": scans.times_s,
     }
-    for name, values in (
-        ("intensity", scans.intensities), ("doppler", scans.doppler_mps), ("sigma", scans.sigmas)
-    ):  # fmt: skip
-        if values is not None:
-            arrays[name] = np.concatenate(values)
-    if scans.times_s is not None:
-        arrays["times"] = scans.times_s
     if scans.imu is not None:
-        values_of = vars(scans.imu).values()
-        arrays |= {name: array for name, array in zip(_IMU, values_of, strict=True) if array is not None}
+        arrays |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))
     if scans.ground_truth is not None:
         arrays["lidar_points"] = scans.ground_truth
-        if scans.truth_kind == "simulated":
-            arrays["simulated"] = np.array(1, np.uint8)
+        arrays["simulated"] = np.array(1, np.uint8) if scans.truth_kind == "simulated" else None
     target = path_of(path, "path")
     named = target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz")
-    write_arrays(named, arrays, compressed=True)
+    held = {name: array for name, array in arrays.items() if array is not None}
+    write_arrays(named, held, compressed=True)
+
+
+def holds_scans(path: str | PathLike[str]) -> bool:
+    """Whether an ``.npz`` file has poses. Raises as :func:`read_scans`."""
+    return bool(arrays_of(path, ["poses"]))
+
+
+def array_in(path: Path) -> NDArray[Any]:
+    """The array of an ``.npy`` file, as a memory map: a header that claims more than the file holds is refused."""
+    check_regular_file(path)
+    with reading(path, "a whole .npy file", EOFError):
+        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        return array
+
+
+def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """The arrays of an ``.npz`` file that have these names, in this order. Raises as :func:`read_scans`."""
+    check_regular_file(path)
+    arrays = {}
+    # Damaged files raise exceptions of many kinds, among them OSError.
+    with reading(path, "a whole .npz file", Exception), zipfile.ZipFile(path) as file:
+        held = set(file.namelist())
+        members = {name: file.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in held}
+        unpacked = sum(member.file_size for member in members.values())
+        if unpacked > max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * Path(path).stat().st_size):
+            msg = f"its arrays would unpack to {unpacked} bytes: measurements do not compress that much"
+            raise ValueError(msg)
+        for name, member in members.items():
+            with file.open(member) as stream:
+                arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
+    return arrays
+
+
+def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[Any, ...]]) -> None:
+    """Raises a ValueError unless the wanted arrays are there, each of its type and shape. A length of None is any."""
+    for name, (dtype, *shape) in wanted.items():
+        array = arrays.get(name)
+        if (
+            array is not None
+            and array.dtype == dtype
+            and array.ndim == len(shape)
+            and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+        ):
+            continue
+        msg = f"{name} is missing, or of another type or shape"
+        raise ValueError(msg)
+
+
+def write_arrays(
+    path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
+) -> None:
+    """Writes the ``.npz`` that :func:`arrays_of` reads, whole or not at all."""
+    for name, array in arrays.items():
+        if np.asarray(array).dtype.hasobject:
+            msg = f"{name} has objects of Python, which are not written"
+            raise ValueError(msg)
+    file = io.BytesIO()
+    save: Callable[..., None] = np.savez_compressed if compressed else np.savez
+    save(file, **arrays)
+    write_whole(path, file.getvalue())

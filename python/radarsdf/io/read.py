@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One door for scans in files, folders and bags of any kind."""
+"""One function that reads scans from files, folders and bags of any kind."""
 
 from __future__ import annotations
 
@@ -14,39 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import check_pose, path_of, positions, positive
+from radarsdf.io import datasets
 from radarsdf.io.bags.reading import bags_in, is_bag, read_bags
-from radarsdf.io.clouds.fields import Cloud
+from radarsdf.io.clouds.fields import finite_scan
 from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
-from radarsdf.io.datasets import published
-from radarsdf.io.datasets.folders import base_T_radar, lidar_map
+from radarsdf.io.folders import read_files, read_folder
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.reading import (
-    FIND_POSES,
-    POSE_FILES,
-    UNPOSED,
-    NoPoses,
-    ScanPoses,
-    StampedPoses,
-    poses_of,
-)
-from radarsdf.io.poses.trajectory import MAX_GAP_S
+from radarsdf.io.poses.files import POSE_FILES, poses_of
+from radarsdf.io.poses.trajectory import MAX_GAP_S, UNPOSED, ScanPoses, StampedPoses
+from radarsdf.io.recordings import WITHOUT_POSES, Request, Truth, scan_poses
 from radarsdf.io.scans import Notes, Scan, Scans
-from radarsdf.io.sources import (
-    NOT_FINITE,
-    WITHOUT_POSES,
-    Request,
-    Truth,
-    cloud_files,
-    in_order_of_time,
-    note_viewpoint,
-    scan_poses,
-    scans_of_files,
-    viewpoint_poses,
-)
 
 _STAMPS = (None, "header", "record")
-_CALIBRATIONS = ("calib.txt", "calibration.txt")
+_OF_BAGS = ("topic", "pose_topic", "imu_topic", "world_frame", "stamps")  # choices without effect elsewhere
 
 
 def read(
@@ -78,36 +59,36 @@ def read(
 
         - our ``.npz`` (see :func:`read_scans`);
         - a folder with a file a scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
-          file, whose column such as frame or scan_id splits it into scans. Files are read in natural order, or in the order
+          file, which a column such as frame or scan_id splits into scans. Files are read in natural order, or in the order
           of the times in their names. Ground truth is ``lidar.pcd`` or ``lidar.ply`` in the folder;
-        - a folder of a data set that :mod:`radarsdf.io.datasets.published` knows by its shape;
+        - a folder of a data set that :mod:`radarsdf.io.datasets` knows by its shape;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
-        (F, 4, 4) T_world_sensor, m, or a file for :func:`radarsdf.io.poses.reading.read_poses`: TUM, KITTI, 4 x 4 matrices,
-        or a table that names its columns. By default what the data set says, or the ``.npz`` has; in a folder, a file of
-        `radarsdf.io.poses.reading.POSE_FILES`, or the ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`.
-        `radarsdf.io.UNPOSED` reads scans that have none.
+        (F, 4, 4) T_world_sensor, m, or a file: TUM, KITTI, 4 x 4 matrices, or a table that names its columns. By default
+        those of the data set or the ``.npz``; in a folder, a file such as ``poses.txt`` or ``poses.tum``, or the
+        ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
     topic : str or sequence of str, optional
-        In a bag, the topics of the scans, which are merged in the order of their times. By default the radar's, if there is
-        one. Each message has the pose of the frame that its header names.
+        In a bag, the topics of the scans, merged in the order of their times. By default the radar's, if there is one.
+        Each message has the pose of the frame in its header.
     pose_topic : str, optional
         In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one that covers the times
         of the scans; what was passed over is noted. Goals, plans and initial poses never count.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
-        The rotation from the axes of the IMU to those of the radar. By default that of the file, or in a bag that of the
-        static transforms.
+        Rotation from the axes of the IMU to those of the radar. By default that of the file, or of the static transforms of
+        a bag.
     world_frame : str, optional
         With poses of TF, the frame of the world. By default the root of its tree.
     stamps : {"header", "record"}, optional
         In a bag, the time of a scan: of its header, or when it was recorded. By default of the header, unless its stamps
         are zero or stand still.
     fields : mapping, optional
-        Field of the file by role, if the table of :mod:`radarsdf.io.clouds.fields` is wrong: ``{"intensity": "Power"}``. Numbers
-        mean columns, None leaves a role out. Roles are those of `radarsdf.io.clouds.fields.ROLES`.
+        Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. Numbers mean columns,
+        None leaves a role out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth
+        and sigma_elevation.
     columns : int or sequence of str, optional
         Of files without names of columns: how many a point has, or their names. By default the content of several files
         decides for ``.bin``.
@@ -119,19 +100,19 @@ def read(
     Returns
     -------
     Scans
-        They are read while they are iterated, in memory bounded by a scan; see :class:`Scans`. Points keep the precision
-        of the file; intensities, Doppler and deviations are float32.
+        They are read while they are iterated, in memory bounded by a scan. Points keep the precision of the file;
+        intensities, Doppler and deviations are float32.
 
     Raises
     ------
     NoPoses
         If scans have no poses: a ValueError.
     ValueError
-        If files are damaged or do not fit together, something is missing, or a choice is not clear.
+        If files are damaged or do not fit together, something is missing, or a choice is ambiguous.
     OSError
         If a file cannot be read.
     ImportError
-        If it takes a library that is not installed; the message says which.
+        If a library is not installed; the message names it.
 
     Examples
     --------
@@ -163,85 +144,54 @@ def read(
     )
     if isinstance(poses, (str, PathLike)):
         _check_exists(Path(poses))
-    if not isinstance(path, (str, PathLike)):
+    if isinstance(path, (str, PathLike)):
+        _check_exists(Path(path))
+        found = _read(Path(path), request)
+    else:
         paths = [path_of(part, "path") for part in (path if isinstance(path, Iterable) else [path])]
         for part in paths:
             _check_exists(part)
         found = read_bags(paths, request)
-    else:
-        found = _read(Path(path), request)
     if request.truth is not None:
         found.truth_kind = "given"
     return found
 
 
 def _read(path: Path, request: Request) -> Scans:
-    _check_exists(path)
+    """By what the path is: a bag, a data set, a folder of bags or of clouds, our own file, or a cloud."""
     if is_bag(path):
         return read_bags([path], request)
     if path.is_dir():
-        dataset = published.find(path)
-        if dataset is not None:
+        if (dataset := datasets.find(path)) is not None:
             return dataset.read(path, request)
-        if found := bags_in(path):
-            beside = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
-            if request.poses is None and request.pose_topic is None and beside is not None:
-                request.notes.add(f"poses: of {beside.name}")
-                request = dataclasses.replace(request, poses=beside)
-            return read_bags(found, request)
-        return _folder(path, request)
-    if path.suffix.lower() == ".npz":
+        if bags := bags_in(path):
+            return read_bags(bags, _with_poses_in(path, request))
+    for name in _OF_BAGS:
+        if getattr(request, name) not in (None, ()):
+            msg = f"{path} is no bag: {name} is of bags alone"
+            raise ValueError(msg)
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return read_folder(path, request)
+    if suffix == ".npz":
         return _npz(path, request)
-    if path.suffix.lower() in CLOUD_SUFFIXES:
-        return _files([path], path.parent, request)
+    if suffix in CLOUD_SUFFIXES:
+        return read_files([path], path.parent, request)
     msg = f"{path} is of no kind that can be read: .npz, .bag, .mcap, .db3, {', '.join(CLOUD_SUFFIXES)}, or a folder of them"
     raise ValueError(msg)
 
 
-def _folder(folder: Path, request: Request) -> Scans:
-    files = cloud_files(folder)
-    if not files:
-        msg = f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}"
-        raise ValueError(msg)
-    return _files(files, folder, request, lambda: lidar_map(folder))
-
-
-def _refuse_choices_of_bags(path: Path, request: Request) -> None:
-    """Raises where a choice would have no effect."""
-    for name in ("topic", "pose_topic", "imu_topic", "world_frame", "stamps"):
-        if getattr(request, name) not in (None, ()):
-            msg = f"{path} is no bag: {name} is of bags alone"
-            raise ValueError(msg)
-
-
-def _files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
-    """Scans of files with poses."""
-    _refuse_choices_of_bags(files[0], request)
-    places = dict.fromkeys((folder, files[0].parent, files[0].parent.parent))
-    poses = request.poses
-    if poses is None:
-        poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
-        if poses is not None and poses.parent != folder:  # which is easily overlooked
-            request.notes.add(f"poses: of {poses}")
-        if poses is None:
-            files, times_s, _ = in_order_of_time(files, UNPOSED, request.notes)
-            viewpoints = viewpoint_poses(files, request.notes)
-            if viewpoints is not None:
-                return scans_of_files(files, times_s, viewpoints, request.extrinsic, request, truth)
-            what = files[0] if len(files) == 1 else folder
-            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
-            raise NoPoses(msg)
-    if isinstance(poses, (str, PathLike)):
-        places = dict.fromkeys((Path(poses).parent, *places))
-    calibrations = [place / name for place in places for name in _CALIBRATIONS]
-    given = poses_of(poses, request.notes, calibrations)
-    note_viewpoint(files[0], request.notes)
-    files, times_s, given = in_order_of_time(files, given, request.notes)
-    T_base_sensor = request.extrinsic if request.extrinsic is not None else base_T_radar(folder)
-    return scans_of_files(files, times_s, given, T_base_sensor, request, truth)
+def _with_poses_in(folder: Path, request: Request) -> Request:
+    """The request with the file of poses in a folder of bags, unless a user has chosen others."""
+    file = next((folder / name for name in POSE_FILES if (folder / name).is_file()), None)
+    if file is None or request.poses is not None or request.pose_topic is not None:
+        return request
+    request.notes.add(f"poses: of {file.name}")
+    return dataclasses.replace(request, poses=file)
 
 
 def _npz(path: Path, request: Request) -> Scans:
+    """The scans of our own file, with its poses or those that are given."""
     given = None if request.poses is UNPOSED else request.poses
     if given is None and request.extrinsic is not None:
         msg = f"{path} has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
@@ -249,34 +199,31 @@ def _npz(path: Path, request: Request) -> Scans:
     if request.fields is not None or request.columns is not None:
         msg = f"{path} has arrays of known names: fields and columns are not used for .npz files"
         raise ValueError(msg)
-    _refuse_choices_of_bags(path, request)
+    notes = request.notes
     scans = read_scans(path)
-    lost = np.flatnonzero(~np.isfinite(scans.poses).all(axis=(1, 2)))
     matched = None if given is None else _other_poses(given, scans, path, request)
-    if matched is not None and request.truth is None and scans.ground_truth is not None:
-        request.notes.add(
-            f"the ground truth of {path.name} is left out: it lies in the world of the poses there"
-        )
+    truth = scans.ground_truth if given is None else None
+    if given is not None and request.truth is None and scans.ground_truth is not None:
+        notes.add(f"the ground truth of {path.name} is left out: it lies in the world of the poses there")
 
     def source() -> Iterator[Scan]:
         for number, scan in enumerate(scans):
-            if matched is None and number in lost:
-                request.notes.count("scans left out: their poses are not finite", 1, f"scan {number}")
+            pose = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
+            if pose is None:
+                notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s), 1)
                 continue
-            T_world_sensor = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
-            if T_world_sensor is None:
-                request.notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s), 1)
+            if not np.isfinite(pose).all():
+                notes.count("scans left out: their poses are not finite", 1, f"scan {number}")
                 continue
-            cloud = Cloud.of_finite(scan.points, scan.intensities, scan.doppler_mps, scan.sigma)
-            request.notes.count(NOT_FINITE, cloud.dropped)
-            if len(cloud.points):
-                yield cloud.scan(T_world_sensor, scan.time_s)
+            arrays = scan.intensities, scan.doppler_mps, scan.time_s, scan.sigma
+            finite = finite_scan(scan.points, pose, *arrays, notes)
+            if len(finite):
+                yield finite
 
     imu = scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
-    own_truth = None if matched is not None else scans.ground_truth
-    found = Scans.of_source(source, request.notes, request.truth or (lambda: own_truth), lambda: imu)
+    found = Scans.of_source(source, notes, request.truth or (lambda: truth), lambda: imu)
     found.truth_kind = scans.truth_kind
     return found
 

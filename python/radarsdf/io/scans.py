@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -17,6 +19,8 @@ from radarsdf.io.imu import Imu
 
 _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")
+
+_ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # of one array a scan
 
 TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
 """Where ground truth comes from: the lidar of a recording, a simulator, or the user."""
@@ -53,16 +57,11 @@ class Scan:
 
 
 class Notes:
-    """Sentences on what was assumed or left out. Each is logged once, as a warning of the logger ``radarsdf.io``.
-
-    Parameters
-    ----------
-    about : str
-        What is read, for errors.
-    """
+    """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``."""
 
     def __init__(self, about: str = "the scans") -> None:
         self.about = about
+        """What is read, for errors."""
         self.lines: list[str] = []
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
@@ -77,18 +76,18 @@ class Notes:
         """All sentences, to end an error with."""
         return "".join(f"; {line}" for line in self.lines)
 
-    def start_counts(self) -> None:
-        """Forget the counts: the files are read again."""
-        self._counts = {}
-
     def count(self, what: str, number: int, example: str = "") -> None:
-        """Add to the count of what was left out, of which the first example is said."""
+        """Count what was left out in this pass through the files, and keep the first example."""
         if number:
             self._first.setdefault(what, f"; the first: {example}" if example else "")
             self._counts[what] = self._counts.get(what, 0) + number
 
-    def counted(self) -> None:
-        """Turn the counts into sentences, in the end of a pass through the files."""
+    def start_pass(self) -> None:
+        """Forget the counts: the files are read again."""
+        self._counts = {}
+
+    def end_pass(self) -> None:
+        """Turn the counts into sentences."""
         for what, number in self._counts.items():
             self.add(f"{number} {what}{self._first[what]}")
 
@@ -134,21 +133,18 @@ class Scans:
         truth_kind: TruthKind = "lidar",
         imu: Imu | None = None,
     ) -> None:
+        self._arrays: dict[str, Any] | None = {
+            name: None if arrays is None else list(one_for_each_scan(arrays, name))
+            for name, arrays in zip(_ARRAYS, (points, intensities, doppler_mps, sigmas), strict=True)
+        }
+        self._poses: NDArray[np.float64] | None = poses
+        self._times_s = times_s
         self._source: Callable[[], Iterator[Scan]] | None = None
         self._notes = Notes()
-        self._points: list[NDArray[Any]] | None = list(one_for_each_scan(points, "points"))
-        self._poses: NDArray[np.float64] | None = poses
-        self._intensities = _listed(intensities, "intensities")
-        self._doppler_mps = _listed(doppler_mps, "doppler_mps")
-        self._sigmas = _listed(sigmas, "sigmas")
-        self._times_s = times_s
         self._ground_truth: Callable[[], NDArray[Any] | None] = lambda: ground_truth
-        self._truth_known = False
+        self._imu: Callable[[], Imu | None] = lambda: imu
         self.truth_kind: TruthKind = truth_kind
         """Where the ground truth comes from."""
-        self._truth: NDArray[Any] | None = None
-        self._read_imu: Callable[[], Imu | None] | None = None
-        self._imu = imu
 
     @classmethod
     def of_source(
@@ -156,34 +152,24 @@ class Scans:
         source: Callable[[], Iterator[Scan]],
         notes: Notes,
         ground_truth: Callable[[], NDArray[Any] | None] = lambda: None,
-        imu: Callable[[], Imu | None] | None = None,
+        imu: Callable[[], Imu | None] = lambda: None,
     ) -> Scans:
         """Scans that are read while they are iterated.
 
-        Parameters
-        ----------
-        source : callable
-            Gives a new iterator over the scans, which have at least one return each.
-        notes : Notes
-            What the source says of its files.
-        ground_truth : callable
-            Reads the ground truth, when it is asked for.
-        imu : callable, optional
-            Likewise, what the IMU measured.
+        `source` returns a new iterator over them, each with at least one return, and `notes` take what it assumes. The
+        ground truth and the IMU are read once, when they are asked for.
         """
         scans = cls([], np.zeros((0, 4, 4)))
-        scans._source = source
-        scans._notes = notes
-        scans._points = scans._poses = None
-        scans._ground_truth = ground_truth
-        scans._read_imu = imu
+        scans._source, scans._notes = source, notes
+        scans._arrays = scans._poses = None
+        scans._ground_truth, scans._imu = cache(ground_truth), cache(imu)
         return scans
 
     def __iter__(self) -> Iterator[Scan]:
         """One scan after another."""
-        if self._points is None:
+        if self._arrays is None:
             return self._read()
-        return (self._scan(i) for i in range(len(self._points)))
+        return (self._scan(self._arrays, i) for i in range(len(self._arrays["points"])))
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -197,9 +183,8 @@ class Scans:
     @property
     def points(self) -> list[NDArray[Any]]:
         """F arrays (N_i, 3), sensor frame, m."""
-        self._load()
-        assert self._points is not None
-        return self._points
+        found: list[NDArray[Any]] = self._loaded()["points"]
+        return found
 
     @property
     def poses(self) -> NDArray[np.float64]:
@@ -212,20 +197,17 @@ class Scans:
     @property
     def intensities(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
-        self._load()
-        return self._intensities
+        return self._optional("intensities")
 
     @property
     def doppler_mps(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), m/s: see `Scan.doppler_mps`. None if there is none."""
-        self._load()
-        return self._doppler_mps
+        return self._optional("doppler_mps")
 
     @property
     def sigmas(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i, 3), m, rad, rad: see `Scan.sigma`. None if there are none."""
-        self._load()
-        return self._sigmas
+        return self._optional("sigmas")
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
@@ -236,16 +218,12 @@ class Scans:
     @property
     def ground_truth(self) -> NDArray[Any] | None:
         """(M, 3) lidar points, world frame, m. None if there are none."""
-        if not self._truth_known:
-            self._truth, self._truth_known = self._ground_truth(), True
-        return self._truth
+        return self._ground_truth()
 
     @property
     def imu(self) -> Imu | None:
         """What an inertial measurement unit measured meanwhile. None if there is none."""
-        if self._read_imu is not None:
-            self._imu, self._read_imu = self._read_imu(), None
-        return self._imu
+        return self._imu()
 
     @property
     def notes(self) -> list[str]:
@@ -254,17 +232,10 @@ class Scans:
 
     def select(self, frames: NDArray[np.int64]) -> Scans:
         """The scans with the numbers `frames`, (K,), in this order. All scans are read."""
-        return Scans(
-            [self.points[i] for i in frames],
-            self.poses[frames],
-            chosen(self.intensities, frames),
-            self.ground_truth,
-            doppler_mps=chosen(self.doppler_mps, frames),
-            times_s=None if self.times_s is None else self.times_s[frames],
-            sigmas=chosen(self.sigmas, frames),
-            truth_kind=self.truth_kind,
-            imu=self.imu,
-        )
+        scans = self.with_poses(self.poses[frames])
+        scans._arrays = {name: chosen(arrays, frames) for name, arrays in self._loaded().items()}
+        scans._times_s = None if self._times_s is None else self._times_s[frames]
+        return scans
 
     def select_range(self, rows: slice) -> Scans:
         """The scans of a range of numbers. All scans are read."""
@@ -275,40 +246,29 @@ class Scans:
 
         `other_world`: the poses are not in the world of the ground truth, which is then left out.
         """
-        return Scans(
-            self.points,
-            poses,
-            self.intensities,
-            None if other_world else self.ground_truth,
-            doppler_mps=self.doppler_mps,
-            times_s=self.times_s,
-            sigmas=self.sigmas,
-            truth_kind=self.truth_kind,
-            imu=self.imu,
-        )
+        self._loaded()
+        scans = copy(self)
+        scans._poses, scans._notes = poses, Notes()
+        if other_world:
+            scans._ground_truth = lambda: None
+        return scans
 
-    def _scan(self, i: int) -> Scan:
-        assert self._points is not None
-        return Scan(
-            self._points[i],
-            self.poses[i],
-            None if self._intensities is None else self._intensities[i],
-            None if self._doppler_mps is None else self._doppler_mps[i],
-            None if self._times_s is None else float(self._times_s[i]),
-            None if self._sigmas is None else self._sigmas[i],
-        )
+    def _scan(self, arrays: dict[str, Any], i: int) -> Scan:
+        points, intensities, doppler_mps, sigma = (arrays[n] and arrays[n][i] for n in _ARRAYS)
+        time_s = None if self._times_s is None else float(self._times_s[i])
+        return Scan(points, self.poses[i], intensities, doppler_mps, time_s, sigma)
 
     def _read(self) -> Iterator[Scan]:
         """Reads the files, and keeps what is small once they are read to the end."""
         assert self._source is not None
         poses: list[NDArray[np.float64]] = []
         times_s: list[float | None] = []
-        self._notes.start_counts()
+        self._notes.start_pass()
         for scan in self._source():
             poses.append(scan.T_world_sensor)
             times_s.append(scan.time_s)
             yield scan
-        self._notes.counted()
+        self._notes.end_pass()
         if not poses:
             msg = f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}"
             raise ValueError(msg)
@@ -321,28 +281,25 @@ class Scans:
             for _ in self._read():
                 pass
 
-    def _load(self) -> None:
-        """Reads all scans, and keeps them."""
-        if self._points is not None:
-            return
-        scans = list(self._read())
-        self._intensities = _all_or_none([scan.intensities for scan in scans])
-        self._doppler_mps = _all_or_none([scan.doppler_mps for scan in scans])
-        self._sigmas = _all_or_none([scan.sigma for scan in scans])
-        self._points = [scan.points for scan in scans]
+    def _optional(self, name: str) -> list[NDArray[Any]] | None:
+        arrays: list[NDArray[Any]] | None = self._loaded()[name]
+        return arrays
+
+    def _loaded(self) -> dict[str, Any]:
+        """The arrays of all scans, which are read from their files at the first call."""
+        if self._arrays is None:
+            self._arrays = _arrays_of(list(self._read()))
+        return self._arrays
 
 
 def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
     """Scans one after another as one, with what all of them have."""
     times_s = _all_or_none([scan.time_s for scan in scans])
     return Scans(
-        [scan.points for scan in scans],
-        np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
-        _all_or_none([scan.intensities for scan in scans]),
-        doppler_mps=_all_or_none([scan.doppler_mps for scan in scans]),
+        poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
         times_s=None if times_s is None else np.array(times_s, np.float64),
-        sigmas=_all_or_none([scan.sigma for scan in scans]),
         imu=imu,
+        **_arrays_of(scans),
     )
 
 
@@ -359,8 +316,14 @@ def chosen(arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64]) -> lis
     return None if arrays is None else [arrays[i] for i in numbers]
 
 
-def _listed(arrays: Sequence[NDArray[Any]] | None, name: str) -> list[NDArray[Any]] | None:
-    return None if arrays is None else list(one_for_each_scan(arrays, name))
+def _arrays_of(scans: Sequence[Scan]) -> dict[str, Any]:
+    """By their names in :class:`Scans`: lists of one array a scan, or None where a scan has none."""
+    return {
+        "points": [scan.points for scan in scans],
+        "intensities": _all_or_none([scan.intensities for scan in scans]),
+        "doppler_mps": _all_or_none([scan.doppler_mps for scan in scans]),
+        "sigmas": _all_or_none([scan.sigma for scan in scans]),
+    }
 
 
 def _all_or_none(values: list[_Value | None]) -> list[_Value] | None:

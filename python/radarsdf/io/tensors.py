@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Safetensors files with a checksum of each array: how they are written and opened."""
+"""Safetensors files with a checksum of each array."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from radarsdf.io.files import in_utf8
-
 # CRC-32 finds each error of up to 32 bits in a row, and misses one of 4e9 others. One core reads 3.4 GB/s with it, with
 # SHA-256 1.5 and blake2b 0.6; maps load at 0.06 to 0.12 GB/s, of which checksums take 4 to 8 %.
 _CHECKSUM = "crc32"
 
 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
-    """A safetensors file with checksums of its arrays and of `metadata`, which :func:`open_tensors` compares."""
+    """A safetensors file with checksums of its arrays and of `metadata`."""
     whole = {name: tensor.contiguous() for name, tensor in tensors.items()}
     checksums = {f"{_CHECKSUM} {name}": _checksum_of(tensor) for name, tensor in whole.items()}
     described = {**metadata, **checksums}
@@ -32,7 +30,7 @@ def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> 
 
 
 class TensorFile:
-    """An open safetensors file; `file` is what ``safetensors.safe_open`` gives. Older files have no checksums."""
+    """An open safetensors file, as ``safetensors.safe_open`` opens it. Older files have no checksums."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -56,14 +54,8 @@ class TensorFile:
 
 @contextmanager
 def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[TensorFile]:
-    """A safetensors file, whose arrays are read as they are asked for.
-
-    Yields
-    ------
-    TensorFile
-        Its arrays are of this `framework`, as ``safetensors.safe_open`` has it.
-    """
-    with in_utf8(path) as readable, safe_open(readable, framework=framework) as file:
+    """A safetensors file whose arrays, of this `framework`, are read as they are asked for."""
+    with safe_open(path, framework=framework) as file:
         yield TensorFile(file)
 
 

@@ -1,18 +1,24 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Text files of numbers, as programs write them: one way to read them, in which no line is lost without a word."""
+"""Tables of numbers in text files, in which no line is lost silently, and the units of their columns."""
 
 from __future__ import annotations
 
 import codecs
+import contextlib
 import itertools
 import re
+from bisect import bisect
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.files import are_numbers
+from radarsdf.io.files import reading
+from radarsdf.io.scans import Notes
 
 # Of UTF-32 before UTF-16, whose mark is the beginning of the other's.
 _MARKS = (
@@ -22,27 +28,122 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-COMMENTS = ("#", "//", "%")
-"""Signs after which the rest of a line is a comment."""
-_COMMENT = re.compile("(" + "|".join(COMMENTS) + ").*")
+_COMMENTS = ("#", "//", "%")
+_COMMENT = re.compile("(" + "|".join(_COMMENTS) + ").*")
 _DECIMAL_COMMA = r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?"
 _IN_CELL = re.compile(rf"(?:^|;)[ \t]*{_DECIMAL_COMMA}(?=[ \t]*(?:;|$))", re.MULTILINE)
 
+SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "mrad": 1e-3,
+          **dict.fromkeys(("km/h", "kmh", "kph"), 1 / 3.6),
+          **dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180)}  # fmt: skip
+"""Units in names of columns, in m, s, m/s or rad."""
+
+_UNIT = re.compile(
+    r"[\s_]+(m|cm|mm|km|s|ms|us|ns|rad|mrad|radians?|deg|degrees?|mps|kmh|kph|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
+)
+_SINCE_1970 = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
+_LIMITS = (1e11, 1e14, 1e17)  # of the absolute times since 1970, from one of these units to the next
+_BEYOND = 1.05  # angles that exceed a limit by rounding
+_STEPS, _ENOUGH = 4, 30  # parts of a degree, and angles that lie in such steps not by chance
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The R rows of numbers of a text file."""
+
+    header: list[str] | None
+    """Names of columns: the words of the line above the rows, if that has no number and is no comment."""
+    heads: list[list[str]]
+    """The words of all lines above the rows, comments too: one of them may name the columns."""
+    values: NDArray[np.float64]
+    """(R, W). NaN for a word that is no number, and in a row of another width."""
+    lines: list[int]
+    """Number of the line of each row, from 1."""
+
+
+def read_table(path: Path) -> Table:
+    """Reads a text file with a row of numbers a line, separated by commas, semicolons, tabs or spaces.
+
+    Comments begin with ``#``, ``//`` or ``%``; decimal commas are read where semicolons separate the numbers. The first
+    line with a number is the first row. Raises a ValueError if most rows have words that are no numbers.
+    """
+    lines = _with_points(read_text(path)).split("\n")
+    header: list[str] | None = None
+    heads: list[list[str]] = []
+    start = len(lines)
+    for number, line in enumerate(lines):
+        bare = _without_comment(line)
+        words = _words_of((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
+        if bare and (header is not None or any(map(_is_number, words))):
+            start = number
+            break
+        if bare:
+            header = words
+        if line.strip():
+            heads.append(words)
+    rows = [
+        number
+        for number, line in enumerate(lines)
+        if number >= start and line and not line.isspace() and not line.lstrip().startswith(_COMMENTS)
+    ]
+    if not rows:
+        return Table(header, heads, np.zeros((0, len(header or ()))), [])
+    values = _values([lines[number] for number in rows], [number + 1 for number in rows], header)
+    return Table(header, heads, values, [number + 1 for number in rows])
+
+
+def _values(texts: list[str], lines: list[int], header: list[str] | None) -> NDArray[np.float64]:
+    """(R, W) the numbers in the lines of the rows, by NumPy at once or else, where some are damaged, row by row."""
+    separator = next((sign for sign in (";", ",", "\t") if sign in _without_comment(texts[0])), None)
+    with contextlib.suppress(ValueError):
+        table: NDArray[np.float64] = np.loadtxt(texts, delimiter=separator, comments=_COMMENTS, ndmin=2)
+        return table
+    words = [re.split(r"\s*[,;]\s*|\s+", _without_comment(text).rstrip(",; \t")) for text in texts]
+    width = len(header) if header else Counter(map(len, words)).most_common(1)[0][0]
+    table = np.full((len(words), width), np.nan)
+    known = np.zeros(table.shape, bool)
+    for row, parts in enumerate(words):
+        if len(parts) == width:
+            known[row] = [_is_number(part) for part in parts]
+            table[row, known[row]] = [float(part) for part in parts if _is_number(part)]
+    of_words = ~known.any(axis=0)  # a column of labels is no damage
+    damaged = ~known[:, ~of_words].all(axis=1)
+    if of_words.all() or 2 * damaged.sum() > len(words):
+        first = int(np.argmax(damaged))
+        msg = f"line {lines[first]} is no row of {width} numbers: {texts[first].strip()!r:.50}"
+        raise ValueError(msg)
+    return table
+
+
+def read_numbers(path: Path, columns: int | None = None) -> NDArray[np.float64]:
+    """(R, columns) finite numbers of a text file; None: as many as it has. Raises a ValueError that names the line."""
+    with reading(
+        path, "a table of numbers" if columns is None else f"a table of {columns} columns of numbers"
+    ):
+        table = read_table(path)
+        bad = ~np.isfinite(table.values).all(axis=1)
+        if bad.any():
+            msg = f"line {table.lines[int(np.argmax(bad))]} is not finite numbers, as many as in other lines"
+            raise ValueError(msg)
+        if columns not in (None, table.values.shape[1]):
+            msg = f"it has {table.values.shape[1]}"
+            raise ValueError(msg)
+    return table.values
+
 
 def read_text(path: Path) -> str:
-    """The text of a file, with a line feed after each line.
+    """The text of a file with line feeds, in UTF-8 or the encoding that a byte order mark names.
 
-    It is in UTF-8, or in another encoding of Unicode that a byte order mark names, which is left out. What does not
-    decode, such as a comment in Latin-1, becomes replacement characters. Lines may end as those of any system.
+    What does not decode, such as a comment in Latin-1, becomes replacement characters.
     """
     data = path.read_bytes()
     encoding = next((encoding for mark, encoding in _MARKS if data.startswith(mark)), "utf-8")
     return data.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
-def with_points(text: str) -> str:
+def _with_points(text: str) -> str:
     """The same numbers with decimal points, if there are decimal commas: then semicolons separate numbers."""
-    bare = map(without_comment, text.split("\n"))
+    bare = map(_without_comment, text.split("\n"))
     rows = list(itertools.islice(filter(None, bare), 2))  # a line of names, and one of numbers
     if any(";" in row for row in rows):
         return _IN_CELL.sub(lambda cell: cell[0].replace(",", "."), text)
@@ -53,77 +154,69 @@ def with_points(text: str) -> str:
     return text
 
 
-def without_comment(line: str) -> str:
-    """A line without a comment, and without white space at its ends."""
+def _without_comment(line: str) -> str:
     return _COMMENT.sub("", line).strip()
 
 
-def check_header(words: list[str]) -> None:
-    """Raises a ValueError if the words above numbers are no names, but a row of numbers with something else in it."""
-    number = next((word for word in words if are_numbers([word])), None)
-    if number is not None:
-        wrong = next(word for word in words if not are_numbers([word]))
-        msg = f"its first line has the number {number:.50} and {wrong!r:.50}, which is none"
-        raise ValueError(msg)
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
-def separator_of(line: str) -> str | None:
-    """What separates the words of a line; None: white space."""
-    return next((sign for sign in (";", ",", "\t") if sign in line), None)
-
-
-def words_of(line: str) -> list[str]:
+def _words_of(line: str) -> list[str]:
     """The words of a line, separated by commas, semicolons, tabs or else white space."""
-    separator = separator_of(line)
+    separator = next((sign for sign in (";", ",", "\t") if sign in line), None)
     line = line if separator else re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
     return [word.strip().strip('"') for word in line.split(separator)]
 
 
-def text_rows(path: Path) -> tuple[list[list[str]], list[tuple[int, list[str]]]]:
-    """What may be the names of columns in a text file, and its rows with the numbers of their lines, from 1.
+def without_unit(name: str) -> tuple[str, str]:
+    """The name of a column in lower case without its unit, and the unit: of ``azimuth_deg``, ``x [m]``, ``time(ns)``."""
+    name = name.strip().lower()
+    found = _UNIT.search(name)
+    if found is None or not found.start():
+        return name, ""
+    return name[: found.start()], found[1] if found[1] is not None else found[2].strip()
 
-    Names are above the rows: comments after ``#``, ``//`` or ``%``, or a line without a number. Words of a row are
-    separated by commas, semicolons or white space. Other comments and blank lines are left out.
+
+def unit_since_1970(time: float) -> tuple[str, float]:
+    """The unit of a time since 1970 and its length, s."""
+    return _SINCE_1970[bisect(_LIMITS, abs(time))]
+
+
+def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[np.float64]:
+    """Times (N,) of the file `name`, s. They may be in ms, µs or ns since 1970, which is noted."""
+    if not np.isfinite(times).all():
+        msg = f"{name} holds a time that is not finite"
+        raise ValueError(msg)
+    units = {unit_since_1970(time) for time in times[times != 0].tolist()}
+    if len(units) > 1:
+        msg = f"{name} holds times of different units, such as s and ns"
+        raise ValueError(msg)
+    ((unit, scale),) = units or {_SINCE_1970[0]}
+    if unit != "s":
+        notes.add(f"times of {name} are taken as {unit} since 1970")
+    return times * scale
+
+
+def are_degrees(azimuth: NDArray[Any], elevation: NDArray[Any], unit: str = "") -> bool:
+    """Whether angles (N,) are in degrees: by the unit in their names, or else by their numbers.
+
+    In degrees are numbers beyond what rad can be, or in steps that only degrees have.
     """
-    heads: list[list[str]] = []
-    rows: list[tuple[int, list[str]]] = []
-    named = False
-    for number, line in enumerate(with_points(read_text(path)).split("\n"), 1):
-        bare = without_comment(line)
-        if bare:
-            words = re.split(r"\s*[,;]\s*|\s+", bare.rstrip(",; \t"))
-            if rows or named or any(are_numbers([word]) for word in words):
-                rows.append((number, words))
-                continue
-            named = True
-        if line.strip() and not rows:
-            heads.append(words_of((bare or line.strip().lstrip("/#% ")).rstrip(",; \t")))
-    return heads, rows
-
-
-def number_rows(path: Path) -> list[list[str]]:
-    """The rows of a text file of numbers, without names above them; see :func:`text_rows`."""
-    _, rows = text_rows(path)
-    for number, words in rows:
-        if not are_numbers(words):
-            if number == rows[0][0]:
-                check_header(words)
-            wrong = next(word for word in words if not are_numbers([word]))
-            msg = f"line {number} has {wrong!r:.50} where a number must be"
-            raise ValueError(msg)
-        if len(words) != len(rows[0][1]):
-            msg = f"line {number} has {len(words)} numbers, and lines before it have {len(rows[0][1])}"
-            raise ValueError(msg)
-    return [words for _, words in rows]
-
-
-def numbers_of(rows: list[tuple[int, list[str]]], width: int) -> NDArray[np.float64]:
-    """(R, width) the numbers of rows; NaN for a word that is none, and in a row of another width."""
-    table = np.full((len(rows), width), np.nan)
-    for values, (_, words) in zip(table, rows, strict=True):
-        if len(words) == width:
-            try:
-                values[:] = [float(word) for word in words]
-            except ValueError:
-                values[:] = [float(word) if are_numbers([word]) else np.nan for word in words]
-    return table
+    if unit:
+        return SCALES.get(unit) == SCALES["deg"]
+    finite = np.isfinite(azimuth) & np.isfinite(elevation)
+    if not finite.any():
+        return False
+    azimuth, elevation = azimuth[finite], elevation[finite]
+    largest, highest = (np.quantile(np.abs(angles), 0.99) / np.pi for angles in (azimuth, elevation))
+    if highest > _BEYOND / 2 or largest > 2 * _BEYOND:
+        return True
+    if largest > _BEYOND:  # rad from 0 to a whole turn have no other sign
+        return bool(azimuth.min() < 0)
+    steps = azimuth * _STEPS
+    return bool(len(steps) >= _ENOUGH and steps.any() and (steps == np.round(steps)).all())

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from radarsdf._core import GrowingSums
-from radarsdf.io.locking import take_lock
+from radarsdf.io.files import take_lock
 from radarsdf.io.npz import arrays_of, write_arrays
 from radarsdf.live.regions import REGION_BITS, regions_of
 from radarsdf.live.rows import Keys

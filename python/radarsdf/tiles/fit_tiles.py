@@ -19,7 +19,7 @@ import torch
 from radarsdf.checks import are_rigid, flag, instance, one_for_each_scan, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.io.files import write_whole
-from radarsdf.io.poses.reading import UNPOSED, NoPoses
+from radarsdf.io.poses.trajectory import UNPOSED, NoPoses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.returns.noise import NOISE_SETTINGS

@@ -9,14 +9,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from radarsdf.io.locking import take_lock
+from radarsdf.io.files import take_lock
 
 LOCK = "plan.lock"
 
 
 @contextmanager
 def only_planner(folder: Path) -> Iterator[None]:
-    """No other process or thread is in such a block for the same folder. Raises as :func:`radarsdf.io.locking.take_lock`."""
+    """No other process or thread is in such a block for the same folder. Raises as :func:`radarsdf.io.files.take_lock`."""
     descriptor = take_lock(folder / LOCK, "planned")
     try:
         yield

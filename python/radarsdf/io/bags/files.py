@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import heapq
+import importlib
 import re
+import threading
 from collections import Counter
 from collections.abc import Collection, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -18,13 +20,14 @@ from numpy.typing import NDArray
 
 from radarsdf.extras import require
 from radarsdf.io.bags.messages import read_message
-from radarsdf.io.files import check_regular_file, in_utf8
+from radarsdf.io.files import check_regular_file
 from radarsdf.io.scans import Notes
-from radarsdf.io.unpacking import bound_ros1, bounded, check_zstd_files, unpack_zstd
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _ROS1_SUFFIX = ".bag"
 _METADATA = "metadata.yaml"
+_ENCODINGS = ("cdr", "ros1")
+_PATCHED = threading.Lock()
 _QUOTED = re.compile(r"\('(.*?)',\)")  # how rosbags prints the words of another error
 
 
@@ -40,7 +43,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Message:
-    """The bytes of a message."""
+    """A message of a bag."""
 
     topic: str
     message_type: str
@@ -50,7 +53,7 @@ class Message:
     """Whether it is of ROS 2."""
     bag: Path
     content: Any = None
-    """What it says; see :func:`radarsdf.io.bags.messages.read_message`."""
+    """What :func:`radarsdf.io.bags.messages.read_message` returns."""
     number: int = 0
     """Of its topic, from 0."""
 
@@ -74,8 +77,7 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
     topics: dict[str, Topic] = {}
     with ExitStack() as stack:
         for path in paths:
-            reader = stack.enter_context(_opened(path))
-            for connection in reader.connections:
+            for connection in stack.enter_context(_opened(path)).connections:
                 if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
                     raise _damaged(path, ValueError("a topic has no name or no type"))
                 name = connection.topic
@@ -84,25 +86,13 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
     return topics
 
 
-def _type_of(connection: Any) -> str:
-    """As ROS 2 writes it, and the encoding where it is none of ROS, as MCAP files may have."""
-    package, slash, name = connection.msgtype.partition("/")
-    ros2 = connection.msgtype if not slash or "/" in name else f"{package}/msg/{name}"
-    encoding = _encoding(connection)
-    return ros2 if encoding in ("cdr", "ros1") else f"{ros2} in {encoding}"
-
-
-def _encoding(connection: Any) -> str:
-    return str(getattr(connection.ext, "serialization_format", "ros1"))
-
-
 def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
     """Those that have messages of these types."""
     return {name: topic for name, topic in topics.items() if topic.message_type in types and topic.count}
 
 
 def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
-    """The messages of some topics of bags, in the order of their recording; damaged ones are left out, and noted in the end."""
+    """The messages of some topics, in the order of their recording; damaged ones are left out, and noted in the end."""
     numbers: Counter[str] = Counter()
     damaged: dict[str, list[str]] = {}
     with ExitStack() as stack:
@@ -135,36 +125,33 @@ def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes:
     return True
 
 
+def _type_of(connection: Any) -> str:
+    """As ROS 2 writes it, and the encoding where it is none of ROS, as MCAP files may have."""
+    package, slash, name = connection.msgtype.partition("/")
+    ros2 = connection.msgtype if not slash or "/" in name else f"{package}/msg/{name}"
+    encoding = _encoding(connection)
+    return ros2 if encoding in _ENCODINGS else f"{ros2} in {encoding}"
+
+
+def _encoding(connection: Any) -> str:
+    return str(getattr(connection.ext, "serialization_format", "ros1"))
+
+
 def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
     with _opened(path) as reader:
-        connections = [c for c in reader.connections if c.topic in names and _encoding(c) in ("cdr", "ros1")]
+        connections = [c for c in reader.connections if c.topic in names and _encoding(c) in _ENCODINGS]
         if not connections:  # of none, rosbags would give all messages
             return
-        messages = _messages(reader, connections)
-        while True:
-            try:
-                with bounded():
-                    connection, recorded_ns, raw = next(messages)
-            except StopIteration:
-                return
-            except Exception as error:  # damaged bags raise exceptions of many kinds
-                raise _damaged(path, error) from error
-            # A database of SQLite may hold values of any type.
-            if not (isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))):
-                raise _damaged(path, ValueError("a message has no time or no bytes"))
-            cdr = _encoding(connection) == "cdr"
-            yield Message(connection.topic, _type_of(connection), 1e-9 * recorded_ns, raw, cdr, path)
-
-
-def _messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, Any, Any]]:
-    """Of rosbags, but messages that are packed one by one are unpacked with a bound."""
-    storage = getattr(reader, "storage", None)
-    if storage is None or storage.metadata.compression_mode != "message":
-        yield from reader.messages(connections=connections)
-        return
-    storage.metadata = storage.metadata._replace(compression_mode=None)
-    for connection, recorded_ns, packed in reader.messages(connections=connections):
-        yield connection, recorded_ns, unpack_zstd(packed)
+        try:
+            for connection, recorded_ns, raw in reader.messages(connections=connections):
+                # A database of SQLite may hold values of any type.
+                if not (isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))):
+                    msg = "a message has no time or no bytes"
+                    raise ValueError(msg)  # noqa: TRY004 - the file is damaged
+                cdr = _encoding(connection) == "cdr"
+                yield Message(connection.topic, _type_of(connection), 1e-9 * recorded_ns, raw, cdr, path)
+        except Exception as error:  # damaged bags raise exceptions of many kinds
+            raise _damaged(path, error) from error
 
 
 @contextmanager
@@ -174,24 +161,43 @@ def _opened(path: Path) -> Iterator[Any]:
     require("rosbags", what=f"{path}: bags are read by")
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
 
-    ros1 = path.suffix.lower() == _ROS1_SUFFIX
-    with in_utf8(path) as readable:  # which SQLite needs
-        try:
-            reader: Any = rosbag1.Reader(readable) if ros1 else rosbag2.Reader(readable)
-            if path.is_dir():
-                check_zstd_files(path)
-            with bounded():
+    try:
+        if path.suffix.lower() == _ROS1_SUFFIX:
+            reader: Any = rosbag1.Reader(path)
+            reader.open()
+        else:
+            reader = rosbag2.Reader(path)
+            with _any_mcap():
                 reader.open()
-            if ros1:
-                bound_ros1(reader)
-        except PermissionError:
-            raise
-        except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
-            raise _damaged(path, error) from error
+    except PermissionError:
+        raise
+    except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
+        raise _damaged(path, error) from error
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+@contextmanager
+def _any_mcap() -> Iterator[None]:
+    """Within it, rosbags opens MCAP files of any profile and encoding of schemas, of which it knows one."""
+    storage: Any = importlib.import_module("rosbags.rosbag2.storage_mcap")
+    with _PATCHED:
+        read_string, schema = storage.read_string, storage.Schema
+
+        def any_string(file: Any) -> str:
+            start, raw = file.tell(), storage.read_bytes(file)
+            text = str(raw.decode(errors="replace"))
+            # What begins a record is the profile of the file, or a key.
+            return text if start or text == "offered_qos_profiles" else "ros2"
+
+        storage.read_string = any_string
+        storage.Schema = lambda number, name, _, data: schema(number, name, "ros2msg", data)
         try:
-            yield reader
+            yield
         finally:
-            reader.close()
+            storage.read_string, storage.Schema = read_string, schema
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
@@ -204,7 +210,6 @@ def _damaged(path: Path, error: Exception) -> ValueError:
         remedy = f"; if its recording was cut off, rosbag reindex {path.name} may repair it"
     elif "end magic" in why:
         files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        remedy = (
-            f"; if its recording was cut off, mcap recover {files[0].name} may repair it" if files else ""
-        )
+        name = files[0].name if files else path.name
+        remedy = f"; if its recording was cut off, mcap recover {name} may repair it"
     return ValueError(f"{path} is not a whole bag: {why}{remedy}")

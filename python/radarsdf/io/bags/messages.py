@@ -9,6 +9,7 @@ last byte; one with another layout is an error.
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,21 +19,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.io.ply import Columns
+
 _POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_RADAR_RETURN = np.dtype(
-    [(n, "<f4") for n in ("range", "azimuth", "elevation", "doppler_velocity", "amplitude")]
-)
-_ARS548_ANGLES_TO_RATE = [
-    (n, "f4") for n in ("elevation", "elevation_std", "range", "range_std", "range_rate", "range_rate_std")
+_RADAR_RETURN = [
+    (n, "f4") for n in ("range", "azimuth_rad", "elevation_rad", "doppler_velocity", "amplitude")
 ]
-_ARS548_IDENTITY = [("id", "u2"), ("existence", "u1"), ("class", "u1"), ("multi", "u1"), ("object", "u2"), ("ambiguity", "u1")]  # fmt: skip
 _ARS548_RETURN = [
-    *((n, "f4") for n in ("azimuth", "azimuth_std")), ("flags", "u1"), *_ARS548_ANGLES_TO_RATE, ("rcs", "i1"),
-    *_ARS548_IDENTITY, ("sort_index", "u2"),
+    *((n, "f4") for n in ("azimuth", "azimuth_std")), ("flags", "u1"),
+    *((n, "f4") for n in ("elevation", "elevation_std", "range", "range_std", "range_rate", "range_rate_std")),
+    ("rcs", "i1"), ("id", "u2"), ("existence", "u1"), ("class", "u1"), ("multi", "u1"), ("object", "u2"),
+    ("ambiguity", "u1"), ("sort_index", "u2"),
 ]  # fmt: skip
 """As the radar sends it, and ars548_messages has it."""
 _NEBULA_RETURN = [(n, "V8" if n == "flags" else kind) for n, kind in _ARS548_RETURN[:-1]]
 _ARS548_LIST_BYTES, _ARS548_RETURNS_AT, _ARS548_COUNT_AT, _ARS548_MAX = 35336, 101, 35309, 800
+_TI_POINT = [("point_id", "H"), *((n, "f") for n in ("x", "y", "z", "range", "velocity")), ("doppler_bin", "H"),
+             ("bearing", "f"), ("intensity", "f")]  # fmt: skip
 _CDR_HEADER = 4
 _MAX_CDR_PADDING = 7
 _NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
@@ -48,11 +51,10 @@ class Header:
 
 @dataclass(frozen=True, eq=False)
 class CloudMessage:
-    """A message with points."""
+    """A message with points, whose columns (N,) by field are read when they are asked for."""
 
     header: Header
-    columns: Callable[[], dict[str, NDArray[Any]]]
-    """Reads the points: (N,) each by field, most of them views of the message."""
+    columns: Callable[[], Columns]
     point_id: int | None = None
     """Number of the point, of messages of one point each."""
 
@@ -70,54 +72,49 @@ class PoseMessage:
 
 @dataclass(frozen=True, eq=False)
 class ImuMessage:
-    """What an inertial measurement unit (IMU) measured at one time, in its own axes."""
+    """What an IMU measured at one time, in its own axes. None: it does not measure it."""
 
     header: Header
     angular_velocity: tuple[float, ...] | None
-    """rad/s. None: it does not measure it."""
+    """rad/s."""
     specific_force: tuple[float, ...] | None
-    """m/s²: acceleration less that of gravity. None: it does not measure it."""
+    """m/s²: acceleration less that of gravity."""
 
 
 class _Cursor:
-    """Reads the fields of a message, one after another: of ROS 1, or of ROS 2 (CDR), where they are aligned."""
+    """Reads the fields of a message one after another: of ROS 1, or of ROS 2 (CDR), where they are aligned."""
 
     def __init__(self, raw: bytes | memoryview, cdr: bool) -> None:
-        self.raw = memoryview(raw)
-        self.cdr = cdr
-        self.at = 0
+        self.raw, self.cdr, self.at = memoryview(raw), cdr, 0
         if cdr:
             if len(self.raw) < _CDR_HEADER or self.raw[1] != 1:
                 msg = "it is not little-endian CDR"
                 raise ValueError(msg)
             self.raw = self.raw[_CDR_HEADER:]
 
-    def take(self, kind: str) -> Any:
-        size = struct.calcsize(kind)
-        self._align(size)
-        (value,) = struct.unpack_from("<" + kind, self.raw, self.at)
-        self.at += size
-        return value
+    def values(self, kinds: str) -> tuple[Any, ...]:
+        """Numbers of these types, as those of `struct`."""
+        found: list[Any] = []
+        for kind, run in itertools.groupby(kinds):
+            layout = "<" + "".join(run)
+            self._align(struct.calcsize(kind))
+            found += struct.unpack_from(layout, self.raw, self.at)
+            self.at += struct.calcsize(layout)
+        return tuple(found)
+
+    def value(self, kind: str) -> Any:
+        return self.values(kind)[0]
+
+    def count(self) -> int:
+        found: int = self.value("I")
+        return found
+
+    def data(self) -> memoryview:
+        return self._bytes(self.count())
 
     def string(self) -> str:
-        text = bytes(self._bytes(self.take("I")))
+        text = bytes(self.data())
         return (text[:-1] if self.cdr else text).decode("utf-8", "replace")
-
-    def array(self, dtype: Any, count: int, alignment: int) -> NDArray[Any]:
-        dtype = np.dtype(dtype)
-        if count:
-            self._align(alignment)
-        return np.frombuffer(self._bytes(count * dtype.itemsize), dtype)
-
-    def doubles(self, count: int) -> tuple[float, ...]:
-        self._align(8)
-        values = struct.unpack_from(f"<{count}d", self.raw, self.at)
-        self.at += 8 * count
-        return values
-
-    def skip(self, kinds: str) -> None:
-        for kind in kinds:
-            self.take(kind)
 
     def records(self, fields: list[tuple[str, str]], count: int) -> NDArray[Any]:
         """Structures whose first field is the widest, which CDR aligns as C does."""
@@ -130,13 +127,10 @@ class _Cursor:
         data = bytes(self._bytes(dtype.itemsize * (count - 1) + end))
         return np.frombuffer(data.ljust(dtype.itemsize * count, b"\0"), dtype)
 
-    def data(self) -> memoryview:
-        return self._bytes(self.take("I"))
-
     def header(self) -> Header:
         if not self.cdr:
-            self.take("I")  # the sequence number, which ROS 2 has not
-        seconds, nanoseconds = self.take("i" if self.cdr else "I"), self.take("I")
+            self.value("I")  # the sequence number, which ROS 2 has not
+        seconds, nanoseconds = self.values("iI" if self.cdr else "II")
         return Header(seconds + 1e-9 * nanoseconds, self.string().lstrip("/"))
 
     def end(self) -> None:
@@ -153,23 +147,17 @@ class _Cursor:
         if self.at + size > len(self.raw):  # before anything is allocated
             msg = f"it needs {size} bytes, of which {max(0, len(self.raw) - self.at)} are there"
             raise ValueError(msg)
-        part = self.raw[self.at : self.at + size]
         self.at += size
-        return part
+        return self.raw[self.at - size : self.at]
 
 
 def _point_cloud2(cursor: _Cursor) -> CloudMessage:
     header = cursor.header()
-    height, width = cursor.take("I"), cursor.take("I")
-    fields = []
-    for _ in range(cursor.take("I")):
-        name = cursor.string()
-        offset, datatype, count = cursor.take("I"), cursor.take("B"), cursor.take("I")
-        fields.append((name, offset, datatype, count))
-    big_endian = cursor.take("B")
-    point_step, row_step = cursor.take("I"), cursor.take("I")
+    height, width = cursor.values("II")
+    fields = [(cursor.string(), *cursor.values("IBI")) for _ in range(cursor.count())]
+    big_endian, point_step, row_step = cursor.values("BII")
     data = cursor.data()
-    cursor.take("B")  # is_dense; what is not finite is looked for anyway
+    cursor.value("B")  # is_dense; what is not finite is looked for anyway
     row_step = row_step if height > 1 else point_step * width  # of one row, some drivers leave it 0
     if point_step * width > row_step or row_step * height > len(data):
         msg = f"{height} x {width} points of {point_step} bytes do not fit into its {len(data)} bytes"
@@ -183,17 +171,18 @@ def _point_cloud2(cursor: _Cursor) -> CloudMessage:
         if count <= 1 and name:  # 0 is what some drivers write for 1
             columns.setdefault(name, (offset, (">" if big_endian else "<") + kind))
 
-    def read() -> dict[str, NDArray[Any]]:
+    record = np.dtype(
+        {
+            "names": list(columns),
+            "formats": [kind for _, kind in columns.values()],
+            "offsets": [offset for offset, _ in columns.values()],
+            "itemsize": point_step,
+        }
+    )
+
+    def read() -> Columns:
         if not height * width:
             return {name: np.zeros(0, kind) for name, (_, kind) in columns.items()}
-        record = np.dtype(
-            {
-                "names": list(columns),
-                "formats": [kind for _, kind in columns.values()],
-                "offsets": [offset for offset, _ in columns.values()],
-                "itemsize": point_step,
-            }
-        )
         # One view of the message: no loop over points, and no copy.
         cloud: NDArray[Any] = np.ndarray((height, width), record, data, strides=(row_step, point_step))
         return {name: cloud[name].reshape(-1) for name in columns}
@@ -203,11 +192,10 @@ def _point_cloud2(cursor: _Cursor) -> CloudMessage:
 
 def _point_cloud(cursor: _Cursor) -> CloudMessage:
     header = cursor.header()
-    xyz = cursor.array("<f4", 3 * cursor.take("I"), 4).reshape(-1, 3)
-    columns = dict(zip("xyz", xyz.T, strict=True))
-    for _ in range(cursor.take("I")):
-        name = cursor.string()
-        values = cursor.array("<f4", cursor.take("I"), 4)
+    xyz = cursor.records([(axis, "f4") for axis in "xyz"], cursor.count())
+    columns: Columns = {axis: xyz[axis] for axis in "xyz"}
+    for _ in range(cursor.count()):
+        name, values = cursor.string(), cursor.records([("value", "f4")], cursor.count())["value"]
         if len(values) == len(xyz):
             columns.setdefault(name, values)
     return CloudMessage(header, lambda: columns)
@@ -215,31 +203,25 @@ def _point_cloud(cursor: _Cursor) -> CloudMessage:
 
 def _radar_scan(cursor: _Cursor) -> CloudMessage:
     header = cursor.header()
-    returns = cursor.array(_RADAR_RETURN, cursor.take("I"), 4)
-    return CloudMessage(header, lambda: {name: returns[name] for name in _RADAR_RETURN.names or ()})
+    returns = cursor.records(_RADAR_RETURN, cursor.count())
+    return CloudMessage(header, lambda: {name: returns[name] for name, _ in _RADAR_RETURN})
 
 
 def _ti_radar_scan(cursor: _Cursor) -> CloudMessage:
     """One point a message."""
     header = cursor.header()
-    point_id = cursor.take("H")
-    x, y, z, _range, velocity = (cursor.take("f") for _ in range(5))
-    cursor.take("H")  # doppler_bin
-    cursor.take("f")  # bearing
-    intensity = cursor.take("f")
-    values = {"x": x, "y": y, "z": z, "velocity": velocity, "intensity": intensity}
+    fields = {name: cursor.value(kind) for name, kind in _TI_POINT}
+    used = ("x", "y", "z", "velocity", "intensity")
     return CloudMessage(
-        header, lambda: {n: np.array([v], np.float32) for n, v in values.items()}, int(point_id)
+        header, lambda: {name: np.array([fields[name]], np.float32) for name in used}, fields["point_id"]
     )
 
 
 def _nebula_list(cursor: _Cursor) -> CloudMessage:
     """A ContinentalArs548DetectionList."""
     header = cursor.header()
-    cursor.take("B")
-    cursor.doubles(3)  # where the sensor is on the vehicle
-    cursor.skip("ffffffffB")
-    returns = cursor.records(_NEBULA_RETURN, cursor.take("I"))
+    cursor.values("B" + "ddd" + "ffffffffB")  # among them, where the sensor is on the vehicle
+    returns = cursor.records(_NEBULA_RETURN, cursor.count())
     invalid = np.frombuffer(returns["flags"].tobytes(), bool).reshape(-1, 8)
     return CloudMessage(header, lambda: _ars548_columns(returns, invalid))
 
@@ -247,19 +229,18 @@ def _nebula_list(cursor: _Cursor) -> CloudMessage:
 def _ars548_list(cursor: _Cursor) -> CloudMessage:
     """A DetectionList of ars548_messages: as the radar sends it, always with space for 800 returns."""
     header = cursor.header()
-    cursor.skip("QIIIIIBIBH" + "f" * 12 + "B")
+    cursor.values("QIIIIIBIBH" + "f" * 12 + "B")
     returns = cursor.records(_ARS548_RETURN, _ARS548_MAX)
-    cursor.skip("ff")
-    returns = returns[: cursor.take("I")]
-    cursor.skip("ffB")
+    _, _, count, *_ = cursor.values("ffIffB")
+    returns = returns[:count]
     return CloudMessage(header, lambda: _ars548_columns(returns))
 
 
 def _nebula_packets(cursor: _Cursor) -> CloudMessage:
     """What an ARS548 sent, among which lists of returns are found by their length."""
     header, lists = cursor.header(), []
-    for _ in range(cursor.take("I")):
-        cursor.skip("iI" if cursor.cdr else "II")
+    for _ in range(cursor.count()):
+        cursor.values("II")  # its time
         packet = cursor.data()
         if len(packet) == _ARS548_LIST_BYTES:
             count = min(int.from_bytes(packet[_ARS548_COUNT_AT : _ARS548_COUNT_AT + 4], "big"), _ARS548_MAX)
@@ -269,41 +250,47 @@ def _nebula_packets(cursor: _Cursor) -> CloudMessage:
     return CloudMessage(header, lambda: _ars548_columns(returns))
 
 
-def _ars548_columns(
-    returns: NDArray[Any], invalid: NDArray[np.bool_] | None = None
-) -> dict[str, NDArray[Any]]:
+def _ars548_columns(returns: NDArray[Any], invalid: NDArray[np.bool_] | None = None) -> Columns:
     """Columns of returns of an ARS548, NaN where it calls a value invalid: distance, azimuth, elevation and range rate,
     each before its deviation. Azimuth is positive to the left, elevation upwards."""
     if invalid is None:
         invalid = np.unpackbits(returns["flags"][:, None], axis=1, bitorder="little").astype(bool)
-    names = ("range", "azimuth", "elevation", "range_rate")
-    columns = {n: np.where(invalid[:, 2 * i], np.nan, returns[n]) for i, n in enumerate(names)}
+    values = {
+        "range": "range",
+        "azimuth_rad": "azimuth",
+        "elevation_rad": "elevation",
+        "range_rate": "range_rate",
+    }
+    columns = {
+        name: np.where(invalid[:, 2 * i], np.nan, returns[field])
+        for i, (name, field) in enumerate(values.items())
+    }
     return columns | {n: returns[n] for n in ("rcs", "range_std", "azimuth_std", "elevation_std")}
 
 
 def _pose(cursor: _Cursor, *, child: bool = False, behind: int = 0) -> list[PoseMessage]:
     """One pose; whether the message names the child frame, and how many numbers are behind the pose."""
     header = cursor.header()
-    pose = PoseMessage(header, cursor.string().lstrip("/") if child else "", cursor.doubles(7))
-    cursor.doubles(behind)
+    pose = PoseMessage(header, cursor.string().lstrip("/") if child else "", cursor.values("d" * 7))
+    cursor.values("d" * behind)
     return [pose]
 
 
 def _path(cursor: _Cursor) -> list[PoseMessage]:
     cursor.header()
-    return [_pose(cursor)[0] for _ in range(cursor.take("I"))]
+    return [_pose(cursor)[0] for _ in range(cursor.count())]
 
 
 def _transforms(cursor: _Cursor) -> list[PoseMessage]:
-    return [_pose(cursor, child=True)[0] for _ in range(cursor.take("I"))]
+    return [_pose(cursor, child=True)[0] for _ in range(cursor.count())]
 
 
 def _imu(cursor: _Cursor) -> ImuMessage:
     header = cursor.header()
-    cursor.doubles(4 + 9)  # an orientation, by a filter that nobody knows, and its covariance
+    cursor.values("d" * (4 + 9))  # an orientation, by a filter that nobody knows, and its covariance
     measured = []
     for _ in range(2):
-        values, covariance = cursor.doubles(3), cursor.doubles(9)
+        values, covariance = cursor.values("ddd"), cursor.values("d" * 9)
         measured.append(None if covariance[0] == _NOT_MEASURED else values)
     return ImuMessage(header, *measured)
 

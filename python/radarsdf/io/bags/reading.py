@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans with poses from bags: which topics, which clock, and the first message to the last in bounded memory."""
+"""Scans, poses and inertial measurements from bags: which topics, which clock, and all messages in bounded memory."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
 import re
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
@@ -14,21 +15,29 @@ from dataclasses import replace
 from functools import cache, partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.bags.files import Topic, bags_in, by_record, is_bag, read_messages, topics_of, topics_with
-from radarsdf.io.bags.imu import imu_in_bags, imu_topic
-from radarsdf.io.bags.messages import CLOUD_TYPES, PACKETS, POINT_A_MESSAGE, CloudMessage
-from radarsdf.io.bags.poses import FindPoses, attached, poses_in_bags, transforms_of
+from radarsdf.io.bags.messages import (
+    CLOUD_TYPES,
+    IMU,
+    PACKETS,
+    POINT_A_MESSAGE,
+    CloudMessage,
+    Header,
+    ImuMessage,
+)
+from radarsdf.io.bags.poses import attached, poses_in_bags
+from radarsdf.io.bags.tf import transforms_in
 from radarsdf.io.clouds.fields import Fields
-from radarsdf.io.clouds.reading import Columns
 from radarsdf.io.imu import Imu
-from radarsdf.io.poses.reading import UNPOSED, ScanPoses, StampedPoses, poses_of
+from radarsdf.io.ply import Columns
+from radarsdf.io.poses.files import poses_of
+from radarsdf.io.poses.trajectory import UNPOSED, ScanPoses, StampedPoses
+from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
 from radarsdf.io.scans import Notes, Scans
-from radarsdf.io.sources import RawScan, Request, posed, scan_poses
 
 __all__ = ["bags_in", "is_bag", "read_bags"]
 
@@ -80,18 +89,17 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         return np.array([raw.time_s for raw in raw_scans()], np.float64)
 
     poses = request.poses
-    find: Any
     if poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses))):
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name), scan_times_s)
     else:
         find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
-    of_imu = imu_topic(topics, request)
+    of_imu = _imu_topic(topics, request)
 
     def imu() -> Imu | None:
         if of_imu is None:
             return None
-        return imu_in_bags(paths, of_imu, frames[0], by_recording[scan_topics[0].name], request)
+        return _read_imu(paths, of_imu, frames[0], by_recording[scan_topics[0].name], request)
 
     truth = request.truth or (lambda: None)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
@@ -104,18 +112,20 @@ def _given(
     frames: list[str],
     raw_scans: Callable[[], Iterator[RawScan]],
     request: Request,
-) -> ScanPoses | FindPoses:
+) -> FindPoses:
     """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
     if isinstance(poses, np.ndarray):
         numbered = len(topics) == 1 and topics[0].message_type != POINT_A_MESSAGE
         count = topics[0].count if numbered else sum(1 for _ in raw_scans())
-        return scan_poses(poses, count, None, request.extrinsic, request)[0]
+        numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
+        return lambda _: numbered_poses
     if poses is UNPOSED:
         if len(frames) > 1:
             listed = ", ".join(frames)
             request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
-        return ScanPoses(poses, np.eye(4), request.max_gap_s)
-    return attached(poses, frames[0], cache(lambda: transforms_of(paths, request)), request)
+        unposed = ScanPoses(poses, np.eye(4), request.max_gap_s)
+        return lambda _: unposed
+    return attached(poses, frames[0], cache(lambda: transforms_in(paths, request)), request)
 
 
 def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) -> list[Topic]:
@@ -204,25 +214,82 @@ def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request
 
 def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
     """Scans of messages of one point each. A scan begins where the number of the point does not grow, or after a pause."""
-    points: list[CloudMessage] = []
+    scan: list[CloudMessage] = []
     last, last_s, start_s, number = -1, 0.0, 0.0, 0
+    name = ""
     for message in read_messages(paths, {topic.name}, request.notes):
         cloud: CloudMessage = message.content
-        point_id = -1 if cloud.point_id is None else cloud.point_id
-        if points and (point_id <= last or message.recorded_s > last_s + _PAUSE_S):
-            yield _joined(points, start_s, f"{message.bag}: scan {number} of {topic.name}", topic)
-            points, number = [], number + 1
-        if not points:
+        assert cloud.point_id is not None
+        if scan and (cloud.point_id <= last or message.recorded_s > last_s + _PAUSE_S):
+            yield RawScan(partial(_joined, scan), start_s, name, scan[0].header.frame, topic.name)
+            scan, number = [], number + 1
+        if not scan:
             start_s = message.recorded_s if recorded else cloud.header.stamp_s
-        points.append(cloud)
-        last, last_s = point_id, message.recorded_s
-    if points:
-        yield _joined(points, start_s, f"{paths[-1]}: scan {number} of {topic.name}", topic)
+            name = f"{message.bag}: scan {number} of {topic.name}"
+        scan.append(cloud)
+        last, last_s = cloud.point_id, message.recorded_s
+    if scan:
+        yield RawScan(partial(_joined, scan), start_s, name, scan[0].header.frame, topic.name)
 
 
-def _joined(points: list[CloudMessage], time_s: float, name: str, topic: Topic) -> RawScan:
-    def columns() -> Columns:
-        rows = [point.columns() for point in points]
-        return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}
+def _joined(points: list[CloudMessage]) -> Columns:
+    rows = [point.columns() for point in points]
+    return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}
 
-    return RawScan(columns, time_s, name, points[0].header.frame, topic.name)
+
+def _imu_topic(topics: dict[str, Topic], request: Request) -> Topic | None:
+    """The topic of the IMU: the wanted one, or the only one. None: there is none, or none is named of several."""
+    fitting = topics_with([IMU], topics)
+    listed = ", ".join(sorted(fitting))
+    if request.imu_topic is not None:
+        if request.imu_topic not in fitting:
+            msg = f"{request.notes.about} has no inertial measurements in {request.imu_topic}: topics that have some are {listed or 'none'}"
+            raise ValueError(msg)
+        return fitting[request.imu_topic]
+    if len(fitting) > 1:
+        request.notes.add(
+            f"there are several topics of IMUs, of which none is used: say by imu_topic which, of {listed}"
+        )
+    return next(iter(fitting.values())) if len(fitting) == 1 else None
+
+
+def _read_imu(
+    paths: list[Path],
+    topic: Topic,
+    sensor_frame: str,
+    recorded_scans: bool,
+    request: Request,
+) -> Imu | None:
+    """What the topic holds; None if it has no gyroscope.
+
+    `recorded_scans`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
+    from stamp to record, because messages of an IMU are recorded several at a time.
+    """
+    stamps_s, recorded_s, rates, forces = (array("d") for _ in range(4))
+    first: Header | None = None
+    for message in read_messages(paths, {topic.name}, request.notes):
+        measured: ImuMessage = message.content
+        if measured.angular_velocity is None:
+            request.notes.add(f"{topic.name} has no angular velocity: it is not used")
+            return None
+        first = measured.header if first is None else first
+        stamps_s.append(measured.header.stamp_s)
+        recorded_s.append(message.recorded_s)
+        rates.extend(measured.angular_velocity)
+        forces.extend(measured.specific_force or (np.nan,) * 3)
+    stamps, recorded = np.array(stamps_s), np.array(recorded_s)
+    times_s = recorded
+    if not by_record(stamps, topic.name, None, None if recorded_scans else request.notes):
+        times_s = stamps + np.median(recorded - stamps) if recorded_scans else stamps
+    table = np.column_stack([np.array(rates).reshape(-1, 3), np.array(forces).reshape(-1, 3)])
+    order = np.argsort(times_s, kind="stable")
+    finite = order[np.isfinite(table[order, :3]).all(axis=1)]
+    if len(finite) == 0:
+        return None
+    table = table[finite]
+    has_force = np.isfinite(table).all() and table[:, 3:].any()
+    R_sensor_imu = request.R_sensor_imu
+    if R_sensor_imu is None and first is not None and first.frame:
+        T_imu_sensor = transforms_in(paths, request).fixed(first.frame, sensor_frame)
+        R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
+    return Imu(times_s[finite], table[:, :3], table[:, 3:] if has_force else None, R_sensor_imu)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the fields of a radar's point cloud mean: one table of the dialects, and the reading of a cloud by it."""
+"""What the fields of a radar's point cloud mean: a table of names, and the returns of a scan by it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.scans import Notes, Scan
-from radarsdf.io.units import SCALES, are_degrees, without_unit
+from radarsdf.io.text import SCALES, are_degrees, without_unit
 
 ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
          "sigma_range", "sigma_azimuth", "sigma_elevation")  # fmt: skip
@@ -22,45 +22,11 @@ ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
 _SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
+_NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 
-
-@dataclass(frozen=True)
-class Dialect:
-    """How one kind of sensor or data set names its fields. Case does not matter."""
-
-    name: str
-    doppler: str
-    intensity: str
-    sigma: tuple[str, str, str] | None = None
-    """Standard deviations of range, azimuth and elevation."""
-    sigma_in_degrees: bool = False
-    polar: bool = False
-    """Whether positions are range, azimuth and elevation, m and rad, not x, y and z."""
-    note: str = ""
-    """What a user must know of the numbers, one sentence."""
-
-
-DIALECTS = (
-    Dialect("Sensrad Hugin", "doppler", "power"),
-    Dialect("Oculii Eagle", "doppler", "power", ("rangeaccu", "aziaccu", "eleaccu"), sigma_in_degrees=True),
-    Dialect("Oculii, NTU4DRadLM", "doppler", "power"),  # a sensor_msgs/PointCloud with channels
-    Dialect("ARS548, nebula", "range_rate", "rcs", ("range_std", "azimuth_std", "elevation_std")),
-    Dialect(
-        "ARS548, SNAIL-Radar", "doppler", "intensity", ("range_std", "azimuth_std", "elevation_std"),
-        note="the intensities of ARS548 clouds with these fields are RCS + 128",
-    ),
-    Dialect("ARS548, HKUST RIO", "velocity", "rcs", ("rangestd", "azimuthstd", "elevationstd"), polar=True),
-    Dialect("smartmicro", "radial_speed", "power"),
-    Dialect("TI ti_mmwave", "velocity", "intensity"),  # of ti_mmwave_rospkg/RadarScan too
-    Dialect("TI reve", "v_doppler_mps", "snr_db"),
-    Dialect("radar_msgs/RadarScan", "doppler_velocity", "amplitude", polar=True),
-    Dialect("View-of-Delft", "v_r", "rcs"),
-    Dialect("TJ4DRadSet", "v_r", "power"),
-)  # fmt: skip
-"""The twelve dialects. A cloud is read by the one of which it has the most fields, all of them."""
 
 _ALIASES: dict[str, tuple[str, ...]] = {
-    # For clouds of no dialect: the first name that a cloud has, without what separates words. Files of ours come first.
+    # The first name that a cloud has counts. Files of ours come first.
     "intensity": ("power", "intensity", "rcs", "snr", "snrdb", "amplitude", "reflectivity", "reflectance", "magnitude",
                   "rssi", "signalpower", "signalstrength"),
     "doppler": ("doppler", "velocity", "dopplervelocity", "vdopplermps", "radialspeed", "radialvelocity", "rangerate",
@@ -69,10 +35,16 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "range": ("range", "distance", "r", "rng", "dist", "radius", "slantrange"),
     "azimuth": ("azimuth", "azimuthangle", "az", "azi", "azim", "angleazimuth"),
     "elevation": ("elevation", "elevationangle", "el", "ele", "elev", "angleelevation"),
-    "sigma_range": ("sigmarange", "rangestd"),
-    "sigma_azimuth": ("sigmaazimuth", "azimuthstd"),
-    "sigma_elevation": ("sigmaelevation", "elevationstd"),
+    "sigma_range": ("sigmarange", "rangestd", "rangeaccu"),
+    "sigma_azimuth": ("sigmaazimuth", "azimuthstd", "aziaccu"),
+    "sigma_elevation": ("sigmaelevation", "elevationstd", "eleaccu"),
 }  # fmt: skip
+"""Names that sensors, drivers and data sets give to a role, in lower case and without what separates words.
+
+Of Sensrad Hugin, Oculii Eagle, Continental ARS548 (nebula, SNAIL-Radar, HKUST RIO), smartmicro, TI mmWave (ti_mmwave,
+reve), radar_msgs, View-of-Delft, TJ4DRadSet, and others.
+"""
+_SNAIL_ARS548 = {"x", "doppler", "intensity", "range_std", "azimuth_std", "elevation_std"}
 
 COLUMNS: dict[int, tuple[str, ...]] = {
     3: ("x", "y", "z"),
@@ -99,33 +71,27 @@ def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
     return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
 
 
-@dataclass(frozen=True)
-class Cloud:
-    """The returns of one scan of a file, by what they mean."""
-
-    points: NDArray[Any]
-    """(N, 3) sensor frame, m. float64 if the file has it, else float32."""
-    intensities: NDArray[np.float32] | None
-    doppler_mps: NDArray[np.float32] | None
-    sigma: NDArray[np.float32] | None
-    dropped: int
-    """Returns that were left out, since a coordinate or the intensity was not finite."""
-
-    @classmethod
-    def of_finite(cls, points: NDArray[Any], intensities: Any, doppler_mps: Any, sigma: Any) -> Cloud:
-        """The returns whose coordinates and intensity are finite, with their Doppler and deviations."""
-        # All at once first: that is usual, and row by row takes twenty times as long.
-        if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
-            return cls(points, intensities, doppler_mps, sigma, 0)
+def finite_scan(
+    points: NDArray[Any],
+    T_world_sensor: NDArray[np.float64],
+    intensities: NDArray[Any] | None,
+    doppler_mps: NDArray[Any] | None,
+    time_s: float | None,
+    sigma: NDArray[Any] | None,
+    notes: Notes,
+) -> Scan:
+    """The returns whose coordinates and intensity are finite. The others are counted."""
+    # All at once first: that is usual, and row by row takes twenty times as long.
+    if not (np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all())):
         finite = np.isfinite(points).all(axis=1)
         if intensities is not None:
             finite &= np.isfinite(intensities)
-        kept = [None if array is None else array[finite] for array in (intensities, doppler_mps, sigma)]
-        return cls(points[finite], kept[0], kept[1], kept[2], int((~finite).sum()))
-
-    def scan(self, T_world_sensor: NDArray[np.float64], time_s: float | None) -> Scan:
-        """These returns with the pose and the time of the scan."""
-        return Scan(self.points, T_world_sensor, self.intensities, self.doppler_mps, time_s, self.sigma)
+        notes.count(_NOT_FINITE, int((~finite).sum()))
+        points = points[finite]
+        intensities, doppler_mps, sigma = (
+            None if array is None else array[finite] for array in (intensities, doppler_mps, sigma)
+        )
+    return Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma)
 
 
 @dataclass(frozen=True)
@@ -134,8 +100,6 @@ class Fields:
 
     names: dict[str, str]
     """Field by role, of `ROLES`."""
-    dialect: Dialect | None = None
-    """The dialect that was recognised."""
     in_degrees: bool = False
     """Whether angles whose names have no unit are in degrees."""
 
@@ -150,14 +114,11 @@ class Fields:
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
         # AzimuthAngle, azimuth_angle and Azimuth Angle are one name.
-        squeezed = {re.sub(r"[\W_]+", "", name): lower[name] for name in reversed(lower)}
+        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
-        dialect = _dialect(lower)
-        if dialect is not None:
-            found = {role: lower[name] for role, name in _roles(dialect).items()}
         for role, aliases in ({axis: (axis,) for axis in _XYZ} | _ALIASES).items():
             name = next((squeezed[alias] for alias in aliases if alias in squeezed), None)
-            if role not in found and name is not None and name not in found.values():
+            if name is not None and name not in found.values():
                 found[role] = name
         for role, field in (overrides or {}).items():
             if role not in ROLES:
@@ -173,16 +134,17 @@ class Fields:
             if {"theta", "phi"} & set(lower):
                 msg += "; theta and phi have several meanings: name the azimuth and the elevation above the horizon"
             raise ValueError(msg)
-        return cls(found, dialect)
+        return cls(found)
 
     @property
     def polar(self) -> bool:
         """Whether positions are of range and angles."""
         return not set(_XYZ) <= set(self.names)
 
-    def place(self, columns: Mapping[str, NDArray[Any]]) -> bool:
-        """Whether a cloud has the fields of the positions."""
-        return {self.names[role] for role in (_POLAR if self.polar else _XYZ)} <= set(columns)
+    @property
+    def position_names(self) -> set[str]:
+        """The fields of the positions."""
+        return {self.names[role] for role in (_POLAR if self.polar else _XYZ)}
 
     def judged(self, clouds: Iterable[Mapping[str, NDArray[Any]]], notes: Notes) -> Fields:
         """These fields with the unit of their angles: of their names, or else by the numbers in some clouds."""
@@ -195,7 +157,7 @@ class Fields:
         named = next((role for role, unit in units.items() if unit), None)
         in_degrees = are_degrees(azimuth, elevation, units[named] if named else "")
         by = f"as {named} is by its name" if named else "by their numbers"
-        if in_degrees or (self.dialect is None and not named):
+        if in_degrees or not named:
             notes.add(
                 f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
                 "names such as azimuth_deg or azimuth_rad decide"
@@ -204,8 +166,8 @@ class Fields:
 
     def note_use(self, names: Iterable[str], notes: Notes, *, chosen: bool) -> None:
         """Notes what to know of the numbers, and which fields are not used, unless a user has chosen some."""
-        if self.dialect is not None and self.dialect.note:
-            notes.add(self.dialect.note)
+        if {name.lower() for name in names} >= _SNAIL_ARS548:
+            notes.add("the intensities of ARS548 clouds with these fields are RCS + 128")
         if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
             notes.add(
                 f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
@@ -216,8 +178,15 @@ class Fields:
                 f"fields that are not used: {', '.join(unused)}; fields={{role: name}} or --field chooses others"
             )
 
-    def read(self, columns: Mapping[str, NDArray[Any]], what: str) -> Cloud:
-        """The cloud in these columns, (N,) each, without returns that are not finite."""
+    def scan(
+        self,
+        columns: Mapping[str, NDArray[Any]],
+        what: str,
+        T_world_sensor: NDArray[np.float64],
+        time_s: float | None,
+        notes: Notes,
+    ) -> Scan:
+        """The finite returns in the columns, (N,) each, of the cloud `what`."""
         for name in self.names.values():
             if name not in columns:
                 msg = f"{what} lacks the field {name}, which other scans have: it has {', '.join(columns)}"
@@ -225,20 +194,15 @@ class Fields:
             if columns[name].dtype.kind not in "biuf":
                 msg = f"{what}: the field {name} holds no numbers"
                 raise ValueError(msg)
-        with np.errstate(over="ignore"):  # too large a number becomes infinite, and is dropped
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is dropped
+            points, sigma = self.points(columns), self._sigma(columns)
             intensities, doppler_mps = (self._column(columns, role) for role in ("intensity", "doppler"))
-            sigma = self._sigma(columns)
-        return Cloud.of_finite(self._positions(columns), intensities, doppler_mps, sigma)
+        return finite_scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma, notes)
 
-    def check_no_more(self, others: Fields, what: str, first: str) -> None:
-        """Raises a ValueError if the cloud `what` has a role that these fields, of the cloud `first`, leave out."""
-        for role in ("intensity", "doppler", *_SIGMA):
-            if role in others.names and role not in self.names:
-                msg = (
-                    f"{what} has the field {others.names[role]} for {role}, which {first} lacks: leave it out of all scans "
-                    f"by fields={{{role!r}: None}}"
-                )
-                raise ValueError(msg)
+    def missing_role(self, others: Fields) -> str | None:
+        """A role that `others` have for more than positions, and these fields leave out."""
+        roles = ("intensity", "doppler", *_SIGMA)
+        return next((role for role in roles if role in others.names and role not in self.names), None)
 
     def _column(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[np.float32] | None:
         if role not in self.names:
@@ -254,8 +218,9 @@ class Fields:
         values = columns[self.names[role]]
         return values if scale is None else values * np.float64(scale)
 
-    def _positions(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        if set(_XYZ) <= set(self.names):
+    def points(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """(N, 3) sensor frame, m: float64 if the file has it or else float32."""
+        if not self.polar:
             parts = [self._values(columns, axis) for axis in _XYZ]
             dtype = np.float64 if any(part.dtype.itemsize > 4 for part in parts) else np.float32
             points = np.zeros((len(parts[0]), 3), dtype)
@@ -263,16 +228,15 @@ class Fields:
                 points[:, axis] = part
             return points
         ranges, azimuth, elevation = (self._values(columns, role).astype(np.float64) for role in _POLAR)
-        with np.errstate(invalid="ignore"):  # what is not finite is dropped later
-            flat = ranges * np.cos(elevation)
-            xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
+        flat = ranges * np.cos(elevation)
+        xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
         return np.stack(xyz, axis=1).astype(np.float32)
 
     def _sigma(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32] | None:
         if not set(_SIGMA) <= set(self.names):
             return None
         sigma = np.stack([self._values(columns, role) for role in _SIGMA], axis=1).astype(np.float32)
-        if self.dialect is not None and self.dialect.sigma_in_degrees:
+        if _squeezed(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
             sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
         return sigma
 
@@ -282,18 +246,8 @@ def plain_name(name: str) -> tuple[str, str]:
     return without_unit(name.lower().removeprefix("scalar_"))
 
 
-def _roles(dialect: Dialect) -> dict[str, str]:
-    """Field by role."""
-    position = _POLAR if dialect.polar else _XYZ
-    roles = {role: role for role in position} | {"doppler": dialect.doppler, "intensity": dialect.intensity}
-    return roles | dict(zip(_SIGMA, dialect.sigma or (), strict=False))
-
-
-def _dialect(lower: Mapping[str, str]) -> Dialect | None:
-    """The dialect with the most fields among those of which the cloud has all. Polar ones only without x, y and z."""
-    polar = not set(_XYZ) <= set(lower)
-    fitting = [d for d in DIALECTS if set(_roles(d).values()) <= set(lower) and d.polar == polar]
-    return max(fitting, key=lambda dialect: len(_roles(dialect)), default=None)
+def _squeezed(name: str) -> str:
+    return re.sub(r"[\W_]+", "", name.lower())
 
 
 def _field(field: Any, names: list[str], lower: Mapping[str, str], role: str, what: str) -> str:

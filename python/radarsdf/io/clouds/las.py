@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.extras import require
-from radarsdf.io.clouds.las_checks import check_las_points, check_las_records
 
 # The extra dimension of intensities: LAS's own are whole numbers from 0 to 65535.
 _INTENSITY = "radar_intensity"
 _SCALE_M = 1e-4
 _POINT_FORMAT = 6  # the first of LAS 1.4, with a time
 
+_MAX_COMPRESSION = 200  # LAZ packs lidar points to a tenth
+_HEADER_BYTES, _COUNT_AT, _RECORD_BYTES = 227, 100, 54  # of the least header, and the least record behind it
+
 
 def read_las(path: Path) -> dict[str, NDArray[Any]]:
-    """The columns (N,) of a file by their names. Those of radars that :func:`las_writer` wrote have the names as there."""
+    """The columns (N,) of a file by their names. Those of radars that :func:`write_las` wrote have the names as there."""
     laspy = require("laspy", what=f"{path}: LAS and LAZ files are read by")
-    check_las_records(path)
+    size = path.stat().st_size
+    with path.open("rb") as raw:  # laspy would count to four billion
+        records = int.from_bytes(raw.read(_HEADER_BYTES)[_COUNT_AT : _COUNT_AT + 4], "little")
+    if records * _RECORD_BYTES > size:
+        msg = f"its header says {records} records, for which the file is too small"
+        raise ValueError(msg)
     # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
         header = file.header
-        check_las_points(path, header)
+        compression = _MAX_COMPRESSION if header.are_points_compressed else 1
+        if header.point_count * header.point_format.size > size * compression:
+            msg = f"its header says {header.point_count} points, for which the file is too small"
+            raise ValueError(msg)
         cloud = file.read_points(header.point_count)
     # Scaled and shifted, in double precision: the integers in the file are no metres.
     columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
@@ -40,25 +51,17 @@ def read_las(path: Path) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def las_writer(compressed: bool) -> Callable[[Any, Iterator[NDArray[Any]]], int]:
-    """A function that writes records, an array a scan, to an open file, and gives their number."""
-
-    def write(file: Any, rows: Iterator[NDArray[Any]]) -> int:
-        laspy = require("laspy", what="LAS and LAZ files are written by")
-        count, writer = 0, None
-        try:
-            for part in rows:
-                if writer is None:
-                    header = _header(laspy, part)
-                    writer = laspy.open(file, mode="w", header=header, closefd=False, do_compress=compressed)
-                writer.write_points(_points(laspy, part, header))
-                count += len(part)
-        finally:
-            if writer is not None:
-                writer.close()
-        return count
-
-    return write
+def write_las(file: Any, rows: Iterator[NDArray[Any]], *, compressed: bool) -> int:
+    """Writes records, an array a scan, to an open file, and returns their number."""
+    laspy = require("laspy", what="LAS and LAZ files are written by")
+    first = next(rows)
+    header = _header(laspy, first)
+    count = 0
+    with laspy.open(file, mode="w", header=header, closefd=False, do_compress=compressed) as writer:
+        for part in itertools.chain([first], rows):
+            writer.write_points(_points(laspy, part, header))
+            count += len(part)
+    return count
 
 
 def _extra(part: NDArray[Any]) -> dict[str, str]:

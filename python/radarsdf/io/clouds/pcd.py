@@ -12,46 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.io.clouds.lzf import unpack_lzf
+from radarsdf.io.ply import Columns
 
-_TYPES = {f"{kind}{size}" for kind, sizes in {"F": "48", "I": "1248", "U": "1248"}.items() for size in sizes}
 _MAX_HEADER_LINES = 64  # a header has eleven
 _MAX_LINE = 1 << 16
-_MAX_COMPRESSION = 100  # LZF reaches at most 88: three bytes for 264
+_LITERALS = 32  # control bytes of LZF below this are followed by so many bytes, and one more, as they are
 
 
-def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
-    """The fields with one number a point, (N,) each by name: of ascii, binary or binary_compressed files to version 0.7.
+def read_pcd(path: Path) -> Columns:
+    """The fields with one number a point: of ascii, binary or binary_compressed files to version 0.7.
 
     ``VIEWPOINT`` is not applied: :func:`read_viewpoint` has it.
     """
     with path.open("rb") as file:
         header = _header(file)
-        if missing := [
-            key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA") if not header.get(key)
-        ]:
-            msg = f"its header lacks {', '.join(missing)}"
-            raise ValueError(msg)
         body = file.read()
-    names = header["FIELDS"]
-    types = [kind + size for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    if missing := {"FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA"} - {
+        key for key in header if header[key]
+    }:
+        msg = f"its header lacks {', '.join(sorted(missing))}"
+        raise ValueError(msg)
+    names, points = header["FIELDS"], int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-    points = int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-    if not len(names) == len(types) == len(counts) or not _TYPES.issuperset(types):
-        msg = "FIELDS, SIZE, TYPE and COUNT do not fit together"
-        raise ValueError(msg)
-    if points < 0 or min(counts) < 1:
-        msg = "the number of points is negative, or a COUNT is zero or negative"
-        raise ValueError(msg)
-    if header["DATA"] == ["binary"]:
-        columns = _binary(body, types, counts, points)
-    elif header["DATA"] == ["ascii"]:
-        columns = _ascii(body, counts, points)
-    elif header["DATA"] == ["binary_compressed"]:
-        columns = _compressed(body, types, counts, points)
-    else:
-        msg = f"DATA {' '.join(header['DATA'])} is not known: it is ascii, binary or binary_compressed"
-        raise ValueError(msg)
+    fields = zip(names, header["TYPE"], header["SIZE"], counts, strict=True)
+    dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for _, kind, size, count in fields]
+    readers = {"binary": _binary, "ascii": _ascii, "binary_compressed": _compressed}
+    columns = readers[header["DATA"][0]](body, dtypes, points)
     # The name _ means padding, and several fields may have it.
     return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
 
@@ -83,44 +69,64 @@ def _header(file: BinaryIO) -> dict[str, list[str]]:
     return header
 
 
-def _binary(body: bytes, types: list[str], counts: list[int], points: int) -> list[NDArray[Any]]:
-    fields = [
-        (f"f{i}", f"<{kind.lower()}", (count,))
-        for i, (kind, count) in enumerate(zip(types, counts, strict=True))
-    ]
-    record = np.dtype(fields)
-    if len(body) < points * record.itemsize:  # a wrong header must not allocate much memory
-        msg = f"{points} points need {points * record.itemsize} bytes, but only {len(body)} are there"
-        raise ValueError(msg)
+def _binary(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
+    record = np.dtype([(f"f{i}", dtype) for i, dtype in enumerate(dtypes)])
     cloud = np.frombuffer(body, record, points)
-    return [cloud[f"f{i}"][:, 0] for i in range(len(types))]
+    return [cloud[name][:, 0] for name in record.names or ()]
 
 
-def _compressed(body: bytes, types: list[str], counts: list[int], points: int) -> list[NDArray[Any]]:
+def _compressed(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
     """Compressed by LZF, one field after another."""
     packed, unpacked = (int(size) for size in np.frombuffer(body[:8], "<u4"))
-    sizes = [int(kind[1]) * count * points for kind, count in zip(types, counts, strict=True)]
-    if unpacked != sum(sizes) or len(body) < 8 + packed or unpacked > _MAX_COMPRESSION * packed:
-        msg = f"its {packed} compressed bytes do not fit to {points} points of {sum(sizes)} bytes"
+    sizes = [dtype.itemsize * points for dtype in dtypes]
+    if unpacked != sum(sizes):
+        msg = f"its {unpacked} unpacked bytes are not {points} points of {sum(sizes)} bytes"
         raise ValueError(msg)
     data = unpack_lzf(body[8 : 8 + packed], unpacked)
-    starts = np.cumsum([0, *sizes[:-1]])
+    starts = np.cumsum([0, *sizes[:-1]]).tolist()
     return [
-        np.frombuffer(data, f"<{kind.lower()}", points * count, int(start)).reshape(points, count)[:, 0]
-        for kind, count, start in zip(types, counts, starts, strict=True)
+        np.frombuffer(data, dtype, points, start)[:, 0] for dtype, start in zip(dtypes, starts, strict=True)
     ]
 
 
-def _ascii(body: bytes, counts: list[int], points: int) -> list[NDArray[Any]]:
+def _ascii(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
+    widths = [dtype.shape[0] for dtype in dtypes]
     text = body.decode("ascii")
-    wrong = f"the file does not hold {points} rows of {sum(counts)} values, as its header says"
-    table = np.zeros((0, sum(counts)))
+    table = np.zeros((0, sum(widths)))
     if text and not text.isspace():  # of no rows, NumPy warns
-        try:
-            table = np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2)
-        except ValueError as error:
-            raise ValueError(wrong) from error
-    if table.shape != (points, sum(counts)):
-        raise ValueError(wrong)
-    first = np.cumsum([0, *counts[:-1]])
-    return [table[:, i] for i in first]
+        table = np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2)
+    if table.shape != (points, sum(widths)):
+        msg = f"the file does not hold {points} rows of {sum(widths)} values, as its header says"
+        raise ValueError(msg)
+    return [table[:, i] for i in np.cumsum([0, *widths[:-1]])]
+
+
+def unpack_lzf(data: bytes, size: int) -> bytes:
+    """Unpacks `size` bytes of the LZF compression."""
+    out = bytearray()
+    at = 0
+    while at < len(data) and len(out) <= size:
+        control = data[at]
+        at += 1
+        if control < _LITERALS:
+            out += data[at : at + control + 1]
+            at += control + 1
+            continue
+        head = data[at : at + 2]
+        length = 2 + (control >> 5)
+        if length == 2 + 7:  # a longer one: the next byte says by how much
+            length += head[0] if head else 0
+            head = head[1:]
+            at += 1
+        at += 1
+        start = len(out) - ((control & 0x1F) << 8) - (head[0] if head else size) - 1
+        if start < 0:
+            msg = "its compressed data are damaged"
+            raise ValueError(msg)
+        # It may overlap with what it writes: the same bytes again and again.
+        part = bytes(out[start : start + length])
+        out += (part * (length // len(part) + 1))[:length]
+    if len(out) != size:
+        msg = f"its compressed data do not unpack to {size} bytes"
+        raise ValueError(msg)
+    return bytes(out)

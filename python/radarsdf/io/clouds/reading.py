@@ -4,43 +4,25 @@
 
 from __future__ import annotations
 
-import io
-import re
-from collections import Counter
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
-from radarsdf.interrupts import whole_import
+from radarsdf.io.clouds.bin import read_bin
 from radarsdf.io.clouds.fields import Fields, names_of
 from radarsdf.io.clouds.las import read_las
 from radarsdf.io.clouds.pcd import read_pcd, read_viewpoint
-from radarsdf.io.clouds.raw_binary import read_bin
-from radarsdf.io.files import are_numbers, check_regular_file
-from radarsdf.io.origin import origin_of
-from radarsdf.io.records import without_ply_comments
+from radarsdf.io.files import check_regular_file, origin_of
+from radarsdf.io.ply import Columns, read_ply
 from radarsdf.io.scans import Notes
-from radarsdf.io.text import (
-    COMMENTS,
-    check_header,
-    numbers_of,
-    read_text,
-    separator_of,
-    text_rows,
-    with_points,
-    without_comment,
-    words_of,
-)
+from radarsdf.io.text import read_table
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
 _PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
-
-Columns = dict[str, NDArray[Any]]
 
 
 def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Columns:
@@ -55,7 +37,7 @@ def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Colu
         msg = f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}"
         raise ValueError(msg)
     try:
-        return _NAMED[suffix](path) if suffix in _NAMED else _NAMELESS[suffix](path, columns)
+        return READERS[suffix](path, columns)
     except (ImportError, MemoryError):
         raise
     except BaseException as error:  # libraries raise many kinds for damaged files, OSError among them
@@ -92,7 +74,8 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     """
     columns = read_columns(path_of(path, "path"))
     fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
-    points = fields.judged([columns], Notes(str(path))).read(columns, str(path)).points.astype(np.float64)
+    fields = fields.judged([columns], Notes(str(path)))
+    points = fields.scan(columns, str(path), np.eye(4), None, Notes()).points.astype(np.float64)
     if path_of(path, "path").suffix.lower() == ".pcd":
         T_world_sensor = read_viewpoint(path_of(path, "path"))
         points = points @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
@@ -115,81 +98,29 @@ def _npy(path: Path, columns: int | Sequence[str] | None) -> Columns:
 
 
 def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
-    text = with_points(read_text(path))
-    skipped, first = 0, ""
-    for line in text.split("\n"):
-        first = line.strip()
-        if first and not _is_comment(first):
-            break
-        skipped, first = skipped + 1, ""
-    if not first:
-        return {name: np.zeros(0) for name in names_of(3, None)}
-    first = without_comment(first.lstrip("/#% "))  # names may be after a comment sign
-    separator, words = separator_of(first), words_of(first)
-    header = not are_numbers(words)
-    if header:
-        check_header(words)
-    try:
-        table = np.loadtxt(
-            io.StringIO(text), delimiter=separator, skiprows=skipped + header, ndmin=2, comments=COMMENTS
-        )
-    except ValueError:  # a row that is none becomes NaN, which is left out, and counted
-        _, rows = text_rows(path)
-        width = len(words) if header else Counter(len(row) for _, row in rows).most_common(1)[0][0]
-        table = numbers_of(rows, width)
-        numeric = ~np.isnan(table).all(axis=0)  # others hold labels, say
-        if 2 * np.isfinite(table[:, numeric]).all(axis=1).sum() < len(table) or not numeric.any():
-            raise
-    if header:
-        if table.size == 0:
-            return {name: np.zeros(0) for name in words}
-        if table.shape[1] != len(words) or len(set(words)) != len(words):
-            msg = f"its header has {len(words)} names for {table.shape[1]} columns, or a name twice"
-            raise ValueError(msg)
-        return dict(zip(words, table.T, strict=True))
-    return dict(zip(names_of(table.shape[1], columns), table.T, strict=True))
-
-
-def _is_comment(line: str) -> bool:
-    """Whether a line is a comment. Names of columns after a comment sign, as CloudCompare writes them, are a header."""
-    if not line.startswith(COMMENTS):
-        return False
-    return not {"x", "y", "z"} <= set(re.split(r"[\s,;]+", line.lstrip("/#%").strip().lower()))
-
-
-def _ply(path: Path) -> Columns:
-    with whole_import():
-        import trimesh  # noqa: PLC0415 - takes long, and few files need it
-
-    # Of its bytes, and without materials: a PLY file may name an image, which is then not looked for.
-    file = io.BytesIO(without_ply_comments(path.read_bytes()))
-    loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
-    vertex = loaded.metadata.get("_ply_raw", {}).get("vertex")
-    if vertex is None or not vertex["length"]:
-        return {axis: np.zeros(0) for axis in "xyz"}
-    data = vertex["data"]
-    names = data.keys() if isinstance(data, dict) else data.dtype.names
-    columns = {str(name): np.asarray(data[name]).reshape(-1) for name in names}
-    if any(len(column) != vertex["length"] for column in columns.values()):
-        msg = f"its header says {vertex['length']} points, which it does not hold"
+    table = read_table(path)
+    names = table.header
+    if names is None:  # CloudCompare writes names of columns after a comment sign
+        named = [head for head in table.heads if {"x", "y", "z"} <= {word.lower() for word in head}]
+        names = named[0] if named else names_of(table.values.shape[1] or 3, columns)
+    if len(table.lines) == 0:
+        return {name: np.zeros(0) for name in names}
+    if table.values.shape[1] != len(names) or len(set(names)) != len(names):
+        msg = f"its header has {len(names)} names for {table.values.shape[1]} columns, or a name twice"
         raise ValueError(msg)
-    return columns
+    return dict(zip(names, table.values.T, strict=True))
 
 
-_NAMED: dict[str, Callable[[Path], Columns]] = {
-    ".pcd": read_pcd,
-    ".ply": _ply,
-    ".las": read_las,
-    ".laz": read_las,
-}
-"""Readers of formats that name their columns."""
-
-_NAMELESS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
+READERS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
+    ".pcd": lambda path, _: read_pcd(path),
+    ".ply": lambda path, _: read_ply(path),
+    ".las": lambda path, _: read_las(path),
+    ".laz": lambda path, _: read_las(path),
     ".bin": read_bin,
     ".npy": _npy,
     **dict.fromkeys(TEXT_SUFFIXES, _text),
 }
-"""Readers of formats that may not."""
+"""Reads a file as named columns (N,), by its suffix. What a user says of the columns helps where a format names none."""
 
-CLOUD_SUFFIXES = (*_NAMED, *_NAMELESS)
+CLOUD_SUFFIXES = tuple(READERS)
 """What :func:`read_columns` reads."""

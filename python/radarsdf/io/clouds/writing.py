@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -15,10 +16,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from radarsdf.checks import path_of
-from radarsdf.io.clouds.las import las_writer
-from radarsdf.io.files import whole_file
-from radarsdf.io.origin import origin_for, write_origin
-from radarsdf.io.records import ply_header, records
+from radarsdf.io.clouds.las import write_las
+from radarsdf.io.files import origin_for, whole_file, write_origin
+from radarsdf.io.ply import ply_header, records
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.progress import hides_bar
 
@@ -30,7 +30,7 @@ Rows = Iterator[NDArray[Any]]
 
 
 class CloudWritten(NamedTuple):
-    """What :func:`write_cloud` wrote."""
+    """Size and origin of a cloud that was written."""
 
     returns: int
     """Number of returns."""
@@ -159,23 +159,17 @@ def _npy(dtype: np.dtype[Any], count: int) -> bytes:
     )
 
 
-def _binary(header: Callable[[np.dtype[Any], int], bytes]) -> Callable[[BinaryIO, Rows], int]:
-    """A writer of records behind a header, whose length does not depend on their number."""
-
-    def write(file: BinaryIO, rows: Rows) -> int:
-        count, dtype = 0, None
-        for part in rows:
-            if dtype is None:
-                dtype = part.dtype
-                file.write(header(dtype, 0))
-            file.write(part.tobytes())
-            count += len(part)
-        assert dtype is not None  # scans without a return raise an error
-        file.seek(0)
-        file.write(header(dtype, count))
-        return count
-
-    return write
+def _binary(file: BinaryIO, rows: Rows, header: Callable[[np.dtype[Any], int], bytes]) -> int:
+    """Writes records behind a header, whose length does not depend on their number."""
+    first = next(rows)
+    file.write(header(first.dtype, 0))
+    count = 0
+    for part in itertools.chain([first], rows):
+        file.write(part.tobytes())
+        count += len(part)
+    file.seek(0)
+    file.write(header(first.dtype, count))
+    return count
 
 
 def _csv(file: BinaryIO, rows: Rows) -> int:
@@ -190,11 +184,11 @@ def _csv(file: BinaryIO, rows: Rows) -> int:
 
 
 _WRITERS: dict[str, Callable[[Any, Rows], int]] = {
-    ".ply": _binary(_ply),
-    ".pcd": _binary(_pcd),
-    ".las": las_writer(compressed=False),
-    ".laz": las_writer(compressed=True),
-    ".npy": _binary(_npy),
+    ".ply": partial(_binary, header=_ply),
+    ".pcd": partial(_binary, header=_pcd),
+    ".las": partial(write_las, compressed=False),
+    ".laz": partial(write_las, compressed=True),
+    ".npy": partial(_binary, header=_npy),
     ".csv": _csv,
 }
 

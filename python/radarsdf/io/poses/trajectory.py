@@ -1,20 +1,19 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Trajectories: poses with times, interpolation between them, and their files."""
+"""Poses by time: trajectories, interpolation between their poses, and the pose of each scan."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from radarsdf.io.scans import Notes
-from radarsdf.io.text import number_rows
 
 MAX_GAP_S = 0.5
 """Longest time between two poses over which poses are interpolated, by default."""
@@ -175,15 +174,78 @@ def listed(mask: NDArray[np.bool_], lines: Sequence[int] | None) -> str:
     return f"{'pose' if lines is None else 'line'} {', '.join(named)}{', …' if len(rows) > _LISTED else ''}"
 
 
-def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
-    """Reads a text file of finite numbers, (R, columns) float64, with comments after ``#``; None: of any poses."""
-    wanted = "poses" if columns is None else f"{columns} columns of numbers"
-    try:
-        table = np.array(number_rows(path), np.float64)
-    except ValueError as error:
-        msg = f"{path} is not a table of {wanted}: {error}"
-        raise ValueError(msg) from error
-    if table.ndim != 2 or columns not in (None, table.shape[1]) or not np.isfinite(table).all():
-        msg = f"{path} is not a table of {wanted}, all finite and in rows of one length"
-        raise ValueError(msg)
-    return table
+class StampedPoses(Protocol):
+    """Poses by time."""
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+        """T_world_base (4, 4) at a time, s; None if there is none near enough."""
+
+    def span(self) -> str:
+        """First and last time, for messages."""
+
+
+class NoPoses(ValueError):
+    """Scans have no poses, and none are given."""
+
+
+class _Unposed:
+    """Scans without poses: the identity at all times."""
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64]:  # noqa: ARG002
+        return np.eye(4)
+
+    def span(self) -> str:
+        return "all times"
+
+    def __repr__(self) -> str:
+        return "UNPOSED"
+
+
+UNPOSED: StampedPoses = _Unposed()
+"""In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransformChain:
+    """A product of transforms, each of which is constant or moves: T_world_a · T_a_b · … of a tree of frames."""
+
+    links: tuple[Trajectory | NDArray[np.float64], ...]
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+        """T_world_base (4, 4) at a time, s; None if a link has none near enough."""
+        pose = np.eye(4)
+        for link in self.links:
+            part = link.pose_at(time_s, max_gap_s) if isinstance(link, Trajectory) else link
+            if part is None:
+                return None
+            pose = pose @ part
+        return pose
+
+    def moving(self) -> list[Trajectory]:
+        """The links that are not constant."""
+        return [link for link in self.links if isinstance(link, Trajectory)]
+
+    def span(self) -> str:
+        """First and last time of its moving links, for messages."""
+        return ", ".join(link.span() for link in self.moving())
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPoses:
+    """The pose of the radar for each scan: of its time, or of its number."""
+
+    poses: StampedPoses | NDArray[np.float64]
+    """T_world_base by time, or (F, 4, 4) in the order of the scans."""
+    T_base_sensor: NDArray[np.float64]
+    max_gap_s: float
+
+    def of(self, number: int, time_s: float | None) -> NDArray[np.float64] | None:
+        """T_world_sensor (4, 4) of scan `number`, which was taken at `time_s`; None if it has none."""
+        if isinstance(self.poses, np.ndarray):
+            T_world_base = self.poses[number] if number < len(self.poses) else None
+        else:
+            T_world_base = None if time_s is None else self.poses.pose_at(time_s, self.max_gap_s)
+        if T_world_base is None or np.isnan(T_world_base[0, 0]):
+            return None
+        T_world_sensor: NDArray[np.float64] = T_world_base @ self.T_base_sensor
+        return T_world_sensor

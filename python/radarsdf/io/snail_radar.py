@@ -2,18 +2,16 @@
 # SPDX-License-Identifier: MIT
 """Sequences of SNAIL-Radar, snail-radar.github.io: its two radars, the poses of its lidar, and the lidar as ground truth.
 
-The points of each sensor are in its own frame, in m. `T_a_b` transforms points of frame b to frame a, and so does the
-matrix in a file `a_T_b.txt`. There is no other transformation: the poses are in UTM, and so is the world frame.
+`T_a_b` transforms points of frame b to frame a, and so does the matrix in a file `a_T_b.txt`. The poses are in UTM, and so
+is the world frame.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
@@ -21,10 +19,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf._core import cell_keys
+from radarsdf.io.clouds.fields import Fields
 from radarsdf.io.clouds.reading import read_columns
-from radarsdf.io.datasets.folders import lidar_map, read_transform
-from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, read_table, trajectory_of
-from radarsdf.io.scans import Notes
+from radarsdf.io.folders import lidar_map, scans_of_files
+from radarsdf.io.poses.files import poses_of, read_transform
+from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, trajectory_of
+from radarsdf.io.recordings import Request
+from radarsdf.io.scans import Notes, Scans
+from radarsdf.io.text import read_numbers
 
 RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")
 """Folders of clouds in a sequence: of the Oculii Eagle, and of the Continental ARS548. The first that is there counts."""
@@ -69,7 +71,7 @@ def is_snail_radar(folder: Path) -> bool:
 
 
 def _parts(folder: Path) -> tuple[Path, str] | None:
-    """The sequence and the radar, of `RADARS`, that a folder means: a sequence, or a part of it."""
+    """The sequence and the radar, of `RADARS`, that a folder means: a sequence, or a folder in it. None: it is neither."""
     here = folder.resolve()
     for sequence in (here, *here.parents[:2]):
         for radar in RADARS:
@@ -78,9 +80,8 @@ def _parts(folder: Path) -> tuple[Path, str] | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class SnailRadar:
-    """A sequence of SNAIL-Radar and one of its radars.
+def read(folder: Path, request: Request) -> Scans:
+    """A sequence, or one radar of it: ``data3`` means its Oculii Eagle, ``data3/ars548/points`` its Continental ARS548.
 
     ::
 
@@ -96,93 +97,74 @@ class SnailRadar:
     is that of the date, the name of the folder above. Of the Oculii, only x, y and z are used: its angles are in another
     frame (right, down, forward). ``tf_static.launch`` is not read.
     """
+    found = _parts(folder)
+    assert found is not None
+    sequence, radar = found
+    others = [other for other in RADARS if other != radar and (sequence / other).is_dir()]
+    if others and folder.resolve() == sequence:
+        request.notes.add(f"{radar} is read; {' and '.join(others)} are read as folders of their own")
+    files = _stamped_files(sequence / radar)
+    times_s = [time_s for time_s, _ in files]
+    if not files:
+        msg = f"{sequence / radar} holds no scans"
+        raise ValueError(msg)
+    poses = _trajectory(sequence) if request.poses is None else poses_of(request.poses, request.notes)
+    extrinsic = _T_xt32_radar(sequence, radar) if request.extrinsic is None else request.extrinsic
+    truth = partial(_ground_truth, sequence, np.array(times_s))
+    return scans_of_files([path for _, path in files], times_s, poses, extrinsic, request, truth)
 
-    folder: Path
-    radar: str
-    """Of `RADARS`."""
 
-    @classmethod
-    def of(cls, folder: Path) -> SnailRadar:
-        """The sequence and the radar that a folder means; see :func:`is_snail_radar`."""
-        parts = _parts(folder)
-        if parts is None:
-            msg = f"{folder} is no sequence of SNAIL-Radar: it has none of {', '.join(RADARS)}"
-            raise ValueError(msg)
-        return cls(*parts)
+def _trajectory(sequence: Path) -> Trajectory:
+    """Of the lidar, in UTM zone 50R."""
+    path = sequence / _TRAJECTORY
+    if not path.is_file():
+        msg = f"{sequence} lacks {_TRAJECTORY}: copy it from full_trajs/<date>/<sequence> of the data set"
+        raise ValueError(msg)
+    return trajectory_of(read_numbers(path, 8), str(path), Notes())
 
-    @property
-    def clouds(self) -> Path:
-        """The folder of the clouds of the radar."""
-        return self.folder / self.radar
 
-    def others(self) -> list[str]:
-        """The other radars of the sequence."""
-        return [radar for radar in RADARS if radar != self.radar and (self.folder / radar).is_dir()]
+def _T_xt32_radar(sequence: Path, radar: str) -> NDArray[np.float64]:
+    """The radar in the frame of the lidar, (4, 4). Raises a ValueError if it is not known."""
+    T_body_xt32 = read_transform(sequence / "body_T_xt32.txt", _BODY_T_XT32)
+    if radar.startswith("ars548"):
+        file = sequence / "body_T_ars548.txt"
+        T_body_radar = read_transform(file, np.eye(4)) if file.is_file() else _body_T_ars548(sequence, file)
+    else:
+        T_body_radar = read_transform(sequence / "body_T_oculii.txt", _BODY_T_OCULII)
+    T_xt32_radar: NDArray[np.float64] = np.linalg.inv(T_body_xt32) @ T_body_radar
+    return T_xt32_radar
 
-    def files(self) -> list[tuple[float, Path]]:
-        """Times, s, and files of the clouds of the radar."""
-        return _stamped_files(self.clouds)
 
-    @cached_property
-    def trajectory(self) -> Trajectory:
-        """Of the lidar, in UTM zone 50R. Raises a ValueError or an OSError if it cannot be read."""
-        if not (self.folder / _TRAJECTORY).is_file():
-            msg = f"{self.folder} lacks {_TRAJECTORY}: copy it from full_trajs/<date>/<sequence> of the data set"
-            raise ValueError(msg)
-        path = self.folder / _TRAJECTORY
-        return trajectory_of(read_table(path, 8), str(path), Notes())
+def _body_T_ars548(sequence: Path, file: Path) -> NDArray[np.float64]:
+    """The published calibration of the day."""
+    name = sequence.parent.name
+    found = _DAY.match(name)
+    day = float(found[1]) + 0.5 * (found[2] is not None) if found else 0.0
+    known = [orientation for first, orientation in _ARS548_ORIENTATIONS if first <= day]
+    if not known:
+        msg = (
+            f"{sequence}: the calibration of the ARS548 depends on the day, which is the name of the folder above, such "
+            f"as 20231105_aft, but that is {name}: give extrinsic, or the radar in the body (4 x 4) in {file.name}"
+        )
+        raise ValueError(msg)
+    T_body_ars548 = np.eye(4)
+    T_body_ars548[:3, :3] = Rotation.from_quat(known[-1]).as_matrix()
+    T_body_ars548[:3, 3] = _ARS548_POSITION_M
+    return T_body_ars548
 
-    @cached_property
-    def T_base_radar(self) -> NDArray[np.float64]:
-        """The radar in the frame of the lidar. Raises a ValueError if it is not known."""
-        T_body_xt32 = read_transform(self.folder / "body_T_xt32.txt", _BODY_T_XT32)
-        if self.radar.startswith("ars548"):
-            file = self.folder / "body_T_ars548.txt"
-            T_body_radar = read_transform(file, np.eye(4)) if file.is_file() else self._body_T_ars548(file)
-        else:
-            T_body_radar = read_transform(self.folder / "body_T_oculii.txt", _BODY_T_OCULII)
-        T_xt32_radar: NDArray[np.float64] = np.linalg.inv(T_body_xt32) @ T_body_radar
-        return T_xt32_radar
 
-    def _body_T_ars548(self, file: Path) -> NDArray[np.float64]:
-        """The published calibration of the day."""
-        name = self.folder.parent.name
-        found = _DAY.match(name)
-        day = float(found[1]) + 0.5 * (found[2] is not None) if found else 0.0
-        known = [orientation for first, orientation in _ARS548_ORIENTATIONS if first <= day]
-        if not known:
-            msg = (
-                f"{self.folder}: the calibration of the ARS548 depends on the day, which is the name of the folder above, such "
-                f"as 20231105_aft, but that is {name}: give extrinsic, or the radar in the body (4 x 4) in {file.name}"
-            )
-            raise ValueError(msg)
-        T_body_ars548 = np.eye(4)
-        T_body_ars548[:3, :3] = Rotation.from_quat(known[-1]).as_matrix()
-        T_body_ars548[:3, 3] = _ARS548_POSITION_M
-        return T_body_ars548
-
-    def ground_truth(self) -> NDArray[np.float64] | None:
-        """Lidar points (M, 3), UTM zone 50R, m, from the first to the last scan; None if there are none.
-
-        Of scans of the lidar, they have a range of 1 to 60 m, and there is at most one in each cell of 5 cm. Each is moved
-        with the pose at its own time, or at the time of its scan if the file has no field ``timestamp``.
-        """
-        points = lidar_map(self.folder)
-        if points is None and (self.folder / "xt32").is_dir() and (self.folder / _TRAJECTORY).is_file():
-            times_s = np.array([time_s for time_s, _ in self.files()])
-            times_s = times_s[self.trajectory.covers(times_s)]
-            if len(times_s):
-                points = _read_lidar_scans(self.folder / "xt32", self.trajectory, times_s[0], times_s[-1])
+def _ground_truth(sequence: Path, times_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Lidar points (M, 3), UTM zone 50R, m, of all lidar scans while the radar's were taken, at most one in each cell."""
+    points = lidar_map(sequence)
+    if points is not None or not (sequence / "xt32").is_dir() or not (sequence / _TRAJECTORY).is_file():
         return points
-
-
-def _read_lidar_scans(
-    folder: Path, trajectory: Trajectory, first_s: float, last_s: float
-) -> NDArray[np.float64] | None:
-    """Points (M, 3), world frame, m, of all lidar scans between two times, at most one in each cell."""
+    trajectory = _trajectory(sequence)
+    times_s = times_s[trajectory.covers(times_s)]
+    if not len(times_s):
+        return None
     origin = trajectory.positions[0]  # cell keys are relative to it: UTM coordinates are out of their range
     found = [np.zeros((0, 3))]
-    for count, world in enumerate(_lidar_scans(folder, trajectory, first_s, last_s), 1):
+    for count, world in enumerate(_lidar_scans(sequence / "xt32", trajectory, times_s[0], times_s[-1]), 1):
         found.append(_thin(world - origin))
         if count % _LIDAR_BATCH == 0:
             found = [_thin(np.concatenate(found))]
@@ -193,11 +175,13 @@ def _read_lidar_scans(
 def _lidar_scans(
     folder: Path, trajectory: Trajectory, first_s: float, last_s: float
 ) -> Iterator[NDArray[np.float64]]:
+    """(K, 3) world, m, of 1 to 60 m range, each point moved with the pose at its own time if it has a ``timestamp``."""
     for time_s, path in _stamped_files(folder):
         if not first_s <= time_s <= last_s:
             continue
         columns = read_columns(path)
-        xyz = _xyz_of(columns, path)
+        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
+        xyz = fields.points(columns).astype(np.float64)
         times_s = columns.get("timestamp", np.full(len(xyz), time_s)).astype(np.float64)
         ranges_m = np.linalg.norm(xyz, axis=1)
         used = (ranges_m >= _LIDAR_RANGE_M[0]) & (ranges_m <= _LIDAR_RANGE_M[1]) & np.isfinite(times_s)
@@ -221,13 +205,6 @@ def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
             raise ValueError(msg)
         files.append((time_s, path))
     return sorted(files)
-
-
-def _xyz_of(columns: dict[str, NDArray[Any]], path: Path) -> NDArray[np.float64]:
-    if missing := [name for name in "xyz" if name not in columns]:
-        msg = f"{path} lacks the fields {', '.join(missing)}: it has {', '.join(columns)}"
-        raise ValueError(msg)
-    return np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1)
 
 
 def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,277 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans in files of a folder, one scan each, or in one file: which files, their times, and their poses."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Sequence
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.io.clouds.bin import KITTI, bin_layout
+from radarsdf.io.clouds.fields import names_of, plain_name
+from radarsdf.io.clouds.pcd import read_viewpoint
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, read_columns, read_points
+from radarsdf.io.ply import Columns
+from radarsdf.io.poses.files import FIND_POSES, POSE_FILES, poses_of, read_transform
+from radarsdf.io.poses.trajectory import UNPOSED, NoPoses, StampedPoses
+from radarsdf.io.recordings import RawScan, Request, Truth, posed, scan_poses
+from radarsdf.io.scans import Notes, Scans
+from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970, without_unit
+
+BASE_T_RADAR = "base_T_radar.txt"
+"""A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""
+
+TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
+"""Names of files with a time, s, for each scan, one a line."""
+
+SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
+"""Names of folders of scans that are found within the folder that is read."""
+
+_CALIBRATIONS = ("calib.txt", "calibration.txt")
+_NOT_SCANS = {*POSE_FILES, *TIME_FILES, *_CALIBRATIONS, BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
+_TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
+_SCAN_FIELDS = ("frame", "scan", "scan_id", "frame_id", "scan_index", "frame_index", "scan_number", "frame_number",
+                "sweep", "sweep_id", "cycle", "cycle_id")  # fmt: skip
+_TIME_FIELDS = ("time", "timestamp", "stamp", "t")
+_SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
+_TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
+
+Poses = StampedPoses | NDArray[np.float64]
+"""By time, or (F, 4, 4) in the order of the scans."""
+
+
+def read_folder(folder: Path, request: Request) -> Scans:
+    """The scans of the files in a folder; see :func:`radarsdf.io.read`."""
+    files = cloud_files(folder)
+    if not files:
+        msg = f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}"
+        raise ValueError(msg)
+    return read_files(files, folder, request, partial(lidar_map, folder))
+
+
+def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
+    """The scans of files with the poses of the request, or those that are found in or near the folder."""
+    notes = request.notes
+    places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
+    poses = request.poses
+    if poses is None:
+        poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
+        if poses is not None and poses.parent != folder:  # which is easily overlooked
+            notes.add(f"poses: of {poses}")
+    if poses is None:
+        files, times_s, _ = in_order_of_time(files, UNPOSED, notes)
+        viewpoints = _viewpoint_poses(files, notes)
+        if viewpoints is None:
+            what = files[0] if len(files) == 1 else folder
+            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
+            raise NoPoses(msg)
+        return scans_of_files(files, times_s, viewpoints, request.extrinsic, request, truth)
+    if isinstance(poses, (str, PathLike)):
+        places = list(dict.fromkeys((Path(poses).parent, *places)))
+    known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
+    _note_viewpoint(files[0], notes)
+    files, times_s, known = in_order_of_time(files, known, notes)
+    T_base_sensor = request.extrinsic
+    if T_base_sensor is None:
+        T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
+    return scans_of_files(files, times_s, known, T_base_sensor, request, truth)
+
+
+def scans_of_files(
+    files: list[Path],
+    times_s: Sequence[float] | None,
+    poses: Poses,
+    T_base_sensor: NDArray[np.float64] | None,
+    request: Request,
+    truth: Truth = lambda: None,
+) -> Scans:
+    """Scans of one file each, or of the one table of a recording; `truth` counts if the request has none."""
+    columns: Any = request.columns
+    if any(path.suffix.lower() == ".bin" for path in files):
+        columns = _bin_columns(files, columns, request.notes)
+    reads = [partial(read_columns, path, columns) for path in files]
+    names = [str(path) for path in files]
+    if len(files) == 1:
+        parts, times_s, poses = _split(files[0], columns, times_s, poses, request.notes)
+        if parts is not None:
+            reads = [partial(dict, part) for part in parts]
+            names = [f"{files[0]}: scan {i}" for i in range(len(parts))]
+    matched, known_s = scan_poses(poses, len(reads), times_s, T_base_sensor, request)
+    stamps = [None] * len(reads) if known_s is None else known_s
+    raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
+    source = posed(lambda: raw_scans, lambda _: matched, request)
+    return Scans.of_source(source, request.notes, request.truth or truth)
+
+
+def cloud_files(folder: Path) -> list[Path]:
+    """The scans of a folder, or of a folder of `SCAN_FOLDERS` in it, in natural order: of the kind with most files."""
+    for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
+        if not inner.is_dir():
+            continue
+        kinds: dict[str, list[Path]] = {}
+        for path in inner.iterdir():
+            suffix = path.suffix.lower()
+            if suffix not in CLOUD_SUFFIXES or path.name.startswith(".") or not path.is_file():
+                continue
+            if path.name.lower() in _NOT_SCANS or path.stem == _TRUTH_STEM:
+                continue
+            kinds.setdefault("text" if suffix in TEXT_SUFFIXES else suffix, []).append(path)
+        if kinds:
+            most = max(kinds.values(), key=len)
+            return sorted(most, key=natural)
+    return []
+
+
+def natural(path: Path) -> tuple[Any, ...]:
+    """To sort names as people do: scan_9 before scan_10."""
+    parts = re.split(r"(\d+)", path.name)
+    return tuple((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts))
+
+
+def lidar_map(folder: Path) -> NDArray[np.float64] | None:
+    """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``. None if there is neither."""
+    found = (folder / f"{_TRUTH_STEM}{suffix}" for suffix in (".pcd", ".ply"))
+    return next((read_points(path) for path in found if path.is_file()), None)
+
+
+def in_order_of_time(
+    files: list[Path], poses: Poses, notes: Notes
+) -> tuple[list[Path], list[float] | None, Poses]:
+    """Scans in the order of their times, these times, s, None if there are none, and the poses.
+
+    Poses without times belong to the files by number: in the order of the times in their names, or, where a file has the
+    times line by line, in the order of these lines.
+    """
+    times, listed = _times_of(files, notes)
+    if times is None:
+        return files, None, poses
+    order = np.argsort(times, kind="stable")
+    if (np.diff(order) < 0).any():
+        if listed is not None:
+            notes.add(f"{listed.name} is not ascending: scans are read in the order of their times")
+            if isinstance(poses, np.ndarray) and len(poses) == len(files):
+                poses = poses[order]
+        elif isinstance(poses, np.ndarray):
+            notes.add(
+                "the times in the names of the scans are in another order than the names: poses are in that of times"
+            )
+    return [files[i] for i in order], [times[i] for i in order], poses
+
+
+def _times_of(files: list[Path], notes: Notes) -> tuple[list[float] | None, Path | None]:
+    """Times of scans, s, by their names, or by a file of times near them, and this file; None if there are none."""
+    named = [_time_in(path.stem) for path in files]
+    times = [time for time in named if time is not None]
+    if len(times) == len(files) and len(set(times)) == len(files):
+        return times, None
+    if len(times) == len(files) > 1:
+        notes.add("several scans have the same time in their names: these times are not used")
+    for folder in (files[0].parent, files[0].parent.parent):
+        for name in TIME_FILES:
+            if (path := folder / name).is_file():
+                return _listed_times(path, len(files), notes), path
+    return None, None
+
+
+def _time_in(stem: str) -> float | None:
+    """The time, s, that a name ends in: with a point s; in 12, 15 or 18 digits or more ms, µs or ns. Others are numbers."""
+    if parts := _SECONDS_AND_NANOSECONDS.search(stem):
+        return int(parts[1]) + 1e-9 * int(parts[2])
+    found = _TIME.search(stem)
+    if found is None:
+        return None
+    if "." in found[1]:
+        return float(found[1])
+    return int(found[1]) * unit_since_1970(int(found[1]))[1]
+
+
+def _listed_times(path: Path, count: int, notes: Notes) -> list[float]:
+    times = read_numbers(path)[:, -1]
+    if len(times) != count:
+        msg = f"{path} has {len(times)} times for {count} scans"
+        raise ValueError(msg)
+    seconds: list[float] = in_seconds(times, path.name, notes).tolist()
+    if len(set(seconds)) < count:
+        notes.add(f"{path.name} has the same time for several scans")
+    return seconds
+
+
+def _split(
+    path: Path, columns: Any, times_s: Sequence[float] | None, poses: Poses, notes: Notes
+) -> tuple[list[Columns] | None, Sequence[float] | None, Poses]:
+    """The scans in the one table of a recording, by a column with their numbers or times; None if it is one scan."""
+    whole = None, times_s, poses
+    try:
+        table = read_columns(path, columns)
+    except ValueError:  # which is noted when the scan is read
+        return whole
+    plain = {plain_name(name)[0]: name for name in reversed(table)}
+    number = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
+    time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
+    one_pose = isinstance(poses, np.ndarray) and len(poses) == 1
+    key = number if number is not None or one_pose else time
+    if key is None or table[key].dtype.kind not in "biuf":
+        return whole
+    rows = np.flatnonzero(np.isfinite(table[key]))
+    values, first, part = np.unique(table[key][rows], return_index=True, return_inverse=True)
+    if len(values) < 2 or (key != number and 2 * len(values) > len(rows)):
+        return whole
+    notes.add(f"{path.name} is read as {len(values)} scans, by its field {key}")
+    if len(rows) < len(table[key]):
+        notes.add(f"{path.name}: {len(table[key]) - len(rows)} rows left out: their {key} is not a number")
+    order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
+    if time is not None and table[time].dtype.kind in "iuf":
+        scale = SCALES.get(without_unit(time)[1], 1.0)
+        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
+    if (
+        isinstance(poses, np.ndarray)
+        and len(values) < len(poses)
+        and 0 <= values[0] <= values[-1] < len(poses)
+    ):
+        poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
+    return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
+
+
+def _bin_columns(files: list[Path], columns: Any, notes: Notes) -> Any:
+    """What :func:`read_columns` needs to know of files ``.bin``, by the content of several of them."""
+    if columns is not None and not isinstance(columns, int):
+        return columns
+    try:
+        layout = bin_layout([path for path in files if path.suffix.lower() == ".bin"], columns)
+    except ValueError as error:
+        msg = f"{notes.about}: {error}"
+        raise ValueError(msg) from error
+    if layout != KITTI:
+        names, kind = ", ".join(names_of(layout.width, None)), np.dtype(layout.dtype).name
+        notes.add(f"the .bin files have {layout.width} numbers a return, {kind}, taken as {names}")
+    return layout
+
+
+def _viewpoint_poses(files: list[Path], notes: Notes) -> NDArray[np.float64] | None:
+    """T_world_sensor (F, 4, 4) of the ``VIEWPOINT`` of PCD files, if it is where each scan was taken."""
+    if {path.suffix.lower() for path in files} != {".pcd"}:
+        return None
+    poses = np.full((len(files), 4, 4), np.nan)
+    for pose, path in zip(poses, files, strict=True):
+        with contextlib.suppress(ValueError):
+            pose[:] = read_viewpoint(path)
+    known = poses[np.isfinite(poses).all(axis=(1, 2))]
+    if not len(known) or (known == (np.eye(4) if len(files) == 1 else known[0])).all():
+        return None
+    notes.add("poses: VIEWPOINT of the PCD files")
+    return poses
+
+
+def _note_viewpoint(path: Path, notes: Notes) -> None:
+    """Notes that the ``VIEWPOINT`` of a scan is not applied where poses are given: it would place the scan twice."""
+    with contextlib.suppress(ValueError):
+        if path.suffix.lower() == ".pcd" and (read_viewpoint(path) != np.eye(4)).any():
+            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")
