@@ -81,7 +81,7 @@ def checked_report(report: Any) -> dict[str, Any]:
     try:
         checked: dict[str, Any] = _REPORT.validate_python(by_name(report, "the report"))
     except ValidationError as error:
-        raise ValueError(first_wrong(error, "report.")) from None
+        raise ValueError(f"report.{first_wrong(error)}") from None
     for name, value in checked.items():
         if (
             name.endswith("_s")
