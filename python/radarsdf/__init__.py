@@ -14,7 +14,7 @@ with open(f"{__file__}i", encoding="utf-8") as _stub:  # noqa: PTH123 - pathlib 
     ]  # from MODULE import NAME as NAME
 _MODULES = {words[3]: words[1] for words in _IMPORTS}
 
-__all__ = list(_MODULES)  # noqa: PLE0605
+__all__ = list(_MODULES)
 
 
 def __dir__() -> list[str]:

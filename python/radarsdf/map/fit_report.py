@@ -81,7 +81,8 @@ def checked_report(report: Any) -> dict[str, Any]:
     try:
         checked: dict[str, Any] = _REPORT.validate_python(by_name(report, "the report"))
     except ValidationError as error:
-        raise ValueError(f"report.{first_wrong(error)}") from None
+        msg = f"report.{first_wrong(error)}"
+        raise ValueError(msg) from None
     for name, value in checked.items():
         if (
             name.endswith("_s")
