@@ -91,5 +91,5 @@ def test_options_are_the_parameters_of_read(tmp_path):
     ]
     with pytest.raises(ValueError, match="world_frame"):
         Recording(tmp_path / "scans", poses, columns="power,x,y,z", world_frame="map").read()
-    with pytest.raises(ValueError, match="poses.tum"):
+    with pytest.raises(ValueError, match=r"poses\.tum"):
         Recording(tmp_path / "scans", poses, columns="power,x,y,z", extrinsic=poses).read()
