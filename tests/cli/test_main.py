@@ -12,8 +12,9 @@ import sys
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.cli import COMMANDS, main
+from radarsdf.cli import main
 from radarsdf.cli.app import message_of
+from radarsdf.cli.commands import COMMANDS
 from radarsdf.cli.results import Results
 
 from .calls import call, refusal

@@ -16,7 +16,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from radarsdf.cli import COMMANDS
+from radarsdf.cli.commands import COMMANDS
 
 app = typer.Typer(
     name="radarsdf",

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 from typer.core import TyperGroup
 
-from radarsdf.cli import COMMANDS
 from radarsdf.cli.app import app, command, refuse_if, warn
+from radarsdf.cli.commands import COMMANDS
 from radarsdf.cli.options import Recording, Settings, Surface
 from radarsdf.cli.results import Results
 from radarsdf.cli.scans import finding_poses, scans_or_unposed, warn_or_refuse
