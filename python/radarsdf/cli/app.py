@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import inspect
+import io
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -38,6 +39,16 @@ _SHARED_HELP = {
     "refine": "Refine the poses by the returns first.",
     "quiet": "Show no progress bar.",
 }
+_METAVARS = {
+    "box": "X0 Y0 Z0 X1 Y1 Z1",
+    "viewpoint": "X Y Z",
+    "pose": "P",
+    "heights": "LOW HIGH",
+    "set": "NAME=VALUE",
+    "field": "ROLE=NAME",
+    "topic": "NAME",
+    "tile": "NAME",
+}
 
 
 class UsageError(typer.TyperException):
@@ -59,9 +70,8 @@ def warn(text: str) -> None:
 
 def run(words: Sequence[str]) -> int:
     """Run the command of these words, print its error, and return the exit status."""
-    if hasattr(
-        sys.stdout, "reconfigure"
-    ):  # a character that a terminal lacks must not cost the work before it
+    # A character that a terminal lacks must not cost the work before it.
+    if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
     for module in _MODULES:
         import_module(f"radarsdf.cli.{module}")
@@ -128,14 +138,15 @@ def _texts(documented: Any) -> dict[str, str]:
 def _as_typer_has_it(parameter: inspect.Parameter, text: str, panel: str | None) -> inspect.Parameter:
     option = f"--{parameter.name.replace('_', '-')}"
     if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
-        metavar = parameter.name.removesuffix("_path").upper()
-        described: Any = typer.Argument(metavar=metavar, help=text, show_default=False)
+        name = parameter.name.removesuffix("_path").upper()
+        described: Any = typer.Argument(metavar=name, help=text, show_default=False)
     elif parameter.name == "out":
-        described = typer.Option(option, "-o", help=text)
+        described = typer.Option(option, "-o", metavar="PATH", help=text)
     elif "bool" in str(parameter.annotation) and parameter.default is not False:
         described = typer.Option(f"{option}/--no-{option[2:]}", help=text)
     else:
-        described = typer.Option(option, help=text, rich_help_panel=panel)
+        metavar = _METAVARS.get(parameter.name)
+        described = typer.Option(option, metavar=metavar, help=text, rich_help_panel=panel)
     annotation: Any = Annotated[parameter.annotation, described]
     return parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=annotation)
 

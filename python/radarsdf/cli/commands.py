@@ -42,5 +42,8 @@ def overview() -> str:
     ]
     for panel, commands in COMMANDS.items():
         lines += ["", f"{panel}:", *(f"  {name:<9}{text}" for name, text in commands.items())]
-    lines += ["", "radarsdf COMMAND --help lists the options of a command; --version, --install-completion."]
+    lines += [
+        "",
+        "radarsdf COMMAND --help lists the options of a command. Others: --version, --install-completion.",
+    ]
     return "\n".join(lines)

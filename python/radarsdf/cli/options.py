@@ -41,7 +41,7 @@ class Recording:
     imu_topic: In a bag: the topic of the inertial measurements, for poses that are found.
     imu_rotation: File of the 3 x 3 matrix from the axes of the IMU to those of the radar, R_sensor_imu; default: of the
         bag, or found.
-    field: ROLE=NAME, the field of the file for x, y, z, intensity or doppler, such as intensity=Power; may be repeated.
+    field: The field of the file for x, y, z, intensity or doppler, such as intensity=Power; may be repeated.
     columns: Of files without names: how many numbers a return has, or their names, such as x,y,z,intensity,doppler.
     max_gap: Longest time between two poses over which poses are interpolated, s; default: 0.5.
     world_frame: In a bag with TF: the frame of the world.
@@ -126,7 +126,7 @@ class Settings:
     quick: Average distances instead of training the surface: less accurate, but done in under a second; mesh the map with
         --voxel 0.2.
     config: Change the settings that this TOML file has; radarsdf config prints all of them.
-    set: NAME=VALUE, changes one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated.
+    set: Change one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated.
     """
 
     panel: ClassVar[str] = "Settings of the fit"
