@@ -19,7 +19,7 @@ import typer
 from radarsdf.cli.app import command, refuse_if, warn
 from radarsdf.cli.options import MAP_SUFFIX, Address, Recording, Settings, Surface, words_of
 from radarsdf.cli.pages import add_report, show
-from radarsdf.cli.results import Results, add_intensity_errors, counted, save_map, until_stopped
+from radarsdf.cli.results import Results, add_intensity_errors, counted, save_map, split, until_stopped
 from radarsdf.cli.scans import scans_and_poses, scans_or_unposed, warn_or_refuse
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def fit(
         when the map is written.
     report: Also write a page about the map, .html: pictures, errors, plots, settings.
     """
-    from radarsdf import check, estimate, evaluation, fit
+    from radarsdf import check, estimate, fit
     from radarsdf.io.files import check_outputs
     from radarsdf.report.extras import require_extras
     from radarsdf.report.subject import Subject
@@ -82,10 +82,7 @@ def fit(
     check_outputs([out, checkpoint, report], recording.inputs)
     every_scan, posed = scans_and_poses(recording, config, results, refine=refine)
     config = posed.config(config)
-    scans, held_out = every_scan, None
-    if holdout is not None:
-        train, test = evaluation.holdout(len(every_scan.points), holdout)
-        scans, held_out = every_scan.select(train), every_scan.select(test)
+    scans, held_out = split(every_scan, holdout)
     intensities = None if geometry_only else scans.intensities
     if out is None:
         expected = estimate(scans.points, scans.poses, intensities, config=config)

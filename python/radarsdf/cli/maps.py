@@ -12,7 +12,7 @@ import typer
 
 from radarsdf.cli.app import command, refuse_if
 from radarsdf.cli.options import MAP_SUFFIX, Address, Box, Recording, Surface, corners_of
-from radarsdf.cli.results import Results, add_intensity_errors, counted, load_map, until_stopped
+from radarsdf.cli.results import Results, add_intensity_errors, counted, load_map, split, until_stopped
 from radarsdf.cli.scans import add_mesh
 
 if TYPE_CHECKING:
@@ -173,9 +173,10 @@ def _eval(
             found = radar_map.mesh(surface.voxel, **surface.limits, progress=False if quiet else None)
         metrics = evaluation.surface_metrics(found, ground_truth, box=corners_of(box), samples=samples)
         results.add(evaluation.format_metrics(metrics), surface=metrics)
-    if holdout is not None and radar_map is not None and scans is not None:
-        train, test = evaluation.holdout(len(scans), holdout)
-        add_intensity_errors(results, radar_map, scans.select(test), scans.select(train))
+    if radar_map is not None and scans is not None:
+        known, held_out = split(scans, holdout)
+        if held_out is not None:
+            add_intensity_errors(results, radar_map, held_out, known)
 
 
 def _holds_scans(path: Path) -> bool:

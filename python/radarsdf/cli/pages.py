@@ -13,7 +13,7 @@ import typer
 
 from radarsdf.cli.app import command, refuse_if
 from radarsdf.cli.options import Address, Box, MaybeRecording, Surface, corners_of
-from radarsdf.cli.results import Results, load_map, until_stopped
+from radarsdf.cli.results import Results, load_map, split, until_stopped
 
 if TYPE_CHECKING:
     from radarsdf.io.scans import Scans
@@ -97,7 +97,7 @@ def report(
     )
     require_extras()
 
-    from radarsdf import check, evaluation
+    from radarsdf import check
     from radarsdf.io.files import check_outputs
     from radarsdf.report.subject import Subject
 
@@ -105,11 +105,9 @@ def report(
     radar_map = load_map(map_path)
     scans = findings = held_out = None
     if recording.scans:
-        scans = recording.read()
-        findings = check(scans, config=radar_map.config)
-        if holdout is not None:
-            train, test = evaluation.holdout(len(scans.points), holdout)
-            scans, held_out = scans.select(train), scans.select(test)
+        every_scan = recording.read()
+        findings = check(every_scan, config=radar_map.config)
+        scans, held_out = split(every_scan, holdout)
     subject = Subject(
         radar_map,
         map_path.absolute().name,

@@ -124,6 +124,16 @@ def until_stopped(page: Page) -> None:
         typer.echo("stopped")
 
 
+def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:
+    """The scans of a fit, and those that ``--holdout`` leaves out."""
+    from radarsdf.evaluation import holdout
+
+    if every is None:
+        return scans, None
+    train, test = holdout(len(scans.points), every)
+    return scans.select(train), scans.select(test)
+
+
 def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: Scans) -> None:
     """Add the intensity errors on scans that a fit left out, and those of a kNN baseline on the scans that it used."""
     from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
