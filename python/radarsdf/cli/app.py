@@ -100,7 +100,8 @@ def command(group: typer.Typer = app, **settings: Any) -> Callable[[_Command], _
         parameters: list[inspect.Parameter] = []
         texts, name = _SHARED_HELP | _texts(function), function.__name__.strip("_")
         for parameter in inspect.signature(function, eval_str=True).parameters.values():
-            kind, fields, panel = parameter.annotation, [parameter], None
+            kind: Any = parameter.annotation
+            fields, panel = [parameter], None
             if dataclasses.is_dataclass(kind):
                 fields = list(inspect.signature(kind, eval_str=True).parameters.values())
                 groups[parameter.name] = (kind, [field.name for field in fields])

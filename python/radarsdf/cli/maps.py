@@ -6,9 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
+from typer.core import TyperCommand
 
 from radarsdf.cli.app import command, refuse_if
 from radarsdf.cli.options import MAP_SUFFIX, Address, Box, Recording, Surface, corners_of
@@ -187,10 +188,10 @@ def _holds_scans(path: Path) -> bool:
     return path.is_dir() or is_bag(path) or (path.suffix.lower() == ".npz" and holds_scans(path))
 
 
-class _SeveralNumbers(typer.core.TyperCommand):
+class _SeveralNumbers(TyperCommand):
     """Takes ``--pose 5 0 1.5`` for ``--pose "5 0 1.5"``: an option of click has a fixed number of words."""
 
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         joined: list[str] = []
         words = iter(args)
         in_pose = False

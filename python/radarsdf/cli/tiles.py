@@ -31,7 +31,7 @@ _FIRST_SCANS = 100  # that are checked before the work
 class _Steps(TyperGroup):
     """Runs the step ``run`` where the first word is the name of no step."""
 
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in (*self.commands, "--help", "-h"):
             args = ["run", *args]
         return super().parse_args(ctx, args)
