@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import inspect
 import io
@@ -102,7 +101,7 @@ def command(group: typer.Typer = app, **settings: Any) -> Callable[[_Command], _
         for parameter in inspect.signature(function, eval_str=True).parameters.values():
             kind: Any = parameter.annotation
             fields, panel = [parameter], None
-            if dataclasses.is_dataclass(kind):
+            if hasattr(kind, "__dataclass_fields__"):
                 fields = list(inspect.signature(kind, eval_str=True).parameters.values())
                 groups[parameter.name] = (kind, [field.name for field in fields])
                 texts, panel = _texts(kind) | texts, getattr(kind, "panel", None)
