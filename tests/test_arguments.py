@@ -7,10 +7,8 @@ The same examples on every run; `python -m bench.stress arguments --count 5000` 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,11 +18,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from radarsdf import FitConfig
-from radarsdf.evaluation import KNNIntensity, holdout, intensity_metrics, surface_metrics
 from radarsdf.io.npz import read_scans
 from radarsdf.map.marching_cubes import marching_cubes
 from radarsdf.returns.rays import prepare
-from radarsdf.simulate import SCENES, RadarSensor, simulate
 
 from bench.stress import samples
 
@@ -144,32 +140,6 @@ def test_prepare(sizes, ranges, frames, origin, odd, data):
         assert rays.intensities.min() < rays.intensities.max()
 
 
-GROUPS = {
-    field.name: [own.name for own in dataclasses.fields(group)]
-    for field in dataclasses.fields(FitConfig)
-    if dataclasses.is_dataclass(group := getattr(FitConfig(), field.name))
-}
-
-
-@examples(300)
-@given(
-    st.sampled_from(
-        [(field.name, None) for field in dataclasses.fields(FitConfig)]
-        + [(group, name) for group, names in GROUPS.items() for name in names]
-    ),
-    THINGS | st.lists(THINGS, max_size=3).map(tuple),
-)
-def test_config(names, value):
-    group, name = names
-    try:
-        config = FitConfig(**{group: value if name is None else {name: value}})
-    except ValueError:
-        return
-    assert FitConfig.from_dict(config.to_dict()) == config
-    if isinstance(value, float):
-        assert np.isfinite(value)
-
-
 @examples(60)
 @given(
     volume=hnp.array_shapes(min_dims=3, max_dims=3, min_side=0, max_side=5).flatmap(lambda s: arrays(*s)),
@@ -194,99 +164,6 @@ def test_marching_cubes(volume, level, spacing, origin, mask, num_threads, odd):
     assert vertices.shape[1:] == faces.shape[1:] == (3,)
     assert np.isfinite(vertices).all()
     assert np.unique(faces).tolist() == list(range(len(vertices)))
-
-
-@examples(60)
-@given(
-    vertices=arrays(4, 3),
-    faces=mostly(
-        st.just([[0, 1, 2], [0, 2, 3]]),
-        st.sampled_from([[[0, 1, 9]], [[0, -1, 2]], [[0, 0, 0]], []]) | arrays(2, 3),
-    ),
-    truth=arrays(5, 3),
-    keywords=st.fixed_dictionaries(
-        {},
-        optional={
-            "box": mostly(st.just([[-8, -8, -8], [8, 8, 8]]), arrays(2, 3)),
-            "threshold_m": mostly(st.floats(0, 9), THINGS),
-            "outlier_m": mostly(st.floats(0, 9), THINGS),
-            "truncation_m": mostly(st.floats(0, 9), THINGS),
-            "seed": st.integers(-1, 30),
-        },
-    ),
-    count=mostly(st.integers(1, 50), st.sampled_from([None, 2.5, "9", np.int32(7), True, 0, -1])),
-)
-def test_surface_metrics(vertices, faces, truth, keywords, count):
-    mesh = SimpleNamespace(vertices=vertices, faces=faces)
-    metrics = answer(surface_metrics, mesh, truth, samples=count, **keywords)
-    if metrics is None:
-        return
-    for name in (
-        "accuracy_ratio",
-        "outlier_ratio",
-        "completion_ratio",
-        "f_score",
-        "precision",
-        "f_score_all",
-    ):
-        assert 0 <= metrics[name] <= 1
-    # A mean of equal numbers may be rounded up.
-    assert 0 <= metrics["completion_error_m"] <= metrics["truncation_m"] * (1 + 1e-12)
-    assert 0 < metrics["num_mesh_samples"] <= count
-
-
-@examples(100)
-@given(arrays(4), arrays(4))
-def test_intensity_metrics(predicted, measured):
-    metrics = answer(intensity_metrics, predicted, measured)
-    if metrics is not None:
-        assert 0 <= metrics["mae"] < np.inf
-        assert 0 <= metrics["medae"] < np.inf
-        assert metrics["num_returns"] == len(predicted)
-
-
-@examples(100)
-@given(
-    points=arrays(6, 3),
-    sensors=arrays(3) | arrays(6, 3),
-    intensities=arrays(6),
-    queries=arrays(2, 3),
-    keywords=st.fixed_dictionaries(
-        {},
-        optional={"k": THINGS, "candidates": THINGS, "distance_scale_m": THINGS, "angle_scale_rad": THINGS},
-    ),
-)
-def test_nearest_neighbours(points, sensors, intensities, queries, keywords):
-    baseline = answer(KNNIntensity, points, sensors, intensities, **keywords)
-    if baseline is None:
-        return
-    predicted = answer(baseline.predict, queries, np.array([50.0, 60, 70]))
-    if predicted is None:
-        return
-    assert predicted.shape == (len(queries),)
-    values = np.asarray(intensities, np.float64)
-    tolerance = 1e-9 * np.abs(values).max()
-    assert ((predicted >= values.min() - tolerance) & (predicted <= values.max() + tolerance)).all()
-
-
-@examples(100)
-@given(
-    NUMBERS
-    | arrays(5)
-    | mostly(st.lists(st.integers(-5, 99), max_size=6), st.lists(st.integers(-5, 2**64), max_size=6)),
-    mostly(st.integers(-1, 5), THINGS),
-)
-def test_holdout(frames, every):
-    split = answer(holdout, frames, every)
-    if split is None:
-        return
-    train, test = split
-    assert train.dtype == test.dtype == np.int64
-    assert len(train) > 0
-    assert len(test) > 0
-    assert not np.isin(train, test).any()
-    numbers = np.arange(frames) if isinstance(frames, int) else np.unique(frames)
-    np.testing.assert_array_equal(np.sort(np.concatenate([train, test])), numbers)
 
 
 @pytest.fixture(scope="module")
@@ -344,37 +221,6 @@ def test_meshes_of_a_map(tiny_map, voxel_size, box, viewpoint):
         assert np.isfinite(mesh.vertices).all()
 
 
-@examples(40)
-@given(
-    field=st.sampled_from(dataclasses.fields(RadarSensor)),
-    value=THINGS,
-    poses=arrays(1, 4, 4),
-    odd=st.booleans(),
-)
-def test_simulation(field, value, poses, odd):
-    sensor = answer(RadarSensor, **({"beams": 20} | {field.name: value}))
-    if sensor is None or sensor.clutter_per_scan > 1e4:
-        return
-    wall = made_wall()
-    poses = poses if odd else wall.poses
-    simulation = answer(simulate, wall.scene, sensor, poses, name="odd", lidar_rays=5)
-    if simulation is not None:
-        assert len(simulation) == len(poses)
-        for points, values in zip(simulation.points, simulation.intensities, strict=True):
-            assert points.shape == (*values.shape, 3)
-            assert np.isfinite(points).all()
-            assert np.isfinite(values).all()
-
-
-WALL = []
-
-
-def made_wall():
-    if not WALL:
-        WALL.append(SCENES["wall"](frames=2))
-    return WALL[0]
-
-
 @examples(60)
 @given(
     st.one_of(
@@ -387,3 +233,38 @@ def test_paths(path):
             continue
         with pytest.raises((ValueError, TypeError, OSError)):
             read(path)
+
+
+TINY = FitConfig(
+    num_threads=1,
+    max_memory_bytes=10**9,
+    returns={"min_range_m": 0.0},
+    encoding={"num_levels": 2, "fourier_count": 2},
+    networks={"sdf_hidden": (4,), "intensity_hidden": (4,)},
+    training={"sdf_iterations": 1, "intensity_iterations": 1, "batch_size": 16, "intensity_batch_size": 16},
+)
+
+
+@examples(60)
+@given(
+    sizes=st.lists(st.integers(1, 4), min_size=1, max_size=3),
+    poses=mostly(st.none(), arrays(2, 4, 4)),
+    far=mostly(st.just(0.0), FLOATS),
+    data=st.data(),
+)
+def test_fit_and_estimate(sizes, poses, far, data):
+    points = [data.draw(arrays(size, 3)) for size in sizes]
+    intensities = data.draw(st.sampled_from([None, [data.draw(arrays(size)) for size in sizes]]))
+    if poses is None:
+        poses = [pose(far * i) for i in range(len(sizes))]
+    radar_map = answer(radarsdf.fit, points, poses, intensities, config=TINY, progress=False)
+    estimate = answer(radarsdf.estimate, points, poses, intensities, config=TINY)
+    if radar_map is None:
+        return
+    assert estimate is not None
+    assert radar_map.report["returns_used"] <= estimate.returns
+    assert 0 < estimate.peak_memory_bytes <= 10**9
+    assert 0 < estimate.seconds < 60
+    centres = (radar_map.field.cells.table.leaf_cells() + 0.5) * TINY.leaf_size_m + radar_map.origin
+    for values in (radar_map.sdf(centres), radar_map.gradient(centres), radar_map.confidence(centres)):
+        assert np.isfinite(values).all()

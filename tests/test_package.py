@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -14,6 +15,16 @@ from pathlib import Path
 import pytest
 import radarsdf
 from radarsdf import _core
+from radarsdf.extras import REQUIREMENTS, require
+
+if sys.version_info < (3, 11):
+    import tomli as tomllib
+else:
+    import tomllib
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+CONDA_NAMES = {"torch": "pytorch-cpu", "matplotlib": "matplotlib-base"}
 
 
 def run(code):
@@ -25,13 +36,13 @@ def test_importing_the_package_imports_nothing_else():
     run(
         "import sys; before = set(sys.modules); import radarsdf; dir(radarsdf);"
         "new = {name.partition('.')[0] for name in set(sys.modules) - before};"
-        "assert new - sys.stdlib_module_names == {'lazy_loader', 'radarsdf'}, new"
+        "assert new - sys.stdlib_module_names == {'radarsdf'}, new"
     )
 
 
 def test_the_names_are_those_of_the_reference():
     """A name that goes, or one that comes without a word in the reference, is seen here."""
-    pages = (Path(__file__).parents[1] / "docs/api").glob("*.md")
+    pages = (ROOT / "docs/api").glob("*.md")
     named = set()
     for page in pages:
         module = ""
@@ -59,39 +70,41 @@ def test_functions_are_not_hidden_by_packages_of_similar_names():
         assert inspect.ismodule(import_module(f"radarsdf.{name}"))
 
 
-def test_all_names_are_listed():
-    assert set(radarsdf.__all__) <= set(dir(radarsdf))
-
-
-def test_star_import():
-    names = {}
-    exec("from radarsdf import *", names)  # noqa: S102
-    assert set(radarsdf.__all__) <= set(names)
-
-
 def test_an_unknown_name():
-    with pytest.raises(AttributeError, match="radarsdf attribute fitt"):
+    with pytest.raises(AttributeError, match="fitt"):
         radarsdf.fitt  # noqa: B018
     assert not hasattr(radarsdf, "_nothing")
 
 
 def test_the_version_is_written_once():
-    root = Path(__file__).parents[1]
-    written = re.search(
-        r'^version = "(.+)"$', (root / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE
-    )
-    assert radarsdf.__version__ == _core.__version__ == written[1]
-    # The one copy, for those who cite.
-    assert f"\nversion: {written[1]}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
+    assert radarsdf.__version__ == _core.__version__ == PROJECT["version"]
+    # The copies, for those who cite, and for conda.
+    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    recipe = (ROOT / "conda/recipe.yaml").read_text(encoding="utf-8")
+    assert re.findall(r'version: "(.+)"', recipe) == [PROJECT["version"]]
 
 
-def test_the_version_of_sources_that_are_not_installed_is_that_of_the_core():
-    run(
-        "import importlib.metadata as m\n"
-        "def missing(name): raise m.PackageNotFoundError(name)\n"
-        "m.version = missing\n"
-        "import radarsdf; assert radarsdf.__version__ == radarsdf.versions.versions()['radarsdf']"
-    )
+def test_conda_asks_for_what_pip_asks_for():
+    recipe = (ROOT / "conda/recipe.yaml").read_text(encoding="utf-8")
+    asked = re.search(r"  run:\n((?:    - .+\n)+)", recipe)[1]
+    found = {tuple(line[6:].partition("#")[0].split()) for line in asked.splitlines()}
+    extras = PROJECT["optional-dependencies"]
+    wanted = {("python", PROJECT["requires-python"])}
+    for requirement in [*PROJECT["dependencies"], *extras["plot"], *extras["view"]]:
+        name, limit = re.fullmatch(r"([\w-]+)(>=[\w.]+)(?:;.*)?", requirement.replace(" ", "")).groups()
+        wanted.add((CONDA_NAMES.get(name, name), limit))
+    assert found == wanted
+
+
+def test_what_is_missing_is_named_with_a_command(monkeypatch):
+    extras = PROJECT["optional-dependencies"]
+    wanted = {one for name in ("cluster", "las", "plot", "ros", "view") for one in extras[name]}
+    assert set(REQUIREMENTS.values()) == wanted
+    for name in ("viser", "laspy"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=re.escape('viser and laspy: pip install "viser>=1.1" "laspy[')):
+        require("json", "viser", "laspy", what="it takes")
+    assert require("json", what="it takes").loads("1") == 1
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -103,3 +116,15 @@ def test_the_core_shares_the_openmp_runtime_of_pytorch():
         "libraries = {line.split()[-1] for line in lines if any(x in line for x in ('gomp', 'iomp', 'libomp'))};"
         "assert len(libraries) == 1, libraries"
     )
+
+
+def test_an_unknown_instruction_set_is_a_warning():
+    done = subprocess.run(
+        [sys.executable, "-c", "import radarsdf.threads, radarsdf.evaluation"],
+        env=os.environ | {"RADARSDF_ISA": "nonsense"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert done.stderr.count("RADARSDF_ISA=nonsense is none of baseline") == 1

@@ -4,32 +4,17 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from radarsdf.budget import durations
-from radarsdf.budget.estimate import available_bytes
-from radarsdf.io.files import check_outputs, write_whole
+from radarsdf.io.files import write_whole
 
 # Modules and functions of Python that only POSIX has.
 MODULES = ("fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios")
 FUNCTIONS = ("fork", "register_at_fork", "sched_getaffinity", "getuid", "statvfs")
 SIGNALS = ("SIGKILL", "SIGHUP", "SIGALRM", "setitimer", "pthread_sigmask")
-
-
-def test_processors_are_counted_without_affinity(monkeypatch):
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    assert durations.processors() == 3
-    monkeypatch.setattr(os, "cpu_count", lambda: None)
-    assert durations.processors() == 1
-
-
-def test_without_proc_there_is_no_limit_of_memory(tmp_path):
-    assert available_bytes(tmp_path) is None
 
 
 def test_every_module_is_imported_and_a_fit_works_without_what_only_posix_has():
@@ -70,11 +55,3 @@ def test_a_file_that_another_program_has_open_stays(tmp_path, monkeypatch):
         write_whole(path, b"new")
     assert path.read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["map.safetensors"]
-
-
-def test_names_as_other_systems_have_them(tmp_path):
-    """Spaces, and letters that are no ASCII."""
-    path = tmp_path / "Straße nach Åre (2).safetensors"
-    check_outputs([path])
-    write_whole(path, b"new")
-    assert [file.name for file in tmp_path.iterdir()] == [path.name]

@@ -7,11 +7,8 @@ from __future__ import annotations
 import ast
 import functools
 import graphlib
-import subprocess
-import sys
 from pathlib import Path
 
-import pytest
 import radarsdf
 
 ROOT = Path(radarsdf.__file__).parent
@@ -119,31 +116,3 @@ def test_imports_go_downwards():
 
 def test_there_are_no_circles():
     graphlib.TopologicalSorter(graph()).prepare()  # a CycleError names the circle
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="forks")
-def test_pytorch_is_imported_before_the_core():
-    code = """
-import importlib, os, sys
-
-class Finder:
-    def find_spec(name, path=None, target=None):
-        if name in ("torch", "radarsdf._core"):
-            os._exit(name != "torch")
-
-# What most of them need, before the forks, or each would import it again.
-import numpy, pydantic, safetensors, scipy.sparse.csgraph, scipy.spatial, tqdm, trimesh
-sys.meta_path.insert(0, Finder)
-for name in sys.argv[1:]:
-    if (child := os.fork()) == 0:
-        importlib.import_module(f"radarsdf.{name}")
-        os._exit(17)
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    if status == 17:  # it imports neither, and the next ones need not import it again
-        importlib.import_module(f"radarsdf.{name}")
-    elif status != 0:
-        print(name)
-"""
-    names = sorted((name for name, _ in modules()), key=lambda name: LEVEL[name.split(".")[0]])
-    done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []

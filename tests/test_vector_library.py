@@ -6,12 +6,11 @@ from __future__ import annotations
 
 import ast
 import subprocess
+import sys
 from pathlib import Path
 
 import radarsdf
 from radarsdf import threads
-
-from .warm_python import warm_python
 
 ROOT = Path(radarsdf.__file__).parent
 # What of PyTorch's has vectors, and in the last bits depends on who computes it. Not sqrt and norm, which IEEE 754 defines.
@@ -37,11 +36,6 @@ def test_all_that_are_used_are_called_first_by_one_thread():
     used = {name for room in ("field", "fitting", "map") for name in called(room)} & TRANSCENDENTAL
     assert "log10" in used
     assert used <= started
-
-
-def run(code):
-    """In a process that has imported PyTorch, and called nothing of it."""
-    subprocess.run([*warm_python(), "-c", code], check=True)
 
 
 RECORDED = """
@@ -70,41 +64,11 @@ everything = {(name, dtype, True) for name in names for dtype in (torch.float32,
 
 
 def test_before_the_first_work_and_only_once():
-    run(
-        RECORDED
-        + """
+    work = """
 assert not calls
 for _ in range(2):
     with threads.Workers(2) as workers:
         assert all(workers.map(lambda _: set(calls) == everything, range(8)))
 assert len(calls) == len(everything)
 """
-    )
-
-
-def test_before_a_query_that_needs_no_workers(tmp_path, scene):
-    radarsdf.fit(scene.points, scene.poses, config=radarsdf.FitConfig.quick(), progress=False).save(
-        tmp_path / "map.safetensors"
-    )
-    run(
-        RECORDED
-        + f"""
-import radarsdf
-radar_map = radarsdf.load({str(tmp_path / "map.safetensors")!r})
-assert not calls
-radar_map.sdf([[1.0, 2.0, 3.0]])
-assert everything <= set(calls)
-"""
-    )
-
-
-def test_whatever_the_default_device():
-    run(
-        """
-import torch
-from radarsdf.threads import Workers
-torch.set_default_device("meta")
-with torch.inference_mode(), Workers(2):
-    pass
-"""
-    )
+    subprocess.run([sys.executable, "-c", RECORDED + work], check=True)

@@ -1,21 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What is no argument at all is refused in one sentence of the package that names the argument."""
+"""What is no argument at all is refused by an error that names the argument."""
 
 from __future__ import annotations
-
-import traceback
-from pathlib import Path
 
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, io, simulate
-from radarsdf.evaluation import adjacent_angles, holdout, surface_metrics
+from radarsdf.evaluation import (
+    adjacent_angles,
+    gamma_from_moments,
+    holdout,
+    intensity_metrics,
+    surface_metrics,
+)
 
 from bench.stress import samples
 
-PACKAGE = Path(radarsdf.__file__).parent
 NO_PATH = (None, b"a", 2.5)
 NO_ARRAY = ("a", {}, [[1], [2, 3]], np.array([1, {}], object), 1j)
 NO_ITERABLE = (np.nan, 3, np.array(1.0))
@@ -35,15 +37,10 @@ def a_map(tmp_path_factory):
 
 
 def refused(name, function, values, /, *given, **others):
-    """Each of the `values` of the argument is refused by a line of the package that says the name."""
+    """Each of the `values` of the argument is refused by an error that has its name."""
     for value in values:
-        with pytest.raises((TypeError, ValueError)) as caught:
+        with pytest.raises((TypeError, ValueError), match=name.removesuffix("s")):
             function(*given, **others | {name: value})
-        where = traceback.extract_tb(caught.value.__traceback__)[-1]
-        assert Path(where.filename).is_relative_to(PACKAGE), (value, caught.value)
-        assert where.line.startswith("raise"), (value, caught.value)
-        assert name.removesuffix("s") in str(caught.value), (value, caught.value)
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("function", [radarsdf.fit, radarsdf.estimate, radarsdf.check])
@@ -107,3 +104,35 @@ def test_simulation(wall):
     refused("sensor", simulate.simulate, ("a", None), **given)
     refused("poses", simulate.simulate, (None, *NO_ARRAY), **given)
     refused("lidar_rays", simulate.simulate, ("a", -1, 2.5), **given)
+
+
+@pytest.mark.parametrize(
+    "take", [gamma_from_moments, lambda values: intensity_metrics(values, [1.0, 2.0, 3.0])]
+)
+def test_arrays_of_other_types_or_with_masked_values(take):
+    for wrong in ([1 + 2j, 2, 3], ["1", "2", "3"], np.array(["2026-01-01"] * 3, "datetime64[D]")):
+        with pytest.raises(TypeError, match="real numbers"):
+            take(np.array(wrong))
+    with pytest.raises(ValueError, match="masked"):
+        take(np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False]))
+
+
+def test_masked_integers_masks_and_returns(scene):
+    volume = np.zeros((2, 2, 2))
+    masked = np.ma.array(volume == 0, mask=volume == 0)
+    scan = np.ma.array(scene.points[0], mask=scene.points[0] > 5)
+    for call in (
+        lambda: holdout(np.ma.array([1, 2, 3], mask=[0, 1, 0])),
+        lambda: radarsdf.marching_cubes(np.ma.array(volume, mask=masked)),
+        lambda: radarsdf.marching_cubes(volume, mask=masked),
+        lambda: radarsdf.fit([scan], scene.poses[:1]),
+    ):
+        with pytest.raises(ValueError, match="masked"):
+            call()
+
+
+def test_generators_of_scans_are_counted(scene):
+    config = FitConfig.quick(training={"intensity_iterations": 1})
+    points, intensities = iter(scene.points), iter(scene.intensities)
+    radar_map = radarsdf.fit(points, scene.poses, intensities, config=config, progress=False)
+    assert radar_map.report["returns"] == sum(map(len, scene.points))

@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
     else:
         environment = os.environ | {"RADARSDF_EXAMPLES": str(words.count)}
         folder = Path(__file__).parents[2] / "tests"
-        tests = [folder / "test_arguments.py", folder / "test_arguments_of_fits.py"]
+        tests = [folder / "test_arguments.py"]
         sys.exit(
             subprocess.run(
                 [sys.executable, "-m", "pytest", "-q", *tests], env=environment, check=False

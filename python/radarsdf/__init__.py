@@ -2,26 +2,39 @@
 # SPDX-License-Identifier: MIT
 """From 3D radar scans with known poses to a surface and a reflectance map, on a CPU.
 
-Each public name is imported from its module when it is first used, so ``import radarsdf`` alone is fast: it imports
-neither PyTorch nor NumPy. The names are in ``__init__.pyi``.
+The public names are in ``__init__.pyi``. Each is imported when it is first used, so that ``import radarsdf`` alone imports
+neither PyTorch nor NumPy.
 """
 
-import lazy_loader
+from importlib import import_module
 
-_public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+with open(f"{__file__}i", encoding="utf-8") as _stub:  # noqa: PTH123 - pathlib takes as long to import as all of this
+    _IMPORTS = [
+        line.split() for line in _stub if line.startswith("from .")
+    ]  # from MODULE import NAME as NAME
+_MODULES = {words[3]: words[1] for words in _IMPORTS}
+
+__all__ = list(_MODULES)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
 
 
 def __getattr__(name: str) -> object:
-    """Import a name when it is first used."""
-    if name != "__version__":
-        return _public(name)
-    from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - takes as long as the package
+    if name == "__version__":
+        from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - takes as long as the package
 
-    try:
-        found = version("radarsdf")
-    except PackageNotFoundError:  # the sources on PYTHONPATH, not installed
-        from radarsdf.versions import versions  # noqa: PLC0415 - it imports the core
-
-        found = versions()["radarsdf"]
+        try:
+            found: object = version("radarsdf")
+        except PackageNotFoundError:  # the sources on PYTHONPATH, not installed
+            found = import_module("radarsdf._core").__version__
+    elif (module := _MODULES.get(name)) is None:
+        msg = f"module {__name__!r} has no attribute {name!r}"
+        raise AttributeError(msg)
+    elif module == ".":
+        return import_module(f".{name}", __name__)
+    else:
+        found = getattr(import_module(module, __name__), name)
     globals()[name] = found  # the next use does not come here
     return found

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-# The public names and where they are, for lazy_loader and for type checkers.
+# The public names and where they are, for `__init__.py`, which reads the lines as they are, and for type checkers.
 
 from . import evaluation as evaluation
 from . import io as io

@@ -26,16 +26,16 @@ _MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; sc
 _RIGID = f"rotation, translation within {MAX_POSITION_M:g} m, last row 0 0 0 1"
 
 
+def _require(holds: object, message: str) -> None:
+    if not holds:
+        raise ValueError(message)
+
+
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
     """`values` as an array of `dtype`, of any shape. It is not copied if it is one already.
 
-    Raises
-    ------
-    TypeError
-        If `values` are not real numbers, or rows have different lengths. NumPy would drop the imaginary part of
-        complex numbers, and parse text.
-    ValueError
-        If a value is masked, or an integer is too large for float64.
+    A TypeError is raised for what NumPy would take for real numbers: complex numbers, text, rows of different lengths, and a
+    ValueError for masked values and integers that are too large for float64.
     """
     refuse_masked(values, name)
     try:
@@ -45,11 +45,8 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
     except OverflowError as error:
         msg = f"{name}: {error}"
         raise ValueError(msg) from error
-    except RuntimeError as error:  # a tensor that requires a gradient
-        msg = f"{name}: {error}"
-        raise TypeError(msg) from error
-    except (TypeError, ValueError) as error:
-        msg = f"{name} must be real numbers, and all rows equally long"
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor that requires a gradient
+        msg = f"{name} must be real numbers, and all rows equally long: {error}"
         raise TypeError(msg) from error
     if array.dtype.kind not in "biuf":
         msg = f"{name} must be real numbers, not {array.dtype}"
@@ -61,49 +58,43 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
 def refuse_masked(values: Any, name: str) -> None:
     """Raises a ValueError where values are masked: NumPy would take what is under the mask for a value."""
     parts = values if isinstance(values, (list, tuple)) else [values]
-    if any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts):
-        msg = f"{name} has masked values: leave them out"
-        raise ValueError(msg)
+    masked = any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts)
+    _require(not masked, f"{name} has masked values: leave them out")
 
 
 def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """`values` as (N, 3) finite positions, m, in C order."""
     points: NDArray[np.float64] = np.ascontiguousarray(real_array(values, name))
-    if points.ndim != 2 or points.shape[1] != 3:
-        msg = f"{name} must be (N, 3), not {points.shape}"
-        raise ValueError(msg)
-    if not (np.abs(points) <= MAX_POSITION_M).all():
-        msg = f"{name} must be finite, and within {MAX_POSITION_M:g} m"
-        raise ValueError(msg)
+    _require(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
+    _require_positions(points, name)
     return points
 
 
 def check_box(box: ArrayLike) -> NDArray[np.float64]:
     """Lower and upper corner (2, 3), world, m. Raises a ValueError if they are none."""
     corners = real_array(box, "box")
-    if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
-        msg = "box must be a lower and an upper corner, (2, 3), the lower corner first"
-        raise ValueError(msg)
-    if not (np.abs(corners) <= MAX_POSITION_M).all():
-        msg = f"box must be finite, and within {MAX_POSITION_M:g} m"
-        raise ValueError(msg)
+    ordered = corners.shape == (2, 3) and (corners[0] < corners[1]).all()
+    _require(ordered, "box must be a lower and an upper corner, (2, 3), the lower corner first")
+    _require_positions(corners, "box")
     return corners
+
+
+def _require_positions(values: NDArray[np.float64], name: str) -> None:
+    within = (np.abs(values) <= MAX_POSITION_M).all()
+    _require(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
 
 
 def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
     """Raises a ValueError unless there are scans, each an array (N, 3)."""
-    if not scans:
-        msg = "points holds no scans"
-        raise ValueError(msg)
+    _require(scans, "points holds no scans")
     for i, scan in enumerate(scans):
         check_scan_shape(scan, i)
 
 
 def check_scan_shape(scan: NDArray[Any], number: int) -> None:
     """Raises a ValueError unless scan `number` is an array (N, 3)."""
-    if scan.ndim != 2 or scan.shape[1] != 3:
-        msg = f"scan {number} must have shape (N, 3), not {scan.shape}"
-        raise ValueError(msg)
+    fits = scan.ndim == 2 and scan.shape[1] == 3
+    _require(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
 
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
@@ -115,16 +106,13 @@ def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArra
 
 def check_equal_numbers(num_values: int, num_scans: int, name: str) -> None:
     """Raises a ValueError unless there are as many arrays of values as scans."""
-    if num_values != num_scans:
-        msg = f"{name} holds {num_values} scans, points {num_scans}"
-        raise ValueError(msg)
+    _require(num_values == num_scans, f"{name} holds {num_values} scans, points {num_scans}")
 
 
 def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, number: int) -> None:
     """Raises a ValueError unless the values are an array (N,) for scan `number`, (N, 3)."""
-    if value.shape != (len(scan),):
-        msg = f"{name} of scan {number} must have shape ({len(scan)},), not {value.shape}"
-        raise ValueError(msg)
+    fits = value.shape == (len(scan),)
+    _require(fits, f"{name} of scan {number} must have shape ({len(scan)},), not {value.shape}")
 
 
 MISSING_POSES = "poses are missing: T_world_sensor (4, 4) of each scan; radarsdf.odometry(points, doppler_mps=..., times_s=...) finds them"
@@ -136,37 +124,33 @@ def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.
     T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")
     if num_scans is None:
         num_scans = len(T_world_sensor) if T_world_sensor.ndim else 0
-    if T_world_sensor.shape != (num_scans, 4, 4):
-        msg = f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}"
-        raise ValueError(msg)
+    fits = T_world_sensor.shape == (num_scans, 4, 4)
+    _require(
+        fits,
+        f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}",
+    )
     return T_world_sensor
 
 
 def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
     """`pose` as (4, 4) float64 T_a_b, m. Raises a ValueError if it is not a rigid transform."""
     matrix: NDArray[np.float64] = real_array(pose, name)
-    if matrix.shape != (4, 4):
-        msg = f"{name} must have shape (4, 4), not {matrix.shape}"
-        raise ValueError(msg)
-    if not are_rigid(matrix[None]).all():
-        msg = f"{name} is not a rigid transform ({_RIGID})"
-        raise ValueError(msg)
+    _require(matrix.shape == (4, 4), f"{name} must have shape (4, 4), not {matrix.shape}")
+    _require(are_rigid(matrix[None]).all(), f"{name} is not a rigid transform ({_RIGID})")
     return matrix
 
 
 def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
     """`poses` as (F, 4, 4) float64 T_world_sensor, m: as many as scans, where their number is given.
 
-    Raises
-    ------
-    ValueError
-        If the shape is wrong, or a pose is not a rigid transform. The error names the first such pose.
+    A ValueError names the first pose that is not a rigid transform.
     """
     T_world_sensor = pose_matrices(poses, num_scans)
     rigid = are_rigid(T_world_sensor)
-    if not rigid.all():
-        msg = f"pose {int(np.argmin(rigid))} is not a rigid transform ({_RIGID})"
-        raise ValueError(msg)
+    _require(
+        rigid.all(),
+        f"pose {0 if not len(rigid) else int(np.argmin(rigid))} is not a rigid transform ({_RIGID})",
+    )
     return T_world_sensor
 
 
@@ -221,18 +205,14 @@ def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:
     """`value`, if it is of this kind."""
     if not isinstance(value, kind):
-        msg = f"{name} must be a {kind.__name__}, not {_said(value)}"
-        raise TypeError(msg)
+        raise _wrong_type(name, f"a {kind.__name__}", value)
     return value
 
 
 def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
     """`values`, if they can be taken one after another."""
-    try:
-        iter(values)
-    except TypeError as error:
-        msg = f"{name} must be a list of arrays, one a scan, not {_said(values)}"
-        raise TypeError(msg) from error
+    if not (hasattr(values, "__iter__") or hasattr(values, "__getitem__")):
+        raise _wrong_type(name, "a list of arrays, one a scan", values)
     found: Iterable[Any] = values
     return found
 
@@ -240,28 +220,23 @@ def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
 def path_of(value: Any, name: str) -> Path:
     """`value` as a path."""
     if not isinstance(value, (str, os.PathLike)):
-        msg = f"{name} must be a path, not {_said(value)}"
-        raise TypeError(msg)
+        raise _wrong_type(name, "a path", value)
     return Path(value)
 
 
 def flag(value: Any, name: str) -> bool:
     """`value` as a bool."""
     if not isinstance(value, (bool, np.bool_)):
-        msg = f"{name} must be True or False, not {_said(value)}"
-        raise TypeError(msg)
+        raise _wrong_type(name, "True or False", value)
     return bool(value)
 
 
 def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:
     """`value` as an int, `lowest` ≤ value ≤ `highest`."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        msg = f"{name} must be a whole number, not {_said(value)}"
-        raise TypeError(msg)
-    if not lowest <= value <= highest:
-        least = "positive" if lowest == 1 else f"at least {lowest}"
-        msg = f"{name} must be {least} and at most {highest}, not {_said(value)}"
-        raise ValueError(msg)
+        raise _wrong_type(name, "a whole number", value)
+    least = "positive" if lowest == 1 else f"at least {lowest}"
+    _require(lowest <= value <= highest, f"{name} must be {least} and at most {highest}, not {_said(value)}")
     return int(value)
 
 
@@ -282,10 +257,12 @@ def number(value: Any, name: str) -> float:
 
 def _scalar(value: Any, name: str, wanted: str, fits: Callable[[float], bool]) -> float:
     array = real_array(value, name)
-    if array.shape != () or not fits(float(array)):
-        msg = f"{name} must be {wanted}, not {_said(value)}"
-        raise ValueError(msg)
+    _require(array.shape == () and fits(float(array)), f"{name} must be {wanted}, not {_said(value)}")
     return float(array)
+
+
+def _wrong_type(name: str, wanted: str, value: Any) -> TypeError:
+    return TypeError(f"{name} must be {wanted}, not {_said(value)}")
 
 
 def _said(value: Any) -> str:

@@ -14,24 +14,14 @@ REQUIREMENTS = {
     "rosbags": "rosbags>=0.11",
     "viser": "viser>=1.1",
 }
-"""What pip is asked for, by module: the extras of `pyproject.toml`. An extra by name, such as ``radarsdf[view]``, needs a
-release in pip's index, or a clone."""
+"""What pip is asked for, by module: the extras of `pyproject.toml`, whose names need a release in pip's index."""
 
 
 def require(*modules: str, what: str) -> Any:
-    """Import libraries that may not be installed, and return the last one.
+    """Import libraries of `REQUIREMENTS` that may not be installed, and return the last one.
 
-    Parameters
-    ----------
-    *modules : str
-        Names in `REQUIREMENTS`, or modules of these libraries.
-    what : str
-        What needs them, with its verb, such as "the viewer needs".
-
-    Raises
-    ------
-    ImportError
-        If one is missing. The message names all that are, and the command that installs them.
+    `what` needs them, with its verb, such as "the viewer needs". An ImportError names all that are missing, and the command
+    that installs them.
     """
     missing: list[str] = []
     found: Any = None

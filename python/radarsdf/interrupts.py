@@ -13,18 +13,15 @@ from types import FrameType
 
 @contextmanager
 def deferred_interrupts() -> Iterator[Callable[[], bool]]:
-    """Delays Ctrl-C in a ``with`` block. Gives a function that tells whether it was pressed.
+    """Delay Ctrl-C in a ``with`` block, and yield a function that returns whether it was pressed.
 
-    The caller stops at the next safe place. A second Ctrl-C interrupts at once. Nothing is changed in a
-    thread that is not the main one, since only that receives the signal, nor if the program has its own
-    handler for the signal.
+    A second Ctrl-C interrupts at once. Nothing changes outside the main thread, which alone receives the signal, nor if the
+    program has its own handler.
     """
     pressed = False
     handler_before = signal.getsignal(signal.SIGINT)
-    if (
-        threading.current_thread() is not threading.main_thread()
-        or handler_before is not signal.default_int_handler
-    ):
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or handler_before is not signal.default_int_handler:
         yield lambda: False
         return
 
@@ -42,11 +39,7 @@ def deferred_interrupts() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def whole_import() -> Iterator[None]:
-    """Delays Ctrl-C until an import is complete.
-
-    For libraries such as trimesh, which take any exception during an import for a missing optional module.
-    They would go on without the module, and Ctrl-C would have no effect.
-    """
+    """Delay Ctrl-C until an import is complete: trimesh takes any exception meanwhile for a missing optional module."""
     with deferred_interrupts() as pressed:
         yield
     if pressed():

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Products of matrices whose bits do not depend on threads.
+"""Products of matrices whose bits do not depend on threads: `np.einsum` without `optimize` calls no BLAS.
 
-BLAS, which NumPy calls for `@`, shares the rows of a large product out among its threads. How many these are decides where
-a part begins and in which order it is summed, and so the last bits. Numbers on their way to a map are multiplied here:
-`np.einsum` without `optimize` calls no BLAS. Solving few equations is no matter: LAPACK uses one thread for these.
+BLAS, which NumPy calls for `@`, splits a large product among its threads, and their number decides the order of the sums
+and so the last bits. LAPACK solves few equations with one thread.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ def hides_bar(progress: bool | None) -> bool | None:
 
     A service, or a command after ``2>&-``, has no standard error: then there is never a bar.
     """
-    wanted = None if progress is None else flag(progress, "progress")
     if sys.stderr is None or getattr(sys.stderr, "closed", False):
         return True
-    return None if wanted is None else not wanted
+    return None if progress is None else not flag(progress, "progress")

@@ -1,15 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Python threads for large pieces of work. PyTorch's own threads are off meanwhile.
+"""A pool of Python threads, in whose place PyTorch's own threads are off.
 
-PyTorch splits every operation over OpenMP threads, which spin while they wait for each other. Beside another
-busy process, a fit of 1.8 s took 88 s: threads that had work waited for the time slices of threads that only
-spun. Python threads sleep while they wait. They synchronise once in an iteration instead of a hundred times.
-On an idle machine they are no slower. The interpreter's lock costs little, because PyTorch and the compiled
-core release it.
-
-For the halves of an iteration of a training, which take less than a millisecond, they are too slow to wake. That is
-the work of :attr:`Workers.crew`.
+PyTorch splits every operation over OpenMP threads, which spin while they wait for each other. Next to another busy
+process, a fit of 1.8 s took 88 s: threads with work waited for the time slices of threads that only spun. Python threads
+sleep while they wait, synchronise once in an iteration, and are no slower on an idle machine: PyTorch and the compiled
+core release the interpreter's lock. For work of less than a millisecond, there is :attr:`Workers.crew`.
 """
 
 from __future__ import annotations
@@ -21,7 +17,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
@@ -50,11 +45,7 @@ def _use_one_thread() -> None:
 
 
 def _reset_after_fork() -> None:
-    """Makes a forked child use one thread.
-
-    The child has only the thread that forked. OpenMP would wait for ever for the others, and a lock that
-    another thread held would never be released. The compiled core limits its own number of threads.
-    """
+    """One thread for a forked child: it has only the one that forked, and OpenMP would wait for ever for the others."""
     global _lock, _users, _blocks  # noqa: PLW0603 - this state belongs to the process
     _lock = threading.Lock()
     _users, _blocks = 0, threading.local()
@@ -65,22 +56,20 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_reset_after_fork)
 
 
-def _check_instruction_set() -> None:
-    """The core takes what it knows of the environment, and goes on with its own choice where it knows nothing."""
-    wanted, known = os.environ.get("RADARSDF_ISA"), _core.available_instruction_sets()
-    if wanted and wanted not in known:
-        msg = f"RADARSDF_ISA={wanted!s:.50} is none of {', '.join(known)}: {_core.instruction_set()} is used"
-        warnings.warn(msg, RuntimeWarning, stacklevel=2)
-
-
-_check_instruction_set()
+_wanted, _known = os.environ.get("RADARSDF_ISA"), _core.available_instruction_sets()
+if _wanted and _wanted not in _known:  # the core goes on with its own choice
+    warnings.warn(
+        f"RADARSDF_ISA={_wanted!s:.50} is none of {', '.join(_known)}: {_core.instruction_set()} is used",
+        RuntimeWarning,
+        stacklevel=2,
+    )
 
 
 def start_vector_library() -> None:
     """Call PyTorch's transcendental functions once in this process, by one thread alone.
 
-    The libraries behind them look for the processor's instructions in the first call. Where several threads make it at
-    once, some get other last bits than in all later calls: the same fit would differ about once in fifty processes.
+    Their libraries look for the processor's instructions in the first call. Where several threads make it at once, some get
+    other last bits than later: the same fit would differ about once in fifty processes.
     """
     if not _vector_library_started:
         with _lock:
@@ -103,19 +92,16 @@ def _start_vector_library() -> None:
 
 
 def resolve_num_threads(num_threads: int) -> int:
-    """`num_threads`, or if it is 0 as many as PyTorch uses.
-
-    Inside a block of :class:`Workers`, PyTorch uses one. Then it is the number from before the block.
-    """
+    """`num_threads`, or if it is 0 as many as PyTorch uses, or used before a block of :class:`Workers`."""
     with _lock:
         return num_threads or (_threads_before if _users else torch.get_num_threads())
 
 
 @contextmanager
 def torch_threads(num_threads: int) -> Iterator[None]:
-    """PyTorch, and what asks it how many, uses so many threads in the block. 0: as before.
+    """A block in which PyTorch uses this number of threads. 0: as before.
 
-    For processes beside each other: two with two threads on two processors took twice the processor time for a mesh.
+    For several processes: two with two threads on two processors took twice the processor time for a mesh.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(num_threads or before)
@@ -128,10 +114,9 @@ def torch_threads(num_threads: int) -> Iterator[None]:
 class Workers:
     """A pool of `num_threads` threads for a ``with`` block. 0: as many as PyTorch uses.
 
-    PyTorch keeps its number of threads for each thread. A new thread starts with the number that any thread
-    set last. So the outermost block of each thread sets 1 and restores the number afterwards. It restores the
-    number from before the first block that is still open, because a thread that first used PyTorch since then
-    has read 1.
+    PyTorch keeps its number of threads for each thread; a new thread starts with what any thread set last. So the outermost
+    block of each thread sets 1, and restores the number from before the first block that is still open, because a thread
+    that first used PyTorch since then has read 1.
     """
 
     def __init__(self, num_threads: int = 0) -> None:
@@ -154,9 +139,7 @@ class Workers:
         self._pool = ThreadPoolExecutor(self.num_threads, "radarsdf", initializer=_use_one_thread)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         global _users  # noqa: PLW0603
         assert self._pool is not None
         self._crew = None
@@ -171,10 +154,9 @@ class Workers:
 
     @property
     def crew(self) -> _core.Crew:
-        """As many threads of the core, for short work that it does without Python. They start at the first use.
+        """As many threads of the core, for short work without Python: they look for work for a moment before they sleep.
 
-        On two threads, an iteration of a training took 4.1 ms with the pool, which was woken ten times in it, and takes
-        2.3 with these, which look for work for a moment before they sleep.
+        On two threads, an iteration of a training took 4.1 ms with the pool, which was woken ten times, and takes 2.3.
         """
         assert self._pool is not None
         if self._crew is None:
@@ -182,11 +164,9 @@ class Workers:
         return self._crew
 
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
-        """Like the built-in ``map``, with the items on different threads and the results in their order.
+        """Like the built-in ``map``, with the items on different threads, where gradients are on.
 
-        PyTorch's grad mode is not passed on: `function` starts with gradients on in the threads of the pool.
-        If only one thread is used, or there is only one item, it runs in the calling thread, with the grad
-        mode of that.
+        With one thread or one item it runs in the calling thread, with the grad mode of that.
         """
         assert self._pool is not None
         if self.num_threads == 1 or len(items) <= 1:

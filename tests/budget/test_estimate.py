@@ -151,13 +151,13 @@ def test_the_command_says_it_in_one_line(scene, tmp_path, capsys):
         "fit",
         str(tmp_path / "scans.npz"),
         "-o",
-        str(tmp_path / "map"),
+        str(tmp_path / "map.safetensors"),
         "--set",
         "max_memory_bytes=1000",
     ]
     assert main(words) == 1
     assert capsys.readouterr().err.count("\n") == 1
-    assert not (tmp_path / "map").exists()
+    assert not (tmp_path / "map.safetensors").exists()
 
 
 @LINUX

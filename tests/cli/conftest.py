@@ -37,18 +37,6 @@ def small_pictures_of_meshes(monkeypatch):
 
 
 @pytest.fixture
-def garbage(tmp_path):
-    """A function: a file of the given name ending whose content is no file of any format."""
-
-    def make(suffix):
-        path = tmp_path / f"garbage{suffix}"
-        path.write_bytes(b"\x93 this is nothing of the kind \x00\xff")
-        return path
-
-    return make
-
-
-@pytest.fixture
 def small_pictures(monkeypatch):
     pytest.importorskip("viser", reason="the extra view is not installed")
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")

@@ -1,15 +1,21 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""`radarsdf fit`. Ctrl-C is tested with the other ends of a fit, `--dry-run` with the estimate."""
+"""``radarsdf fit`` and ``demo``: the map, what is printed of it, and what happens where it cannot be written."""
 
 from __future__ import annotations
+
+import re
+import shutil
+import tempfile
 
 import numpy as np
 import pytest
 import radarsdf
+import trimesh
+from radarsdf.checking.doppler import velocity_of_poses
 from radarsdf.io import Scans, write_scans
 
-from .calls import FAST, call, files, refusal
+from .calls import FAST, QUICK, call, files, refusal, values
 
 
 def test_the_map_is_of_these_scans_and_settings(map_file):
@@ -21,36 +27,42 @@ def test_the_map_is_of_these_scans_and_settings(map_file):
 
 def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     path = tmp_path / "map.safetensors"
-    assert call("fit", scans_file, "-o", path, "--quick", "--geometry-only") == 0
-    printed = capsys.readouterr().out
-    used, fitted, noise, written, following = printed.splitlines()
-    assert used.startswith("9000 of 9000 returns in 6 scans make the surface")
-    assert fitted.startswith("fit ")
-    assert written == f"written to {path}"
-    assert following == f"next: radarsdf mesh {path} -o {path.with_suffix('.ply')} --voxel 0.2"
-    sigma = radarsdf.load(path).report["noise"]
-    assert noise == (
-        f"noise {sigma['range_m']:.3f} m, azimuth {sigma['azimuth_rad']:.4f} rad, "
-        f"elevation {sigma['elevation_rad']:.4f} rad"
-    )
+    assert call("fit", scans_file, "-o", path, "--geometry-only", "--holdout", 3, *QUICK) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith("6000 of 6000 returns in 4 scans")
+    assert printed[-2:] == [
+        f"next: radarsdf mesh {path} -o {path.with_suffix('.ply')} --voxel 0.2",
+        f"and: radarsdf eval {path} {scans_file} --holdout 3",
+    ]
     radar_map = radarsdf.load(path)
     assert not radar_map.has_intensity
     assert radar_map.config == radarsdf.FitConfig.quick()
-    assert radar_map.report["returns"] == 6 * 1500
 
 
-def test_wild_intensities_are_counted(scene, tmp_path, capsys):
-    intensities = [np.where(np.arange(len(scan)) % 100, scan, -9999) for scan in scene.intensities]
-    write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, intensities))
-    assert call("fit", tmp_path / "scans.npz", "-o", tmp_path / "map.safetensors", "--quick") == 0
-    assert "90 intensities cannot belong to the others, and are left out" in capsys.readouterr().out
-    assert radarsdf.load(tmp_path / "map.safetensors").report["wild_intensities"] == 90
-
-
-def test_what_was_held_out_is_to_be_evaluated(scans_file, tmp_path, capsys):
-    path = tmp_path / "map.safetensors"
-    assert call("fit", scans_file, "-o", path, "--quick", "--holdout", 3) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"and: radarsdf eval {path} {scans_file} --holdout 3"
+def test_a_fit_says_the_same_to_people_and_to_programs(tmp_path, capsys):
+    scans = radarsdf.simulate.wall(frames=6)
+    rng = np.random.default_rng(0)
+    doppler = []
+    velocities = velocity_of_poses(scans.poses, 0.1 * np.arange(6))
+    for points, velocity in zip(scans.points, velocities, strict=True):
+        away = points / np.linalg.norm(points, axis=1, keepdims=True)
+        doppler.append(-away @ velocity + 3.0 * (rng.random(len(points)) < 0.1))
+    intensities = [np.where(np.arange(len(scan)) % 100, scan, -9999) for scan in scans.intensities]
+    path = tmp_path / "scans.npz"
+    write_scans(path, Scans(scans.points, scans.poses, intensities, doppler_mps=doppler))
+    words = ["fit", path, "-o", tmp_path / "map.safetensors", *FAST]
+    assert call(*words) == 0
+    printed = capsys.readouterr().out
+    found = values(capsys, *words)
+    used, returns, scans_used = map(int, re.match(r"(\d+) of (\d+) returns in (\d+) scans", printed).groups())
+    assert (used, returns, scans_used) == (found["returns_used"], found["returns"], found["scans"])
+    assert f"{found['movers']} move by their Doppler" in printed
+    assert 0.08 * returns < found["movers"] < 0.12 * returns
+    assert f"{found['wild_intensities']} intensities are outliers" in printed
+    assert f"sdf loss {found['losses']['sdf']:.3g}" in printed
+    dry = values(capsys, "fit", path, "--dry-run")
+    assert dry["returns"] < found["returns"]  # only those within the ranges
+    assert dry["peak_memory_bytes"] > 0
 
 
 def test_the_checkpoint_is_used_and_removed(scans_file, tmp_path, capsys):
@@ -63,45 +75,92 @@ def test_the_checkpoint_is_used_and_removed(scans_file, tmp_path, capsys):
     assert files(tmp_path) == ["map.safetensors"]
 
 
-def test_a_fit_that_diverges(scans_file, tmp_path, capsys):
-    words = [
-        "fit",
-        scans_file,
-        "-o",
-        tmp_path / "map.safetensors",
-        *FAST,
-        "--set",
-        "training.learning_rate=1e30",
-    ]
-    assert "learning rate" in refusal(capsys, tmp_path, *words)
-
-
-def test_scans_that_do_not_exist(tmp_path, capsys):
-    absent = tmp_path / "absent.npz"
-    assert str(absent) in refusal(capsys, tmp_path, "fit", absent, "-o", tmp_path / "map.safetensors")
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".ply"])
-def test_files_that_are_no_scans(garbage, tmp_path, capsys, suffix):
-    path = garbage(suffix)
-    assert str(path) in refusal(capsys, tmp_path, "fit", path, "-o", tmp_path / "map.safetensors")
-
-
-def test_a_folder_that_does_not_exist(scans_file, tmp_path, capsys):
-    out = tmp_path / "absent" / "map.safetensors"
-    assert "absent" in refusal(capsys, tmp_path, "fit", scans_file, "-o", out, *FAST)
-
-
-def test_a_map_is_known_by_its_ending(scans_file, tmp_path, capsys):
-    for name in ("map", "map.npz"):
-        said = refusal(capsys, tmp_path, "fit", scans_file, "-o", tmp_path / name, *FAST)
-        assert "a map is written as .safetensors" in said
-
-
-def test_choices_without_an_effect_are_refused(scans_file, tmp_path, capsys):
-    out = tmp_path / "map.safetensors"
-    for words, said in (
-        (["--topic", "/radar"], "is no bag: topic is of bags alone"),
-        (["--field", "intensity=Power"], "fields and columns are not used for .npz files"),
+def test_fits_that_fail(scans_file, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "garbage.npz").write_bytes(b"\x93 nothing \x00\xff")
+    out = ["-o", "map.safetensors"]
+    for words, named in (
+        (["absent.npz", *out], "absent.npz"),
+        (["garbage.npz", *out], "garbage.npz"),
+        ([scans_file, "-o", "absent/map.safetensors"], "absent"),
+        ([scans_file, *out, "--set", "training.learning_rate=1e30", *FAST], "learning rate"),
+        ([scans_file, *out, "--topic", "/radar"], "topic"),
+        ([scans_file, *out, "--field", "intensity=Power"], "fields"),
+        ([scans_file, *out, "--checkpoint", "map.safetensors"], "same file"),
+        ([scans_file, *out, "--report", "map.safetensors"], "same file"),
     ):
-        assert said in refusal(capsys, tmp_path, "fit", scans_file, "-o", out, *words)
+        assert named in refusal(capsys, tmp_path, "fit", *words)
+
+
+@pytest.fixture
+def broken_folder(tmp_path, monkeypatch):
+    """A folder that is removed when the fit is done, and the temporary folder."""
+    out, spare = tmp_path / "out", tmp_path / "spare"
+    out.mkdir()
+    spare.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(spare))
+    save = radarsdf.RadarMap.save
+
+    def remove_and_save(radar_map, path):
+        shutil.rmtree(out, ignore_errors=True)
+        save(radar_map, path)
+
+    monkeypatch.setattr(radarsdf.RadarMap, "save", remove_and_save)
+    return out, spare
+
+
+@pytest.mark.parametrize("command", ["fit", "demo"])
+def test_a_map_that_cannot_be_written_is_kept_elsewhere(command, scans_file, broken_folder, capsys):
+    out, spare = broken_folder
+    words = {"fit": [scans_file, "-o", out / "map.safetensors"], "demo": ["--frames", 4, "-o", out]}[command]
+    assert call(command, *words, *QUICK[:2]) == 1
+    (kept,) = files(spare)
+    assert f"saved in {spare / kept}" in capsys.readouterr().err
+    assert len(radarsdf.load(spare / kept).mesh(0.4).faces) > 0
+
+
+def test_an_interrupted_map_is_kept(scans_file, tmp_path, monkeypatch, capsys):
+    fit = radarsdf.fit
+
+    def interrupted(*scans, **settings):
+        raise radarsdf.Interrupted(fit(*scans, **settings))
+
+    monkeypatch.setattr(radarsdf, "fit", interrupted)
+    out = tmp_path / "map.safetensors"
+    assert call("fit", scans_file, "-o", out, *QUICK) == 130
+    said = capsys.readouterr().err
+    assert said.startswith("error: interrupted")
+    assert str(out) in said
+    radarsdf.load(out)
+
+
+def test_the_demo_writes_everything_and_prints_the_errors(tmp_path, capsys):
+    out = tmp_path / "demo"
+    assert call("demo", "--frames", 4, "--out", out, "--voxel", 0.2, *FAST) == 0
+    printed = capsys.readouterr()
+    assert files(out) == ["map.safetensors", "mesh.ply", "picture.png", "scans.npz"]
+    for word in ("accuracy", "completion", "F-score", "held-out intensity error", "kNN      intensity error"):
+        assert word in printed.out
+    assert printed.err == ""
+    assert len(trimesh.load_mesh(out / "mesh.ply", process=False).faces) > 0
+    assert (out / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("screen", "words", "shown"), [(True, [], 1), (False, [], 0), (True, ["--json"], 0)])
+def test_the_viewer_ends_the_demo_where_somebody_looks(screen, words, shown, tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    calls = []
+    monkeypatch.setattr("radarsdf.view.serving.has_display", lambda: screen)
+    monkeypatch.setattr("radarsdf.cli.fits.show", lambda *_, **__: calls.append(1))
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    assert (
+        call("demo", "--scene", "wall", "--frames", 2, "-o", tmp_path, "--voxel", 0.4, *QUICK[:2], *words)
+        == 0
+    )
+    assert len(calls) == shown
+
+
+def test_the_demo_offers_every_scene(capsys):
+    call("demo", "--scene", "moon")
+    said = capsys.readouterr().err
+    assert all(name in said for name in radarsdf.simulate.SCENES)

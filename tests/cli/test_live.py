@@ -4,18 +4,17 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.cli import main
 from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
 from radarsdf.live.replay import replay
 
 from ..conftest import ground_and_wall
+from .calls import refusal, values
 
 SCENE = ground_and_wall(scans=6, returns_per_scan=600)
 
@@ -26,14 +25,13 @@ def recording(tmp_path):
     return tmp_path
 
 
-def test_it_writes_the_map_and_where_scans_were_put(recording, capsys):
-    words = ["live", str(recording / "scans.npz"), "--rate", "0", "--quick", "--quiet", "--json"]
-    out, way = recording / "map.safetensors", recording / "way.npy"
-    assert main([*words, "-o", str(out), "--trajectory", str(way)]) == 0
-    said = json.loads(capsys.readouterr().out)
+def test_it_writes_the_map_and_where_scans_were_placed(recording, capsys):
+    out, trajectory = recording / "map.safetensors", recording / "way.npy"
+    words = ["live", recording / "scans.npz", "--rate", 0, "--quick", "--quiet"]
+    said = values(capsys, *words, "-o", out, "--trajectory", trajectory)
     assert (said["scans"], said["dropped"], said["lost"]) == (6, 0, 0)
     assert 0 < said["p50_s"] <= said["worst_s"]
-    assert np.load(way).tobytes() == SCENE.poses.tobytes()
+    assert np.load(trajectory).tobytes() == SCENE.poses.tobytes()
     assert len(radarsdf.load(out).mesh(0.2).faces) > 100
 
 
@@ -52,5 +50,4 @@ def test_scans_that_come_too_fast_are_dropped():
 
 
 def test_scans_without_poses_need_times(recording, capsys):
-    assert main(["live", str(recording / "scans.npz"), "--find"]) == 1
-    assert "need times" in capsys.readouterr().err
+    assert "times" in refusal(capsys, recording, "live", recording / "scans.npz", "--find")

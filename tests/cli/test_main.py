@@ -1,185 +1,171 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What holds for every command: help, usage errors, errors, Ctrl-C."""
+"""Help, usage errors, exit statuses and streams of all commands."""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
-import radarsdf.cli.info
-from radarsdf.cli import COMMANDS, main
-from radarsdf.cli.tiles import STEPS
+import radarsdf
+from radarsdf.cli import main
+from radarsdf.cli.app import message_of
+from radarsdf.cli.commands import COMMANDS
+from radarsdf.cli.results import Results
 
-ANSWERED = """
+from .calls import call, refusal
+
+NAMES = [name for commands in COMMANDS.values() for name in commands]
+STEPS = ["run", "plan", "fit", "mesh", "status", "clean"]
+
+IMPORTED = """
 import sys
 before = set(sys.modules)
-from radarsdf.cli import COMMANDS, main
-try:
-    main(sys.argv[1:])
-except SystemExit as end:
-    imported = set(sys.modules) - before
-    foreign = {name.partition(".")[0] for name in imported} - sys.stdlib_module_names - {"radarsdf", "lazy_loader"}
-    assert not foreign, foreign
-    print("imported:", *(name for name in COMMANDS if f"radarsdf.cli.{name}" in imported))
-    sys.exit(end.code)
+from radarsdf.cli import main
+main(sys.argv[1:])
+print("imported:", *sorted({name.partition(".")[0] for name in set(sys.modules) - before} - sys.stdlib_module_names))
 """
 
 
-def answer(*words):
-    """What help or a usage error says, and its status. Only the standard library, lazy_loader and modules of the command line may
-    be imported for it; the last line names the commands among these."""
-    done = subprocess.run(
-        [sys.executable, "-c", ANSWERED, *words],
+def python(code, *words, **settings):
+    return subprocess.run(
+        [sys.executable, "-c", code, *words],
         capture_output=True,
         text=True,
-        env=os.environ | {"COLUMNS": "200"},  # no line of a help text is broken
         timeout=60,
         check=False,
+        **settings,
     )
-    assert "Traceback" not in done.stderr, done.stderr
-    return done
 
 
-def test_help_lists_every_command_and_imports_none():
-    done = answer("--help")
-    assert done.returncode == 0
-    said = " ".join(done.stdout.split())  # a long name has its text on the next line
-    for name, text in COMMANDS.items():
-        assert f" {name} {text} " in said
-    assert done.stdout.splitlines()[-1] == "imported:"
+def test_the_overview_lists_every_command_and_imports_nothing():
+    done = python(IMPORTED, "--help")
+    *said, imported = done.stdout.splitlines()
+    assert imported == "imported: radarsdf"
+    assert [line.split()[0] for line in said if line.startswith("  ")] == NAMES
+    assert python(IMPORTED).stdout == done.stdout
 
 
-def test_no_words_are_a_wish_for_help():
-    done, asked = answer(), answer("--help")
-    assert (done.returncode, done.stdout, done.stderr) == (0, asked.stdout, "")
+def test_help_of_a_command_imports_neither_numpy_nor_torch():
+    imported = python(IMPORTED, "fit", "--help").stdout.splitlines()[-1].split()
+    assert not {"numpy", "scipy", "torch", "trimesh"} & set(imported)
+
+
+@pytest.mark.parametrize(
+    "words", [*([name] for name in NAMES), *(["tiles", step] for step in STEPS)], ids=" ".join
+)
+def test_help(words, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("TERMINAL_WIDTH", "200")
+    assert call(*words, "--help") == 0
+    said = capsys.readouterr().out
+    assert f"Usage: radarsdf {' '.join(words)} " in said
+    assert ("--json" in said) == (words[-1] not in ("config", "view", "tiles"))
+    makes_a_mesh = words[-1] in ("demo", "mesh", "view", "report", "eval", "run")
+    assert ("--min-confidence" in said) == makes_a_mesh
 
 
 def test_the_version(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["--version"])
-    assert (end.value.code, capsys.readouterr().out) == (0, f"radarsdf {radarsdf.__version__}\n")
+    assert call("--version") == 0
+    assert capsys.readouterr().out == f"radarsdf {radarsdf.__version__}\n"
 
 
-@pytest.mark.parametrize("step", STEPS)
-def test_help_of_a_step(step):
-    done = answer("tiles", step, "--help")
-    assert done.returncode == 0
-    assert f"usage: radarsdf tiles {step} " in done.stdout
-    assert STEPS[step] in done.stdout
-    assert ("--tile-size" in done.stdout) == (step == "plan")
-
-
-def test_the_value_of_an_option_is_no_step():
-    assert "usage: radarsdf tiles [-h] [--extrinsic" in answer("tiles", "-o", "plan", "--help").stdout
+def test_completion_of_shells(capsys, monkeypatch):
+    monkeypatch.setenv("_RADARSDF_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "radarsdf con")
+    monkeypatch.setenv("COMP_CWORD", "1")
+    call("con")
+    assert capsys.readouterr().out.split() == ["convert", "config"]
 
 
 @pytest.mark.parametrize(
-    "words", [["mesh"], ["view"], ["report"], ["eval"], ["demo"], ["tiles"], ["tiles", "mesh"]], ids=" ".join
-)
-def test_all_commands_that_make_a_mesh_have_the_options_of_one(words):
-    said = answer(*words, "--help").stdout
-    for option in ("--voxel M", "--min-confidence C", "--max-uncertainty M", "--min-component N", "--quiet"):
-        assert f" {option}" in said
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_a_command_imports_this_one_only(command):
-    done = answer(command, "--help")
-    assert done.returncode == 0
-    assert f"usage: radarsdf {command} " in done.stdout
-    assert ("--out " in done.stdout) == ("-o OUT, --out OUT" in done.stdout)
-    assert COMMANDS[command] in done.stdout
-    assert done.stdout.splitlines()[-1] == f"imported: {command}"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "named"),
     [
-        (["paint"], "invalid choice: 'paint'"),
-        (["--paint"], "arguments are required: COMMAND"),
-        (["fit"], "one of the arguments -o/--out --dry-run is required"),
-        (["fit", "-o", "map"], "arguments are required: scans"),
-        (["fit", "scans"], "one of the arguments -o/--out --dry-run is required"),
-        (["fit", "scans", "-o", "map", "--dry-run"], "not allowed with"),
-        (["fit", "scans", "-o", "map", "--quick", "--paper"], "not allowed with"),
-        (["mesh", "map", "-o", "mesh", "--box", "1"], "--box: expected 6 arguments"),
-        (["mesh", "map", "-o", "mesh", "--voxel", "x"], "invalid float value: 'x'"),
-        (["view"], "arguments are required: map"),
-        (["view", "map", "--port", "x"], "invalid int value: 'x'"),
-        (["eval", "mesh"], "arguments are required: truth"),
-        (["demo", "--scene", "moon"], "invalid choice: 'moon'"),
-        (["tiles", "scans"], "arguments are required: -o/--out"),
-        (["tiles", "plan"], "arguments are required: "),
-        (["tiles", "fit"], "arguments are required: folder"),
-        (["tiles", "clean", "city", "--quick"], "unrecognized arguments: --quick"),
-        (["tiles", "a.npz", "b.txt", "c", "-o", "city"], "unrecognized arguments: c"),
-        (["info", "map", "more"], "unrecognized arguments: more"),
+        (["paint"], "paint"),
+        (["--paint"], "--paint"),
+        (["fit", "scans"], "-o"),
+        (["fit", "-o", "map.safetensors"], "SCANS"),
+        (["fit", "scans", "-o", "map.safetensors", "--dry-run"], "--dry-run"),
+        (["fit", "scans", "-o", "map"], ".safetensors"),
+        (["fit", "scans", "-o", "map.safetensors", "--quick", "--paper"], "--paper"),
+        (["fit", "scans", "-o", "map.safetensors", "--set", "seed"], "--set takes NAME=VALUE, not 'seed'"),
+        (["check", "scans", "--field", "intensity"], "--field"),
+        (["mesh", "map", "-o", "mesh", "--box", "1"], "--box"),
+        (["mesh", "map", "-o", "mesh", "--voxel", "x"], "--voxel"),
+        (["view", "map", "--port", "x"], "--port"),
+        (["eval", "mesh"], "SCANS"),
+        (["demo", "--scene", "moon"], "moon"),
+        (["demo", "--frames", "1"], "--frames"),
+        (["render", "map", "-o", "a.jpg", "--pose", "1", "2", "3"], ".npz, .ply, .png"),
+        (["render", "map", "-o", "a.npz", "--pose", "1", "2"], "--pose"),
+        (["render", "map", "-o", "a.npz", "--pose", "1", "2", "3", "0", "0", "0", "0"], "length 1"),
+        (["render", "map", "-o", "a.npz", "--pose", "1", "2", "3", "--seed", "-1"], "--seed"),
+        (["report", "map", "-o", "a.html", "--holdout", "3"], "--holdout"),
+        (["tiles", "scans"], "--out"),
+        (["tiles", "fit"], "FOLDER"),
+        (["tiles", "clean", "city", "--quick"], "--quick"),
+        (["tiles", "fit", "city", "--processes", "0"], "--processes"),
+        (["info", "map", "more"], "more"),
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage_is_status_2(words, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert named in refusal(capsys, tmp_path, *words, status=2)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ValueError("no such\nthing"), "no such thing"),
+        (FileNotFoundError(2, "No such file", "scans.npz"), "scans.npz: No such file"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (MemoryError("needs 80 GB"), "needs 80 GB"),
+        (MemoryError("Unable to allocate 4.04 MiB for an array"), "there is not enough memory"),
     ],
 )
-def test_wrong_usage_is_status_2(words, said):
-    done = answer(*words)
-    assert done.returncode == 2
-    assert done.stderr.startswith("usage: radarsdf ")
-    assert said in done.stderr
+def test_an_error_is_one_line(error, said):
+    assert message_of(error) == said
 
 
-def test_success_is_status_0(monkeypatch, capsys):
-    monkeypatch.setattr(radarsdf.cli.info, "run", lambda _: None)
-    assert main(["info"]) == 0
-    assert capsys.readouterr() == ("", "")
+def test_ctrl_c_is_status_130(monkeypatch, capsys):
+    def interrupt(_):
+        raise radarsdf.Interrupted
 
-
-@pytest.mark.parametrize(
-    ("error", "status", "said"),
-    [
-        (ValueError("no such thing"), 1, "no such thing"),
-        (
-            FileNotFoundError(2, "No such file or directory", "scans.npz"),
-            1,
-            "scans.npz: there is no such file or folder",
-        ),
-        (OSError(28, "No space left on device"), 1, "No space left on device"),
-        (ImportError("no matplotlib"), 1, "no matplotlib"),
-        (FloatingPointError("the loss is nan"), 1, "the loss is nan"),
-        (MemoryError("needs 80 GB"), 1, "needs 80 GB"),
-        (MemoryError(), 1, "there is not enough memory"),
-        (MemoryError("Unable to allocate 4.04 MiB for an array"), 1, "there is not enough memory"),
-        (KeyboardInterrupt(), 130, "interrupted"),
-        (radarsdf.Interrupted(), 130, "interrupted before the training"),
-        (radarsdf.Diverged("the loss is inf"), 1, "the loss is inf"),
-    ],
-    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
-)
-def test_an_error_is_one_line(monkeypatch, capsys, error, status, said):
-    def fail(_):
-        raise error
-
-    monkeypatch.setattr(radarsdf.cli.info, "run", fail)
-    assert main(["info"]) == status
-    assert capsys.readouterr() == ("", f"radarsdf info: {said}\n")
+    monkeypatch.setattr("radarsdf.cli.maps.load_map", interrupt)
+    assert call("info", "map.safetensors") == 130
+    assert capsys.readouterr().err.startswith("error: interrupted")
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch):
-    monkeypatch.setattr(radarsdf.cli.info, "run", lambda _: {}["missing"])
+    monkeypatch.setattr("radarsdf.cli.maps.load_map", lambda _: {}["missing"])
     with pytest.raises(KeyError, match="missing"):
-        main(["info"])
+        main(["info", "map.safetensors"])
 
 
-def test_ctrl_c_during_the_imports_of_a_command():
-    code = """
-import importlib.abc, signal, sys
-class Press(importlib.abc.MetaPathFinder):
-    def find_spec(self, name, path, target=None):
-        if name == "torch":
-            signal.raise_signal(signal.SIGINT)
-sys.meta_path.insert(0, Press())
-from radarsdf.cli import main
-sys.exit(main(["info"]))
-"""
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX")
+def test_a_pipe_whose_reader_has_gone_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-m", "radarsdf", "config"],
+        stdout=write,
+        stderr=subprocess.PIPE,
+        timeout=60,
+        check=False,
     )
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "radarsdf info: interrupted\n")
+    os.close(write)
+    assert done.stderr == b""
+
+
+def test_what_json_lacks(capsys):
+    results = Results(json=True)
+    results.add("a line for people", number=np.float32(0.5), row=np.arange(2), deep=[np.inf], name="word")
+    assert capsys.readouterr().out == ""
+    results.end()
+    found = json.loads(capsys.readouterr().out)
+    assert found == {"number": 0.5, "row": [0, 1], "deep": [None], "name": "word"}

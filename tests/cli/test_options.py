@@ -4,149 +4,92 @@
 
 from __future__ import annotations
 
-import argparse
-
+import numpy as np
 import pytest
 from radarsdf import FitConfig
-from radarsdf.cli.options import add_box, add_fit_options, box_of, config_of, progress_of
+from radarsdf.cli.options import Recording, Settings, words_of
 
 from .calls import call, refusal
 
 
-def parsed(*words):
-    parser = argparse.ArgumentParser()
-    add_fit_options(parser)
-    add_box(parser)
-    return parser.parse_args(words)
+def config(*, changes=(), **options):
+    return Settings(set=list(changes), **options).load()
 
 
-def config(*words):
-    return config_of(parsed(*words))
-
-
-def test_presets():
-    assert config() == FitConfig()
-    assert config("--paper") == FitConfig.paper()
-    assert config("--quick", "--set", "seed=3") == FitConfig.quick(seed=3)
-
-
-def test_settings_of_every_type():
-    settings = [
-        "encoding.kind=octree",
-        "networks.sdf_hidden=(8, 8)",
-        "training.sigma_cells=0.5",
-        "networks.normals=True",
-        "returns.max_range_m=None",
-        "seed=4",
-        "seed=5",  # the last one counts
-    ]
-    words = [word for setting in settings for word in ("--set", setting)]
-    assert config("--paper", *words) == FitConfig.paper(
-        encoding={"kind": "octree"},
-        networks={"sdf_hidden": (8, 8), "normals": True},
-        training={"sigma_cells": 0.5},
-        returns={"max_range_m": None},
-        seed=5,
-    )
-
-
-def test_settings_from_a_file(tmp_path):
+def test_a_preset_then_a_file_then_single_settings(tmp_path):
     path = tmp_path / "settings.toml"
     path.write_text("seed = 3\n[training]\nsdf_iterations = 7\nbatch_size = 64\n")
-    expected = FitConfig.quick(seed=3, training={"sdf_iterations": 7, "batch_size": 32})
-    assert config("--quick", "--config", str(path), "--set", "training.batch_size=32") == expected
+    changes = [
+        "training.batch_size=32",
+        "encoding.kind=octree",
+        "returns.max_range_m=None",
+        "networks.normals=true",
+    ]
+    assert config() == FitConfig()
+    assert config(paper=True) == FitConfig.paper()
+    assert config(quick=True, config=path, changes=changes) == FitConfig.quick(
+        seed=3,
+        training={"sdf_iterations": 7, "batch_size": 32},
+        encoding={"kind": "octree"},
+        returns={"max_range_m": None},
+        networks={"normals": True},
+    )
 
 
 @pytest.mark.parametrize("preset", [[], ["--quick"], ["--paper"]])
 def test_what_config_prints_is_the_same_configuration(capsys, tmp_path, preset):
     path = tmp_path / "settings.toml"
-    assert call("config", *preset, "--set", "networks.sdf_hidden=(8, 4)") == 0
+    words = [*preset, "--set", "networks.sdf_hidden=(8, 4)"]
+    assert call("config", *words) == 0
     path.write_text(capsys.readouterr().out)
-    assert config("--config", str(path)) == config(*preset, "--set", "networks.sdf_hidden=(8, 4)")
+    assert call("config", "--config", path) == 0
+    assert capsys.readouterr().out == path.read_text()
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("setting", "named"),
     [
-        ("seed =", "is not a TOML file"),
-        ("seed = " + "[" * 5000, "is not a TOML file"),
-        ("colour = 1", "unknown setting colour"),
-        ("[training]\nbar = 1", "unknown setting training.bar"),
+        ("colour=1", "colour"),
+        ("training.colour=1", "training.colour"),
+        ("seed.a=1", "seed"),
+        ("training=1", "training"),
+        ("training.sigma_cells=-1", "training.sigma_cells must be greater than 0, not -1"),
+        ("training.sigma_cells=1e999", "training.sigma_cells"),
+        ("encoding.kind=tree", "'octree'"),
+        ("networks.sdf_hidden=wide", "networks.sdf_hidden"),
     ],
 )
-def test_a_file_that_makes_no_sense(tmp_path, text, said):
+def test_settings_that_make_no_sense(capsys, tmp_path, setting, named):
+    assert named in refusal(capsys, tmp_path, "config", "--set", setting)
+
+
+@pytest.mark.parametrize(("text", "named"), [("seed =", "TOML"), ("[training]\nbar = 1", "training.bar")])
+def test_a_file_that_makes_no_sense(capsys, tmp_path, text, named):
     path = tmp_path / "settings.toml"
     path.write_text(text)
-    with pytest.raises(ValueError, match=said):
-        config("--config", str(path))
+    assert named in refusal(capsys, tmp_path, "config", "--config", path)
 
 
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [
-        ("seed", "--set takes NAME=VALUE, not 'seed'"),
-        ("colour=1", "unknown setting colour"),
-        ("self=1", "unknown setting self"),
-        ("x" * 99, f"--set takes NAME=VALUE, not '{'x' * 49}"),
-        ("training={1: 2}", "training must have names as keys, not 1"),
-        ("leaf_size_m=1e300", "leaf_size_m must be less than or equal to 1000000, not 1e+300"),
-        ("training.colour=1", "unknown setting training.colour"),
-        ("colour.seed=1", "unknown setting colour"),
-        ("seed.a=1", "seed must be a valid integer, not {'a': 1}"),
-        ("training=1", "training must be an instance of TrainingConfig, not 1"),
-        ("training.sigma_cells=-1", "training.sigma_cells must be greater than 0, not -1"),
-        ("training.sigma_cells=1e999", "training.sigma_cells must be a finite number, not inf"),
-        ("training.sigma_cells=wide", "training.sigma_cells must be a valid number, not 'wide'"),
-        ("training.sigma_cells=None", "training.sigma_cells must be a valid number, not None"),
-        ("encoding.kind=tree", "encoding.kind must be 'tri-quadtree' or 'octree', not 'tree'"),
-        ("encoding.kind=3", "encoding.kind must be 'tri-quadtree' or 'octree', not 3"),
-        ("training.sdf_iterations=1.5", "training.sdf_iterations must be a valid integer, not 1.5"),
-        ("training.sdf_iterations=many", "training.sdf_iterations must be a valid integer, not 'many'"),
-        ("training.batch_size=[1]", "training.batch_size must be a valid integer, not [1]"),
-        ("networks.sdf_hidden=3", "networks.sdf_hidden must be a valid tuple, not 3"),
-        ("networks.sdf_hidden=(8, 0.5)", "networks.sdf_hidden must be a valid integer, not 0.5"),
-        ("networks.sdf_hidden=wide", "networks.sdf_hidden must be a valid tuple, not 'wide'"),
-        ("networks.normals=perhaps", "networks.normals must be a valid boolean, not 'perhaps'"),
-        ("encoding.num_levels=2.5", "encoding.num_levels must be a valid integer, not 2.5"),
-        ("seed=-1.5", "seed must be a valid integer, not -1.5"),
-    ],
-)
-def test_settings_that_make_no_sense(capsys, tmp_path, setting, said):
-    # The scans do not exist: settings are checked before they are read.
-    words = ["fit", tmp_path / "absent.npz", "-o", tmp_path / "map.safetensors", "--set", setting]
-    assert refusal(capsys, tmp_path, *words) == f"radarsdf fit: {said}\n"
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        "",
-        "=1",
-        "1 +",
-        "1+[]",
-        "f(1)",
-        "{[]:1}",
-        "{[]}",
-        "9" * 5000,
-        "\0",
-        "\udcff",
-        "(" * 100,
-        "(" * 100_000,
-        "-" * 100_000 + "1",  # too deep for the parser
-        "1" + "+1" * 100_000,  # too deep for the recursion limit
-    ],
-    ids=lambda value: repr(value[:8]),
-)
-def test_a_value_that_is_no_literal_is_a_string(value):
-    with pytest.raises(ValueError, match="seed must be a valid integer, not '"):
-        config("--set", f"seed={value}")
-
-
-def test_quiet():
-    assert progress_of(parsed()) is None
-    assert progress_of(parsed("--quiet")) is False
-
-
-def test_box():
-    assert box_of(parsed()) is None
-    assert box_of(parsed(*["--box", "1", "2", "3", "-4", "5", "6e2"])) == [[1, 2, 3], [-4, 5, 600]]
+def test_options_are_the_parameters_of_read(tmp_path):
+    (tmp_path / "scans").mkdir()
+    for i in range(4):
+        row = np.array([[9, 5 + i, 1, 2], [9, 6 + i, 2, 3]], "<f4")
+        row.tofile(tmp_path / "scans" / f"{100 + 2 * i}.0.bin")
+    poses = tmp_path / "poses.tum"
+    poses.write_text("".join(f"{100 + 4 * i} {i} 0 0 0 0 0 1\n" for i in range(3)))
+    for max_gap, count in ((None, 2), (5.0, 4)):
+        recording = Recording(tmp_path / "scans", poses, columns="power,x,y,z", max_gap=max_gap)
+        scans = recording.read()
+        assert len(scans) == count
+        np.testing.assert_array_equal(scans.points[0], [[5, 1, 2], [6, 2, 3]])
+    words = [tmp_path / "scans", poses, "--columns", "power,x,y,z", "--max-gap", 5.0]
+    assert words_of(recording, Settings(quick=True, set=["seed=1"])) == [
+        *map(str, words),
+        "--quick",
+        "--set",
+        "seed=1",
+    ]
+    with pytest.raises(ValueError, match="world_frame"):
+        Recording(tmp_path / "scans", poses, columns="power,x,y,z", world_frame="map").read()
+    with pytest.raises(ValueError, match=r"poses\.tum"):
+        Recording(tmp_path / "scans", poses, columns="power,x,y,z", extrinsic=poses).read()

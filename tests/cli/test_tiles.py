@@ -1,33 +1,46 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""`radarsdf tiles`."""
+"""``radarsdf tiles``, and the other commands given its folder as a map."""
 
 from __future__ import annotations
 
 import shutil
 
+import numpy as np
 import pytest
 import radarsdf
 import trimesh
+from radarsdf.io.npz import read_scans
 from radarsdf.tiles import cluster
 
-from .calls import call, refusal, values
+from .calls import QUICK, call, refusal, values
 
-FIT = ["--quick", "--set", "num_threads=1", "--geometry-only", "--quiet"]
-PLAN = ["--tile-size", 12.8, "--halo", 6.4, "--no-check", *FIT]
+PLAN = ["--tile-size", 12.8, "--halo", 6.4, "--set", "num_threads=1", *QUICK]
+VOXEL = ["--voxel", 0.2]
+POSE = ["--pose", 1.3, 0.4, 1.5]
 
 
 @pytest.fixture(scope="module")
 def city(scans_file, tmp_path_factory):
     out = tmp_path_factory.mktemp("tiles") / "city"
-    assert call("tiles", scans_file, "-o", out, "--voxel", 0.2, *PLAN) == 0
+    assert call("tiles", scans_file, "-o", out, *VOXEL, *PLAN) == 0
     return out
 
 
-def test_all_steps(city):
-    mesh = trimesh.load_mesh(city / "mesh.ply", process=False)
-    assert len(mesh.faces) > 1000
-    assert radarsdf.load(city).missing == {}
+@pytest.fixture
+def copied(city, tmp_path):
+    """A copy of the city, without its mesh."""
+    out = tmp_path / "city"
+    shutil.copytree(city, out, ignore=shutil.ignore_patterns("mesh*"))
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(scans_file, tmp_path_factory):
+    """The same scans in one map."""
+    path = tmp_path_factory.mktemp("whole") / "map.safetensors"
+    assert call("fit", scans_file, "-o", path, "--set", "num_threads=1", *QUICK) == 0
+    return path
 
 
 def test_step_by_step_gives_the_same_mesh(city, scans_file, tmp_path, capsys):
@@ -35,7 +48,6 @@ def test_step_by_step_gives_the_same_mesh(city, scans_file, tmp_path, capsys):
     said = values(capsys, "tiles", "plan", scans_file, "-o", out, *PLAN)
     assert said["tiles"] > 2
     assert said["tile_m"] == 12.8
-    assert call("tiles", "status", out) == 1  # nothing is done
     names = sorted(path.name for path in (out / "tiles").iterdir())
     assert call("tiles", "fit", out, "--tile", names[0], "--quiet") == 0
     capsys.readouterr()
@@ -44,52 +56,71 @@ def test_step_by_step_gives_the_same_mesh(city, scans_file, tmp_path, capsys):
     assert printed.out == f"1 of {len(names)} tiles are done\n"
     assert printed.err.count("not yet done") == len(names) - 1
     assert call("tiles", "fit", out, "--quiet") == 0
-    assert call("tiles", "mesh", out, "-o", ply, "--voxel", 0.2, "--quiet") == 0
+    assert call("tiles", "mesh", out, "-o", ply, *VOXEL, "--quiet") == 0
     assert ply.read_bytes() == (city / "mesh.ply").read_bytes()
     assert values(capsys, "tiles", "status", out)["missing"] == {}
 
 
-def test_a_clean_folder(city, tmp_path, capsys):
-    out, ply = tmp_path / "city", tmp_path / "mesh.ply"
-    shutil.copytree(city, out)
-    freed = values(capsys, "tiles", "clean", out)["bytes"]
+def test_a_clean_folder(city, copied, tmp_path, capsys):
+    ply = tmp_path / "mesh.ply"
+    freed = values(capsys, "tiles", "clean", copied)["bytes"]
     assert freed > 20 * 9000  # at least a ray for each return
-    assert not list(out.glob("tiles/*/rays.bin"))
-    assert values(capsys, "tiles", "status", out)["missing"] == {}
-    assert call("tiles", "fit", out, "--quiet") == 0
-    assert call("tiles", "mesh", out, "-o", ply, "--voxel", 0.2, "--quiet") == 0
+    assert not list(copied.glob("tiles/*/rays.bin"))
+    assert values(capsys, "tiles", "status", copied)["missing"] == {}
+    assert call("tiles", "mesh", copied, "-o", ply, *VOXEL, "--quiet") == 0
     assert ply.read_bytes() == (city / "mesh.ply").read_bytes()
 
 
-def test_a_tile_that_failed_is_named(city, tmp_path, capsys):
-    out = tmp_path / "city"
-    shutil.copytree(city, out)
-    name = max((out / "tiles").iterdir()).name
-    (out / "tiles" / name / "map.safetensors").unlink()
-    (out / "tiles" / name / "rays.bin").write_bytes(b"")
+@pytest.mark.usefixtures("small_pictures")
+def test_a_tile_that_failed_is_named_by_every_command(copied, scans_file, tmp_path, capsys):
+    name = max(radarsdf.load(copied).plan.tiles, key=lambda tile: tile.returns).name
+    (copied / "tiles" / name / "map.safetensors").unlink()
+    (copied / "tiles" / name / "rays.bin").write_bytes(b"")
     capsys.readouterr()
-    assert call("tiles", "fit", out, "--quiet") == 1
-    said = capsys.readouterr().err
-    assert said.startswith(f"radarsdf tiles: {name}: ")
-    assert "rays instead of" in said
+    assert call("tiles", "fit", copied, "--quiet") == 1
+    assert capsys.readouterr().err.startswith(f"error: {name}: ")
+    assert values(capsys, "info", copied)["missing_tiles"] == [name]
+    page = tmp_path / "report.html"
+    assert call("report", copied, scans_file, "-o", page, *VOXEL, "--quiet") == 0
+    assert capsys.readouterr().err.startswith(f"warning: {copied} lacks 1 of 4 tiles")
+    assert call("eval", copied, scans_file, "--holdout", 3, "--samples", 20000, *VOXEL) == 0
+    assert " held-out returns are in no tile\n" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["status", "nowhere"], "no such file or folder"),
-        (["mesh", "nowhere"], "there is no folder"),
-        (["clean", "nowhere"], "no such file or folder"),
-        (["nowhere.npz", "-o", "city"], "does not exist"),
-    ],
-)
-def test_wrong_words(tmp_path, monkeypatch, capsys, words, said):
-    monkeypatch.chdir(tmp_path)
-    assert said in refusal(capsys, tmp_path, "tiles", *words)
+def test_the_city_is_the_map(city, whole, scans_file, tmp_path, capsys):
+    of_tiles, of_one = (values(capsys, "info", path) for path in (city, whole))
+    assert of_tiles["leaf_cells"] == pytest.approx(of_one["leaf_cells"], rel=0.05)
+    assert (of_tiles["returns"], of_tiles["scans"]) == (of_one["returns"], of_one["scans"])
+    np.testing.assert_allclose(of_tiles["extent"], of_one["extent"], atol=1.0)
+    ply = tmp_path / "mesh.ply"
+    assert call("mesh", city, "-o", ply, *VOXEL, "--viewpoint", 2, 0, 1.5, "--quiet") == 0
+    expected = radarsdf.load(city).mesh(0.2, progress=False)
+    np.testing.assert_array_equal(trimesh.load_mesh(ply, process=False).faces, expected.faces)
+    words = [scans_file, "--samples", 20000, "--holdout", 3, *VOXEL]
+    of_tiles, of_one = (values(capsys, "eval", path, *words) for path in (city, whole))
+    assert of_tiles["surface"]["f_score_all"] == pytest.approx(of_one["surface"]["f_score_all"], abs=0.02)
+    assert of_tiles["held_out"]["mae"] == pytest.approx(of_one["held_out"]["mae"], rel=0.2)
+    assert of_tiles["knn"] == of_one["knn"]
+    out = tmp_path / "view.npz"
+    assert call("render", city, *POSE, "--pose", 1e6, 0, 0, "-o", out) == 0
+    assert len(read_scans(out).points) == 1
 
 
-def test_a_tile_that_is_not_in_the_plan(city, capsys, tmp_path):
-    assert "has no tile 99_99" in refusal(capsys, tmp_path, "tiles", "fit", city, "--tile", "99_99")
+def test_folders_and_words_that_are_wrong(city, tmp_path, capsys):
+    nothing, planned, ply = tmp_path / "nothing", tmp_path / "planned", tmp_path / "x.ply"
+    for folder in (nothing, planned):
+        folder.mkdir()
+    shutil.copy(city / "plan.json", planned)
+    for words, named in (
+        (["info", nothing], f"{nothing} is no map"),
+        (["mesh", planned, "-o", ply], "radarsdf tiles fit"),
+        (["mesh", city, "-o", ply, "--voxel", 0.15], "0.1 or 0.2"),
+        (["tiles", "status", tmp_path / "nowhere"], "nowhere"),
+        (["tiles", "mesh", tmp_path / "nowhere"], "nowhere"),
+        (["tiles", "fit", city, "--tile", "99_99"], "99_99"),
+        (["tiles", tmp_path / "nowhere.npz", "-o", tmp_path / "new"], "nowhere.npz"),
+    ):
+        assert named in refusal(capsys, tmp_path, *words)
 
 
 def test_no_cluster(city, capsys, tmp_path, monkeypatch):

@@ -117,7 +117,7 @@ def _same(expected: list[str], printed: list[str]) -> bool:
 
 
 def shell_environment(folder: Path) -> dict[str, str]:
-    """Variables for the shell: `radarsdf` and `python` are those of this process, with all imported."""
+    """Variables for the shell: `radarsdf` and `python` are those of this process."""
     tools = folder / "tools"
     tools.mkdir()
     python = shlex.join(warm_python())
@@ -125,7 +125,12 @@ def shell_environment(folder: Path) -> dict[str, str]:
         script = tools / name
         script.write_text(f'#!/bin/sh\nexec {words} "$@"\n', encoding="utf-8")
         script.chmod(0o755)
-    return os.environ | {"PATH": f"{tools}{os.pathsep}{os.environ['PATH']}", "MPLBACKEND": "Agg"}
+    root = Path(__file__).parents[2]
+    return os.environ | {
+        "PATH": os.pathsep.join([str(tools), os.environ["PATH"]]),
+        "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")]),
+        "MPLBACKEND": "Agg",
+    }
 
 
 def _bash(text: str, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:

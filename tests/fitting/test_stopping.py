@@ -229,7 +229,7 @@ sys.exit(main())
     _, said = process.communicate(timeout=HUNG_S)
     assert process.returncode == 130
     assert (
-        said == f"radarsdf fit: interrupted while training; the map so far is in {tmp_path}/map.safetensors\n"
+        said == f"error: interrupted while training; the map so far is in {tmp_path}/map.safetensors\n"
     )
     radar_map = radarsdf.load(tmp_path / "map.safetensors")
     assert 0 < radar_map.report["iterations_done"]["sdf"] < 1_000_000

@@ -1,81 +1,160 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Options that several commands share, and what they stand for."""
+"""Groups of options that several commands share. The lines of a docstring are the help of its fields."""
 
 from __future__ import annotations
 
-import argparse
 import ast
+import dataclasses
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from radarsdf.cli.app import refuse_if
 
 if TYPE_CHECKING:
     from radarsdf import FitConfig
+    from radarsdf.io.poses.trajectory import StampedPoses
+    from radarsdf.io.scans import Scans
+
+MAP_SUFFIX = ".safetensors"
+"""By which the file of a map is known from a mesh."""
+
+Box = tuple[float, float, float, float, float, float] | None
+"""The lower and the upper corner."""
 
 
-def add_fit_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that :func:`config_of` reads, and ``--quiet``."""
-    add_config_options(parser)
-    add_quiet(parser)
+def corners_of(box: Box) -> list[list[float]] | None:
+    """The lower and the upper corner of ``--box``, world frame, m."""
+    return None if box is None else [list(box[:3]), list(box[3:])]
 
 
-def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that :func:`config_of` reads."""
-    presets = parser.add_mutually_exclusive_group()
-    presets.add_argument(
-        "--paper",
-        action="store_true",
-        help="use the published configuration: slower, for comparison",
-    )
-    presets.add_argument(
-        "--quick",
-        action="store_true",
-        help="average distances instead of training the surface: less accurate, but done in under a second; "
-        "mesh the map with --voxel 0.2",
-    )
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="TOML",
-        help="change the settings that this file has; radarsdf config prints all of them",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="change one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated",
-    )
+@dataclass
+class Recording:
+    """The scans of a command, their poses, and how both are read.
+
+    scans: The scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set.
+    poses: Their poses, where the scans have none: a file in TUM or KITTI format, or of 4 x 4 matrices.
+    extrinsic: File of the 4 x 4 matrix from the sensor's frame to that of the poses, T_base_sensor, if they differ.
+    topic: In a bag: the topic of the scans; may be repeated.
+    pose_topic: In a bag: the topic of the poses.
+    imu_topic: In a bag: the topic of the inertial measurements, for poses that are found.
+    imu_rotation: File of the 3 x 3 matrix from the axes of the IMU to those of the radar, R_sensor_imu; default: of the
+        bag, or found.
+    field: The field of the file for x, y, z, intensity or doppler, such as intensity=Power; may be repeated.
+    columns: Of files without names: how many numbers a return has, or their names, such as x,y,z,intensity,doppler.
+    max_gap: Longest time between two poses over which poses are interpolated, s; default: 0.5.
+    world_frame: In a bag with TF: the frame of the world.
+    stamps: In a bag: the time of a scan; default: of its header, unless stamps are zero or constant.
+    """
+
+    panel: ClassVar[str] = "Reading scans"
+    scans: Path
+    poses: Path | None = None
+    _: KW_ONLY
+    extrinsic: Path | None = None
+    topic: list[str] | None = None
+    pose_topic: str | None = None
+    imu_topic: str | None = None
+    imu_rotation: Path | None = None
+    field: list[str] | None = None
+    columns: str | None = None
+    max_gap: float | None = None
+    world_frame: str | None = None
+    stamps: Literal["header", "record"] | None = None
+
+    def read(self, poses: StampedPoses | None = None) -> Scans:
+        """The scans, with `poses` in place of theirs. What was assumed or left out is logged on standard error."""
+        from radarsdf.io.read import read
+
+        columns = self.columns
+        replaced: Any = self.poses if poses is None else poses
+        return read(
+            self.scans,
+            replaced,
+            extrinsic=_matrix(self.extrinsic, 4, "extrinsic: that is a 4 x 4 matrix T_base_sensor"),
+            topic=self.topic,
+            pose_topic=self.pose_topic,
+            imu_topic=self.imu_topic,
+            R_sensor_imu=_matrix(self.imu_rotation, 3, "rotation: that is a 3 x 3 matrix R_sensor_imu"),
+            fields=dict(_role_and_name(text) for text in self.field or ()) or None,
+            columns=int(columns) if columns and columns.isdecimal() else columns and columns.split(","),
+            world_frame=self.world_frame,
+            stamps=self.stamps,
+            **({} if self.max_gap is None else {"max_gap_s": self.max_gap}),
+        )
+
+    @property
+    def inputs(self) -> list[Path]:
+        """The files and folders that are read, which no output may overwrite."""
+        paths = (self.scans, self.poses, self.extrinsic, self.imu_rotation)
+        return [path for path in paths if path is not None]
 
 
-def config_of(options: argparse.Namespace) -> FitConfig:
-    """The configuration: the chosen preset, then the changes of ``--config``, then those of ``--set``."""
-    from radarsdf.config.fit_config import FitConfig
-    from radarsdf.config.toml import read_toml
+@dataclass
+class MaybeRecording(Recording):
+    """The same for commands that work without scans: the field `scans` may be None."""
 
-    config = FitConfig.paper() if options.paper else FitConfig.quick() if options.quick else FitConfig()
-    if options.config is not None:
-        config = config.override(**read_toml(options.config))
-    for text in options.set:
-        config = config.override(**setting_of(text))
-    return config
+    scans: Path | None = None  # type: ignore[assignment]
 
 
-def config_words(options: argparse.Namespace) -> list[str]:
-    """The options that :func:`config_of` reads, as one would type them again."""
-    words = [f"--{name}" for name in ("paper", "quick") if getattr(options, name)]
-    words += [] if options.config is None else ["--config", str(options.config)]
-    for text in options.set:
-        words += ["--set", text]
-    return words
+MaybeRecording.__doc__ = Recording.__doc__
+
+
+def _matrix(path: Path | None, size: int, what: str) -> Any:
+    """The matrix in a file, if there is one; `what` it should be is in the error."""
+    from radarsdf.io.text import read_numbers
+
+    try:
+        return None if path is None else read_numbers(path, size)
+    except ValueError as error:
+        msg = f"{path} is no {what}, {size} lines of {size} numbers"
+        raise ValueError(msg) from error
+
+
+def _role_and_name(text: str) -> tuple[str, str]:
+    role, equals, name = text.partition("=")
+    refuse_if(not (equals and role and name), f"--field takes ROLE=NAME, not {text!r:.50}")
+    return role, name
+
+
+@dataclass(kw_only=True)
+class Settings:
+    """The configuration of a fit: a preset, then the changes of a file, then single ones.
+
+    paper: Use the published configuration: slower, for comparison.
+    quick: Average distances instead of training the surface: less accurate, but done in under a second; mesh the map with
+        --voxel 0.2.
+    config: Change the settings that this TOML file has; radarsdf config prints all of them.
+    set: Change one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated.
+    """
+
+    panel: ClassVar[str] = "Settings of the fit"
+    paper: bool = False
+    quick: bool = False
+    config: Path | None = None
+    set: list[str] | None = None
+
+    def __post_init__(self) -> None:
+        refuse_if(self.paper and self.quick, "--paper and --quick are two presets: leave out one of them")
+
+    def load(self) -> FitConfig:
+        """The configuration."""
+        from radarsdf.config.fit_config import FitConfig
+        from radarsdf.config.toml import read_toml
+
+        config = FitConfig.paper() if self.paper else FitConfig.quick() if self.quick else FitConfig()
+        if self.config is not None:
+            config = config.override(**read_toml(self.config))
+        for text in self.set or ():
+            config = config.override(**setting_of(text))
+        return config
 
 
 def setting_of(text: str) -> dict[str, Any]:
     """One ``NAME=VALUE`` or ``GROUP.NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
     path, equals, value = text.partition("=")
-    if not equals:
-        msg = f"--set takes NAME=VALUE, not {text!r:.50}"
-        raise ValueError(msg)
+    refuse_if(not equals, f"--set takes NAME=VALUE, not {text!r:.50}")
     group, dot, name = path.partition(".")
     try:
         read = ast.literal_eval(value)
@@ -84,91 +163,71 @@ def setting_of(text: str) -> dict[str, Any]:
     return {group: {name: read}} if dot else {path: read}
 
 
-def add_quiet(parser: argparse.ArgumentParser) -> None:
-    """Add the option that :func:`progress_of` reads."""
-    parser.add_argument("--quiet", action="store_true", help="show no progress bar")
+def words_of(*groups: Recording | Settings) -> list[str]:
+    """Arguments and options as one would type them again."""
+    words: list[str] = []
+    for group in groups:
+        for field in dataclasses.fields(group):
+            value = getattr(group, field.name)
+            option = f"--{field.name.replace('_', '-')}"
+            if value in (None, False, []):
+                continue
+            if value is True:
+                words.append(option)
+            elif not field.kw_only:
+                words.append(str(value))
+            else:
+                words += [
+                    word
+                    for one in (value if isinstance(value, list) else [value])
+                    for word in (option, str(one))
+                ]
+    return words
 
 
-def progress_of(options: argparse.Namespace) -> bool | None:
-    """The argument ``progress`` of a fit or a mesh. None: a bar if standard error is a terminal."""
-    return False if options.quiet else None
+@dataclass(kw_only=True)
+class Surface:
+    """The voxels of a mesh, and what it leaves out.
+
+    voxel: Edge length of a voxel, m.
+    min_confidence: Leave out the surface whose confidence is below this, 0 to 1; default: that of the highest expected
+        F-score.
+    max_uncertainty: Leave out the surface whose standard error is above this, m; default: there is no limit.
+    min_component: Leave out connected components of fewer triangles; default: 30, and fewer in voxels above 0.1 m.
+    """
+
+    panel: ClassVar[str] = "Surface"
+    voxel: float = 0.1
+    min_confidence: float | None = None
+    max_uncertainty: float | None = None
+    min_component: int | None = None
+
+    @property
+    def limits(self) -> dict[str, Any]:
+        """What the mesh leaves out, as arguments of ``Map.mesh``."""
+        return {
+            "min_confidence": self.min_confidence,
+            "max_uncertainty": self.max_uncertainty,
+            "min_component_triangles": self.min_component,
+        }
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add the option that :class:`radarsdf.cli.results.Results` reads."""
-    parser.add_argument(
-        "--json",
-        action="store_true",
-        help="print the results as one JSON object, lengths in m; progress and warnings go to standard error",
-    )
+@dataclass(kw_only=True)
+class Address:
+    """Where a page is served.
 
+    host: Address to listen on. 127.0.0.1 is reached from this machine alone; with 0.0.0.0 everyone who can reach the machine
+        sees the map, by its address or its name.
+    port: Port to listen on; default: 8080, or the next that is free.
+    """
 
-def add_surface(parser: argparse.ArgumentParser) -> None:
-    """Add ``--voxel``, and the options that :func:`limits_of` reads: those of every command that makes a mesh."""
-    parser.add_argument(
-        "--voxel", type=float, default=0.1, metavar="M", help="edge length of a voxel, m; default: 0.1"
-    )
-    parser.add_argument(
-        "--min-confidence",
-        type=float,
-        metavar="C",
-        help="leave out the surface whose confidence is below C, 0 to 1; default: that of the highest expected F-score",
-    )
-    parser.add_argument(
-        "--max-uncertainty",
-        type=float,
-        metavar="M",
-        help="leave out the surface whose standard error is above M, m; default: there is no limit",
-    )
-    parser.add_argument(
-        "--min-component",
-        type=int,
-        metavar="N",
-        help="leave out connected pieces of fewer triangles; default: 30, and fewer in voxels above 0.1 m",
-    )
+    panel: ClassVar[str] = "Address of the page"
+    host: str = "127.0.0.1"
+    port: int | None = None
 
+    def check(self) -> None:
+        """Before any work: raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
+        from radarsdf.view.serving import free_port, require_viser
 
-def limits_of(options: argparse.Namespace) -> dict[str, Any]:
-    """What a mesh leaves out, as arguments of ``Map.mesh``."""
-    return {
-        "min_confidence": options.min_confidence,
-        "max_uncertainty": options.max_uncertainty,
-        "min_component_triangles": options.min_component,
-    }
-
-
-def add_box(parser: argparse.ArgumentParser) -> None:
-    """Add the option that :func:`box_of` reads."""
-    parser.add_argument(
-        "--box",
-        type=float,
-        nargs=6,
-        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="use only the part between these two corners: lower, upper, world frame, m",
-    )
-
-
-def box_of(options: argparse.Namespace) -> list[list[float]] | None:
-    """The lower and the upper corner, world frame, m. None: no box."""
-    return None if options.box is None else [options.box[:3], options.box[3:]]
-
-
-def add_address(parser: argparse.ArgumentParser) -> None:
-    """Declare where a page is served: ``options.host`` and ``options.port``."""
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen on; default: 127.0.0.1, which only this machine reaches; with 0.0.0.0 everyone who can reach "
-        "the machine sees the map, by its address or its name",
-    )
-    parser.add_argument(
-        "--port", type=int, metavar="N", help="port to listen on; default: 8080, or the next that is free"
-    )
-
-
-def check_address(options: argparse.Namespace) -> None:
-    """Before any work: raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
-    from radarsdf.view.serving import free_port, require_viser
-
-    require_viser()
-    free_port(options.host, options.port or 0, exactly=True)
+        require_viser()
+        free_port(self.host, self.port or 0, exactly=True)

@@ -1,54 +1,76 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The results of a command: lines for people, or with ``--json`` one object for programs."""
+"""What commands print, as lines and tables for people or one JSON object for programs, and how they keep a map."""
 
 from __future__ import annotations
 
-import argparse
-import json
+import json as json_module
 import math
-from collections.abc import Mapping
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from radarsdf.cli.saying import say
+import typer
+
+from radarsdf.cli.app import warn
+
+if TYPE_CHECKING:
+    from radarsdf import RadarMap
+    from radarsdf.io.scans import Scans
+    from radarsdf.map.map import Map
+    from radarsdf.view.serving import Page
 
 
+@dataclass(kw_only=True)
 class Results:
-    """Prints what a command has found. With ``--json`` nothing is printed before :meth:`end`.
+    """Prints what a command has found; with ``--json``, nothing before :meth:`end`.
 
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Of a command with :func:`radarsdf.cli.options.add_json`.
+    json: Print the results as one JSON object, lengths in m; progress and warnings go to standard error.
     """
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        self._json: bool = options.json
+    json: bool = False
+
+    def __post_init__(self) -> None:
         self._values: dict[str, Any] = {}
+        self._ended = False
 
     def add(self, line: str | None = None, **values: Any) -> None:
-        """Print a line, if it is for people. Keep the same numbers for programs, by name; a length is in m, a time in s."""
-        if line is not None and not self._json:
-            say(line)
+        """Print a line for people, and keep the same numbers for programs by name; lengths in m, times in s."""
+        if line is not None and not self.json:
+            typer.echo(line)
         self._values |= values
 
+    def table(self, rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> None:
+        """Print rows for people. With headings, all columns but the first are aligned to the right."""
+        if self.json:
+            return
+        from rich.console import Console
+        from rich.markup import escape
+        from rich.table import Table
+
+        table = Table(box=None, show_header=bool(headings), pad_edge=False)
+        for i, heading in enumerate(headings or ("", "")):
+            table.add_column(heading, justify="right" if headings and i else "left", overflow="fold")
+        for row in rows:
+            table.add_row(*map(escape, row))
+        # What a program reads of a pipe is not broken into lines.
+        Console(width=None if sys.stdout and sys.stdout.isatty() else 10_000).print(table)
+
     def add_threshold(self, metadata: Mapping[str, Any]) -> None:
-        """Say from which confidence on a mesh with this ``metadata`` was kept, and what that costs."""
+        """Add the confidence from which on a mesh with this ``metadata`` was kept, and what that costs."""
         from radarsdf.map.threshold import Threshold
 
         threshold = Threshold.of_mesh(metadata)
         self.add(str(threshold), **threshold.metadata)
 
     def end(self) -> None:
-        """Print the object, if it is for programs. A number that is not finite is null."""
-        if self._json:
-            say(json.dumps(_plain(self._values), indent=2, allow_nan=False))
-
-
-def counted(count: int, what: str) -> str:
-    """Such as "1 scan" or "2 scans"."""
-    return f"{count} {what}{'s' * (count != 1)}"
+        """Print the object, if it is for programs, once. A number that is not finite is null."""
+        if self.json and not self._ended:
+            self._ended = True
+            typer.echo(json_module.dumps(_plain(self._values), indent=2, allow_nan=False))
 
 
 def _plain(value: Any) -> Any:
@@ -62,3 +84,81 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+def counted(count: int, what: str) -> str:
+    """Such as "1 scan" or "2 scans"."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
+def load_map(path: Path) -> Map:
+    """Load a map, and warn of tiles that are missing."""
+    from radarsdf.tiles.any_map import lacking, load
+
+    radar_map = load(path)
+    if tiles := lacking(radar_map):
+        warn(f"warning: {path} lacks {tiles}: radarsdf tiles status {path} lists the reasons")
+    return radar_map
+
+
+def save_map(radar_map: RadarMap, path: Path) -> None:
+    """Save a map, or if that fails, in the temporary folder: a fit is too much work to be lost for its file's name.
+
+    An OSError says where it is instead.
+    """
+    try:
+        radar_map.save(path)
+    except (OSError, ValueError) as error:  # ValueError: it is no regular file any more
+        why = getattr(error, "strerror", None) or str(error)
+        spare = Path(tempfile.mkdtemp(prefix="radarsdf_")) / path.name
+        radar_map.save(spare)
+        msg = f"{path} cannot be written ({why}): the map was saved in {spare} instead"
+        raise OSError(msg) from error
+
+
+def until_stopped(page: Page) -> None:
+    """Serve a page until Ctrl-C, which is the way to end it and no failure."""
+    try:
+        page.wait()
+    except KeyboardInterrupt:
+        typer.echo("stopped")
+
+
+def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:
+    """The scans of a fit, and those that ``--holdout`` leaves out."""
+    from radarsdf.evaluation import holdout
+
+    if every is None:
+        return scans, None
+    train, test = holdout(len(scans.points), every)
+    return scans.select(train), scans.select(test)
+
+
+def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: Scans) -> None:
+    """Add the intensity errors on scans that a fit left out, and those of a kNN baseline on the scans that it used."""
+    from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
+    from radarsdf.returns.movers import rays_as_measured
+    from radarsdf.tiles.any_map import predicted
+
+    if not radar_map.has_intensity or test.intensities is None:
+        return
+    tested, known = (rays_as_measured(scans, radar_map.config) for scans in (test, train))
+    given = len(tested)
+    tested, known = (rays.select(rays.with_intensity) for rays in (tested, known))
+    if outliers := given - len(tested):
+        line = f"{outliers} of {given} held-out intensities are outliers, and are not compared"
+        results.add(line, wild_intensities=outliers)
+    inside, found = predicted(radar_map, tested)
+    if outside := len(tested) - len(inside):
+        results.add(f"{outside} of {len(tested)} held-out returns are in no tile", in_no_tile=outside)
+    (x, sensors), measured = inside.in_world(), inside.intensities
+    assert measured is not None
+    assert known.intensities is not None
+    errors = intensity_metrics(found, measured)
+    results.add("held-out " + format_metrics(errors), held_out=errors)
+    knn = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
+    metrics = intensity_metrics(knn.predict(x, sensors), measured)
+    results.add(
+        f"kNN      {format_metrics(metrics)}, {knn.k} of {knn.candidates} neighbours",
+        knn=metrics | {"neighbours": knn.k, "candidates": knn.candidates},
+    )

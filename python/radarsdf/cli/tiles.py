@@ -4,237 +4,262 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
+import itertools
+import multiprocessing
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from radarsdf.cli.options import (
-    add_config_options,
-    add_json,
-    add_quiet,
-    add_surface,
-    config_of,
-    limits_of,
-    progress_of,
-)
-from radarsdf.cli.posing import finding, scans_or_unposed
+import typer
+from typer.core import TyperGroup
+
+from radarsdf.cli.app import app, command, refuse_if, warn
+from radarsdf.cli.commands import COMMANDS
+from radarsdf.cli.options import Recording, Settings, Surface
 from radarsdf.cli.results import Results
-from radarsdf.cli.saying import complain
-from radarsdf.cli.scans_in import add_scans
+from radarsdf.cli.scans import finding_poses, scans_or_unposed, warn_or_refuse
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     from radarsdf.tiles.plan import Plan
 
-STEPS = {
-    "plan": "read the scans once, and write to a file for each tile the rays that cross it",
-    "fit": "fit the tiles of a plan; those that are done are kept",
-    "mesh": "write the surface of all tiles as one mesh, which need not fit into memory",
-    "status": "name the tiles that are not done, and why",
-    "clean": "remove the rays of tiles that are done, and pieces of meshes",
-}
-"""Name of each step, and its help in one line."""
 _FIRST_SCANS = 100  # that are checked before the work
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of all steps in one go."""
-    _add_plan(parser)
-    _add_where(parser)
-    add_surface(parser)
-    add_quiet(parser)
-    add_json(parser)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    steps = "\n".join(f"  {name:<8}{text}" for name, text in STEPS.items())
-    parser.epilog = f"one step at a time: radarsdf tiles STEP; radarsdf tiles STEP --help says more\n{steps}"
+class _Steps(TyperGroup):
+    """Runs the step ``run`` where the first word is the name of no step."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in (*self.commands, "--help", "-h"):
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
 
 
-def add_step_arguments(parser: argparse.ArgumentParser, step: str) -> None:
-    """Declare the arguments of one of `STEPS`."""
-    if step == "plan":
-        _add_plan(parser)
-    else:
-        parser.add_argument("folder", type=Path, help="what radarsdf tiles plan wrote")
-    if step in ("fit", "status"):
-        parser.add_argument("--tile", action="append", metavar="NAME", help="only this tile; may be repeated")
-    if step == "mesh":
-        parser.add_argument(
-            "-o",
-            "--out",
-            type=Path,
-            help="the mesh to write: a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder",
+_tiles = typer.Typer(cls=_Steps, no_args_is_help=True, subcommand_metavar="[STEP] [ARGS]...")
+_PANEL = next(panel for panel, texts in COMMANDS.items() if "tiles" in texts)
+app.add_typer(_tiles, name="tiles", help=COMMANDS[_PANEL]["tiles"], rich_help_panel=_PANEL)
+
+
+@dataclass(kw_only=True)
+class Cut:
+    """How a drive is cut into tiles.
+
+    tile_size: Edge of a tile, m; default: 512 leaf cells.
+    halo: Margin around a tile that its fit sees, m.
+    refine: Refine the poses by the returns before the plan is made; they are written into the folder, poses.tum.
+    geometry_only: Do not use the intensities.
+    no_check: Do not check the first scans.
+    """
+
+    tile_size: float | None = None
+    halo: float | None = None
+    refine: bool = False
+    geometry_only: bool = False
+    no_check: bool = False
+
+
+@dataclass(kw_only=True)
+class Where:
+    """Who does the work.
+
+    processes: Number of tiles that are fitted at a time, each by a process.
+    cluster: Address of the scheduler of dask.distributed, such as tcp://host:8786.
+    """
+
+    processes: int | None = None
+    cluster: str | None = None
+
+    def __post_init__(self) -> None:
+        refuse_if(
+            self.processes and self.cluster, "--processes and --cluster exclude each other: leave out one"
         )
-        add_surface(parser)
-    if step in ("plan", "fit", "mesh"):
-        _add_where(parser)
-        add_quiet(parser)
-    add_json(parser)
+        refuse_if(
+            self.processes is not None and self.processes < 1,
+            f"--processes must be at least 1, not {self.processes}",
+        )
+
+    @property
+    def is_here(self) -> bool:
+        """Whether this process does it."""
+        return self.processes is None and self.cluster is None
+
+    def executor(self, folder: Path) -> AbstractContextManager[Executor | None]:
+        """What runs the tasks. None: this process."""
+        if self.cluster is not None:
+            from radarsdf.tiles.cluster import cluster_executor
+            from radarsdf.tiles.plan import Plan
+
+            return cluster_executor(self.cluster, max(tile.memory_bytes for tile in Plan.load(folder).tiles))
+        if self.processes is not None:
+            # Not forked: a forked child has only one of the threads of PyTorch and OpenMP.
+            return ProcessPoolExecutor(self.processes, multiprocessing.get_context("spawn"))
+        return nullcontext()
 
 
-def _add_plan(parser: argparse.ArgumentParser) -> None:
-    add_scans(parser)
-    parser.add_argument("-o", "--out", type=Path, required=True, help="the folder to write")
-    parser.add_argument(
-        "--tile-size", type=float, metavar="M", help="edge of a tile, m; default: 512 leaf cells"
-    )
-    parser.add_argument("--halo", type=float, metavar="M", help="what a tile knows beyond its edges, m")
-    parser.add_argument(
-        "--refine",
-        action="store_true",
-        help="mend the poses by the returns before the plan is made; they are written into the folder, poses.tum",
-    )
-    parser.add_argument("--geometry-only", action="store_true", help="do not use the intensities")
-    parser.add_argument("--no-check", action="store_true", help="do not check the first scans")
-    add_config_options(parser)
+@command(_tiles)
+def run(
+    recording: Recording,
+    *,
+    out: Path,
+    cut: Cut,
+    where: Where,
+    settings: Settings,
+    surface: Surface,
+    quiet: bool = False,
+    results: Results,
+) -> int:
+    """Plan, fit and mesh in one go. The word run may be left out: radarsdf tiles SCANS -o CITY.
+
+    out: The folder to write.
+    """
+    plan(recording, out=out, cut=cut, where=where, settings=settings, quiet=quiet, results=results)
+    missing = fit(out, where=where, quiet=quiet, results=results)
+    mesh(out, where=where, surface=surface, quiet=quiet, results=results)
+    return missing
 
 
-def _add_where(parser: argparse.ArgumentParser) -> None:
-    """Who does the work. A plan only estimates by it."""
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--processes", type=int, metavar="N", help="so many tiles at a time")
-    where.add_argument(
-        "--cluster", metavar="ADDRESS", help="the scheduler of dask.distributed, such as tcp://host:8786"
-    )
+@command(_tiles)
+def plan(
+    recording: Recording,
+    *,
+    out: Path,
+    cut: Cut,
+    where: Where,
+    settings: Settings,
+    quiet: bool = False,
+    results: Results,
+) -> None:
+    """Read the scans once, and write to a file for each tile the rays that cross it.
 
-
-def run(options: argparse.Namespace) -> int:
-    """Do one step, or plan, fit and mesh."""
-    step = getattr(options, "step", None)
-    folder: Path = options.out if step in (None, "plan") else options.folder
-    results = Results(options)
-    if step in (None, "plan"):
-        _say_plan(results, _plan(options), folder)
-    if step in (None, "fit"):
-        _fit(options, results, folder)
-    if step in (None, "mesh"):
-        _mesh(options, results, folder, None if step is None else options.out)
-    if step == "clean":
-        _clean(results, folder)
-    names = getattr(options, "tile", None)
-    status = _status(results, folder, names) if step in (None, "fit", "status") else 0
-    results.end()
-    return status
-
-
-def _plan(options: argparse.Namespace) -> Plan:
-    from radarsdf.io.scans import Notes, Scans
+    out: The folder to write.
+    """
+    from radarsdf.io.scans import Notes, Scans, scans_in_memory
     from radarsdf.tiles.fit_tiles import plan_tiles
 
-    scans, missing = scans_or_unposed(options)
-    if not options.no_check and missing is None:
-        _check_first(scans)
-    given = scans
-    if options.geometry_only:
-        given = Scans.of_source(
-            lambda: (_without_intensities(scan) for scan in scans),
-            Notes(str(options.scans)),
+    config = settings.load()
+    scans, missing = scans_or_unposed(recording)
+    if not cut.no_check and missing is None:  # a city of wrong poses would take hours
+        first = list(itertools.islice(iter(scans), _FIRST_SCANS))
+        if len(first) > 1:
+            some = scans_in_memory(first)
+            warn_or_refuse(some, some.intensities)
+    used = scans
+    if cut.geometry_only:
+        used = Scans.of_source(
+            lambda: (dataclasses.replace(scan, intensities=None) for scan in scans),
+            Notes(str(recording.scans)),
             imu=lambda: scans.imu,
         )
-    alone = options.processes is None and options.cluster is None
-    with finding(options, missing):
-        return plan_tiles(
-            given,
-            options.out,
-            tile_size=options.tile_size,
-            halo=options.halo,
-            config=config_of(options),
-            threads=None if alone else 1,
-            refine=options.refine,
+    with finding_poses(missing):
+        planned = plan_tiles(
+            used,
+            out,
+            tile_size=cut.tile_size,
+            halo=cut.halo,
+            config=config,
+            threads=None if where.is_here else 1,
+            refine=cut.refine,
             find=missing is not None,
-            progress=progress_of(options),
+            progress=False if quiet else None,
         )
+    _add_plan(results, planned, out)
 
 
-def _check_first(scans: Any) -> None:
-    """A city of wrong poses would take hours."""
-    import itertools
+@command(_tiles)
+def fit(
+    folder: Path, *, tile: list[str] | None = None, where: Where, quiet: bool = False, results: Results
+) -> int:
+    """Fit the tiles of a plan; those that are done are kept.
 
-    from radarsdf.cli.check import warn_or_refuse
-    from radarsdf.io.scans import scans_in_memory
-
-    some = list(itertools.islice(iter(scans), _FIRST_SCANS))
-    if len(some) > 1:
-        first = scans_in_memory(some)
-        warn_or_refuse(first, first.intensities)
-
-
-def _without_intensities(scan: Any) -> Any:
-    import dataclasses
-
-    return dataclasses.replace(scan, intensities=None)
-
-
-def _executor(options: argparse.Namespace, folder: Path) -> AbstractContextManager[Executor | None]:
-    """What runs the tasks. None: this process."""
-    if options.cluster is not None:
-        from radarsdf.tiles.cluster import cluster_executor
-        from radarsdf.tiles.plan import Plan
-
-        plan = Plan.load(folder)
-        return cluster_executor(options.cluster, max(tile.memory_bytes for tile in plan.tiles))
-    if options.processes is not None:
-        import multiprocessing
-        from concurrent.futures import ProcessPoolExecutor
-
-        from radarsdf.checks import whole_number
-
-        count = whole_number(options.processes, "--processes", 1, 1024)
-        # Not forked: a child that is forked has only one of the threads of PyTorch and OpenMP.
-        return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"))
-    return nullcontext()
-
-
-def _fit(options: argparse.Namespace, results: Results, folder: Path) -> None:
+    folder: What radarsdf tiles plan wrote.
+    tile: Name of a tile, the only one that is fitted; may be repeated.
+    """
     from radarsdf.tiles.fit_tiles import run_fits
 
-    with _executor(options, folder) as executor:
-        city = run_fits(
-            folder, executor=executor, names=getattr(options, "tile", None), progress=progress_of(options)
-        )
+    with where.executor(folder) as executor:
+        city = run_fits(folder, executor=executor, names=tile, progress=False if quiet else None)
     results.add(f"{city} in {folder}", tiles_done=len(city.tiles))
+    return status(folder, tile=tile, results=results)
 
 
-def _mesh(options: argparse.Namespace, results: Results, folder: Path, out: Path | None) -> None:
+@command(_tiles)
+def mesh(
+    folder: Path,
+    *,
+    out: Path | None = None,
+    where: Where,
+    surface: Surface,
+    quiet: bool = False,
+    results: Results,
+) -> None:
+    """Write the surface of all tiles as one mesh, which need not fit into memory.
+
+    folder: What radarsdf tiles fit wrote.
+    out: The mesh to write: a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder.
+    """
     from radarsdf.io.files import check_outputs
     from radarsdf.tiles.tiled_map import TiledMap
 
     out = folder / "mesh.ply" if out is None else out
     check_outputs([out])
     city = TiledMap(folder)
-    with _executor(options, folder) as executor:
+    progress = False if quiet else None
+    with where.executor(folder) as executor:
         vertices, triangles = city.export(
-            out, options.voxel, **limits_of(options), executor=executor, progress=progress_of(options)
+            out, surface.voxel, **surface.limits, executor=executor, progress=progress
         )
-    results.add(
-        f"{vertices} vertices and {triangles} triangles written to {out}",
-        vertices=vertices,
-        triangles=triangles,
-        out=out,
-    )
-    results.add_threshold(city.threshold(options.voxel, **limits_of(options)).metadata)
+    line = f"{vertices} vertices and {triangles} triangles written to {out}"
+    results.add(line, vertices=vertices, triangles=triangles, out=out)
+    results.add_threshold(city.threshold(surface.voxel, **surface.limits).metadata)
 
 
-def _clean(results: Results, folder: Path) -> None:
+@command(_tiles)
+def status(folder: Path, *, tile: list[str] | None = None, results: Results) -> int:
+    """Name the tiles that are not done, and why; the exit status is 1 if there are any.
+
+    folder: What radarsdf tiles plan wrote.
+    tile: Name of a tile, the only one that is looked at; may be repeated.
+    """
+    from radarsdf.tiles.plan import Plan, failure_of
+    from radarsdf.tiles.tile_fit import is_done
+
+    plan = Plan.load(folder)
+    tiles = [planned for planned in plan.tiles if tile is None or planned.name in tile]
+    undone = [planned for planned in tiles if not is_done(folder, plan, planned)]
+    missing = {planned.name: failure_of(folder, planned) or "not yet done" for planned in undone}
+    results.add(f"{len(tiles) - len(missing)} of {len(tiles)} tiles are done", missing=missing)
+    for name, reason in missing.items():
+        warn(f"error: {name}: {reason}")
+    return int(bool(missing))
+
+
+@command(_tiles)
+def clean(folder: Path, *, results: Results) -> None:
+    """Remove the rays of tiles that are done, and parts of meshes.
+
+    folder: What radarsdf tiles fit wrote.
+    """
     from radarsdf.tiles.tiled_map import TiledMap
 
     freed = TiledMap(folder).clean()
-    results.add(f"{freed / 1e6:.1f} MB of rays and pieces of meshes removed from {folder}", bytes=freed)
+    results.add(f"{freed / 1e6:.1f} MB of rays and parts of meshes removed from {folder}", bytes=freed)
 
 
-def _say_plan(results: Results, plan: Plan, folder: Path) -> None:
+def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
     from radarsdf.tiles.drive_poses import TRAJECTORY, DrivePoses
 
     if (poses := DrivePoses.load(folder)) is not None:
-        way, rows = poses.posed.way or {}, poses.posed.rows
+        way: dict[str, Any] = poses.posed.way or {}
+        rows = poses.posed.rows
         results.add(way["verdict"], poses=folder / TRAJECTORY, improved=way["improved"])
         for note in poses.posed.notes:
-            complain(f"radarsdf tiles: {note}")
+            warn(f"note: {note}")
         if poses.posed.pieces > 1:
-            results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest piece")
+            results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest segment")
     returns, rays = (sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays"))
-    most, seconds = max(tile.memory_bytes for tile in plan.tiles), sum(tile.seconds for tile in plan.tiles)
+    seconds, most = sum(tile.seconds for tile in plan.tiles), max(tile.memory_bytes for tile in plan.tiles)
     results.add(
         f"{len(plan.tiles)} tiles of {plan.tile_m:g} m with a halo of {plan.halo_m:g} m, {returns} returns in "
         f"{plan.scans} scans, {rays / returns:.1f} rays for each; about {seconds:.0f} s in all, and "
@@ -249,20 +274,3 @@ def _say_plan(results: Results, plan: Plan, folder: Path) -> None:
         memory_bytes=most,
         plan=folder / "plan.json",
     )
-
-
-def _status(results: Results, folder: Path, names: list[str] | None) -> int:
-    """Name the tiles that are not done, of all or of these `names`. The exit status is 1 if there are any."""
-    from radarsdf.tiles.plan import Plan, failure_of
-    from radarsdf.tiles.tile_fit import is_done
-
-    plan = Plan.load(folder)
-    missing = {}
-    tiles = [tile for tile in plan.tiles if names is None or tile.name in names]
-    for tile in tiles:
-        if not is_done(folder, plan, tile):
-            missing[tile.name] = failure_of(folder, tile) or "not yet done"
-    results.add(f"{len(tiles) - len(missing)} of {len(tiles)} tiles are done", missing=missing)
-    for name, reason in missing.items():
-        complain(f"radarsdf tiles: {name}: {reason}")
-    return 1 if missing else 0

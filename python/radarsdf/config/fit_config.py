@@ -236,7 +236,7 @@ class FitConfig:
             group = getattr(self, name, None)
             if isinstance(group, _Group) and isinstance(value, Mapping):
                 own = {field.name: getattr(group, field.name) for field in dataclasses.fields(group)}
-                merged[name] = type(group)(**(own | by_name(value, name)))
+                merged[name] = own | by_name(value, name)
             else:
                 merged[name] = value
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}

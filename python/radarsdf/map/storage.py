@@ -364,7 +364,8 @@ def checked_report(report: Any) -> dict[str, Any]:
     try:
         checked: dict[str, Any] = _REPORT.validate_python(by_name(report, "the report"))
     except ValidationError as error:
-        raise ValueError(first_wrong(error, "report.")) from None
+        msg = f"report.{first_wrong(error)}"
+        raise ValueError(msg) from None
     for name in checked.keys() - {"skipped_s"}:
         value = checked[name]
         if name.endswith("_s") and not (isinstance(value, float) and 0 <= value < _MOST_SECONDS):

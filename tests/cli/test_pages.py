@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""``radarsdf view`` and ``report``."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+
+from .calls import FAST, call, files, refusal
+
+
+@pytest.mark.parametrize("command", ["fit", "report", "view"])
+def test_what_to_install_is_said_before_the_work(
+    command, scans_file, map_file, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setattr("radarsdf.fitting.fit.prepare", lambda *_, **__: pytest.fail("the work began"))
+    page = tmp_path / "report.html"
+    words = {
+        "fit": [scans_file, "-o", tmp_path / "map.safetensors", "--report", page, *FAST],
+        "report": [map_file, scans_file, "-o", page],
+        "view": [map_file],
+    }[command]
+    assert 'pip install "viser' in refusal(capsys, tmp_path, command, *words)
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_a_fit_with_its_report(scans_file, tmp_path, capsys):
+    out, page = tmp_path / "map.safetensors", tmp_path / "report.html"
+    assert call("fit", scans_file, "-o", out, "--report", page, "--holdout", 3, *FAST) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-1].endswith(f" MB written to {page}")
+    assert not [line for line in printed if "viser" in line]
+    assert files(tmp_path) == ["map.safetensors", "report.html"]
+    assert "<title>map.safetensors</title>" in page.read_text("utf-8")
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_the_map_is_kept_if_the_report_fails(scans_file, tmp_path, capsys, monkeypatch):
+    out, page = tmp_path / "map.safetensors", tmp_path / "report.html"
+
+    def fail(*_, **__):
+        raise OSError(28, "No space left on device", str(page))
+
+    monkeypatch.setattr("radarsdf.cli.fits.add_report", fail)
+    assert call("fit", scans_file, "-o", out, "--report", page, *FAST) == 1
+    assert "No space left on device" in capsys.readouterr().err
+    assert files(tmp_path) == ["map.safetensors"]
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_a_report_of_a_map_and_scans(map_file, scans_file, tmp_path, capsys):
+    page = tmp_path / "report.html"
+    words = [map_file, scans_file, "-o", page, "--holdout", 3, "--voxel", 0.4, "--quiet"]
+    assert call("report", *words, "--box", 8, -6, -1, 21, 6, 5) == 0
+    assert "<title>map.safetensors</title>" in page.read_text("utf-8")
+    assert "same file" in refusal(capsys, tmp_path, "report", map_file, scans_file, "-o", scans_file)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--port", 70000], "port"),
+        (["--host", "192.0.2.1"], "--host"),
+        (["--box", 900, 900, 900, 901, 901, 901], "no surface"),
+        (["--max-vertices", 2], "max_vertices"),
+        (["absent.npz"], "absent.npz"),
+    ],
+)
+def test_views_that_cannot_be_shown(map_file, tmp_path, capsys, words, named):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    assert named in refusal(capsys, tmp_path, "view", map_file, *words, "--no-open", "--quiet")
+
+
+def test_a_port_in_use(map_file, tmp_path, capsys):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert str(port) in refusal(capsys, tmp_path, "view", map_file, "--port", port)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends the signal of Ctrl-C")
+def test_it_serves_until_ctrl_c(map_file, scans_file):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    words = ["view", map_file, scans_file, "--voxel", "0.3", "--port", "0", "--quiet"]
+    hidden = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "radarsdf", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=hidden,
+    )
+    try:
+        port = int(re.search(r"http://localhost:(\d+); Ctrl-C ends it", process.stdout.readline())[1])
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}") as page:
+            assert b"<html" in page.read()
+        process.send_signal(signal.SIGINT)
+        printed, complaints = process.communicate(timeout=30)
+        assert printed.endswith("stopped\n")
+        assert (complaints, process.returncode) == ("", 0)
+    finally:
+        process.kill()
+        process.wait()
