@@ -25,9 +25,7 @@ TOLERANCE = 1.05
 def lines(folder: Path, *, deep: bool = True) -> int:
     """Number of lines of the sources below a folder."""
     found = folder.rglob("*") if deep else folder.glob("*")
-    return sum(
-        len(file.read_text(encoding="utf-8").splitlines()) for file in found if file.suffix in SOURCES
-    )
+    return sum(len(file.read_text(encoding="utf-8").splitlines()) for file in found if file.suffix in SOURCES)
 
 
 def sizes() -> dict[str, int]:
@@ -46,7 +44,9 @@ def sizes() -> dict[str, int]:
 
 def main() -> int:
     """Compare, or write the limits."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--write", action="store_true", help="make today's sizes the limits")
     found = sizes()
     if parser.parse_args().write:

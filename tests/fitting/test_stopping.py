@@ -228,9 +228,7 @@ sys.exit(main())
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=HUNG_S)
     assert process.returncode == 130
-    assert (
-        said == f"error: interrupted while training; the map so far is in {tmp_path}/map.safetensors\n"
-    )
+    assert said == f"error: interrupted while training; the map so far is in {tmp_path}/map.safetensors\n"
     radar_map = radarsdf.load(tmp_path / "map.safetensors")
     assert 0 < radar_map.report["iterations_done"]["sdf"] < 1_000_000
     assert (tmp_path / "state").exists()
