@@ -19,12 +19,12 @@ import trimesh
 from radarsdf import FitConfig
 from radarsdf.budget.schedule import Schedule
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.start import near_leaf_keys
 from radarsdf.fitting.training import Training
 from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import Workers
 

@@ -12,8 +12,8 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.budget import blocks
 from radarsdf.budget.estimate import estimate_rays
+from radarsdf.returns.free_space import Passages
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.passages import Passages
 from radarsdf.returns.rays import prepare
 
 CONFIG = FitConfig.quick(returns={"passages": True})

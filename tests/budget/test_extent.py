@@ -9,8 +9,8 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig, _core
 from radarsdf.budget import estimate as budget
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.sums import lattice_of
 
 from bench.growth.street import street
 

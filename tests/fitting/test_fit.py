@@ -13,8 +13,8 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.budget.schedule import Schedule
 from radarsdf.fitting.sampling import Dropout, RaySampler
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.sums import lattice_of
 
 from ..conftest import ground_and_wall
 

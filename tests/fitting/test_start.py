@@ -11,9 +11,8 @@ import torch
 from radarsdf import FitConfig
 from radarsdf._core import cell_keys
 from radarsdf.field.networks import SDFNetwork
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import ScanSums
+from radarsdf.returns.sums import MeanRays, ScanSums
 from scipy.spatial import cKDTree
 
 from ..conftest import ground_and_wall

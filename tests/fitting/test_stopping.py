@@ -99,7 +99,7 @@ def test_ctrl_c_before_the_training_has_no_map():
     code = """
 import numpy as np
 import radarsdf
-from radarsdf.returns.surfels import Surfels
+from radarsdf.returns.planes import Surfels
 rng = np.random.default_rng(0)
 points = rng.normal(size=(1_000_000, 3))
 points *= 300 / np.linalg.norm(points, axis=1, keepdims=True)

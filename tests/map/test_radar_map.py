@@ -12,9 +12,9 @@ import pytest
 import radarsdf
 import torch
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map.queries import evaluate, evidence, to_local
 from radarsdf.map.radar_map import RadarMap
+from radarsdf.returns.intensities import IntensityScale
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 

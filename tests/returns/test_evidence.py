@@ -11,11 +11,9 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import cell_keys
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import ScanSums
+from radarsdf.returns.sums import MeanRays, ScanSums, lattice_of
 
 from ..reference_looks import looks_at
 

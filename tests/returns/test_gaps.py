@@ -10,10 +10,9 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
-from radarsdf.returns.cells import ReturnCells
-from radarsdf.returns.gaps import _MAX_SUPPORT, _medians, bridged
+from radarsdf.returns.evidence import _MAX_SUPPORT, _medians, bridged, support_at
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.support import support_at
+from radarsdf.returns.sums import ReturnCells
 
 from ..conftest import ground_and_wall
 

@@ -10,7 +10,7 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
 from radarsdf.io.scans import Scans
-from radarsdf.returns.movers import Movers, Standing
+from radarsdf.returns.moving import Movers, Standing
 
 from tests.conftest import recorded_scans
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import Surfels
 
 from ..conftest import ground_and_wall
 from .walls import a_wall

@@ -7,10 +7,9 @@ from __future__ import annotations
 import numpy as np
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.onto_surfels import onto_surfels
+from radarsdf.returns.noise import SensorNoise, onto_surfels
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import Surfels
 
 from ..conftest import ground_and_wall
 from .walls import a_wall

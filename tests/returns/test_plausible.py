@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.returns import plausible
-from radarsdf.returns.plausible import Intensities, Plausible
+from radarsdf.returns import intensities as plausible
+from radarsdf.returns.intensities import Intensities, Plausible
 
 N = 20_000
 

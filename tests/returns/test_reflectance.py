@@ -12,9 +12,9 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.evaluation import KNNIntensity, holdout
 from radarsdf.returns import reflectance
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.reflectance import Reflectance, Residuals
-from radarsdf.returns.surfels import Surfels
 
 LEAF_M = 0.2
 

@@ -10,9 +10,8 @@ import operator
 
 import numpy as np
 import pytest
-from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import QUANTA, UPPER, ScanSums
+from radarsdf.returns.sums import QUANTA, UPPER, ReturnCells, ScanSums
 
 from ..conftest import ground_and_wall
 

@@ -12,13 +12,12 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.returns.evidence import support_at
 from radarsdf.returns.ghosts import find_ghosts
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import ScanSums
-from radarsdf.returns.support import support_at
-from radarsdf.returns.surfels import Surfels
+from radarsdf.returns.sums import MeanRays, ScanSums
 
 from ..conftest import ground_and_wall
 from .walls import a_wall

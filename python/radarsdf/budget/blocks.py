@@ -10,7 +10,7 @@ import numpy as np
 
 from radarsdf._core import CellSet
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.returns.passages import BLOCK_CELLS
+from radarsdf.returns.free_space import BLOCK_CELLS
 from radarsdf.returns.rays import Rays
 
 _MOST_STEPS = 1000  # half blocks along a ray

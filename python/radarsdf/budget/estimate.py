@@ -20,8 +20,8 @@ from radarsdf.budget.schedule import Schedule, seen_jointly
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.widths import fourier_width, intensity_widths, parameters_of, sdf_widths
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.rays import Rays, prepare
+from radarsdf.returns.sums import lattice_of
 from radarsdf.threads import resolve_num_threads
 
 # Bytes. Measured as peaks of fits of 1e4 to 3e6 returns of a street, over the memory of the process before

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 
 
 def check_extent(rays: Rays, config: FitConfig) -> None:

@@ -13,8 +13,8 @@ from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import Recording
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.noise import sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import Surfels
 
 _CLOSE_M = 25.0  # farther returns are below the ground by their noise in elevation
 _BIN_M = 0.25

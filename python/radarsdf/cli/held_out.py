@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.map.map import Map
-from radarsdf.returns.movers import rays_as_measured
+from radarsdf.returns.moving import rays_as_measured
 from radarsdf.tiles.any_map import predicted
 
 if TYPE_CHECKING:

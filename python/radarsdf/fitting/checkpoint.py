@@ -17,9 +17,9 @@ from torch import Tensor
 from radarsdf import _core
 from radarsdf.checks import path_of
 from radarsdf.config.fit_config import FitConfig, flat_settings, settings_of_results
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 
 FORMAT = "radarsdf.checkpoint"

@@ -14,9 +14,9 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.reflectance import Float32, Reflectance, Residuals
-from radarsdf.returns.surfels import Surfels
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,11 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.field.field import Field
 from radarsdf.fitting.surface import SurfaceReturns
-from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.evidence import ReturnsOfCells
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.surfels import Surfels
+from radarsdf.returns.sums import MeanRays, ReturnCells
 
 # Iterations of smoothing. Measured: twice as many are 0.0 to 0.1 points of F-score better on whole simulated scenes, half as
 # many 0.0 to 0.3 worse. See bench/history/live.md.

@@ -20,7 +20,6 @@ from radarsdf.budget.extent import check_extent
 from radarsdf.budget.schedule import Schedule
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.closed_form import ClosedForm
 from radarsdf.fitting.skipped import Skipped, skipped_parts
@@ -30,13 +29,13 @@ from radarsdf.fitting.surface import SurfaceReturns
 from radarsdf.fitting.training import Training
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.echoes import Echoes
-from radarsdf.returns.evidence import Evidence, Looks, ReturnsOfCells
-from radarsdf.returns.gaps import bridged
-from radarsdf.returns.passages import Passages
+from radarsdf.returns.evidence import Evidence, Looks, ReturnsOfCells, bridged
+from radarsdf.returns.free_space import Passages
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.scan_sums import ScanSums
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sums import ScanSums
+from radarsdf.returns.view_statistics import Echoes
 from radarsdf.threads import Workers
 
 
@@ -53,7 +52,7 @@ class FitInput:
     movers: int = 0
     """Number of returns that were left out because they move."""
     why_no_movers: str | None = None
-    """See :class:`radarsdf.returns.movers.Movers`."""
+    """See :class:`radarsdf.returns.moving.Movers`."""
     inside: NDArray[np.bool_] | None = None
     """(N,) returns that the map is learnt from, whole leaf cells of them. The other rays only tell what they passed. None:
     all."""

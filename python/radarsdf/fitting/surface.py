@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.ghosts import find_ghosts
-from radarsdf.returns.mean_rays import MeanRays
-from radarsdf.returns.noise import SensorNoise, sensor_noise
-from radarsdf.returns.onto_surfels import onto_surfels
+from radarsdf.returns.noise import SensorNoise, onto_surfels, sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.scan_sums import ScanSums
-from radarsdf.returns.surfels import Surfels
+from radarsdf.returns.sums import MeanRays, ReturnCells, ScanSums
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from tqdm import tqdm
 from radarsdf.budget.schedule import Schedule
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.autograd_gradients import AutogradGradients
 from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.core_gradients import CoreGradients
@@ -29,6 +28,7 @@ from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.fitting.stopping import Diverged, DivergenceWatch
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.progress import hides_bar
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 

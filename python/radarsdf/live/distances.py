@@ -17,11 +17,9 @@ from radarsdf.fitting.start import average_at_vertices, cells_smoothed, told_by
 from radarsdf.live.ghosts import means_of
 from radarsdf.live.regions import REGION_BITS, RegionTable, regions_of, regions_round
 from radarsdf.live.rows import ROUND, Keys, Replacement, between, leaves_of, shifted, steps_round
-from radarsdf.returns.cells import merged_keys
-from radarsdf.returns.evidence import BLOCK_BITS, ReturnsOfCells, sums_round
-from radarsdf.returns.gaps import bridged
-from radarsdf.returns.mean_rays import MeanRays
+from radarsdf.returns.evidence import BLOCK_BITS, ReturnsOfCells, bridged, sums_round
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.sums import MeanRays, merged_keys
 
 _LARGE_BITS = np.uint64(3)  # by which the key of a block is longer than that of a large one
 _LARGE_CELLS = 16  # along its edge

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
-from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.passages import Passages
+from radarsdf.returns.free_space import Passages
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.view_statistics import Echoes
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.grids.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
-from radarsdf.returns.cells import lattice_of
-from radarsdf.returns.passages import MOST_SCANS
+from radarsdf.returns.free_space import MOST_SCANS
+from radarsdf.returns.sums import lattice_of
 
 if TYPE_CHECKING:
     from radarsdf.map.map import Map

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from radarsdf.checks import check_pose, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries
 from radarsdf.map.parts import MapParts
 from radarsdf.map.positions import as_positions
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 
 if TYPE_CHECKING:

@@ -14,7 +14,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import MAX_POSITION_M, check_box, number, positive, real_array, whole_number
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
@@ -22,6 +21,7 @@ from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.isosurface import extract_cells, mesh_components
 from radarsdf.map.threshold import Tally, Threshold, areas_round
 from radarsdf.map.voxels import sample_lattice
+from radarsdf.returns.intensities import IntensityScale
 
 with whole_import():
     import trimesh

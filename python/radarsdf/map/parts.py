@@ -14,7 +14,7 @@ from torch import Tensor
 
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
-from radarsdf.returns.echoes import EchoesAt
+from radarsdf.returns.view_statistics import EchoesAt
 
 if TYPE_CHECKING:
     import trimesh

@@ -19,8 +19,8 @@ from tqdm import tqdm
 from radarsdf._core import CellBlocks
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.progress import hides_bar
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
 # From this share of rough returns on, the errors are those of a rough scene.

@@ -15,14 +15,14 @@ from torch import Tensor
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
-from radarsdf.returns.cells import lattice_of
-from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sums import lattice_of
+from radarsdf.returns.view_statistics import EchoesAt
 
 if TYPE_CHECKING:
     import trimesh

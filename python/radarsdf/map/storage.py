@@ -20,16 +20,16 @@ from torch import Tensor
 from radarsdf._core import FEATURE_DIM
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.contents import MapContents
 from radarsdf.map.fit_report import checked_report
-from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.passages import Passages
+from radarsdf.returns.free_space import Passages
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.view_statistics import Echoes
 
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 11

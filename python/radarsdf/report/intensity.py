@@ -11,7 +11,7 @@ from radarsdf.evaluation import KNNIntensity, intensity_metrics
 from radarsdf.report import plots
 from radarsdf.report.page import Section, Sentence, grid, image, note, paragraph, table
 from radarsdf.report.subject import Subject
-from radarsdf.returns.movers import rays_as_measured
+from radarsdf.returns.moving import rays_as_measured
 from radarsdf.returns.rays import Rays
 from radarsdf.tiles.any_map import predicted
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import SurfelMap
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.surfels import NEIGHBOUR_WEIGHT, Surfels
+from radarsdf.returns.sums import MeanRays
 
 # Measured on simulated and real scans; see bench/history/surface.md.
 # A ghost is farther behind the surface than these two together, since noise puts returns of the surface

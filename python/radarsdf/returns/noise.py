@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Estimates the noise of the sensor from its returns: along the beam, in azimuth and in elevation."""
+"""Noise of the sensor, estimated from its returns, and returns moved onto planes as far as it explains."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf._core import move_onto_planes
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.surfels import Surfels
 
 NOISE_SETTINGS = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
 """Settings of returns that say the numbers of :class:`SensorNoise`, in their order."""
@@ -165,3 +166,37 @@ def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])
+
+
+def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: int = 0) -> Rays:
+    """The rays with each return moved towards the surfel of its cell, if there is a flat one.
+
+    A plane through dozens of returns has much less noise than one return. But a surface is no plane: where
+    the returns scatter more than their noise explains, the rest is the shape of the surface. So a return keeps
+    the share τ² / (τ² + σ²) of its distance from the plane, with the variance σ² of its noise across the plane
+    and the variance τ² of the surface, which is that of the returns less their mean σ². This is the best linear
+    estimate of its true distance (Wiener, 1949). Along the plane, the return keeps its position.
+
+    Parameters
+    ----------
+    surfels : Surfels
+        Surfels of the returns of `rays`.
+    rays : Rays
+        N rays.
+    noise : SensorNoise
+        Noise of the returns.
+    num_threads : int
+        0: as many as OpenMP uses.
+    """
+    points, directions, ranges_m = move_onto_planes(
+        *rays.in_c_order(),
+        np.ascontiguousarray(rays.scans),
+        rays.up_of_scan,
+        surfels.flat_planes_at(rays.points, num_threads),
+        surfels.centres,
+        surfels.normals,
+        np.ascontiguousarray(surfels.variances[:, 0]),
+        noise.variances,
+        num_threads,
+    )
+    return dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)

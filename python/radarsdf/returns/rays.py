@@ -30,7 +30,7 @@ from radarsdf.checks import (
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
 from radarsdf.products import turned
-from radarsdf.returns.plausible import Plausible
+from radarsdf.returns.intensities import Plausible
 
 _LOG = logging.getLogger("radarsdf.returns")
 _PADDING = 8  # rows that repeat the one before. Sensors with coarse cells repeat some
@@ -273,7 +273,7 @@ def prepare(
     whole : bool
         False: these are a part of the scans. None of their returns need be within the ranges, and their intensities are
         as they are. Of whole scans, intensities that cannot belong to the others become NaN: see
-        :class:`~radarsdf.returns.plausible.Plausible`.
+        :class:`~radarsdf.returns.intensities.Plausible`.
 
     Returns
     -------

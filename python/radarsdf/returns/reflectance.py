@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.response import NUM_COEFFICIENTS, NUM_KINDS, TABLE_SHAPE, Response, kinds_of
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 
 Float32 = NDArray[np.float32]
 

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import number, real_array, usable_poses
 from radarsdf.io.scans import Scans
+from radarsdf.returns.intensities import Plausible
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.plausible import Plausible
 from radarsdf.returns.rays import Rays
 
 # Of the returns: what lies beyond in azimuth, in elevation or in range is taken for a stray one.

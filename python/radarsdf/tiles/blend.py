@@ -19,11 +19,11 @@ from torch import Tensor
 
 from radarsdf.checks import positive
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
-from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sums import lattice_of
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.knowledge import cells_of, holds, knowledge
 from radarsdf.tiles.plan import Plan, TilePlan, failure_of, map_path

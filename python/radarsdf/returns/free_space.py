@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Passages: which leaf cells rays passed on the way to their returns. All that a map knows of free space."""
+"""Free-space crossings: the leaf cells that rays crossed before their returns."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import find_passages
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN, lattice_of
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 
 BLOCK_CELLS = 8
 """Edge of a block, leaf cells."""
