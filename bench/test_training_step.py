@@ -17,13 +17,13 @@ import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
-from radarsdf.budget.schedule import Schedule
-from radarsdf.field.field import Field
+from radarsdf.fitting.schedule import Schedule
+from radarsdf.field.neural_field import NeuralField
 from radarsdf.field.losses import intensity_loss, sdf_loss
-from radarsdf.field.widths import cells_width, fourier_width
+from radarsdf.field.neural_field import cells_width, fourier_width
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.fitting.sampling import Dropout, RaySampler
-from radarsdf.fitting.training import Training
+from radarsdf.fitting.train import Training
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers

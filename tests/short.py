@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import radarsdf
-from radarsdf.budget.schedule import Schedule
+from radarsdf.fitting.schedule import Schedule
 from radarsdf.checking import frames
 from radarsdf.render import picture
 

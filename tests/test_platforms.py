@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from radarsdf.budget import durations
-from radarsdf.budget.estimate import available_bytes
+from radarsdf.fitting import estimate as durations
+from radarsdf.memory import available_bytes
 from radarsdf.io.files import check_outputs, write_whole
 
 # Modules and functions of Python that only POSIX has.

@@ -12,8 +12,8 @@ import sys
 import numpy as np
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.budget import durations
-from radarsdf.budget.schedule import Schedule
+from radarsdf.fitting import estimate as durations
+from radarsdf.fitting.schedule import Schedule
 from radarsdf.config.fit_config import flat_settings
 from scipy.optimize import nnls
 

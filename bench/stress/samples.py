@@ -17,11 +17,11 @@ import radarsdf
 import torch
 import trimesh
 from radarsdf import FitConfig
-from radarsdf.budget.schedule import Schedule
-from radarsdf.field.field import Field
+from radarsdf.fitting.schedule import Schedule
+from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.start import near_leaf_keys
-from radarsdf.fitting.training import Training
+from radarsdf.fitting.average import near_leaf_keys
+from radarsdf.fitting.train import Training
 from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
 from radarsdf.returns.intensities import IntensityScale

@@ -11,7 +11,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.budget import blocks
-from radarsdf.budget.estimate import estimate_rays
+from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.returns.free_space import Passages
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import prepare

@@ -9,10 +9,10 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.budget import durations
-from radarsdf.budget.schedule import Schedule
-from radarsdf.field.widths import intensity_widths, parameters_of, sdf_widths, weights_of
-from radarsdf.fitting.core_gradients import CoreGradients
+from radarsdf.fitting import estimate as durations
+from radarsdf.fitting.schedule import Schedule
+from radarsdf.field.neural_field import intensity_widths, parameters_of, sdf_widths, weights_of
+from radarsdf.fitting.gradients import CoreGradients
 from torch import nn
 
 from ..settings import grouped

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 from radarsdf import FitConfig
-from radarsdf.budget.schedule import Schedule
+from radarsdf.fitting.schedule import Schedule
 
 from ..settings import grouped
 

@@ -39,7 +39,7 @@ def test_points_and_a_picture(map_file, tmp_path, capsys):
 
 
 def test_more_scans_than_memory_holds(map_file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("radarsdf.budget.estimate.available_bytes", lambda: 10**6)
+    monkeypatch.setattr("radarsdf.memory.available_bytes", lambda: 10**6)
     poses = tmp_path / "poses.tum"
     poses.write_text("".join(f"{i} 1.3 0.4 1.5 0 0 0 1\n" for i in range(100)))
     said = refusal(capsys, tmp_path, "render", map_file, "--pose", poses, "-o", tmp_path / "view.npz")

@@ -16,8 +16,8 @@ import pytest
 import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.field import Field
-from radarsdf.fitting.autograd_gradients import AutogradGradients
-from radarsdf.fitting.core_gradients import CoreGradients, _layers
+from radarsdf.fitting.gradients import AutogradGradients
+from radarsdf.fitting.gradients import CoreGradients, _layers
 from radarsdf.fitting.gradients import RandomDropout
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.returns.rays import prepare

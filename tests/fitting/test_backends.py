@@ -12,8 +12,8 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.fitting import training
-from radarsdf.fitting.autograd_gradients import AutogradGradients
-from radarsdf.fitting.core_gradients import CoreGradients
+from radarsdf.fitting.gradients import AutogradGradients
+from radarsdf.fitting.gradients import CoreGradients
 
 from ..conftest import ground_and_wall
 from ..settings import grouped

@@ -15,7 +15,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig, Interrupted
-from radarsdf.fitting.training import Training
+from radarsdf.fitting.train import Training
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from safetensors import safe_open
 
@@ -62,7 +62,7 @@ def interrupted_after(iterations, monkeypatch, *arguments, **keywords):
             return self.left == 0
 
     with monkeypatch.context() as patch:
-        patch.setattr("radarsdf.fitting.training.deferred_interrupts", Deferred)
+        patch.setattr("radarsdf.fitting.train.deferred_interrupts", Deferred)
         with pytest.raises(Interrupted) as caught:
             fitted(*arguments, **keywords)
     return caught.value.radar_map.report["iterations_done"]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf.field.losses import sdf_loss
-from radarsdf.fitting.stopping import DivergenceWatch
+from radarsdf.fitting.train import DivergenceWatch
 
 from bench.stress.training import CASES, fitted, free_and_solid
 

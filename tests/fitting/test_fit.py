@@ -11,7 +11,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.budget.schedule import Schedule
+from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.sampling import Dropout, RaySampler
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sums import lattice_of
@@ -117,8 +117,8 @@ def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
 
 @pytest.mark.parametrize(("effort", "why"), [(1.0, "the others were enough"), (0.05, "effort is 0.05")])
 def test_why_samples_were_left_out(scene, monkeypatch, effort, why):
-    monkeypatch.setattr("radarsdf.budget.schedule._LEAST_SDF_ITERATIONS", 10)
-    monkeypatch.setattr("radarsdf.budget.schedule._MOST_SAMPLES_PER_VERTEX", 8.0)
+    monkeypatch.setattr("radarsdf.fitting.schedule._LEAST_SDF_ITERATIONS", 10)
+    monkeypatch.setattr("radarsdf.fitting.schedule._MOST_SAMPLES_PER_VERTEX", 8.0)
     config = FitConfig(effort=effort, num_threads=1)
     skipped = radarsdf.fit(scene.points, scene.poses, config=config, progress=False).report["skipped"]
     (said,) = (words for words in skipped if "of the samples" in words)
@@ -373,7 +373,7 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
         is_ghost = high[surfels.cells_at(rays.points)]
         return high
 
-    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", upper_wall)
+    monkeypatch.setattr("radarsdf.fitting.average.find_ghosts", upper_wall)
     drawn_from = []
     spread = RaySampler.spread
     monkeypatch.setattr(

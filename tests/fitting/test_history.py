@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.budget.schedule import Schedule
+from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting import history
-from radarsdf.fitting.history import LossHistory
+from radarsdf.fitting.train import LossHistory
 from radarsdf.fitting.skipped import skipped_parts
 
 CONFIG = FitConfig(

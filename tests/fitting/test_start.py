@@ -10,7 +10,7 @@ import radarsdf
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import cell_keys
-from radarsdf.field.networks import SDFNetwork
+from radarsdf.field.neural_field import SDFNetwork
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sums import MeanRays, ScanSums
 from scipy.spatial import cKDTree

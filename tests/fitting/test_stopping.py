@@ -16,7 +16,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import Diverged, FitConfig, Interrupted, _core
-from radarsdf.fitting.core_gradients import CoreGradients
+from radarsdf.fitting.gradients import CoreGradients
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.npz import write_scans
@@ -346,7 +346,7 @@ def test_an_interrupted_fit_is_a_keyboard_interrupt_even_where_nobody_defers(sce
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("radarsdf.fitting.training.Training.run", interrupt)
+    monkeypatch.setattr("radarsdf.fitting.train.Training.run", interrupt)
     config = FitConfig().override(training={"sdf_iterations": 1})
     with pytest.raises(Interrupted, match="while training") as caught:
         radarsdf.fit(scene.points, scene.poses, config=config)

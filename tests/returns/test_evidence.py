@@ -180,7 +180,7 @@ def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeyp
         assert not set(cells[is_false(rays)]) & set(cells[~is_false(rays)])
         return np.isin(np.arange(len(surfels.keys)), cells[is_false(rays)])
 
-    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", cells_of_ghosts)
+    monkeypatch.setattr("radarsdf.fitting.average.find_ghosts", cells_of_ghosts)
     config = STARTS[start].override(
         num_threads=2,
         returns={

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from radarsdf import FitConfig
-from radarsdf.budget.estimate import estimate_rays
+from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io import Scan
 from radarsdf.tiles.fit_tiles import plan_tiles
 from radarsdf.tiles.plan import Plan

@@ -149,7 +149,7 @@ def test_the_surface_is_where_one_map_has_it(city, drive):
 
 
 def test_a_mesh_that_memory_cannot_hold(city, tmp_path, monkeypatch):
-    monkeypatch.setattr("radarsdf.budget.estimate.available_bytes", lambda: 10**6)
+    monkeypatch.setattr("radarsdf.memory.available_bytes", lambda: 10**6)
     with pytest.raises(MemoryError, match="radarsdf tiles mesh"):
         city.mesh(0.2, progress=False)
     assert city.export(tmp_path / "mesh.ply", 0.2, progress=False)[1] > 10**6 / 320

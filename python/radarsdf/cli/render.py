@@ -58,11 +58,11 @@ def run(options: argparse.Namespace) -> None:
     """Predict the scans, and write them."""
     import numpy as np
 
-    from radarsdf.budget.estimate import check_views
     from radarsdf.io.clouds.writing import write_cloud
     from radarsdf.io.files import check_outputs
     from radarsdf.io.npz import write_scans
     from radarsdf.map.views import scans_of_views
+    from radarsdf.memory import check_views
     from radarsdf.render.view_picture import save_view_picture
 
     suffix = options.out.suffix.lower()

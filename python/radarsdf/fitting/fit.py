@@ -68,8 +68,7 @@ def fit(
     -------
     RadarMap
         Its ``report`` has the times and counts of the fit. The same input and seed give the same bits, with any
-        number of threads. Only where the gradients are PyTorch's (``training.gradients``, ``networks.normals``) does
-        the rounding depend on it.
+        number of threads. Only where the gradients are PyTorch's (``networks.normals``) does the rounding depend on it.
 
     Raises
     ------

@@ -21,11 +21,35 @@ from radarsdf._core import (
     random_bytes,
     stable_order,
 )
-from radarsdf.budget.schedule import near_and_labelled
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import Rays
 
+NEAR_SAMPLES, FREE_SAMPLES = 6, 6
+"""Samples near the surface and in free space for each return in one pass (3QFPI: 6 and 6)."""
+NEAR_BAND_CELLS = 1.5
+"""Samples near the surface are uniform within this distance of the return, leaf cells (3QFP: 0.3 m)."""
+FREE_FROM = 0.3
+"""Samples in free space begin at this share of the range (3QFP: 0.3)."""
+FREE_BEYOND_CELLS = 4.0
+"""Samples in free space end this far behind the return, leaf cells (3QFP: 0.8 m)."""
 _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly over an interval of length 1
+
+
+def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
+    """How many samples of a batch of the sdf stage are near the surface, and how many of these have labels.
+
+    A label is the intensity of the return. The intensity network needs no more of them in a large batch than in a batch of
+    its own stage.
+    """
+    near = max(1, round(batch_size * (NEAR_SAMPLES / (NEAR_SAMPLES + FREE_SAMPLES))))
+    training = config.training
+    # With labels in free space, a sample without a label of its own would have that of free space.
+    return near, near if training.intensity_in_free_space else min(near, training.intensity_batch_size)
+
+
+def seen_jointly(config: FitConfig, batch_size: int) -> int:
+    """How many samples of a batch of the sdf stage the intensity network sees in a joint iteration."""
+    return batch_size if config.training.intensity_in_free_space else near_and_labelled(config, batch_size)[1]
 
 
 @dataclass(frozen=True)
@@ -193,17 +217,16 @@ class RaySampler:
     def spread(self, count: int, parts: int = 1) -> Batch:
         """`count` samples near the surface, in `parts`.
 
-        They are uniform within `near_band_m` along the beam, and have the sensor's angular noise across it.
+        They are uniform within the near band along the beam, and have the sensor's angular noise across it.
         """
-        config = self._config
-        places = self._take(count)
-        sdf_m = (2 * self._uniform(count) - 1) * config.near_band_m
+        places, noise_rad = self._take(count), self._config.training.cross_range_noise_rad
+        sdf_m = (2 * self._uniform(count) - 1) * self._config.metres(NEAR_BAND_CELLS)
         ray = self._rays.index_select(0, places)
         points = _returns(ray) - sdf_m[:, None] * _directions(ray)
-        if config.sampling.cross_range_noise_rad > 0:
+        if noise_rad > 0:
             # Noise in all directions is simpler. Along the beam it is small beside the width of the band.
             noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
-            points += noise * (config.sampling.cross_range_noise_rad * ray[:, RAY_RANGE, None])
+            points += noise * (noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
         return Batch(points, sdf_m, ray, list(zip(near, near, strict=True)), near)
 
@@ -291,9 +314,9 @@ class _Layout:
         index = torch.from_numpy(np.concatenate(of_kinds))[order]
         # From the sensor: near samples in range ± near_band, free ones in [free_from · range, range +
         # free_beyond].
-        band_m, before = config.near_band_m, 1 - config.sampling.free_from
+        band_m, beyond_m = config.metres(NEAR_BAND_CELLS), config.metres(FREE_BEYOND_CELLS)
         ends = torch.tensor(
-            [[-band_m, 0, 2 * band_m, 0], [-config.free_beyond_m, 0, config.free_beyond_m, before]],
+            [[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]],
             dtype=torch.float32,
             device="cpu",
         )[(kinds == 2).long()]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.start import normals_at
+from radarsdf.fitting.average import normals_at
 from radarsdf.live.distances import GrowingDistances
 from radarsdf.live.ghosts import NOWHERE, GrowingGhosts, means_of, surfels_of
 from radarsdf.live.regions import RegionTable, Rows, regions_of, regions_round

@@ -16,7 +16,6 @@ from radarsdf.field.field import Field
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.free_space import Passages
 from radarsdf.returns.intensities import IntensityScale
-from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import Echoes
 
@@ -40,12 +39,9 @@ class MapContents(WholeMap):
     """The parts of a map."""
 
     field: Field
-    """The learnt field, in the local frame."""
+    """Signed distance and intensity, in the local frame."""
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
-    reflectance: Reflectance | None
-    """Intensities in closed form, or what the network leaves of them. None: the network alone answers, or there are
-    no intensities."""
     evidence: Evidence
     """What the returns tell of each leaf cell."""
     sensor: Sensor

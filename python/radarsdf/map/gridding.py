@@ -48,7 +48,7 @@ def dense_cells(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
     """Passed, returns and observed of leaf cells from `lower` on, counted from the origin of a map."""
     passed, returns = contents.passages.dense(lower, shape)
-    cells = lattice_of(contents.field.cells.table.leaf_keys()) - lower
+    cells = lattice_of(contents.field.table.leaf_keys()) - lower
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
     observed = np.zeros(shape, bool)
     observed[tuple(cells[inside].T)] = True
@@ -61,7 +61,7 @@ def passage_odds(contents: MapContents) -> NDArray[np.float64]:
     By the map itself: cells of which the returns say on which side of a surface they are. Rays pass solid cells by their
     noise, and on the way to false returns.
     """
-    cells = lattice_of(contents.field.cells.table.leaf_keys())
+    cells = lattice_of(contents.field.table.leaf_keys())
     cells = cells[:: max(1, len(cells) // _ODDS_CELLS)]
     leaf_m = contents.config.leaf_size_m
     centres = torch.from_numpy(((cells + 0.5) * leaf_m).astype(np.float32))

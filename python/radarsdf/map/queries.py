@@ -64,24 +64,17 @@ def signed_distance(
     contents: MapContents, points: Tensor, *, description: str = "", progress: bool | None = False
 ) -> Tensor:
     """(N,) signed distance, m, positive in free space."""
-    return evaluate(contents.field.signed_distance, points, description=description, progress=progress)
+    return evaluate(contents.field.sdf, points, description=description, progress=progress)
 
 
 def gradient(contents: MapContents, points: Tensor) -> Tensor:
     """(N, 3) gradient of the signed distance, towards free space."""
-    field = contents.field
-
-    def of_chunk(chunk: Tensor) -> Tensor:
-        with torch.enable_grad():
-            chunk = chunk.detach().requires_grad_()
-            return torch.autograd.grad(field.signed_distance(chunk).sum(), chunk)[0]
-
-    return evaluate(of_chunk, points)
+    return evaluate(contents.field.gradient, points)
 
 
 def occupied(contents: MapContents, points: Tensor) -> Tensor:
     """(N,) bool, whether each point lies in an occupied leaf cell."""
-    return evaluate(contents.field.cells.occupied, points)
+    return evaluate(contents.field.occupied, points)
 
 
 @torch.inference_mode(mode=False)
@@ -158,7 +151,7 @@ class EvidenceAt(NamedTuple):
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
     """The evidence at each point."""
-    table = contents.field.cells.table
+    table = contents.field.table
     return interpolated(contents.evidence, table.leaf_keys(), table.leaf_size_m, points)
 
 
@@ -267,15 +260,7 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
         directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
         # How the intensity goes on beyond the ranges of the returns, nothing tells. A regression would take it to an end.
         ranges_m = ranges_m.clamp(*contents.sensor.range_m)
-        closed, share = contents.reflectance, 1.0
-        unit = torch.zeros_like(ranges_m)
-        if closed is not None:
-            unit += torch.from_numpy(closed.at(positions.numpy(), directions.numpy(), ranges_m.numpy(), 1))
-            share = closed.network_share
-        if share > 0:
-            unit += share * field.intensity(field.geometry(positions), directions, ranges_m)
-        # The closed form knows no limits, and what is beyond those of the training was never measured.
-        return scale.to_sensor(unit if closed is None else unit.clamp(0, 1))
+        return scale.to_sensor(field.intensity(positions, directions, ranges_m))
 
     return evaluate(of_chunk, torch.cat([points, sensors], 1))
 

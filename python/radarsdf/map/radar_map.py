@@ -129,7 +129,7 @@ class RadarMap(Map):
 
     @property
     def extent(self) -> NDArray[np.float64]:
-        cells = lattice_of(self.field.cells.table.leaf_keys())
+        cells = lattice_of(self.field.table.leaf_keys())
         corners = np.stack([cells.min(axis=0), cells.max(axis=0) + 1])
         return corners * self.config.leaf_size_m + self.origin
 
@@ -143,7 +143,7 @@ class RadarMap(Map):
 
     @property
     def nbytes(self) -> int:
-        """Size of features and networks, bytes. 3QFP calls this the size of the map."""
+        """Size of the parameters of the field, bytes. 3QFP calls this the size of the map."""
         return sum(p.numel() * p.element_size() for p in self.field.parameters())
 
     @property
@@ -153,7 +153,7 @@ class RadarMap(Map):
 
     @property
     def field(self) -> Field:
-        """The learnt field, a PyTorch module in the local frame."""
+        """Signed distance and intensity as a PyTorch module, in the local frame."""
         return self._contents.field
 
 

@@ -17,9 +17,10 @@ from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from radarsdf._core import FEATURE_DIM
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
+from radarsdf.field.grid_field import GridField
+from radarsdf.field.neural_field import NeuralField
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.contents import MapContents
@@ -32,8 +33,7 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import Echoes
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 11
-_FEATURES = "field.cells.features"
+FORMAT_VERSION = 12
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
@@ -108,20 +108,20 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors: dict[str, Tensor] = {
         f"field.{name}": value for name, value in contents.field.state_dict().items()
     }
-    tensors[_FEATURES] = _without_empty_columns(tensors[_FEATURES])
     tensors["origin"] = torch.from_numpy(contents.origin)
     # Morton keys have 63 bits, so they fit into int64, which all readers of safetensors have.
-    tensors["leaf_keys"] = torch.from_numpy(contents.field.cells.table.leaf_keys().astype(np.int64))
+    tensors["leaf_keys"] = torch.from_numpy(contents.field.table.leaf_keys().astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
     tensors |= _tensors_of("passages", contents.passages)
     tensors |= _tensors_of("echoes", contents.echoes)
-    if contents.reflectance is not None:
-        tensors |= _tensors_of("reflectance", contents.reflectance)
+    reflectance = contents.field.reflectance
+    if reflectance is not None:
+        tensors |= _tensors_of("reflectance", reflectance)
     scale = contents.intensity_scale
     description = {
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
-        "network_share": None if contents.reflectance is None else contents.reflectance.network_share,
+        "network_share": None if reflectance is None else reflectance.network_share,
         "echo_sigma": contents.echoes.sigma,
         "rough_share": contents.rough_share,
         "returns_per_cell": contents.returns_per_cell,
@@ -129,22 +129,6 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "report": contents.report,
     }
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
-
-
-def _without_empty_columns(features: Tensor) -> Tensor:
-    """Without columns of zeros at the end: a quick map uses one of eight, and its file is a quarter as large."""
-    used = torch.nonzero((features != 0).any(dim=0))
-    return features[:, : int(used.max()) + 1 if len(used) else 0]
-
-
-def _with_empty_columns(features: Tensor) -> Tensor:
-    """What :func:`_without_empty_columns` left out is zero."""
-    if features.ndim != 2 or features.shape[1] > FEATURE_DIM:
-        msg = f"the features are not up to {FEATURE_DIM} numbers for each vertex"
-        raise ValueError(msg)
-    if features.shape[1] == FEATURE_DIM:
-        return features
-    return torch.cat([features, features.new_zeros(len(features), FEATURE_DIM - features.shape[1])], 1)
 
 
 def _tensors_of(part: str, owner: Passages | Echoes | Reflectance) -> dict[str, Tensor]:
@@ -242,7 +226,7 @@ def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
         raise _OtherFileError(msg)
     version = metadata.get("format_version", "")
     if not version.isdecimal() or len(version) > 9 or int(version) != FORMAT_VERSION:
-        msg = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}"
+        msg = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}: fit it anew (CHANGELOG, 0.2.0)"
         raise _OtherFileError(msg)
 
 
@@ -286,30 +270,19 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
     if (trained or reflectance is not None) != (scale is not None):
         msg = "what answers for intensities is missing, or there are none"
         raise ValueError(msg)
-    # A damaged description could ask for networks of any size. So the number of layers is limited, and the
-    # field is made without memory: it only serves to check the shapes of the tensors.
-    if len(config.networks.sdf_hidden + config.networks.intensity_hidden) > len(tensors):
-        msg = "there are fewer tensors than layers"
-        raise ValueError(msg)
-    with torch.device("meta"):
-        field = Field(
-            leaf_keys.numpy().astype(np.uint64),
-            config,
-            with_intensity=trained,
-        )
-    state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
-    for name, tensor in state.items():
+    field = _field_of(leaf_keys.numpy().astype(np.uint64), config, trained)
+    for name, tensor in tensors.items():
         if tensor.dtype != torch.float32 or not tensor.isfinite().all():
             msg = f"{name} holds something other than finite float32 numbers"
             raise ValueError(msg)
-    state[_FEATURES.removeprefix("field.")] = _with_empty_columns(tensors[_FEATURES])
+    state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
     field.load_state_dict(state, assign=True)  # raises a RuntimeError for wrong names or shapes
+    field.reflectance = reflectance
     field.requires_grad_(False)
     return MapContents(
         field=field,
         origin=origin.numpy(),
         intensity_scale=scale,
-        reflectance=reflectance,
         config=config,
         report=checked_report(description["report"]),
         evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
@@ -319,3 +292,11 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         returns_per_cell=returns_per_cell,
         sensor=Sensor.from_dict(description["sensor"]),
     )
+
+
+def _field_of(leaf_keys: NDArray[np.uint64], config: FitConfig, with_intensity: bool) -> Field:
+    """The field without memory: a damaged description could ask for networks of any size, and shapes are checked later."""
+    with torch.device("meta"):
+        if config.train:
+            return NeuralField(leaf_keys, config, with_intensity=with_intensity)
+        return GridField(leaf_keys, config.leaf_size_m)

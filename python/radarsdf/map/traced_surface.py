@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf._core import SurfaceTracer
-from radarsdf.budget.estimate import check_views
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.meshing import Limits, Surface
 from radarsdf.map.threshold import across_triangles
+from radarsdf.memory import check_views
 from radarsdf.threads import resolve_num_threads
 
 # Scans that looked at a place where none had a return count for so many: with few looks, a rate is uncertain.

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf.budget.estimate import check_mesh
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.isosurface import sparse_lattice
+from radarsdf.memory import check_mesh
 
 _MAX_VOXELS = 2**30  # with repeated ones. Lattice coordinates, and rows of corners, are int32
 # Edges of a leaf cell. A cell is left out if its corners are all farther than this from the surface, on the
@@ -62,14 +62,14 @@ def sample_lattice(
     """
     config, num_threads = contents.config, torch.get_num_threads()
     leaf_size_m = config.leaf_size_m
-    cells = contents.field.cells.table.leaf_cells()
+    cells = contents.field.table.leaf_cells()
     if box is not None:
         lower, upper = box
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
-    if voxel_size == leaf_size_m and box is None and _is_of_vertices(config):
-        corners, voxel_corners, distances_m = _distances_of_vertices(contents, progress)
-        return SampledLattice(corners, voxel_corners, distances_m, len(cells))
-    if voxel_size < leaf_size_m and _smooth_in_cells(config):
+    stored = contents.field.leaf_corners() if voxel_size == leaf_size_m and box is None else None
+    if stored is not None:
+        return SampledLattice(*stored, len(cells))
+    if voxel_size < leaf_size_m and contents.field.smooth_in_cells:
         cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
     voxels = _voxels_of(cells, voxel_size, config)
     if box is not None:
@@ -80,45 +80,6 @@ def sample_lattice(
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return SampledLattice(corners, voxel_corners, distances_m, len(cells))
-
-
-def _smooth_in_cells(config: FitConfig) -> bool:
-    """Whether no wavelength of the encoding is shorter than two leaf cells.
-
-    Otherwise the field could change its sign inside a cell without doing so at its corners.
-    """
-    finest = config.encoding.fourier_count - 1
-    return (
-        config.encoding.fourier_count == 0
-        or 2 * config.fourier_half_width_m / 2**finest >= 2 * config.leaf_size_m
-    )
-
-
-def _is_of_vertices(config: FitConfig) -> bool:
-    """Whether the field at a vertex of the leaf cells depends only on the feature of that vertex."""
-    return (
-        config.encoding.kind == "octree"
-        and config.encoding.num_levels == 1
-        and config.encoding.fourier_count == 0
-    )
-
-
-def _distances_of_vertices(
-    contents: MapContents, progress: bool | None
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-    """If :func:`_is_of_vertices`: vertices (V, 3), rows of them for each leaf cell (C, 8), and distances (V,), m.
-
-    This needs no interpolation, which makes it fast.
-    """
-    field = contents.field
-    corners, cell_corners = field.cells.table.leaf_vertices()
-    values: NDArray[np.float32] = queries.evaluate(
-        lambda features: field.sdf_network([features])[0] * field.sigma_m,
-        field.cells.features.detach(),
-        description="mesh",
-        progress=progress,
-    ).numpy()
-    return corners, cell_corners, values
 
 
 def crossed(

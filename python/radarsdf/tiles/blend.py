@@ -139,7 +139,7 @@ class TileBlend:
         with self._lock:
             if tile not in self._held:
                 contents = contents_of_tile(self.folder, self.plan, self.plan.by_tile[tile])
-                size = round(_OF_FEATURES * contents.field.cells.features.nbytes)
+                size = round(_OF_FEATURES * sum(p.nbytes for p in contents.field.parameters()))
                 while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
                     self._held.popitem(last=False)
                 self._held[tile] = contents, size

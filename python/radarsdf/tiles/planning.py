@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.budget.estimate import estimate_rays
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.surface import SurfaceReturns
+from radarsdf.fitting.average import SurfaceReturns
+from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.scans import Scan, scans_in_memory
 from radarsdf.returns.intensities import Intensities
 from radarsdf.returns.moving import Standing
