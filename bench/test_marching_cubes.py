@@ -215,7 +215,7 @@ def map_lattice():
     cells, corners, _ = sparse_lattice(cells)
     points = corners.astype(np.float32) * np.float32(config.leaf_size_m / 2)
     with torch.no_grad():
-        values = radar_map.field.signed_distance(torch.from_numpy(points)).numpy()
+        values = radar_map.field.sdf(torch.from_numpy(points)).numpy()
     lower = corners.min(0)
     shape = corners.max(0) - lower + 1
     volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)

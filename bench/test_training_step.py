@@ -17,12 +17,12 @@ import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
-from radarsdf.fitting.schedule import Schedule
-from radarsdf.field.neural_field import NeuralField
 from radarsdf.field.losses import intensity_loss, sdf_loss
-from radarsdf.field.neural_field import cells_width, fourier_width
+from radarsdf.field.neural_field import NeuralField, cells_width, fourier_width
+from radarsdf.fitting.gradients import FEATURE_DROPOUT, FOURIER_DROPOUT
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.fitting.sampling import Dropout, RaySampler
+from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import Training
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import prepare
@@ -45,7 +45,7 @@ class Step:
         self.size = (
             CONFIG.training.intensity_batch_size if self.frozen else CONFIG.training.batch_size
         ) // SHARE
-        self.field = Field(leaf_keys, CONFIG, with_intensity=stage != "geometry")
+        self.field = NeuralField(leaf_keys, CONFIG, with_intensity=stage != "geometry")
         self.field.initialise(torch.Generator().manual_seed(0))
         if self.frozen:
             self.field.cells.requires_grad_(False)
@@ -62,7 +62,7 @@ class Step:
         if self.stage == "geometry":
             return samples, None
         dims = (cells_width(CONFIG), fourier_width(CONFIG))
-        dropouts = (CONFIG.networks.feature_dropout, CONFIG.networks.fourier_dropout)
+        dropouts = (FEATURE_DROPOUT, FOURIER_DROPOUT)
         factors = [
             Dropout.draw(share, self.generator).factors(samples.num_near, dim)
             for dim, share in zip(dims, dropouts, strict=True)
@@ -128,7 +128,7 @@ def rays():
 @pytest.fixture(scope="module")
 def leaf_keys(rays):
     cells = CellSet(CONFIG.leaf_size_m)
-    for chunk in rays.along(np.linspace(-CONFIG.near_band_m, CONFIG.near_band_m, 7)):
+    for chunk in rays.along(np.linspace(-0.3, 0.3, 7)):
         cells.insert(chunk)
     return cells.sorted_keys()
 
@@ -156,7 +156,7 @@ def test_samples(benchmark, step, rays):
     points = (samples.of_ray[:, :3] - samples.sdf_m[:, None] * samples.directions).numpy()
     off_m = np.linalg.norm(points - samples.points.numpy(), axis=1)
     # In the last stage, samples are spread across the beam.
-    spread_m = CONFIG.sampling.cross_range_noise_rad * samples.ranges_m.numpy() if step.frozen else 1e-5
+    spread_m = CONFIG.training.cross_range_noise_rad * samples.ranges_m.numpy() if step.frozen else 1e-5
     assert (off_m < 6 * spread_m).all()
     assert np.median(off_m / spread_m) > 1 or not step.frozen
     assert len(samples.points) == step.size
@@ -166,7 +166,7 @@ def test_samples(benchmark, step, rays):
     if dropout is not None:
         factors = torch.cat(dropout, 1)
         assert factors.mean().item() == pytest.approx(1, abs=0.05)
-        assert (factors == 0).float().mean().item() > CONFIG.networks.fourier_dropout
+        assert (factors == 0).float().mean().item() > FOURIER_DROPOUT
 
 
 def test_encodings_forward(benchmark, step):
@@ -175,7 +175,7 @@ def test_encodings_forward(benchmark, step):
     angles = fourier.double().view(len(fourier), 2, -1)
     assert ((angles**2).sum(1) - 1).abs().max() < 1e-5
     points = samples.points.numpy()[: samples.num_near]
-    known = step.field.cells.occupied(samples.points[: samples.num_near]).numpy()
+    known = step.field.occupied(samples.points[: samples.num_near]).numpy()
     assert known.mean() > 0.8
     surface = Surface(step.field.cells.table, step.field.cells.features.detach())
     rows, weights = surface.rows_and_weights(points[known])
@@ -292,7 +292,7 @@ def test_matrix_products(benchmark, step):
 
 def test_whole(benchmark, step, rays):
     """`STEPS` steps of `Training` on one thread. The stage with frozen geometry follows one step of geometry."""
-    field = Field(
+    field = NeuralField(
         step.field.cells.table.leaf_keys(), CONFIG, with_intensity=step.stage != "geometry", num_threads=1
     )
     field.initialise(torch.Generator().manual_seed(0))

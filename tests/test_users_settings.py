@@ -61,7 +61,6 @@ SETTINGS = {
 TRAINING = {"sdf_iterations": 4, "intensity_iterations": 8, "batch_size": 256, "intensity_batch_size": 128}
 CONFIGS = {
     "core": {},
-    "autograd": {"training": {"gradients": "autograd"}},
     "normals": {"networks": {"normals": True}},
     "all rows of an octree": {"training": {"row_updates": False}, "encoding": {"kind": "octree"}},
 }

@@ -33,7 +33,7 @@ def test_presets():
 def test_settings_of_every_type():
     settings = [
         "encoding.kind=octree",
-        "networks.sdf_hidden=(8, 8)",
+        "networks.intensity_hidden=(8, 8)",
         "training.sigma_cells=0.5",
         "networks.normals=True",
         "returns.max_range_m=None",
@@ -43,7 +43,7 @@ def test_settings_of_every_type():
     words = [word for setting in settings for word in ("--set", setting)]
     assert config("--paper", *words) == FitConfig.paper(
         encoding={"kind": "octree"},
-        networks={"sdf_hidden": (8, 8), "normals": True},
+        networks={"intensity_hidden": (8, 8), "normals": True},
         training={"sigma_cells": 0.5},
         returns={"max_range_m": None},
         seed=5,
@@ -60,9 +60,9 @@ def test_settings_from_a_file(tmp_path):
 @pytest.mark.parametrize("preset", [[], ["--quick"], ["--paper"]])
 def test_what_config_prints_is_the_same_configuration(capsys, tmp_path, preset):
     path = tmp_path / "settings.toml"
-    assert call("config", *preset, "--set", "networks.sdf_hidden=(8, 4)") == 0
+    assert call("config", *preset, "--set", "networks.intensity_hidden=(8, 4)") == 0
     path.write_text(capsys.readouterr().out)
-    assert config("--config", str(path)) == config(*preset, "--set", "networks.sdf_hidden=(8, 4)")
+    assert config("--config", str(path)) == config(*preset, "--set", "networks.intensity_hidden=(8, 4)")
 
 
 @pytest.mark.parametrize(
@@ -103,9 +103,9 @@ def test_a_file_that_makes_no_sense(tmp_path, text, said):
         ("training.sdf_iterations=1.5", "training.sdf_iterations must be a valid integer, not 1.5"),
         ("training.sdf_iterations=many", "training.sdf_iterations must be a valid integer, not 'many'"),
         ("training.batch_size=[1]", "training.batch_size must be a valid integer, not [1]"),
-        ("networks.sdf_hidden=3", "networks.sdf_hidden must be a valid tuple, not 3"),
-        ("networks.sdf_hidden=(8, 0.5)", "networks.sdf_hidden must be a valid integer, not 0.5"),
-        ("networks.sdf_hidden=wide", "networks.sdf_hidden must be a valid tuple, not 'wide'"),
+        ("networks.intensity_hidden=3", "networks.intensity_hidden must be a valid tuple, not 3"),
+        ("networks.intensity_hidden=(8, 0.5)", "networks.intensity_hidden must be a valid integer, not 0.5"),
+        ("networks.intensity_hidden=wide", "networks.intensity_hidden must be a valid tuple, not 'wide'"),
         ("networks.normals=perhaps", "networks.normals must be a valid boolean, not 'perhaps'"),
         ("encoding.num_levels=2.5", "encoding.num_levels must be a valid integer, not 2.5"),
         ("seed=-1.5", "seed must be a valid integer, not -1.5"),

@@ -15,10 +15,8 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig, _core
-from radarsdf.field.field import Field
-from radarsdf.fitting.gradients import AutogradGradients
-from radarsdf.fitting.gradients import CoreGradients, _layers
-from radarsdf.fitting.gradients import RandomDropout
+from radarsdf.field.neural_field import NeuralField
+from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, RandomDropout, _layers
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
@@ -29,10 +27,10 @@ CONFIGS = {
     "default": {},
     "octree": {"kind": "octree", "geometry_feature_dim": 3, "fourier_count": 0},
     "features": {"geometry_feature_dim": 15, "num_levels": 2, "fourier_count": 4},
-    "free space": {"intensity_in_free_space": True, "feature_dropout": 0.0, "fourier_dropout": 0.0},
-    "one dropout": {"feature_dropout": 0.0, "sdf_loss_weight": 0.3},
+    "free space": {"intensity_in_free_space": True, "dropout": False},
+    "weighted": {"sdf_loss_weight": 0.3},
     "blind": {"sdf_input": False, "view_direction": False, "log_range": False, "intensity_hidden": (5,)},
-    "not all": {"sdf_input": False, "log_range": False, "sdf_hidden": (17, 16, 3)},
+    "not all": {"sdf_input": False, "log_range": False, "intensity_hidden": (17, 16, 3)},
     "intensities alone": {"sdf_loss_weight": 0.0},
 }
 STAGES = ("sdf", "joint", "intensity")
@@ -49,7 +47,7 @@ def rays():
 class Made:
     """A field, and a batch of samples in three parts."""
 
-    field: Field
+    field: NeuralField
     config: FitConfig
     batch: Batch
 
@@ -69,7 +67,7 @@ def make_batch(rays, dtype=torch.float32, batch_size=400, parts=3, **changes):
     cells = _core.CellSet(config.leaf_size_m)
     for chunk in rays.along(np.linspace(-0.3, 0.3, 7)):
         cells.insert(chunk)
-    field = Field(cells.sorted_keys(), config, with_intensity=True)
+    field = NeuralField(cells.sorted_keys(), config, with_intensity=True)
     field.initialise(torch.Generator().manual_seed(0))
     with torch.no_grad():
         field.cells.features.mul_(6)

@@ -150,10 +150,10 @@ def with_config(group, **changes):
 @pytest.mark.parametrize(
     ("group", "name", "value"),
     [
-        ("networks", "sdf_hidden", [30_000] * 3),
-        ("networks", "sdf_hidden", [4096] * 3),
+        ("networks", "intensity_hidden", [30_000] * 3),
+        ("networks", "intensity_hidden", [4096] * 3),
         ("networks", "intensity_hidden", [2**62, 2**62]),
-        ("networks", "sdf_hidden", [1] * 1_000_000),
+        ("networks", "intensity_hidden", [1] * 1_000_000),
         ("networks", "geometry_feature_dim", 10**9),
         ("networks", "geometry_feature_dim", 4096),
         ("encoding", "num_levels", 12),

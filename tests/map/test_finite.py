@@ -28,14 +28,6 @@ def test_a_box_beyond_all_positions_is_refused(radar_map, far):
         surface_metrics(radar_map.mesh(), [[0, 0, 0]], box=box)
 
 
-@pytest.mark.parametrize("training", [{}, {"joint": False, "sdf_iterations": 0}])
-def test_a_start_that_is_not_finite_hands_over_no_map(scene, training):
-    config = FitConfig.quick(training={"sigma_cells": 1e-43, "intensity_iterations": 3} | training)
-    with pytest.raises(radarsdf.Diverged, match="starts from is not finite") as stop:
-        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
-    assert stop.value.radar_map is None
-
-
 @pytest.mark.parametrize("iterations", [1, 99, 150])
 def test_the_map_of_a_divergence_can_be_saved_and_loaded(scene, tmp_path, iterations):
     config = FitConfig(

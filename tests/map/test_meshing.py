@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
+from radarsdf.field.neural_field import NeuralField
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents
 from radarsdf.map.isosurface import mesh_components
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.map.voxels import _corner_distances, _smooth_in_cells, _voxels_of, crossed
+from radarsdf.map.voxels import _corner_distances, _voxels_of, crossed
 from scipy.spatial import KDTree
 
 from ..conftest import ground_and_wall
@@ -27,7 +28,7 @@ LEAF_M = 0.2
 
 
 def occupied_voxels(radar_map, voxel_size):
-    return _voxels_of(radar_map.field.cells.table.leaf_cells(), voxel_size, radar_map.config)
+    return _voxels_of(radar_map.field.table.leaf_cells(), voxel_size, radar_map.config)
 
 
 def moved(radar_map, origin):
@@ -114,7 +115,7 @@ def test_voxels_that_divide_the_cell_stay_in_observed_cells(sharp_map, mesh_of, 
 def test_small_voxels_have_their_centres_in_the_map(sharp_map, mesh_of, voxel_size):
     local = mesh_of(voxel_size).triangles_center - sharp_map.origin  # each in the middle of one voxel's
     centres = (np.floor(local / voxel_size) + 0.5) * voxel_size
-    occupied = sharp_map.field.cells.occupied(torch.from_numpy(centres.astype(np.float32)))
+    occupied = sharp_map.field.occupied(torch.from_numpy(centres.astype(np.float32)))
     assert occupied.float().mean() > 0.9999
 
 
@@ -133,7 +134,7 @@ def test_any_voxel_size_gives_the_same_surface(sharp_map, mesh_of, voxel_size):
 
 
 def sharp_map_bounds(radar_map):
-    cells = radar_map.field.cells.table.leaf_cells()
+    cells = radar_map.field.table.leaf_cells()
     return cells.min(axis=0) * LEAF_M + radar_map.origin, (cells.max(axis=0) + 1) * LEAF_M + radar_map.origin
 
 
@@ -321,7 +322,7 @@ def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
     # Every voxel sees at its corners what the map says just inside of it. Without features the distance would be
     # that of free space, decimetres off.
     assert np.quantile(jump, 0.999) < 0.02
-    assert sharp_map.field.cells.occupied(torch.from_numpy(inner.reshape(-1, 3).astype(np.float32))).all()
+    assert sharp_map.field.occupied(torch.from_numpy(inner.reshape(-1, 3).astype(np.float32))).all()
 
 
 # Voxels that do not divide the cells are moved otherwise at the border: there, a few vertices differ.
@@ -329,7 +330,7 @@ def test_corners_on_the_border_do_not_jump(sharp_map, voxel_size):
 def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
     sharp_map, mesh_of, voxel_size, monkeypatch
 ):
-    cells = sharp_map.field.cells.table.leaf_cells()
+    cells = sharp_map.field.table.leaf_cells()
     searched = crossed(cells, LEAF_M, functools.partial(_corner_distances, sharp_map._contents, LEAF_M))
     assert len(searched) < 0.8 * len(cells)
     mesh = mesh_of(voxel_size)
@@ -344,9 +345,12 @@ def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
 
 
 def test_cells_are_skipped_only_where_the_encoding_is_smooth():
-    assert _smooth_in_cells(radarsdf.FitConfig())
-    assert _smooth_in_cells(radarsdf.FitConfig(encoding={"fourier_count": 0}))
-    assert not _smooth_in_cells(radarsdf.FitConfig.paper())  # its finest wavelength is 2.5 cm
+    def smooth(config):
+        return NeuralField(np.zeros(1, np.uint64), config, with_intensity=False).smooth_in_cells
+
+    assert smooth(radarsdf.FitConfig())
+    assert smooth(radarsdf.FitConfig(encoding={"fourier_count": 0}))
+    assert not smooth(radarsdf.FitConfig.paper())  # its finest wavelength is 2.5 cm
 
 
 def names(lattice):
@@ -356,7 +360,7 @@ def names(lattice):
 
 
 def test_occupied_voxels_fill_the_cells(sharp_map):
-    cells = names(sharp_map.field.cells.table.leaf_cells())
+    cells = names(sharp_map.field.table.leaf_cells())
     for parts in (1, 2, 4):
         voxels = occupied_voxels(sharp_map, LEAF_M / parts)
         assert len(np.unique(names(voxels))) == len(cells) * parts**3
@@ -365,7 +369,7 @@ def test_occupied_voxels_fill_the_cells(sharp_map):
 
 @pytest.mark.parametrize("voxel_size", [0.07, 0.15, 0.3, 0.45])
 def test_uneven_voxels_cover_the_cells_and_little_more(sharp_map, voxel_size):
-    cells = sharp_map.field.cells.table.leaf_cells()
+    cells = sharp_map.field.table.leaf_cells()
     voxels = occupied_voxels(sharp_map, voxel_size)
     voxels = voxels[np.unique(names(voxels), return_index=True)[1]]
     # The middle of each cell is covered; a hair to either side, as it may lie on a face between two voxels.

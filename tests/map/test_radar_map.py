@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
-from radarsdf.field.field import Field
+from radarsdf.field.neural_field import NeuralField
 from radarsdf.map.queries import evaluate, evidence, to_local
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.intensities import IntensityScale
@@ -222,7 +222,7 @@ def test_many_threads_at_once_get_the_answers_of_one(sharp_map):
 def test_gradient_is_the_derivative_of_the_distance(sharp_map):
     x = on_surface(sharp_map, 400)
     local = torch.from_numpy((x - sharp_map.origin).astype(np.float32)).double()
-    field = Field(sharp_map.field.cells.table.leaf_keys(), sharp_map.config, with_intensity=True)
+    field = NeuralField(sharp_map.field.table.leaf_keys(), sharp_map.config, with_intensity=True)
     field.load_state_dict(sharp_map.field.state_dict(), assign=True)
     field.double()  # so that differences over a tiny step are exact enough
     step = 1e-6

@@ -65,7 +65,7 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
         kind=encoding,
         normals=True,
         geometry_feature_dim=4,
-        sdf_hidden=(16,),
+        intensity_hidden=(16,),
         num_levels=2,
         max_range_m=70.0,
     )
@@ -86,7 +86,7 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
         np.testing.assert_array_equal(*(m.vertex_attributes["intensity"] for m in meshes))
 
     assert after.config == before.config
-    assert isinstance(after.config.networks.sdf_hidden, tuple)
+    assert isinstance(after.config.networks.intensity_hidden, tuple)
     np.testing.assert_array_equal(after.origin, before.origin)
     assert after.origin.dtype == np.float64
     assert after.intensity_scale == before.intensity_scale
@@ -278,7 +278,7 @@ DAMAGE = {
     "fractional count": lambda d: d["config"]["encoding"].update(num_levels=2.5),
     "number beyond floats": lambda d: d["config"]["training"].update(sigma_cells=10**400),
     "other levels": lambda d: d["config"]["encoding"].update(num_levels=5),
-    "other width": lambda d: d["config"]["networks"].update(sdf_hidden=[33, 32]),
+    "other width": lambda d: d["config"]["networks"].update(intensity_hidden=[65, 64, 64]),
     "no config": lambda d: d.pop("config"),
     "config a list": lambda d: d.update(config=[1, 2]),
     "no report": lambda d: d.pop("report"),
@@ -417,17 +417,15 @@ def test_damaged_intensities_in_closed_form_are_refused(saved_closed_form, tmp_p
         radarsdf.load(spoilt)
 
 
-def test_columns_of_features_that_are_zero_are_not_in_the_file(saved, tmp_path):
-    """A quick map uses one of eight. It is the same when it is read, and a map that uses all is written whole."""
+def test_a_map_of_averages_keeps_a_distance_at_each_corner(tmp_path):
     scans = radarsdf.simulate.wall(frames=4)
     quick = radarsdf.fit(scans.points, scans.poses, config=FitConfig.quick(), progress=False)
     quick.save(tmp_path / "quick.safetensors")
     tensors = load_file(tmp_path / "quick.safetensors")
-    assert tensors["field.cells.features"].shape == (quick.report["vertices"], 1)
+    assert tensors["field.distances_m"].shape == (quick.report["vertices"],)
     again = radarsdf.load(tmp_path / "quick.safetensors")
-    assert again.field.cells.features.equal(quick.field.cells.features)
-    assert saved[2]["field.cells.features"].shape[1] == 8
-    assert again.nbytes == quick.nbytes > 3 * (tmp_path / "quick.safetensors").stat().st_size / 2
+    assert again.field.distances_m.equal(quick.field.distances_m)
+    assert again.nbytes == quick.nbytes == 4 * quick.report["vertices"]
 
 
 def test_echoes_are_kept_bit_for_bit(scene, tmp_path):

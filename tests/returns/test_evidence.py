@@ -166,7 +166,7 @@ def test_mean_rays_know_how_many_scans_they_are_of(rays):
 
 STARTS = {
     "average": FitConfig.quick(),
-    "noise": FitConfig(training={"start": "noise", "sdf_iterations": 2, "batch_size": 64}),
+    "noise": FitConfig(training={"sdf_iterations": 2, "batch_size": 64}),
 }
 
 
@@ -195,7 +195,7 @@ def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeyp
     )
     radar_map = radarsdf.fit(*a_scene(), config=config, origin=(0, 0, 0), progress=False)
     assert radar_map.report["ghosts"] == drop_ghosts
-    leaf_keys = radar_map.field.cells.table.leaf_keys()
+    leaf_keys = radar_map.field.table.leaf_keys()
     own = rays.select(~is_false(rays)) if drop_ghosts else rays
     evidence = radar_map.evidence
     np.testing.assert_allclose(
