@@ -11,8 +11,7 @@ from radarsdf import FitConfig
 from radarsdf._core import CellSet
 from radarsdf.field.field import Field
 from radarsdf.field.losses import intensity_loss, sdf_loss
-from radarsdf.field.neural_field import IntensityNetwork, SDFNetwork
-from radarsdf.field.neural_field import cells_width, fourier_width
+from radarsdf.field.neural_field import IntensityNetwork, SDFNetwork, cells_width, fourier_width
 
 BARE = FitConfig(networks={"sdf_input": False, "view_direction": False, "log_range": False})
 SMALL = {"num_levels": 1, "fourier_count": 1}  # 8 and 6 numbers

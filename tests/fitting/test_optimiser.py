@@ -9,7 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
-from radarsdf._core import CellSet, Crew
+from radarsdf._core import CellSet
 from radarsdf.field import kernels
 from radarsdf.field.encodings import Octree, TriQuadtree
 from radarsdf.fitting.optimiser import Adam, RowAdam, Soap, Touched
@@ -159,32 +159,3 @@ def test_by_rows_the_number_of_threads_changes_nothing():
         results.append(steps(cells, batches, threads))
     assert torch.equal(results[0], results[1])
     assert torch.equal(results[0], results[2])
-
-
-def test_a_step_refuses_what_does_not_fit():
-    cells, points, _ = cells_and_points(TriQuadtree)
-    rows = len(cells.features)
-    memory = kernels.AdamMemory(
-        torch.zeros(rows, 16),
-        torch.zeros(rows, 2, dtype=torch.int32),
-    )
-    _, located = kernels.encode(cells.features, points, cells.table)
-    decays, crew = torch.ones(5, 2), Crew(2)
-
-    def step(gradient, features=cells.features, number=1):
-        with kernels.adam_step(
-            cells.table, [(points, located, gradient)], features, memory, decays,
-            step=number, learning_rate=1e-2, epsilon=1e-15, crew=crew,
-        ):  # fmt: skip
-            pass
-
-    good = torch.zeros(len(points), 24)
-    step(good)
-    for gradient in (good[:-1], good[:, :-1]):
-        with pytest.raises(ValueError, match="out_grad"):
-            step(gradient)
-    with pytest.raises(ValueError, match="features"):
-        step(good, features=torch.zeros(rows - 1, 8))
-    for number in (0, 5):
-        with pytest.raises(ValueError, match=r"step|decays"):
-            step(good, number=number)

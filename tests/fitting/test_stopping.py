@@ -158,54 +158,6 @@ def test_ctrl_c_ends_a_long_call_of_the_core():
     assert work_s < 0.6 * whole_s
 
 
-def test_ctrl_c_ends_a_mesh():
-    code = """
-import radarsdf
-from tests.conftest import ground_and_wall
-scene = ground_and_wall()
-config = radarsdf.FitConfig(training={"sdf_iterations": 5})
-radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
-# The first mesh imports. Ctrl-C within an import's exec() of a string, as of a dataclass, is remembered by CPython:
-# the process then ends as if by the signal, although the exception was caught.
-radar_map.mesh(0.2)
-print("ready", flush=True)
-try:
-    while True:
-        radar_map.mesh(0.03)
-except KeyboardInterrupt:
-    print("stopped", flush=True)
-"""
-    assert interrupted_python(code, delay_s=0.3) == ("", 0)
-
-
-def test_ctrl_c_during_the_import_of_trimesh_is_not_taken_for_a_missing_part():
-    code = """
-import importlib.abc, os, signal, sys, torch
-class Press(importlib.abc.MetaPathFinder):
-    def find_spec(self, name, path, target=None):
-        if name == part and not presses:
-            presses.append(name)
-            signal.raise_signal(signal.SIGINT)
-presses = []
-import radarsdf
-for part in ("networkx", "scipy", "shapely"):
-    assert "trimesh" not in sys.modules and part not in sys.modules
-    if (child := os.fork()) == 0:  # PyTorch, which takes seconds, is imported for all three
-        sys.meta_path.insert(0, Press())
-        try:
-            import radarsdf.map.meshing
-        except KeyboardInterrupt:
-            print("stopped", *presses, flush=True)
-        import radarsdf.map.meshing  # and now it is whole
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        os._exit(17)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
-"""
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", code]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stdout == "stopped networkx\nstopped scipy\nstopped shapely\n"
-
-
 def test_the_command_saves_the_map_so_far_and_says_so_in_one_line(tmp_path):
     scene = ground_and_wall()
     write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
@@ -292,14 +244,6 @@ def test_a_gradient_that_is_not_finite_never_reaches_the_map(scene, poisoned):
     assert (
         radar_map.sdf(scene.poses[:, :3, 3], extrapolate=True) > 0
     ).all()  # as learnt before, not as at the start
-
-
-def test_the_last_step_is_looked_at_too(scene, poisoned):
-    poisoned(20)
-    with pytest.raises(Diverged, match="iteration 19 of 20"):
-        radarsdf.fit(
-            scene.points, scene.poses, config=FitConfig(training={"sdf_iterations": 20, "batch_size": 512})
-        )
 
 
 @pytest.mark.parametrize("joint", [True, False])

@@ -72,22 +72,6 @@ def test_the_surface_keeps_their_returns(scans):
             assert tensor.equal(tensors(low)[name]), name
 
 
-def test_a_given_range_does_not_bring_them_back(scans):
-    good, low = (
-        radarsdf.fit(
-            scans.points,
-            scans.poses,
-            values,
-            config=CONFIGS["quick"],
-            progress=False,
-            intensity_range=(70.0, 150.0),
-        )
-        for values in (scans.intensities, struck(scans, -9999.0))
-    )
-    assert low.report["wild_intensities"] > 0
-    assert errors(low, scans).mean() < 1.02 * errors(good, scans).mean()
-
-
 def test_all_tiles_leave_out_the_same(scans, tmp_path):
     """The plan decides for all, also where a tile has no other intensities."""
     whole = struck(scans, -9999.0)

@@ -51,7 +51,7 @@ def test_what_load_would_refuse_is_not_saved(scene, tmp_path):
     path = tmp_path / "map.safetensors"
     radar_map.save(path)
     before = path.read_bytes()
-    radar_map.field.cells.features[3, 0] = np.nan
-    with pytest.raises(ValueError, match="features of the map holds something other than finite numbers"):
+    radar_map.field.distances_m[3] = np.nan
+    with pytest.raises(ValueError, match="distances_m of the map holds something other than finite numbers"):
         radar_map.save(path)
     assert path.read_bytes() == before

@@ -37,7 +37,6 @@ def moved(radar_map, origin):
             field=radar_map.field,
             origin=radar_map.origin + np.asarray(origin),
             intensity_scale=radar_map.intensity_scale,
-            reflectance=None,
             config=radar_map.config,
             evidence=radar_map.evidence,
             rough_share=radar_map.rough_share,

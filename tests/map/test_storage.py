@@ -110,7 +110,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "11"
+    assert metadata["format_version"] == "12"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -155,7 +155,7 @@ def test_files_of_other_programs(tmp_path):
             radarsdf.load(tmp_path / "other.safetensors")
 
 
-@pytest.mark.parametrize("version", ["4", "9", "10", "12", "", "1.5", "-1", "one"])
+@pytest.mark.parametrize("version", ["4", "9", "11", "13", "", "1.5", "-1", "one"])
 def test_other_versions(saved, tmp_path, version):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "new.safetensors", tensors, metadata | {"format_version": version})

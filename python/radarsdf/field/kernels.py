@@ -13,9 +13,7 @@ threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -25,20 +23,9 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from radarsdf import _core
-from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Crew, VertexTable
+from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, VertexTable
 
 _CACHE_LINE = 64  # bytes
-
-
-@dataclass(frozen=True)
-class AdamMemory:
-    """What :func:`adam_step` remembers of each row of features between steps."""
-
-    moments: Tensor
-    """(num_rows, 16): mean (8) and mean square (8) of the row's gradients."""
-    marks: Tensor
-    """(num_rows, 2) int32: the last step that changed the row, 0 for none; then a mark that the core uses
-    during a step, and that is 0 between steps."""
 
 
 def view(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -53,11 +40,9 @@ def rows_view(tensor: Tensor) -> np.ndarray[Any, Any]:
 
 
 def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Zeros of this shape in huge memory pages, for random access.
-
-    NumPy asks for huge pages from 4 MB on, PyTorch does not. With small pages, a step of Adam on a map of a
-    million rows takes 1.5 times as long.
-    """
+    """Zeros of this shape in huge memory pages, for random access."""
+    # NumPy asks for huge pages from 4 MB on, PyTorch does not. With small pages, a step of Adam on a map of a million rows
+    # takes 1.5 times as long.
     like = torch.empty(0, dtype=dtype, device="cpu").numpy()
     numbers = np.zeros(math.prod(shape) + _CACHE_LINE, like.dtype)
     first = -numbers.ctypes.data % _CACHE_LINE // numbers.itemsize  # else a row would lie in two lines
@@ -254,60 +239,6 @@ def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor
     return out, located
 
 
-@contextmanager
-def adam_step(
-    table: VertexTable,
-    batches: Sequence[tuple[Tensor, Tensor, Tensor]],
-    features: Tensor,
-    memory: AdamMemory,
-    decays: Tensor,
-    *,
-    step: int,
-    learning_rate: float,
-    epsilon: float,
-    crew: Crew,
-) -> Iterator[None]:
-    """A step of Adam, in place, on the rows of features that batches touch. Other rows do not change.
-
-    The other threads of `crew` do it during the ``with`` block. At its end, the calling thread helps them.
-
-    Parameters
-    ----------
-    table : VertexTable
-        The rows of `features` at the vertices of each cell.
-    batches : sequence of (points, located, gradient)
-        Points (N, 3), local frame, m; their cells (N, num_levels) int32, from :func:`locate`; and the
-        gradient of the loss with respect to the interpolated features (N, 8 · num_levels).
-    features : Tensor
-        (num_rows, 8).
-    memory : AdamMemory
-        State of Adam from the steps before.
-    decays : Tensor
-        (more than `step`, 2): both betas of Adam to the powers 0, 1, …
-    step : int
-        Number of this step, from 1 on.
-    learning_rate, epsilon : float
-        Adam's.
-    crew : Crew
-        Threads.
-    """
-    table.begin_adam_step(
-        [(view(points), located.numpy(), rows_view(grad)) for points, located, grad in batches],
-        view(features),
-        memory.moments.numpy(),
-        memory.marks.numpy(),
-        decays.numpy(),
-        step,
-        learning_rate,
-        epsilon,
-        crew,
-    )
-    try:
-        yield
-    finally:
-        crew.finish()
-
-
 def locate(points: Tensor, table: VertexTable) -> Tensor:
     """Row of the occupied cell that holds each point (N, 3), local frame, m, at each level.
 
@@ -319,10 +250,7 @@ def locate(points: Tensor, table: VertexTable) -> Tensor:
 
 
 def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequencies: int) -> Tensor:
-    """Sines, then cosines, of 2^k·π·points / half_width_m from k = first_frequency on.
-
-    (N, 6 · num_frequencies).
-    """
+    """Sines, then cosines, of 2^k·π·points / half_width_m from k = first_frequency on: (N, 6 · num_frequencies)."""
     return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-any-return, no-untyped-call]
 
 

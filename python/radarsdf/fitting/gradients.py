@@ -38,9 +38,9 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Touched:
-    """The samples of a batch, and the gradient of the loss with respect to their interpolated features.
+    """Samples of a batch, and the gradient of the loss with respect to their interpolated features.
 
-    The features of cells that hold a sample are called touched.
+    The features of cells that hold a sample are touched.
     """
 
     points: Tensor
@@ -77,8 +77,8 @@ class RandomDropout:
 class GradientBackend(ABC):
     """Losses and gradients of batches.
 
-    The parameters of `field` must keep their memory: a back end may hold views of them. Gradients of a batch's parts are
-    added in their order, so the threads of `workers` change no bit.
+    The parameters of `field` must keep their memory. Gradients of a batch's parts are added in their order, so the threads
+    of `workers` change no bit.
     """
 
     def __init__(
@@ -295,11 +295,7 @@ class AutogradGradients(GradientBackend):
         return self._gradients({"intensity": self._intensity_loss(geometry, part)}, None, frozen=True)
 
     def _touched(self, samples: Samples) -> Touched | None:
-        """If only touched features move: the samples, with interpolated features in place of the gradient.
-
-        These are the leaves that autograd differentiates with respect to. :meth:`_gradients` puts in the
-        gradient.
-        """
+        """If only touched features move: the samples, with interpolated features, which autograd differentiates by."""
         if not self._moves_rows:
             return None
         cells = self._field.cells

@@ -36,10 +36,9 @@ _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly over an interv
 
 
 def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
-    """How many samples of a batch of the sdf stage are near the surface, and how many of these have labels.
+    """How many samples of a batch of the sdf stage are near the surface, and how many of these have intensities as labels.
 
-    A label is the intensity of the return. The intensity network needs no more of them in a large batch than in a batch of
-    its own stage.
+    The intensity network needs no more of them in a large batch than in a batch of its own stage.
     """
     near = max(1, round(batch_size * (NEAR_SAMPLES / (NEAR_SAMPLES + FREE_SAMPLES))))
     training = config.training
@@ -118,25 +117,25 @@ class Batch:
 
 
 class RaySampler:
-    """Draws batches of samples from rays. The memory grows with the returns, not with the samples.
+    """Draws batches of samples from rays.
 
-    Rays are taken in random order without replacement, so all are used equally often. The positions on the
-    rays are random. A batch has one sample near the surface and one in free space on each of its rays,
-    instead of all twelve on a twelfth of the rays: so its gradient covers more of the scene.
+    Rays are taken in random order without replacement, and positions on them are random. A batch has one sample near the
+    surface and one in free space on each of its rays, instead of all twelve on a twelfth of the rays: so its gradient
+    covers more of the scene.
 
     Parameters
     ----------
     rays : Rays
         N rays.
     config : FitConfig
-        Its sampling and its lengths are used.
+        Settings of the fit.
     batch_size : int
         Samples in a batch.
     generator : torch.Generator
         Random numbers. The caller saves and restores its state.
     neighbours : int
-        So many rays that follow each other in Morton order of their returns are always taken together. In a
-        large map, the rays of a batch would otherwise be far apart, and share no cache lines.
+        So many rays that follow each other in Morton order of their returns are taken together. In a large map, the rays
+        of a batch would otherwise share no cache lines.
     intensities : Tensor, optional
         (N,) scaled intensities of the rays.
     num_threads : int
@@ -158,10 +157,8 @@ class RaySampler:
         self._generator = generator
         rows = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
         self._rays = torch.from_numpy(rows)
-        self._order = np.zeros(0, np.int64)
-        self._order_from = generator.get_state()
-        """State of the generator before `_order` was drawn."""
-        self._next = 0
+        self._order, self._next = np.zeros(0, np.int64), 0
+        self._order_from = generator.get_state()  # before the order was drawn
         near, labelled = near_and_labelled(config, batch_size)
         # Samples with labels come first, and a batch without them is in Morton order.
         self._counts = (near if intensities is None else labelled, near, batch_size - near)
@@ -195,10 +192,7 @@ class RaySampler:
         self._next = 0
 
     def _take(self, count: int) -> Tensor:
-        """Rows of the next `count` rays of the random order, ascending: in Morton order of their returns.
-
-        After the last ray, a new order is drawn.
-        """
+        """Rows of the next `count` rays of the random order, ascending: in Morton order of their returns."""
         # A whole pass takes every ray once, in any order: of few rays, a batch would draw hundreds of orders.
         passes, count = divmod(count, len(self._rays))
         parts = [np.repeat(np.arange(len(self._rays)), passes)] if passes else []
@@ -215,10 +209,7 @@ class RaySampler:
         return torch.rand(count, generator=self._generator, dtype=torch.float32, device="cpu")
 
     def spread(self, count: int, parts: int = 1) -> Batch:
-        """`count` samples near the surface, in `parts`.
-
-        They are uniform within the near band along the beam, and have the sensor's angular noise across it.
-        """
+        """`count` samples in the near band, in `parts`, with the sensor's angular noise across the beam."""
         places, noise_rad = self._take(count), self._config.training.cross_range_noise_rad
         sdf_m = (2 * self._uniform(count) - 1) * self._config.metres(NEAR_BAND_CELLS)
         ray = self._rays.index_select(0, places)
@@ -250,10 +241,8 @@ class RaySampler:
 def _in_morton_order(
     rays: Rays, intensities: Tensor | None, leaf_size_m: float, num_threads: int
 ) -> NDArray[np.float32]:
-    """(N, 7 or 8) numbers of the rays in Morton order of their returns; see :attr:`Samples.of_ray`.
-
-    All numbers of a ray are in one row of 32 bytes, half a cache line: a batch reads them by one index_select.
-    """
+    """:attr:`Samples.of_ray` of all rays, in Morton order of their returns."""
+    # All numbers of a ray are in one row of 32 bytes, half a cache line: a batch reads them by one index_select.
     order = stable_order(cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
     columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
     if intensities is not None:
@@ -278,18 +267,14 @@ def share(count: int, part: int, parts: int) -> int:
 
 @dataclass(frozen=True)
 class _Layout:
-    """The order of the B samples of a batch: part by part, with the near samples of each part first.
-
-    A sample is drawn uniformly from a segment of its ray.
-    """
+    """The order of the B samples of a batch, each drawn uniformly from a segment of its ray: part by part, near ones first."""
 
     index: Tensor
     """(B,) int64, row of each sample's ray among the rays that were taken."""
     order: Tensor
     """(B,) int64, row of each sample if all near samples of the batch came first, then all free ones."""
     start: tuple[Tensor, Tensor]
-    """(B,) each: c and d. The segment starts c + d · range in front of the return, m; behind it if
-    negative."""
+    """(B,) each: c and d. The segment starts c + d · range in front of the return, m."""
     length: tuple[Tensor, Tensor]
     """(B,) each: c and d. The segment has the length c + d · range, m, towards the sensor."""
     parts: list[tuple[int, int]]
@@ -338,11 +323,7 @@ def _spread(count: int, of: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Dropout:
-    """Which numbers of a matrix are kept.
-
-    PyTorch's dropout draws from the global generator, so the same seed would not give the same bits. And the threads of
-    the core each make the bytes of their own rows.
-    """
+    """Which numbers of a matrix are kept. PyTorch's own dropout draws from the global generator."""
 
     seed: int
     """Of the random bytes, one for each number of the matrix."""
@@ -351,7 +332,7 @@ class Dropout:
 
     @classmethod
     def draw(cls, dropout: float, generator: torch.Generator) -> Dropout:
-        """Draws a dropout. `dropout`: probability that a number is dropped."""
+        """`dropout`: probability that a number is dropped."""
         seed = torch.empty((), dtype=torch.int64, device="cpu").random_(generator=generator)
         return cls(int(seed), round(256 * (1 - dropout)))
 
