@@ -49,22 +49,10 @@ class Evidence:
         num_threads: int = 0,
         looks: Looks | None = None,
     ) -> Evidence:
-        """Evidence in the leaf cells with these Morton keys (C,), ascending.
+        """Evidence in the leaf cells with these keys (C,), ascending.
 
-        Parameters
-        ----------
-        returns : ReturnsOfCells
-            What the returns tell, cell by cell. Without those that are known to be false.
-        rays : Rays
-            All rays, scan by scan. A ray to a false return looked, too.
-        leaf_keys : ndarray
-            (C,) uint64.
-        leaf_size_m : float
-            Edge of a leaf cell, m.
-        num_threads : int
-            0: as many as OpenMP uses.
-        looks : Looks, optional
-            If they were counted scan by scan. Default: counted here, along all rays.
+        `returns` are those that are not known to be false; `rays` are all, scan by scan, since a ray to a false return also
+        looked. `looks`: visibility counts, if they were kept up scan by scan.
         """
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
         information, detections = sums_round(returns.select(near), leaf_keys, num_threads)
@@ -100,8 +88,8 @@ class ReturnsOfCells:
     def with_uncertain_poses(self, ranges_m: NDArray[np.float32], config: ReturnsConfig) -> ReturnsOfCells:
         """The same with the errors of the poses in `config`. `ranges_m` (M,): of a return in each cell, m.
 
-        The error of a pose is common to the returns of a scan, in a cell and in those round it. So the variance
-        of a cell gets that of a pose over the number of scans, as many times as a surface has cells among 27.
+        The error of a pose is common to the returns of a scan. So the variance of a cell gets that of a pose over the number
+        of scans, as many times as a surface has cells among 27.
         """
         if config.pose_sigma_m == 0 and config.pose_sigma_rad == 0:
             return self
@@ -149,24 +137,7 @@ _MOST = float(np.iinfo(np.uint16).max)
 def support_at(
     leaf_keys: NDArray[np.uint64], keys: NDArray[np.uint64], counts: NDArray[np.float64], num_threads: int = 0
 ) -> NDArray[np.float64]:
-    """Support of leaf cells: the number of returns in each and in the 26 cells round it.
-
-    Parameters
-    ----------
-    leaf_keys : ndarray
-        (C,) uint64 Morton keys of the leaf cells.
-    keys : ndarray
-        (M,) uint64 Morton keys of the cells that hold returns, ascending.
-    counts : ndarray
-        (M,) float64 number of returns in each of `keys`.
-    num_threads : int
-        0: as many as OpenMP uses.
-
-    Returns
-    -------
-    ndarray
-        (C,) float64. A count above 65535 counts as 65535.
-    """
+    """Support (C,) of leaf cells: returns in each and the 26 cells around it, up to 65535. `counts` (M,): of cells with `keys` (M,)."""
     sums = CellBlocks(keys).sum_round(leaf_keys, np.ascontiguousarray(counts)[:, None], 1.0, num_threads)
     return np.minimum(sums[:, 0], _MOST)
 
@@ -186,28 +157,10 @@ def bridged(
     max_cells: int,
     num_threads: int = 0,
 ) -> NDArray[np.uint64]:
-    """Adds the leaf cells that bridge a gap: those on the line between two cells with returns.
+    """Adds to `leaf_keys` (C,), ascending, the cells on the line between two cells with returns.
 
-    Lines run along the axes and the diagonals of the cells, in 13 directions.
-
-    Parameters
-    ----------
-    leaf_keys : ndarray
-        (C,) uint64 Morton keys of the leaf cells near the surface, ascending.
-    keys : ndarray
-        (M,) uint64 Morton keys of the leaf cells that hold returns, ascending. Those that are none of `leaf_keys` do
-        not count.
-    counts : ndarray
-        (M,) float64 number of returns in each of `keys`.
-    max_cells : int
-        Largest number of cells between the two.
-    num_threads : int
-        0: as many as OpenMP uses.
-
-    Returns
-    -------
-    ndarray
-        (C',) uint64 Morton keys of `leaf_keys` and the new cells, ascending.
+    Lines run along the axes and the diagonals, in 13 directions, over at most `max_cells`. `counts` (M,): returns in the cells
+    with `keys` (M,), ascending.
     """
     if max_cells == 0:
         return leaf_keys
@@ -223,10 +176,8 @@ def bridged(
 
 
 def _medians(leaf_keys: NDArray[np.uint64], support: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(C,) median of the `support` (C,) of the leaf cells with returns round them in the block of each cell.
-
-    Of a block, not of the map: what is added here must not depend on how many returns there are elsewhere.
-    """
+    """(C,) median of the `support` (C,) of the leaf cells with returns around them in the block of each cell."""
+    # Of a block, not of the map: what is added must not depend on how many returns there are elsewhere.
     block = leaf_keys >> np.uint64(3 * (LATTICE_BLOCK_CELLS.bit_length() - 1))
     starts = np.flatnonzero(np.diff(block, prepend=~block[:1]))  # cells of a block follow each other
     # Sorted within blocks: the number of the block counts more than the support.

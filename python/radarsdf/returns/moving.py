@@ -28,9 +28,8 @@ FloatArray = NDArray[np.float64]
 MIN_DOPPLER_RETURNS = 10
 """Fewer returns of a scan tell no velocity."""
 
-_DRAWS = (
-    64  # of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999
-)
+# Of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999.
+_DRAWS = 64
 _SIGMA_MPS = 0.15  # a return is off if its Doppler differs by three times the noise, and by at least this
 _LEAST_SIGMA_MPS = 1e-3
 _ROUNDS = 4
@@ -63,22 +62,11 @@ class SensorVelocity:
 def sensor_velocity(
     points: NDArray[Any], doppler_mps: NDArray[Any], *, interval_mps: float | None = None
 ) -> SensorVelocity:
-    """Finds the velocity of the sensor from one scan. The same scan gives the same bits.
+    """The velocity of the sensor in one scan of returns (N, 3) with `doppler_mps` (N,), positive away from the sensor.
 
-    Parameters
-    ----------
-    points : ndarray
-        (N, 3) returns, sensor frame; their unit does not matter.
-    doppler_mps : ndarray
-        (N,) speed along the ray, m/s, positive away from the sensor.
-    interval_mps : float, optional
-        Width of the interval into which the sensor folds speeds, m/s. None: it folds none.
-
-    Returns
-    -------
-    SensorVelocity
-        Without a velocity if there are fewer than 10 returns, or if less than 40 % of them agree. A component that no
-        return measures is 0 m/s, with a deviation of 100 m/s.
+    None if there are fewer than 10 returns, or if less than 40 % of them agree. A component that no return measures is 0 m/s,
+    with a deviation of 100 m/s. `interval_mps`: width of the interval into which the sensor folds speeds. The same scan gives
+    the same bits.
     """
     x, speeds = np.asarray(points, np.float64), np.asarray(doppler_mps, np.float64)
     ranges = np.linalg.norm(x, axis=1)
@@ -140,14 +128,12 @@ def _most_agreed(
 
 
 def folding_interval_mps(doppler_mps: Sequence[NDArray[Any]]) -> float | None:
-    """Width of the interval into which the sensor seems to fold speeds, m/s: None if the speeds do not fill one.
-
-    Folded speeds reach both ends of the interval, which lie about as far from 0.
-    """
+    """Width of the interval into which the sensor seems to fold speeds, m/s: None if the speeds do not fill one."""
     speeds = np.concatenate([np.asarray(values, np.float64) for values in doppler_mps])
     speeds = speeds[np.isfinite(speeds)]
     if len(speeds) < 100:
         return None
+    # Folded speeds reach both ends of the interval, which lie about as far from 0.
     low, high = float(speeds.min()), float(speeds.max())
     if not 0 < -low < 1.25 * high or not high < -1.25 * low:
         return None
@@ -165,15 +151,7 @@ def sensor_velocities(
     doppler_mps: Sequence[NDArray[Any]],
     others_mps: Sequence[NDArray[Any]] = (),
 ) -> list[SensorVelocity]:
-    """The velocity in each of K scans of one sensor, which may fold speeds into an interval.
-
-    Parameters
-    ----------
-    points, doppler_mps : sequences of K arrays
-        (N_i, 3) and (N_i,) each, as for :func:`sensor_velocity`.
-    others_mps : sequence of arrays
-        Speeds of other scans, that help to find the interval.
-    """
+    """The velocity in each of K scans of one sensor. `others_mps`: speeds of other scans, which help to find the folding interval."""
     interval = folding_interval_mps([*others_mps, *doppler_mps]) if points else None
     choices = [
         [sensor_velocity(x, v, interval_mps=folded) for x, v in zip(points, doppler_mps, strict=True)]
@@ -203,12 +181,8 @@ def without_filler(
         filled = (v == filler) & x.any(axis=1)
         if velocity.found and filled.any():
             away = -x[filled] / np.linalg.norm(x[filled], axis=1)[:, None]
-            contradicting += int(
-                (
-                    np.abs(product(velocity.velocity_mps[None], np.ascontiguousarray(away.T)) - filler)
-                    > 3 * _SIGMA_MPS
-                ).sum()
-            )
+            expected = product(velocity.velocity_mps[None], np.ascontiguousarray(away.T))
+            contradicting += int((np.abs(expected - filler) > 3 * _SIGMA_MPS).sum())
             asked += int(filled.sum())
     if 2 * contradicting > asked or (asked == 0 and share > _ONLY_FILLER):
         return (
@@ -235,17 +209,8 @@ class Movers:
     def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> Movers:
         """Finds the returns whose Doppler disagrees with a world that stands still.
 
-        Parameters
-        ----------
-        points : sequence of F arrays
-            (N_i, 3) each, sensor frame, m.
-        doppler_mps : sequence of F arrays
-            (N_i,) each, speed along the ray, m/s, of either sign, folded or not. NaN where it was not measured.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If `doppler_mps` are not numbers, their shapes do not fit to `points`, or a fit refuses these.
+        `points`, `doppler_mps`: F arrays (N_i, 3), sensor frame, m, and (N_i,), m/s, of either sign, folded or not; NaN where it
+        was not measured. TypeError or ValueError: they are no numbers, or do not fit together.
         """
         scans, _, _ = check_scans(points)
         speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))

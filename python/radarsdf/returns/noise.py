@@ -91,17 +91,6 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
 
     A surfel of leaf cells of 0.2 m is 1.2 m wide, so noise of more than some 0.4 m is underestimated. The
     roughness of a surface counts as noise. Measured on simulated scenes: 0.7 to 1.2 times the true deviation.
-
-    Parameters
-    ----------
-    surfels : Surfels
-        Surfels of the returns of `rays`.
-    rays : Rays
-        N rays. About `_RETURNS` of those on a flat surfel are used, evenly spread.
-    config : ReturnsConfig
-        Deviations that the user knows.
-    num_threads : int
-        0: as many as OpenMP uses.
     """
     known = np.array([getattr(config, name) for name in NOISE_SETTINGS], np.float64)
     free = np.isnan(known)
@@ -142,10 +131,7 @@ def variances_across(
 
 
 def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, M) factors of the variances along the beam, in azimuth and in elevation, across planes.
-
-    A return straight above the sensor has no azimuth: its factors of the angles are 0.
-    """
+    """(3, M) factors of the variances along the beam, in azimuth and in elevation, across planes. Above the sensor, 0 of angles."""
     ranges2 = np.square(rays.ranges_m[rows].astype(np.float64))
     up, normal = rays.up_of_scan[rays.scans[rows]].T, normals.T
     along = rays.directions[rows].T.astype(np.float64)
@@ -176,17 +162,6 @@ def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: 
     the share τ² / (τ² + σ²) of its distance from the plane, with the variance σ² of its noise across the plane
     and the variance τ² of the surface, which is that of the returns less their mean σ². This is the best linear
     estimate of its true distance (Wiener, 1949). Along the plane, the return keeps its position.
-
-    Parameters
-    ----------
-    surfels : Surfels
-        Surfels of the returns of `rays`.
-    rays : Rays
-        N rays.
-    noise : SensorNoise
-        Noise of the returns.
-    num_threads : int
-        0: as many as OpenMP uses.
     """
     points, directions, ranges_m = move_onto_planes(
         *rays.in_c_order(),

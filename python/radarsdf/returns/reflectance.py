@@ -143,7 +143,7 @@ class Reflectance:
 
 @dataclass(frozen=True)
 class Residuals:
-    """What regressions leave of a quantity of returns. It holds no rays: of ten million, these are half a gigabyte."""
+    """What regressions leave of a quantity of returns."""
 
     leaf_size_m: float
     """Edge of a leaf cell, m."""
@@ -172,23 +172,10 @@ class Residuals:
         ask: Ask | None = None,
         num_threads: int = 0,
     ) -> Residuals:
-        """The residuals of `rays`.
+        """The residuals of `rays`, with ghosts: a sensor sees these again.
 
-        Parameters
-        ----------
-        rays : Rays
-            All returns, with ghosts: a sensor sees these again.
-        unit : (N,) float32
-            Their intensities, scaled to [0, 1].
-        surfels : Surfels
-            Surfels of the same returns, or of more.
-        leaf_size_m : float
-            Edge of a leaf cell, m.
-        ask : callable, optional
-            What a network answers: intensities (M,) float32, scaled alike, at points (M, 3), local frame, m, seen along
-            directions (M, 3), unit vectors, from ranges (M,), m. Default: there is no network.
-        num_threads : int
-            0: as many as OpenMP uses.
+        `unit` (N,): their intensities, scaled to [0, 1]. `surfels`: of the same returns, or of more. `ask`: what a network
+        answers, intensities (M,) at points (M, 3) seen along directions (M, 3) from ranges (M,). None: there is no network.
         """
         flat = np.flatnonzero(surfels.is_flat())
         normals = surfels.normals.astype(np.float32)

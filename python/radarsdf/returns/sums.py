@@ -167,14 +167,9 @@ class ScanSums:
         return means
 
     def merged_moments(self) -> tuple[NDArray[np.uint64], NDArray[np.float64]]:
-        """Sums over the returns of each cell twice as large.
+        """Keys (P,), ascending, of the cells twice as large, and sums (P, 13) over their returns.
 
-        Returns
-        -------
-        ndarray
-            (P,) uint64, Morton keys of these cells, ascending.
-        ndarray
-            (P, 13) float64, sums of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m², and of the direction (3).
+        Sums are of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m², and of the direction (3).
         """
         keys = merged_keys(self.keys)
         first = np.flatnonzero(np.diff(keys, prepend=keys[:1] + np.uint64(1)))
