@@ -44,7 +44,6 @@ def test_limits_counts_and_thresholds():
     at_m = np.array([8.0, 20.0, 35.0])
     np.testing.assert_allclose(sensor.threshold(at_m), 50 - at_m / 2, atol=2.5)
     assert sensor.beam_rad == pytest.approx((0.02355, 0.0471), rel=1e-3)
-    assert sensor.resolution_m == pytest.approx(0.2355, rel=1e-3)
 
 
 def test_sentinels_are_no_threshold():

@@ -66,9 +66,8 @@ class FitConfig:
     max_memory_bytes: Annotated[int, Field(ge=1, lt=2**63)] | None = None
     """A fit or mesh that takes more is refused with a MemoryError, bytes. None: what the system has left."""
     train: bool = True
-    """Whether the average of the rays (stage 1) is replaced by a trained field (stage 2). Without it, intensities are in
-    closed form, and of the settings only those of `returns` and `encoding.bridge_cells` count. Measured: 1 to 3 points of
-    F-score more with it, in 3 to 6 times the time."""
+    """Whether a field is trained (stage 2). Otherwise the surface is the smoothed average of the rays (stage 1), intensities
+    are in closed form, and of the groups only `returns` and `encoding.bridge_cells` count."""
     returns: Annotated[ReturnsConfig, BeforeValidator(_from_mapping(ReturnsConfig))] = ReturnsConfig()
     """Which returns are used, and how they are cleaned."""
     encoding: Annotated[EncodingConfig, BeforeValidator(_from_mapping(EncodingConfig))] = EncodingConfig()

@@ -87,11 +87,6 @@ class Sensor:
         """Width of a beam in azimuth and elevation, rad: the full width at half maximum of the noise."""
         return _FWHM * self.noise.azimuth_rad, _FWHM * self.noise.elevation_rad
 
-    @property
-    def resolution_m(self) -> float:
-        """Resolution along the beam, m: the full width at half maximum of the noise. It is told; nothing in the package uses it."""
-        return _FWHM * self.noise.range_m
-
     def threshold(self, ranges_m: NDArray[Any]) -> NDArray[np.float64]:
         """(N,) the weakest intensity that is detected at ranges (N,), m, sensor units. -inf without `thresholds`."""
         if not self.thresholds:
