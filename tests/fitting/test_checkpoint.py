@@ -101,21 +101,6 @@ def test_on_another_number_of_threads_it_ends_with_the_same_bits(scene, tmp_path
     assert_same_bits(whole, fitted(scene, tmp_path / "state", QUICK.override(num_threads=3)))
 
 
-def test_it_is_written_on_the_way_without_changing_the_result(scene, tmp_path, monkeypatch):
-    whole = fitted(scene)
-    monkeypatch.setattr("radarsdf.fitting.checkpoint._EVERY_S", 0.0)
-    monkeypatch.setattr("radarsdf.fitting.checkpoint._SHARE", 1e9)
-    written = []
-    write = radarsdf.fitting.checkpoint.Checkpoint.write
-    monkeypatch.setattr(
-        "radarsdf.fitting.checkpoint.Checkpoint.write",
-        lambda self, state: (written.append(1), write(self, state)),
-    )
-    assert_same_bits(whole, fitted(scene, tmp_path / "state"))
-    assert len(written) == 61  # each iteration, and the end
-    assert [p.name for p in tmp_path.iterdir()] == ["state"]
-
-
 def test_a_killed_fit_goes_on_from_what_was_written_last(scene, tmp_path):
     if sys.platform == "win32":
         pytest.skip("kills by signal")
@@ -225,12 +210,6 @@ class TestOtherFiles:
             value = torch.full_like(file.get_tensor(name), float("inf")) if value is None else value
         self.rewrite(path, {name: value})
         self.refused(scene, path, "is not a whole checkpoint of this fit")
-
-
-def test_a_folder_that_does_not_exist_is_said_before_any_work(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("radarsdf.fitting.steps.SurfaceReturns.of", lambda *_: pytest.fail("began"))
-    with pytest.raises(FileNotFoundError, match="no folder"):
-        fitted(scene, tmp_path / "nowhere" / "state")
 
 
 def test_a_full_disk_is_a_warning_and_the_fit_goes_on(scene, tmp_path, monkeypatch):

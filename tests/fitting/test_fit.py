@@ -33,22 +33,6 @@ def test_surface_and_free_space_are_where_they_should_be(radar_map):
     assert np.nanmedian(radar_map.sdf(wall + [0.3, 0, 0])) < -0.2
 
 
-def test_gradient_points_to_free_space_and_is_the_derivative(radar_map):
-    rng = np.random.default_rng(0)
-    ground = np.column_stack(
-        [rng.uniform(9, 18, 300), rng.uniform(-4, 4, 300), rng.uniform(-0.05, 0.05, 300)]
-    )
-    gradient = radar_map.gradient(ground)
-    normal = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-    assert np.median(normal[:, 2]) > 0.97
-    step = 1e-3
-    for axis in range(3):
-        offset = step * np.eye(3)[axis]
-        difference = (radar_map.sdf(ground + offset) - radar_map.sdf(ground - offset)) / (2 * step)
-        # Within a cell and a ReLU's linear piece they agree; a few percent of the steps cross a border.
-        assert np.median(np.abs(difference - gradient[:, axis])) < 0.01
-
-
 def test_intensity_follows_the_radar_equation(radar_map):
     rng = np.random.default_rng(0)
     wall = np.column_stack([np.full(500, 20.0), rng.uniform(-4, 4, 500), rng.uniform(0.5, 3, 500)])
@@ -84,24 +68,6 @@ def test_the_number_of_threads_changes_no_bit(scene, config):
     for other in maps[1:]:
         for name, value in maps[0].field.state_dict().items():
             assert torch.equal(value, other.field.state_dict()[name]), name
-
-
-def test_scans_may_come_one_after_another(scene):
-    config = FitConfig(num_threads=1, training={"sdf_iterations": 3, "intensity_iterations": 3})
-    given = scene.points, scene.poses, scene.intensities
-    streamed = (p for p in scene.points), scene.poses, (v for v in scene.intensities)
-    maps = [radarsdf.fit(*scans, config=config, progress=False) for scans in (given, streamed)]
-    for whole, part in zip(*(m.field.parameters() for m in maps), strict=True):
-        assert torch.equal(whole, part)
-    assert maps[0].report["returns"] == maps[1].report["returns"] == sum(map(len, scene.points))
-
-
-def test_a_fit_leaves_the_global_random_state_and_threads_alone(scene):
-    torch.manual_seed(3)
-    state, threads = torch.get_rng_state(), torch.get_num_threads()
-    radarsdf.fit(scene.points, scene.poses, config=QUICK.override(num_threads=1))
-    assert torch.equal(torch.get_rng_state(), state)
-    assert torch.get_num_threads() == threads
 
 
 def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
@@ -224,18 +190,6 @@ class TestBadInput:
             radarsdf.fit([p[:0] for p in points], poses)
         with pytest.raises(ValueError, match="none of 120 returns"):
             radarsdf.fit([p * 0.01 for p in points], poses)
-
-
-def test_effort_is_that_of_the_fit(scene):
-    """Of 150 and 1200 iterations, the first of which are of both networks."""
-    config = FitConfig(effort=0.02, training={"batch_size": 1024, "intensity_batch_size": 512})
-    report = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config).report
-    whole = radarsdf.estimate(
-        scene.points, scene.poses, scene.intensities, config=config.override(effort=1.0)
-    ).iterations
-    done = report["iterations_done"]
-    assert done["sdf"] == pytest.approx(0.02 * whole["sdf"], abs=1)
-    assert done["sdf"] < done["intensity"] < 0.05 * whole["intensity"]
 
 
 def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tracemalloc
 
 import numpy as np
@@ -143,17 +142,6 @@ def test_memory_of_a_batch_does_not_grow_with_the_rays(rays, kind):
     assert peak < len(many)  # bytes
 
 
-def test_spread_sees_each_ray_equally_often(rays):
-    draw = sampler(rays, 300)
-    seen = np.zeros(NUM_RAYS, int)
-    for _ in range(10):
-        samples = draw.spread(300).split()[0]
-        assert samples.num_near == len(samples.points) == 300
-        assert samples.sdf_m.abs().max() <= NEAR_M
-        np.add.at(seen, rows_of(rays.points, samples).numpy(), 1)
-    assert (seen == 3).all()
-
-
 def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
     samples = sampler(rays, cross_range_noise_rad=0.02).spread(20 * NUM_RAYS).split()[0]
     index = rows_of(rays.points, samples).numpy()
@@ -162,13 +150,6 @@ def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
     across = offset - along[:, None] * rays.directions[index]
     angle_rad = np.linalg.norm(across, axis=1) / rays.ranges_m[index]
     assert np.sqrt((angle_rad**2).mean() / 2) == pytest.approx(0.02, rel=0.02)  # two axes across the beam
-
-
-def test_passes_take_the_rays_in_different_orders(rays):
-    draw = sampler(rays, NUM_RAYS)
-    first, second, third = (rows_of(rays.points, draw.batch().split()[0])[: NUM_RAYS // 2] for _ in range(3))
-    assert set(first.tolist()).isdisjoint(second.tolist())
-    assert set(third.tolist()) not in (set(first.tolist()), set(second.tolist()))
 
 
 @pytest.mark.parametrize("parts", [1, 3])
@@ -193,13 +174,6 @@ def test_only_so_many_intensities_are_labels(rays, parts):
     assert RaySampler(rays, free, 288, generator, 1, unit).batch().split()[0].num_labelled == 144
 
 
-def test_a_batch_larger_than_the_scene(rays):
-    few = rays.select(slice(None, None, 250))
-    samples = sampler(few, 100).batch().split()[0]
-    assert sorted(torch.bincount(rows_of(few.points, samples)[:50], minlength=4).tolist()) == [12, 12, 13, 13]
-    assert len(sampler(few, 1).batch().split()[0].points) == 1
-
-
 def test_the_generator_decides_alone(rays):
     torch.manual_seed(0)
     state = torch.get_rng_state()
@@ -210,16 +184,6 @@ def test_the_generator_decides_alone(rays):
         assert torch.equal(a.of_ray, b.of_ray)
         assert not torch.equal(a.points, c.points)
     assert torch.equal(torch.get_rng_state(), state)
-
-
-def test_neighbours_in_a_batch_are_neighbours_in_space(rays):
-    dense = dataclasses.replace(rays, points=rays.points * np.float32(0.1))
-    samples = sampler(dense, 512).spread(512).split()[0]
-    steps = np.linalg.norm(np.diff(dense.points[rows_of(dense.points, samples).numpy()], axis=0), axis=1)
-    shuffled = np.linalg.norm(
-        np.diff(dense.points[np.random.default_rng(0).permutation(NUM_RAYS)], axis=0), axis=1
-    )
-    assert np.median(steps) < 0.5 * np.median(shuffled)
 
 
 @pytest.mark.parametrize("parts", [2, 3])
@@ -244,23 +208,6 @@ def test_parts_are_the_batch_each_with_its_share(rays, parts):
         assert gap.abs().max() < 2e-5
 
 
-def test_parts_of_spread_samples(rays):
-    (whole,) = sampler(rays).spread(101).split()
-    found = sampler(rays).spread(101, 2).split()
-    assert [part.num_near for part in found] == [50, 51]
-    assert torch.equal(torch.cat([part.points for part in found]), whole.points)
-    assert torch.equal(torch.cat([part.of_ray for part in found]), whole.of_ray)
-
-
-def test_what_is_known_of_a_ray_comes_with_its_samples(rays):
-    unit = torch.linspace(0, 1, len(rays))
-    draw = RaySampler(rays, FitConfig(), 256, torch.Generator().manual_seed(0), intensities=unit)
-    for (samples,) in (draw.batch().split(), draw.spread(100).split()):
-        rows = rows_of(rays.points, samples)
-        assert torch.equal(samples.intensities, unit[rows])
-        assert torch.equal(samples.directions, torch.from_numpy(rays.directions)[rows])
-
-
 @pytest.mark.parametrize("dropout", [0.0, 0.3, 0.85])
 def test_dropout_zeroes_its_share_and_keeps_the_mean(dropout):
     state = torch.get_rng_state()
@@ -276,9 +223,3 @@ def test_dropout_zeroes_its_share_and_keeps_the_mean(dropout):
     assert torch.equal(factors, again)
     assert not torch.equal(factors, other) or dropout == 0
     assert torch.equal(torch.get_rng_state(), state)
-
-
-def test_successive_dropouts_have_nothing_in_common():
-    generator = torch.Generator().manual_seed(0)
-    hidden = [(Dropout.draw(0.5, generator).factors(500, 24) == 0).double().ravel() for _ in range(20)]
-    assert torch.corrcoef(torch.stack(hidden)).fill_diagonal_(0).abs().max() < 0.05

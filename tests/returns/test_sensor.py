@@ -9,7 +9,6 @@ import json
 
 import numpy as np
 import pytest
-from radarsdf.io import Scans
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import Sensor
@@ -58,20 +57,6 @@ def test_sentinels_are_no_threshold():
         assert weakest == pytest.approx(known, abs=2)
 
 
-def test_ranges_limit_what_counts():
-    points, _ = scans()
-    sensor = Sensor.of(points, min_range_m=10.0, max_range_m=30.0)
-    np.testing.assert_allclose(sensor.range_m, [10, 30], atol=0.5)
-    assert sensor.returns_per_scan == pytest.approx(270, abs=30)
-    assert (sensor.threshold(np.array([1.0])) == -np.inf).all()
-
-
-def test_scans_bring_their_intensities():
-    points, intensities = scans()
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    assert Sensor.of(Scans(points, poses, intensities)) == Sensor.of(points, intensities)
-
-
 def test_rays_tell_what_their_scans_tell():
     points, intensities = scans()
     turns = np.radians([10, 80, -130])
@@ -88,17 +73,6 @@ def test_rays_tell_what_their_scans_tell():
 def test_json_keeps_a_sensor():
     sensor = Sensor.of(*scans(), noise=NOISE)
     assert Sensor.from_dict(json.loads(json.dumps(sensor.to_dict()))) == sensor
-
-
-def test_one_return_is_enough():
-    sensor = Sensor.of([[[5.0, 0.0, 0.0]]], [[60.0]])
-    assert sensor.azimuth_rad[0] < sensor.azimuth_rad[1] <= 1e-3
-    assert sensor.threshold(np.array([5.0]))[0] == 60
-
-
-def test_no_return():
-    with pytest.raises(ValueError, match="no return"):
-        Sensor.of(scans()[0], min_range_m=100.0)
 
 
 @pytest.mark.parametrize(
