@@ -39,17 +39,6 @@ def test_planes_are_summed_and_levels_concatenated():
     np.testing.assert_allclose(out.detach(), 3.0, rtol=1e-6)
 
 
-def test_a_level_counts_where_its_own_cell_is_occupied():
-    encoding = TriQuadtree(leaf_keys([[0.1, 0.1, 0.1]]), LEAF_M, 3)
-    torch.nn.init.ones_(encoding.features)
-    # In the leaf; beside it but in its parent; in its grandparent only; outside of all, in the leaf's column.
-    points = tensor([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [0.7, 0.1, 0.1], [0.1, 0.1, 0.9]])
-    blocks = encoding(points).detach().view(4, 3, 8)
-    assert torch.equal((blocks != 0).all(2).int(), torch.tensor([[1, 1, 1], [0, 1, 1], [0, 0, 1], [0, 0, 0]]))
-    assert ((blocks == 0) | (blocks != 0).all(2, keepdim=True)).all()
-    assert encoding.occupied(points).tolist() == [True, False, False, False]
-
-
 @pytest.mark.parametrize("encoding_class", [TriQuadtree, Octree])
 def test_features_are_continuous_across_the_faces_of_occupied_cells(encoding_class):
     encoding = encoding_class(leaf_keys(block_of_cells()), LEAF_M, 3)

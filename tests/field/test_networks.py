@@ -93,19 +93,6 @@ def test_the_intensity_network_sees_what_it_is_told_to(setting, arguments, width
         assert torch.equal(network(**changed), before) != seen, name
 
 
-def test_range_enters_as_its_logarithm():
-    config = BARE.override(encoding=SMALL, networks={"log_range": True, "intensity_hidden": (1,)})
-    network = initialised(IntensityNetwork(config))
-    with torch.no_grad():  # the identity of log10(range / 10 m) + 5
-        for layer in (network.layers[0], network.layers[2]):
-            layer.weight.fill_(1)
-            layer.bias.fill_(0)
-        network.layers[0].weight[0, :14] = 0
-        network.layers[0].bias.fill_(5)
-    given = inputs(config, 4) | {"ranges_m": torch.tensor([1.0, 10.0, 100.0, 0.0])}
-    np.testing.assert_allclose(network(**given).detach(), [4, 5, 6, 1], atol=1e-6)
-
-
 def intensity(field, points, *, frozen=True, encoding_factors=None):
     geometry = field.geometry(points, frozen=frozen)
     return field.intensity_of(geometry, *views(points), encoding_factors=encoding_factors)
@@ -120,24 +107,6 @@ def test_normals_are_the_normalised_gradient():
     x = points.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(field.logit(x).sum(), x)
     np.testing.assert_allclose(seen[0], gradient / gradient.norm(dim=1, keepdim=True), atol=1e-5)
-
-
-@pytest.mark.parametrize("geometry_frozen", [False, True])
-def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_frozen):
-    field, points = make_field(BARE.override(networks={"sdf_input": True}))
-    seen = []
-    field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[:2]))
-    widths = (cells_width(BARE), fourier_width(BARE))
-    factors = [torch.ones(len(points), width) for width in widths]
-    for part in factors:
-        part[:, ::2] = 0
-        part[:, 1::2] = 3
-    for given in (None, factors):
-        intensity(field, points, frozen=geometry_frozen, encoding_factors=given)
-    (encoding, logit), (hidden, logit_with_dropout) = seen
-    for part, before, factor in zip(hidden, encoding, factors, strict=True):
-        assert torch.equal(part, before * factor)
-    assert torch.equal(logit, logit_with_dropout)
 
 
 @pytest.mark.parametrize("normals", [False, True])

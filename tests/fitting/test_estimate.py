@@ -4,24 +4,18 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 import radarsdf
-import torch
 from radarsdf import FitConfig
 from radarsdf.cli import main
-from radarsdf.field.neural_field import intensity_widths, parameters_of, sdf_widths, weights_of
 from radarsdf.fitting import estimate
-from radarsdf.fitting.gradients import CoreGradients
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
 from radarsdf.returns.rays import prepare
-from torch import nn
 
 from bench.stress.memory import peak_of_a_fit
 
@@ -107,18 +101,6 @@ def test_a_dry_run_prints_and_writes_nothing(scene, tmp_path, capsys, monkeypatc
     assert [p.name for p in tmp_path.iterdir()] == ["scans.npz"]
 
 
-@LINUX
-def test_memory_does_not_grow_with_the_fits():
-    code = """
-from bench.stress.memory import memory_of_fits
-found = memory_of_fits(48)  # what freed memory the allocator keeps varies by ten megabytes in the first of them
-assert max(found[32:]) - max(found[4:32]) < 5, found
-"""
-    # With an arena for each thread, as by default, one more of ten megabytes may be begun in any fit.
-    environment = os.environ | {"MALLOC_ARENA_MAX": "1"}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
-
-
 def work(config=BOTH, *, returns=1000, cells=3000, rows=2000, with_intensity=True, **changes):
     config = config.override(**grouped(**changes))
     schedule = Schedule.of(
@@ -144,64 +126,11 @@ def test_what_makes_more_work():
     assert work(FitConfig.quick())["iteration"] == 0
 
 
-def test_widths_are_those_of_the_networks(scene):
-    config = SHORT.override(networks={"geometry_feature_dim": 3})
-    field = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False).field
-    (encoding,) = {sum(part.shape[1] for part in field.encode(torch.zeros(1, 3)))}
-    assert sdf_widths(config)[0] == encoding
-    for network, widths in (
-        (field.sdf_network, sdf_widths(config)),
-        (field.intensity_network, intensity_widths(config)),
-    ):
-        layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
-        assert weights_of(widths) == sum(layer.weight.numel() for layer in layers)
-        assert parameters_of(widths) == sum(p.numel() for p in network.parameters())
-
-
-@pytest.mark.parametrize(
-    ("returns", "with_intensity", "changes"),
-    [(7, True, {}), (60, True, {"joint": False}), (60, False, {"batch_size": 700})],
-)
-def test_samples_are_those_that_the_training_sees(scene, monkeypatch, returns, with_intensity, changes):
-    seen = {"sdf": 0, "joint": 0, "intensity": 0}
-
-    def counted(name):
-        gradients = getattr(CoreGradients, name)
-
-        def counting(backend, batch, meanwhile):
-            seen[name] += len(batch.points)
-            return gradients(backend, batch, meanwhile)
-
-        return counting
-
-    for name in seen:
-        monkeypatch.setattr(CoreGradients, name, counted(name))
-    points, intensities = scene.points[0][:returns], scene.intensities[0][:returns]
-    config = FitConfig(num_threads=1, returns={"drop_ghosts": False}, training=changes)
-    given = ([points], scene.poses[:1], [intensities] if with_intensity else None)
-    rows = radarsdf.fit(*given, config=config, progress=False).report["vertices"]
-    evaluations = 3 * (seen["sdf"] + seen["joint"]) + seen["intensity"]
-    expected = work(config, returns=returns, rows=rows, with_intensity=with_intensity)
-    assert expected["encoded number"] == sdf_widths(config)[0] * evaluations
-
-
 def skipped_of(config, with_intensity):
     sizes = {"returns": 500_000, "with_intensity": with_intensity}
     schedule = Schedule.of(config, surface_returns=sizes["returns"], vertices=10**9, **sizes)
     found = estimate.skipped_parts(config, schedule, cells=10**6, rows=10**6, threads=1, **sizes)
     return schedule, dict(found)
-
-
-def test_samples_that_were_skipped_would_have_taken_their_share_of_the_time():
-    found = {}
-    for effort in (0.25, 0.5):
-        schedule, saved_s = skipped_of(FitConfig(effort=effort), with_intensity=False)
-        (seconds,) = (saved_s[words] for words in saved_s if "of the samples" in words)
-        found[effort] = seconds / schedule.sdf_iterations
-        assert schedule.passes == pytest.approx(0.6 * effort, rel=0.01)
-    # Of each sample that was drawn, so many are missing.
-    missing = {effort: 1 / (0.6 * effort) - 1 for effort in found}
-    assert found[0.25] / found[0.5] == pytest.approx(missing[0.25] / missing[0.5], rel=0.02)
 
 
 def test_each_part_that_was_skipped_has_a_time():

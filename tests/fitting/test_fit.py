@@ -4,14 +4,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.fitting.sampling import Dropout, RaySampler
+from radarsdf.fitting.sampling import RaySampler
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sums import lattice_of
 
@@ -40,13 +38,6 @@ def test_intensity_follows_the_radar_equation(radar_map):
         sensor = np.array([x, 0.0, 1.5])
         expected = 100 - 40 * np.log10(np.linalg.norm(wall - sensor, axis=1))
         assert np.median(np.abs(radar_map.intensity(wall, sensor, extrapolate=True) - expected)) < 0.5
-
-
-def test_observed_is_near_the_returns_only(scene, radar_map):
-    world = scene.points[0] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
-    assert radar_map.observed(world).mean() > 0.99  # some were moved onto a plane
-    assert not radar_map.observed(world + [0, 0, 30.0]).any()
-    assert not radar_map.observed(scene.poses[:, :3, 3]).any()
 
 
 def test_same_seed_same_bits_other_seed_other_bits(scene):
@@ -93,36 +84,6 @@ def test_utm_coordinates_change_nothing():
     np.testing.assert_allclose(
         far.intensity(x + offset, sensor + offset), near.intensity(x, sensor), atol=0.05
     )
-
-
-def test_the_more_often_samples_are_seen_the_more_is_hidden(monkeypatch):
-    scene = ground_and_wall(scans=2, returns_per_scan=128)
-    shares = []
-
-    def record(dropout, generator):
-        shares.append(dropout)
-        return draw(dropout, generator)
-
-    draw = Dropout.draw
-    monkeypatch.setattr(Dropout, "draw", record)
-    samples = 6 * sum(map(len, scene.points))
-    for passes in (1, 3, 27):
-        shares.clear()
-        config = QUICK.override(
-            training={
-                "intensity_batch_size": 128,
-                "intensity_iterations": math.ceil(passes * samples / 128),
-                "sdf_iterations": 1,
-            },
-        )
-        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
-        expected = passes / (passes + 2.5)
-        assert min(shares) == pytest.approx(0.25 * expected, rel=0.02)
-        assert max(shares) == pytest.approx(0.85 * expected, rel=0.02)
-    shares.clear()
-    published = QUICK.override(networks={"dropout": False})
-    radarsdf.fit(scene.points, scene.poses, scene.intensities, config=published)
-    assert not shares
 
 
 class TestBadInput:

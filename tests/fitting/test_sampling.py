@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
-from radarsdf._core import cell_keys
 from radarsdf.fitting.sampling import Dropout, RaySampler
 from radarsdf.returns.rays import prepare
 
@@ -46,23 +45,6 @@ def sensors_of(rays, samples):
 
 
 DRAWS = {"batch": lambda draw: draw.batch().split()[0], "spread": lambda draw: draw.spread(256).split()[0]}
-
-
-def test_neighbours_come_together_and_all_have_their_turn(rays):
-    draw = RaySampler(
-        rays,
-        FitConfig(),
-        64,
-        torch.Generator().manual_seed(0),
-        neighbours=5,
-    )
-    in_order = rays.points[np.argsort(cell_keys(rays.points, FitConfig().leaf_size_m), kind="stable")]
-    seen = []
-    while len(seen) * 32 < len(rays):
-        taken = np.sort(rows_of(in_order, draw.batch().split()[0])[:32].numpy())
-        assert (np.diff(taken) == 1).sum() >= 20  # of 31, where runs of five are cut at most twice
-        seen.append(taken)
-    assert len(np.unique(np.concatenate(seen))) == len(rays)
 
 
 @pytest.mark.parametrize("kind", DRAWS)
@@ -113,21 +95,6 @@ def test_each_ray_is_seen_equally_often(rays, batch_size):
     # Whole passes, and the begun one.
     whole = batches * (batch_size // 2) // NUM_RAYS
     assert set(np.unique(seen)) <= {whole, whole + 1}
-
-
-@pytest.mark.parametrize("kind", DRAWS)
-def test_a_batch_of_few_rays_draws_one_order_at_most(rays, kind, monkeypatch):
-    draws, draw_order = [], RaySampler._draw_order
-    monkeypatch.setattr(RaySampler, "_draw_order", lambda self: (draws.append(1), draw_order(self)))
-    few = rays.select(np.arange(3))
-    draw = sampler(few)
-    seen = np.zeros(3, int)
-    for batch in range(7):
-        samples = DRAWS[kind](draw)
-        rows = rows_of(few.points, samples)
-        np.add.at(seen, rows[: samples.num_near].numpy(), 1)
-        assert len(draws) <= batch + 1
-        assert seen.max() - seen.min() <= 1
 
 
 @pytest.mark.parametrize("kind", DRAWS)

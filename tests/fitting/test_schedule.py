@@ -60,12 +60,6 @@ def test_joint_iterations_count_for_the_intensities():
     assert alone.intensity_iterations == pytest.approx(0.65 * 6 * 3e5 / 1024, abs=1)
 
 
-def test_many_returns_do_not_train_the_intensities_for_ever():
-    assert schedule(10**8, joint=False).intensity_iterations == 1750
-    large = schedule(10**7)
-    assert large.intensity_iterations == large.sdf_iterations + 300
-
-
 def test_a_small_scene_trains_its_intensities_for_long_and_with_more_dropout():
     small, large = schedule(10_000), schedule(10**6)
     assert small.intensity_iterations == 500
@@ -83,12 +77,6 @@ def test_effort_multiplies_the_iterations(returns, joint):
         if not joint:
             assert 2 * one.intensity_iterations == pytest.approx(other.intensity_iterations, abs=1)
     assert half.batch_size == whole.batch_size == twice.batch_size == FitConfig().training.batch_size
-
-
-def test_effort_changes_nothing_that_is_set():
-    for effort in (0.01, 100.0):
-        found = schedule(10**5, sdf_iterations=70, intensity_iterations=90, effort=effort)
-        assert found.iterations == {"sdf": 70, "intensity": 90}
 
 
 def test_great_effort_grows_the_batches_too():

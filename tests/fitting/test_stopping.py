@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import Diverged, FitConfig, Interrupted, _core
-from radarsdf.fitting.gradients import CoreGradients
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.npz import write_scans
@@ -92,33 +91,6 @@ except KeyboardInterrupt as error:
 def test_ctrl_c_while_training_hands_back_the_map(threads):
     code = FIT.format(steps=400, intensities="scene.intensities", config=LONG | {"num_threads": threads})
     assert interrupted_python(code) == ("a map\n", 0)
-
-
-def test_ctrl_c_before_the_training_has_no_map():
-    code = """
-import numpy as np
-import radarsdf
-from radarsdf.returns.planes import Surfels
-rng = np.random.default_rng(0)
-points = rng.normal(size=(1_000_000, 3))
-points *= 300 / np.linalg.norm(points, axis=1, keepdims=True)
-ended = []
-find_surfels = Surfels.of_sums
-def announced(*arguments):
-    print("ready", flush=True)
-    surfels = find_surfels(*arguments)
-    ended.append(surfels)
-    return surfels
-Surfels.of_sums = announced
-try:
-    config = radarsdf.FitConfig(num_threads=1)
-    radarsdf.fit([points], np.eye(4)[None], config=config, progress=False)
-except radarsdf.Interrupted as error:
-    print("stopped", flush=True)
-    print("no map" if error.radar_map is None else error.radar_map)
-    print("after" if ended else "within", "the search for surfels")
-"""
-    assert interrupted_python(code, delay_s=0.05) == ("no map\nwithin the search for surfels\n", 0)
 
 
 def test_ctrl_c_ends_a_long_call_of_the_core():
@@ -231,37 +203,6 @@ def test_a_gradient_that_is_not_finite_never_reaches_the_map(scene, poisoned):
     assert (
         radar_map.sdf(scene.poses[:, :3, 3], extrapolate=True) > 0
     ).all()  # as learnt before, not as at the start
-
-
-@pytest.mark.parametrize("joint", [True, False])
-@pytest.mark.parametrize("name", ["sdf", "intensity"])
-def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypatch, name, joint):
-    calls = 0
-    stage, of = ("sdf", 10) if joint or name == "sdf" else ("intensity", 20)
-    eighth = 8 if stage == "sdf" else 10 + 8
-
-    def failing(of_stage):
-        def gradients(backend, batch, meanwhile):
-            nonlocal calls
-            calls += 1
-            found, result = of_stage(backend, batch, meanwhile)
-            if calls == eighth:
-                found.losses[name] *= math.inf
-            return found, result
-
-        return gradients
-
-    for method in ("sdf", "joint", "intensity"):
-        monkeypatch.setattr(CoreGradients, method, failing(getattr(CoreGradients, method)))
-    config = FitConfig(
-        num_threads=1,
-        training={"sdf_iterations": 10, "intensity_iterations": 20, "batch_size": 512, "joint": joint},
-    )
-    expected = f"the {name} loss is inf at iteration 7 of {of} of the {stage} stage"
-    with pytest.raises(Diverged, match=expected) as caught:
-        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
-    assert isinstance(caught.value, FloatingPointError)
-    assert np.isfinite(caught.value.radar_map.sdf(np.zeros((1, 3)), extrapolate=True)).all()
 
 
 def test_an_interrupted_fit_is_a_keyboard_interrupt_even_where_nobody_defers(scene, monkeypatch):

@@ -41,19 +41,6 @@ def test_spans_have_the_means_of_all_iterations(monkeypatch):
     assert found["sdf"]["seconds"] == sorted(found["sdf"]["seconds"])
 
 
-def test_the_report_of_a_fit_has_both_losses(scene):
-    config = FitConfig(
-        num_threads=1, training={"sdf_iterations": 30, "intensity_iterations": 50, "batch_size": 512}
-    )
-    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
-    found = radar_map.report["loss_history"]
-    assert found["sdf"]["iterations"] == list(range(1, 31))
-    assert found["intensity"]["iterations"] == list(range(1, 51))
-    assert found["sdf"]["losses"][-1] < 0.9 * found["sdf"]["losses"][0]
-    assert found["intensity"]["losses"][-1] == radar_map.report["losses"]["intensity"]
-    assert 0 < found["intensity"]["seconds"][-1] <= radar_map.report["training_s"]
-
-
 def test_the_bound_of_the_distances_is_one():
     labels = torch.linspace(-30, 30, 500)
     for scale in (0.01, 1.0, 10.0):
@@ -83,12 +70,6 @@ def test_a_few_bad_iterations_are_no_divergence_and_the_count_goes_on():
     assert "range of intensities" in losses.fault()
     reports = [one.to_report()["intensity"] for one in (losses, again)]
     assert reports[0]["losses"] == reports[1]["losses"]
-
-
-def test_a_loss_without_weight_is_no_fault():
-    losses = history(FitConfig(training={"sdf_loss_weight": 0.0}))
-    losses.add({"sdf": 0.0, "intensity": 0.5}, {"sdf": 1, "intensity": 1}, torch.ones(3))
-    assert losses.fault() is None
 
 
 @pytest.mark.parametrize("name", CASES)

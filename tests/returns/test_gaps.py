@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from radarsdf._core import CellSet, cell_keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
-from radarsdf.returns.evidence import _MAX_SUPPORT, _medians, bridged, support_at
+from radarsdf.returns.evidence import _MAX_SUPPORT, bridged, support_at
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sums import ReturnCells
 
@@ -87,14 +87,3 @@ def test_as_a_search_of_all_pairs_says(max_cells):
                 line = a + np.arange(1, distance)[:, None] * (way // distance)
                 expected |= set(cell_keys((line + 0.5) * LEAF_M, LEAF_M).tolist())
     assert added(rays, max_cells) == expected - set(leaf_keys.tolist())
-
-
-def test_medians_are_those_of_the_cells_with_returns_in_each_block():
-    rng = np.random.default_rng(4)
-    keys = np.sort(rng.choice(4 * LATTICE_BLOCK_CELLS**3, 3000, replace=False)).astype(np.uint64)
-    support = rng.integers(0, 9, len(keys)).astype(float)
-    block = keys // LATTICE_BLOCK_CELLS**3
-    found = _medians(keys, support)
-    for one in np.unique(block):
-        rows = block == one
-        assert found[rows] == pytest.approx(np.median(support[rows & (support > 0)]))

@@ -80,16 +80,6 @@ def test_accumulated_scans_are_seen_from_the_middle_one():
     np.testing.assert_array_equal(rays.origin, single.origin)
 
 
-def test_utm_coordinates_cost_no_precision():
-    offset = np.array([5e5, 5.4e6, 300.0])
-    points, poses = scans()
-    _, far_poses = scans(offset=offset)
-    near, far = prepare(points, poses), prepare(points, far_poses)
-    np.testing.assert_allclose(far.origin, near.origin + offset, rtol=1e-15)
-    np.testing.assert_allclose(far.points, near.points, atol=1e-5)
-    np.testing.assert_allclose(far.directions, near.directions, atol=1e-6)
-
-
 @pytest.mark.parametrize("changes", [{}, {"accumulate_scans": 3}, {"min_range_m": 12.0}])
 def test_scans_one_after_another_give_the_same_bits(changes):
     points, poses = scans()

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import radarsdf
@@ -52,14 +50,6 @@ def test_it_is_better_than_nearest_neighbours(rays):
     knn = KNNIntensity.chosen(*train.in_world(), train.intensities, train.scans)
     error = np.abs(own - test.intensities).mean()
     assert error < 0.99 * np.abs(knn.predict(*test.in_world()) - test.intensities).mean()
-
-
-def test_a_law_of_the_range_holds_where_there_was_no_return(rays):
-    values = (0.9 - 0.4 * np.log10(rays.ranges_m / 2)).astype(np.float32)
-    found = learnt(rays, values)
-    far = dataclasses.replace(rays, points=rays.points + np.float32(1000))
-    assert values.std() > 0.05
-    np.testing.assert_allclose(at(found, far), values, atol=0.02)
 
 
 def test_with_a_network_the_answer_is_the_mean_of_two(rays):

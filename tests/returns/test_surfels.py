@@ -10,7 +10,6 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.returns.evidence import support_at
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
@@ -67,30 +66,6 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     assert ghosts_of(rays, surfels, noise)[behind].mean() < 0.05
 
 
-def test_what_is_seen_beside_a_trunk_is_no_ghost():
-    """A trunk fills a part of its cells only. Rays through the rest of these end at what is there."""
-    rng = np.random.default_rng(2)
-
-    def strip(x_m, left_m, right_m, count):
-        return np.column_stack(
-            [
-                rng.normal(x_m, 0.02, count),
-                rng.uniform(left_m, right_m, count),
-                rng.uniform(-0.15, 0.15, count),
-            ]
-        )
-
-    def dropped(left_m, right_m):
-        things = strip(10, left_m, right_m, 400), strip(18, 0.47, 0.62, 60)
-        rays = prepare([np.concatenate(things).astype(np.float32)], np.eye(4)[None])
-        return ghosts_of(rays, Surfels.of(rays, LEAF_M), SensorNoise(0.02, 0.001, 0.001))
-
-    assert not dropped(0.02, 0.14).any()
-    behind_a_wall = dropped(0.02, 0.38)
-    assert not behind_a_wall[:400].any()
-    assert behind_a_wall[400:].mean() > 0.9
-
-
 def one_surfel(normal=(-1.0, 0, 0), thickness_m=0.0, reach_m=np.inf):
     """A plane through (10, 0.2, 0.2)."""
     centre = np.array([[10.0, 0.2, 0.2]], np.float32)
@@ -123,18 +98,6 @@ def test_crossings_of_one_surfel():
     assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.0, 0.5)) == [
         0
     ]  # across the beam: no depth
-
-
-def test_support_counts_the_returns_in_27_cells():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
-    cells = np.floor(points / np.float32(0.2)).astype(int)
-    leaf_keys, first = np.unique(cell_keys(points, 0.2), return_index=True)
-    expected = [(np.abs(cells - cell).max(axis=1) <= 1).sum() for cell in cells[first]]
-    counts = np.unique(cell_keys(points, 0.2), return_counts=True)[1].astype(float)
-    support = support_at(leaf_keys, leaf_keys, counts)
-    np.testing.assert_array_equal(support, expected)
-    assert support_at(leaf_keys[:1], leaf_keys[:1], np.array([70_000.0])).tolist() == [65535]
 
 
 def test_returns_per_cell_are_those_of_cells_that_hold_any():

@@ -9,6 +9,7 @@ the time. Tests check that the two are equal up to rounding.
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -66,48 +67,45 @@ class Gradients:
 
 @dataclass(frozen=True)
 class RandomDropout:
-    """What the dropout of a training is drawn from."""
+    """Factor on the usual dropout, and the random numbers that it is drawn from."""
 
     scale: float
-    """Factor on the dropout of the configuration."""
     generator: torch.Generator
-    """Random numbers."""
 
 
 class GradientBackend(ABC):
     """Losses and gradients of batches.
 
     The parameters of `field` must keep their memory. Gradients of a batch's parts are added in their order, so the threads
-    of `workers` change no bit.
+    of `workers` change no bit. The calling thread runs `meanwhile` while others work on the batch; its result is returned.
     """
 
     def __init__(
         self, field: NeuralField, config: FitConfig, dropout: RandomDropout, workers: Workers
     ) -> None:
-        self._field = field
-        self._config = config
-        self._dropout = dropout
-        self._workers = workers
+        self._field, self._config, self._dropout, self._workers = field, config, dropout, workers
         self._moves_rows = config.moves_rows(field.intensity_network is not None)
+
+    def sdf(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+        """Gradients of the sdf loss with respect to features and SDF network."""
+        return self._of("sdf", batch, meanwhile)
+
+    def joint(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+        """Gradients of the sum of both losses with respect to all parameters."""
+        return self._of("joint", batch, meanwhile)
+
+    def intensity(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+        """Gradients of the intensity loss with respect to the intensity network. The other parameters are frozen."""
+        return self._of("intensity", batch, meanwhile)
 
     @abstractmethod
     def num_parts(self, batch_size: int) -> int:
         """The best number of parts of a batch with so many samples."""
 
     @abstractmethod
-    def sdf(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        """Gradients of the sdf loss with respect to features and SDF network, and the result of `meanwhile`.
-
-        The calling thread runs `meanwhile` while others already work on the batch.
-        """
-
-    @abstractmethod
-    def joint(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        """The same of the sum of both losses with respect to all parameters."""
-
-    @abstractmethod
-    def intensity(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        """The same of the intensity loss with respect to the intensity network. The other parameters are frozen."""
+    def _of(
+        self, losses: str, batch: Batch, meanwhile: Callable[[], _Result]
+    ) -> tuple[Gradients, _Result]: ...
 
     def state(self) -> dict[str, Tensor]:
         """The state of the random numbers of dropout."""
@@ -154,55 +152,33 @@ class CoreGradients(GradientBackend):
     def num_parts(self, batch_size: int) -> int:
         return min(max(batch_size // _PART, 1), _MOST_PARTS)
 
-    def sdf(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+    def _of(self, losses: str, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+        crew, sdf_weight = self._workers.crew, self._config.training.sdf_loss_weight
+        arguments: dict[str, Any] = {"points": batch.points.numpy(), "sdf_m": batch.sdf_m.numpy()}
+        arguments |= {"parts": batch.parts, "crew": crew}
         touched = self._untouched(batch)
-        self._loss.begin_sdf(
-            points=batch.points.numpy(),
-            sdf_m=batch.sdf_m.numpy(),
-            parts=batch.parts,
-            weight=1.0,
-            located=touched.located.numpy(),
-            interpolated_grad=touched.gradient.numpy(),
-            crew=self._workers.crew,
-        )
-        (loss, _), result = self._finish(meanwhile)
-        return self._with_features({"sdf": loss}, touched, self._by_sdf), result
-
-    def joint(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        touched, sdf_weight = self._untouched(batch), self._config.training.sdf_loss_weight
-        self._loss.begin_joint(
-            **self._arguments(batch),
-            weights=(sdf_weight, 1.0),
-            located=touched.located.numpy(),
-            interpolated_grad=touched.gradient.numpy(),
-        )
-        (sdf, intensity), result = self._finish(meanwhile)
-        losses = {"sdf": sdf_weight * sdf, "intensity": intensity}
-        return self._with_features(losses, touched, self._by_sdf + self._by_intensity), result
-
-    def intensity(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        self._loss.begin_intensity(**self._arguments(batch), weight=1.0)
-        (_, loss), result = self._finish(meanwhile)
-        return Gradients({"intensity": loss}, list(self._by_intensity), None), result
-
-    def _finish(self, meanwhile: Callable[[], _Result]) -> tuple[tuple[float, float], _Result]:
-        """The losses of the batch that was begun."""
+        if losses != "intensity":
+            arguments["located"] = touched.located.numpy()
+            arguments["interpolated_grad"] = touched.gradient.numpy()
+        if losses != "sdf":
+            arguments["rays"] = batch.of_ray.numpy()
+            arguments["dropout"] = [(dropout.seed, dropout.keep) for _, dropout in self._draw_dropouts()]
+        if losses == "sdf":
+            self._loss.begin_sdf(**arguments, weight=1.0)
+        elif losses == "joint":
+            self._loss.begin_joint(**arguments, weights=(sdf_weight, 1.0))
+        else:
+            self._loss.begin_intensity(**arguments, weight=1.0)
         try:
             result = meanwhile()
         finally:
-            losses = self._loss.finish(self._workers.crew)
-        return losses, result
-
-    def _arguments(self, batch: Batch) -> dict[str, Any]:
-        """What the core's joint and intensity losses are called with."""
-        return {
-            "points": batch.points.numpy(),
-            "sdf_m": batch.sdf_m.numpy(),
-            "parts": batch.parts,
-            "rays": batch.of_ray.numpy(),
-            "dropout": [(dropout.seed, dropout.keep) for _, dropout in self._draw_dropouts()],
-            "crew": self._workers.crew,
-        }
+            sdf, intensity = self._loss.finish(crew)
+        if losses == "intensity":
+            return Gradients({"intensity": intensity}, list(self._by_intensity), None), result
+        if losses == "sdf":
+            return self._with_features({"sdf": sdf}, touched, self._by_sdf), result
+        both = {"sdf": sdf_weight * sdf, "intensity": intensity}
+        return self._with_features(both, touched, self._by_sdf + self._by_intensity), result
 
     def _untouched(self, batch: Batch) -> Touched:
         """Samples with arrays that the core fills."""
@@ -248,14 +224,10 @@ class AutogradGradients(GradientBackend):
     def num_parts(self, batch_size: int) -> int:
         return min(self._workers.num_threads, batch_size)
 
-    def sdf(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        return _sum(list(self._workers.map(self._sdf, batch.split()))), meanwhile()
-
-    def joint(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        return _sum(list(self._workers.map(self._joint, self._parts(batch)))), meanwhile()
-
-    def intensity(self, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        return _sum(list(self._workers.map(self._intensity, self._parts(batch)))), meanwhile()
+    def _of(self, losses: str, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
+        parts = [_Part(samples, None) for samples in batch.split()] if losses == "sdf" else self._parts(batch)
+        of_part = functools.partial(self._of_part, losses)
+        return _sum(list(self._workers.map(of_part, parts))), meanwhile()
 
     def _parts(self, batch: Batch) -> list[_Part]:
         parts = batch.split()
@@ -274,25 +246,23 @@ class AutogradGradients(GradientBackend):
         in_free_space = self._config.training.intensity_in_free_space
         return len(samples.points) if in_free_space else samples.num_labelled
 
-    def _sdf(self, samples: Samples) -> Gradients:
-        touched = self._touched(samples)
-        logit = self._field.logit(samples.points, None if touched is None else touched.gradient)
-        return self._gradients({"sdf": self._sdf_loss(logit, samples)}, touched)
-
-    def _joint(self, part: _Part) -> Gradients:
-        samples = part.samples
+    def _of_part(self, losses: str, part: _Part) -> Gradients:
+        field, samples = self._field, part.samples
+        if losses == "intensity":
+            geometry = field.geometry(samples.points)
+            return self._gradients({"intensity": self._intensity_loss(geometry, part)}, None, frozen=True)
         touched = self._touched(samples)
         interpolated = None if touched is None else touched.gradient
-        geometry = self._field.geometry(samples.points, frozen=False, interpolated=interpolated)
-        losses = {
+        if losses == "sdf":
+            logit = field.logit(samples.points, interpolated)
+            return self._gradients({"sdf": self._sdf_loss(logit, samples)}, touched)
+        geometry = field.geometry(samples.points, frozen=False, interpolated=interpolated)
+        sdf_weight = self._config.training.sdf_loss_weight
+        both = {
             "intensity": self._intensity_loss(geometry, part),
-            "sdf": self._config.training.sdf_loss_weight * self._sdf_loss(geometry.logit, samples),
+            "sdf": sdf_weight * self._sdf_loss(geometry.logit, samples),
         }
-        return self._gradients(losses, touched)
-
-    def _intensity(self, part: _Part) -> Gradients:
-        geometry = self._field.geometry(part.samples.points)
-        return self._gradients({"intensity": self._intensity_loss(geometry, part)}, None, frozen=True)
+        return self._gradients(both, touched)
 
     def _touched(self, samples: Samples) -> Touched | None:
         """If only touched features move: the samples, with interpolated features, which autograd differentiates by."""
