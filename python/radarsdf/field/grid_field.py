@@ -37,7 +37,7 @@ class GridField(Field):
     def __init__(self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_threads: int = 0) -> None:
         super().__init__()
         self.table = VertexTable(leaf_keys, leaf_size_m, 1, Encoding.OCTREE, num_threads)
-        self.distances_m = nn.Parameter(torch.empty(self.table.num_rows, dtype=torch.float32))
+        self.distances_m = nn.Parameter(torch.empty(self.table.num_rows, dtype=torch.float32, device="cpu"))
 
     def sdf(self, points: Tensor) -> Tensor:
         cells = kernels.locate(points, self.table)[:, 0]
