@@ -20,12 +20,10 @@ from radarsdf.checks import (
     check_scan_shape,
     check_scan_shapes,
     check_values_of_scan,
-    number,
     one_for_each_scan,
     pose_matrices,
     real_array,
     usable_poses,
-    whole_number,
 )
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
@@ -251,35 +249,27 @@ def prepare(
     poses : array_like
         (F, 4, 4) T_world_sensor, m.
     intensities : iterable of F arrays, optional
-        (N_i,) each, sensor units.
-    min_range_m, max_range_m : float
-        Returns outside these ranges are dropped, m. `max_range_m` None: no limit.
-    accumulate_scans : int
-        So many consecutive scans are treated as seen from the position of the middle one.
+        (N_i,) each, sensor units. Those that are not finite become NaN.
+    min_range_m, max_range_m, accumulate_scans
+        See :class:`~radarsdf.config.groups.ReturnsConfig`.
     origin : array_like, optional
-        (3,) origin of the local frame, world, m. By default the mean sensor position.
-    lattice : WorldLattice, optional
-        That default is moved to the next corner of a block of it, so that different scans share their cells.
+        (3,) origin of the local frame, world, m. By default the mean sensor position, moved to the next corner of a block
+        of the `lattice` if there is one, so that different scans share their cells.
     whole : bool
-        False: these are a part of the scans. None of their returns need be within the ranges, and their intensities are
-        as they are. Of whole scans, intensities that cannot belong to the others become NaN: see
-        :class:`~radarsdf.returns.intensities.Plausible`.
+        False: these are a part of the scans, of which none need be within the ranges. Of whole scans, intensities that are
+        outliers become NaN.
 
     Returns
     -------
     Rays
-        The returns that are kept, scan by scan.
+        The returns that are kept, scan by scan. Rows that are no returns (not finite, 0 0 0, padding), and scans whose pose
+        is not rigid, are left out, and counted in a warning of the logger ``radarsdf.returns``.
 
     Raises
     ------
     ValueError
         If lengths or shapes do not match, half of the poses or more are not rigid, all intensities are equal or are too
         far apart for float32, or no return is within the ranges.
-
-    Notes
-    -----
-    Rows that are no returns (not finite, 0 0 0, padding), and scans whose pose is not rigid, are left out. They are counted
-    in a warning of the logger ``radarsdf.returns``. Intensities that are not finite are NaN.
     """
     # Of an iterator, the number of scans is known only in the end.
     points = one_for_each_scan(points, "points")
@@ -294,10 +284,6 @@ def prepare(
         local_origin = positions.mean(axis=0)
         if lattice is not None:
             local_origin = lattice.position(lattice.nearest_block(local_origin))
-    min_range_m = number(min_range_m, "min_range_m")
-    max_range_m = None if max_range_m is None else number(max_range_m, "max_range_m")
-    whole_number(accumulate_scans, "accumulate_scans", 1)
-
     kept: list[list[Any]] = [[], [], [], []]
     number_of_scan, left_out = 0, LeftOut(poses=np.flatnonzero(~rigid).tolist())
     for i, (scan, of_scan) in enumerate(_checked(points, intensities, left_out)):
