@@ -11,7 +11,7 @@ from radarsdf.evaluation import KNNIntensity, holdout
 from radarsdf.returns import reflectance
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.reflectance import Reflectance, Residuals
+from radarsdf.returns.reflectance import Reflectance
 
 LEAF_M = 0.2
 
@@ -34,9 +34,8 @@ def unit(rays):
 
 
 def learnt(rays, values, num_threads=1):
-    return Reflectance.of(
-        Residuals.of(rays, values, Surfels.of(rays, LEAF_M, num_threads), LEAF_M), num_threads
-    )
+    surfels = Surfels.of(rays, LEAF_M, num_threads)
+    return Reflectance.of(rays, values, surfels, LEAF_M, num_threads=num_threads)
 
 
 def at(found, rays):
@@ -56,8 +55,8 @@ def test_with_a_network_the_answer_is_the_mean_of_two(rays):
     """That of the network, and of half of it with what that leaves in closed form."""
     answers = np.linspace(0.2, 0.6, len(rays), dtype=np.float32)
     surfels = Surfels.of(rays, LEAF_M, 1)
-    found = Reflectance.of(Residuals.of(rays, unit(rays), surfels, LEAF_M, lambda *_: answers))
-    closed = Reflectance.of(Residuals.of(rays, unit(rays) - answers / 2, surfels, LEAF_M))
+    found = Reflectance.of(rays, unit(rays), surfels, LEAF_M, lambda *_: answers)
+    closed = Reflectance.of(rays, unit(rays) - answers / 2, surfels, LEAF_M)
     whole, leaves = (r.at(rays.points, rays.directions, rays.ranges_m, 1) for r in (found, closed))
     assert closed.network_share == 0
     expected = (answers + (answers / 2 + leaves)) / 2

@@ -23,7 +23,7 @@ from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise, onto_surfels, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.reflectance import Float32, Reflectance, Residuals
+from radarsdf.returns.reflectance import Float32, Reflectance
 from radarsdf.returns.sums import MeanRays, ReturnCells, ScanSums
 
 BAND_CELLS = 2.0
@@ -232,5 +232,4 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
 
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False)
     ask = network if contents.config.trains_intensity else None
-    residuals = Residuals.of(rays, unit, surfels, contents.config.leaf_size_m, ask, num_threads)
-    return Reflectance.of(residuals, num_threads)
+    return Reflectance.of(rays, unit, surfels, contents.config.leaf_size_m, ask, num_threads)
