@@ -21,9 +21,8 @@ from radarsdf.config.presets import PAPER, QUICK
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import by_name, settings
 
-LATTICE_BLOCK_CELLS = (
-    32  # edge of a block, leaf cells: a multiple of that of the cubes in which looks are counted
-)
+# Edge of a block, leaf cells: a multiple of that of the cubes of visibility counts.
+LATTICE_BLOCK_CELLS = 32
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
 

@@ -31,7 +31,6 @@ _NoiseRad = Annotated[float, Field(gt=0, le=_MAX_NOISE_RAD)]
 _Positive = Annotated[float, Field(gt=0)]
 _NotNegative = Annotated[float, Field(ge=0)]
 _Count = Annotated[int, Field(ge=1, le=MAX_ITERATIONS)]
-_Dropout = Annotated[float, Field(ge=0, le=0.95)]
 _Widths = Annotated[
     tuple[Annotated[int, Field(ge=1, le=_MAX_WIDTH)], ...],
     Field(min_length=1, max_length=MAX_LAYERS, strict=False),  # TOML and JSON have lists, not tuples
