@@ -10,7 +10,7 @@ import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
 from radarsdf.field.losses import sdf_loss
-from radarsdf.field.neural_field import IntensityNetwork, NeuralField, SDFNetwork, cells_width, fourier_width
+from radarsdf.field.neural_field import IntensityNetwork, NeuralField, cells_width, fourier_width
 
 BARE = FitConfig(networks={"sdf_input": False, "view_direction": False, "log_range": False})
 SMALL = {"num_levels": 1, "fourier_count": 1}  # 8 and 6 numbers
@@ -53,17 +53,6 @@ def initialised(network):
 def views(points):
     rays = points - torch.tensor([0.0, 0.0, 8.0])
     return rays / rays.norm(dim=1, keepdim=True), rays.norm(dim=1)
-
-
-@pytest.mark.parametrize("geometry_feature_dim", [0, 15])
-def test_sdf_network(geometry_feature_dim):
-    networks = {"geometry_feature_dim": geometry_feature_dim}
-    network = initialised(SDFNetwork(FitConfig(encoding=SMALL, networks=networks)))
-    logit, feature = network([torch.randn(4, 8), torch.randn(4, 6)])
-    assert logit.shape == (4,)
-    assert feature.shape == (4, geometry_feature_dim)
-    widths = [tuple(m.weight.shape) for m in network.layers if isinstance(m, torch.nn.Linear)]
-    assert widths == [(32, 14), (32, 32), (1 + geometry_feature_dim, 32)]
 
 
 @pytest.mark.parametrize(

@@ -141,18 +141,6 @@ def test_only_so_many_intensities_are_labels(rays, parts):
     assert RaySampler(rays, free, 288, generator, 1, unit).batch().split()[0].num_labelled == 144
 
 
-def test_the_generator_decides_alone(rays):
-    torch.manual_seed(0)
-    state = torch.get_rng_state()
-    one, two, other = sampler(rays), sampler(rays), sampler(rays, seed=1)
-    for kind in ("batch", "spread", "batch"):
-        a, b, c = (DRAWS[kind](s) for s in (one, two, other))
-        assert torch.equal(a.points, b.points)
-        assert torch.equal(a.of_ray, b.of_ray)
-        assert not torch.equal(a.points, c.points)
-    assert torch.equal(torch.get_rng_state(), state)
-
-
 @pytest.mark.parametrize("parts", [2, 3])
 def test_parts_are_the_batch_each_with_its_share(rays, parts):
     (whole,) = sampler(rays, 250).batch().split()

@@ -54,12 +54,6 @@ def test_batches_grow_where_iterations_would_be_too_many():
     assert schedule(10**6).neighbours == 1
 
 
-def test_joint_iterations_count_for_the_intensities():
-    alone, joint = schedule(3 * 10**5, joint=False), schedule(3 * 10**5)
-    assert alone.intensity_iterations == joint.intensity_iterations
-    assert alone.intensity_iterations == pytest.approx(0.65 * 6 * 3e5 / 1024, abs=1)
-
-
 def test_a_small_scene_trains_its_intensities_for_long_and_with_more_dropout():
     small, large = schedule(10_000), schedule(10**6)
     assert small.intensity_iterations == 500
@@ -77,12 +71,6 @@ def test_effort_multiplies_the_iterations(returns, joint):
         if not joint:
             assert 2 * one.intensity_iterations == pytest.approx(other.intensity_iterations, abs=1)
     assert half.batch_size == whole.batch_size == twice.batch_size == FitConfig().training.batch_size
-
-
-def test_great_effort_grows_the_batches_too():
-    great = schedule(10**6, effort=10.0)
-    assert great.sdf_iterations == 5000
-    assert great.sdf_iterations * great.batch_size == pytest.approx(0.6 * 10 * 12e6, rel=1e-3)
 
 
 def test_a_batch_of_few_returns_has_the_samples_of_one_pass():

@@ -14,29 +14,6 @@ from .walls import a_wall
 LEAF_M = 0.2
 
 
-def test_returns_come_onto_the_planes_that_they_make():
-    points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01)
-    noise = SensorNoise(0.1, 0.01, 0.01)
-    rays = prepare(points, poses)
-    surfels = Surfels.of(rays, LEAF_M)
-    moved = onto_surfels(surfels, rays, noise)
-    np.testing.assert_array_equal(moved.points, onto_surfels(surfels, rays, noise, num_threads=3).points)
-
-    def error_m(rays):
-        x, _, z = rays.points.T + rays.origin[:, None]
-        wall = (
-            (np.abs(x - 15) < 0.6) & (z > 1) & (z < 3)
-        )  # far from where wall and ground meet, and from their ends
-        ground = (np.abs(z) < 0.6) & (x > 6) & (x < 13)
-        return np.sqrt(np.mean(np.concatenate([x[wall] - 15, z[ground]]) ** 2))
-
-    assert error_m(moved) < 0.35 * error_m(rays)
-    # Seen from where they were, and whole rays.
-    sensors = [r.points - r.directions * r.ranges_m[:, None] for r in (rays, moved)]
-    np.testing.assert_allclose(*sensors, atol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(moved.directions, axis=1), 1, atol=1e-6)
-
-
 def test_the_shift_is_the_best_linear_estimate():
     """As in plain NumPy, one return after another."""
     points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01, scans=2)

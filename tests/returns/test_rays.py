@@ -89,16 +89,3 @@ def test_scans_one_after_another_give_the_same_bits(changes):
     streamed = prepare((p for p in points), poses, (v for v in values), **changes)
     for name in ("points", "directions", "ranges_m", "intensities", "scans", "origin"):
         np.testing.assert_array_equal(getattr(streamed, name), getattr(whole, name))
-
-
-def test_wrong_numbers_of_scans_one_after_another():
-    points, poses = scans()
-    for some, values, said in (
-        (points[:5], None, r"poses must have shape \(5, 4, 4\)"),
-        ([*points, points[0]], None, r"poses must have shape \(8, 4, 4\)"),
-        (points, [np.arange(len(p)) for p in points[:6]], "intensities holds 6 scans, points 7"),
-        (points[:6], [np.arange(len(p)) for p in points], "intensities holds 7 scans, points 6"),
-        ([], None, "no scans"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            prepare(iter(some), poses, None if values is None else iter(values))

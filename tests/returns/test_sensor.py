@@ -45,18 +45,6 @@ def test_limits_counts_and_thresholds():
     assert sensor.beam_rad == pytest.approx((0.02355, 0.0471), rel=1e-3)
 
 
-def test_sentinels_are_no_threshold():
-    points, intensities = scans()
-    expected = Sensor.of(points, intensities)
-    for values in intensities:
-        values[::40] = -9999
-    for (at_m, weakest), (_, known) in zip(
-        Sensor.of(points, intensities).thresholds, expected.thresholds, strict=True
-    ):
-        assert 3 < at_m < 40
-        assert weakest == pytest.approx(known, abs=2)
-
-
 def test_rays_tell_what_their_scans_tell():
     points, intensities = scans()
     turns = np.radians([10, 80, -130])
