@@ -70,7 +70,9 @@ def samples(config: radarsdf.FitConfig, path: Path) -> None:
     axes.plot(x, occupied, color=BLUE, label="label: probability that the point is behind the surface")
     near = range_m + rng.uniform(-1, 1, sampling.NEAR_SAMPLES) * config.metres(sampling.NEAR_BAND_CELLS)
     free = rng.uniform(
-        sampling.FREE_FROM * range_m, range_m + config.metres(sampling.FREE_BEYOND_CELLS), sampling.FREE_SAMPLES
+        sampling.FREE_FROM * range_m,
+        range_m + config.metres(sampling.FREE_BEYOND_CELLS),
+        sampling.FREE_SAMPLES,
     )
     axes.plot(free, np.full(len(free), -0.12), "o", color=LIGHT, label="samples along the ray")
     axes.plot(near, np.full(len(near), -0.12), "o", color=DARK, label="samples near the return")

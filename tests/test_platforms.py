@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from radarsdf.fitting import estimate as durations
-from radarsdf.memory import available_bytes
+from radarsdf.fitting import estimate
 from radarsdf.io.files import check_outputs, write_whole
+from radarsdf.memory import available_bytes
 
 # Modules and functions of Python that only POSIX has.
 MODULES = ("fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios")
@@ -23,9 +23,9 @@ SIGNALS = ("SIGKILL", "SIGHUP", "SIGALRM", "setitimer", "pthread_sigmask")
 def test_processors_are_counted_without_affinity(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    assert durations.processors() == 3
+    assert estimate.processors() == 3
     monkeypatch.setattr(os, "cpu_count", lambda: None)
-    assert durations.processors() == 1
+    assert estimate.processors() == 1
 
 
 def test_without_proc_there_is_no_limit_of_memory(tmp_path):
