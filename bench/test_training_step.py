@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
-from radarsdf._core import CellSet
 from radarsdf.field.losses import intensity_loss, sdf_loss
 from radarsdf.field.neural_field import NeuralField, cells_width, fourier_width
+from radarsdf.fitting.average import near_leaf_keys
 from radarsdf.fitting.gradients import FEATURE_DROPOUT, FOURIER_DROPOUT
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.fitting.sampling import Dropout, RaySampler
@@ -127,10 +127,7 @@ def rays():
 
 @pytest.fixture(scope="module")
 def leaf_keys(rays):
-    cells = CellSet(CONFIG.leaf_size_m)
-    for chunk in rays.along(np.linspace(-0.3, 0.3, 7)):
-        cells.insert(chunk)
-    return cells.sorted_keys()
+    return near_leaf_keys(rays, CONFIG, 1)
 
 
 @pytest.fixture(params=STAGES)

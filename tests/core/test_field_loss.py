@@ -16,6 +16,7 @@ import pytest
 import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.neural_field import NeuralField
+from radarsdf.fitting.average import near_leaf_keys
 from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, RandomDropout, _layers
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.returns.rays import prepare
@@ -64,10 +65,7 @@ class Made:
 
 def make_batch(rays, dtype=torch.float32, batch_size=400, parts=3, **changes):
     config = FitConfig(**grouped(**changes))
-    cells = _core.CellSet(config.leaf_size_m)
-    for chunk in rays.along(np.linspace(-0.3, 0.3, 7)):
-        cells.insert(chunk)
-    field = NeuralField(cells.sorted_keys(), config, with_intensity=True)
+    field = NeuralField(near_leaf_keys(rays, config, 1), config, with_intensity=True)
     field.initialise(torch.Generator().manual_seed(0))
     with torch.no_grad():
         field.cells.features.mul_(6)

@@ -100,18 +100,6 @@ class Rays:
         points = self.points.astype(np.float64) + self.origin
         return points, points - self.directions.astype(np.float64) * self.ranges_m[:, None]
 
-    def along(self, offsets_m: ArrayLike, chunk: int = 1 << 20) -> Iterator[NDArray[np.float32]]:
-        """Points at fixed offsets from the return along each ray, in chunks (M, 3), local, m.
-
-        Positive offsets are behind the return. A chunk has about `chunk` points.
-        """
-        offsets = np.asarray(offsets_m, np.float32)
-        rays_per_chunk = max(1, chunk // len(offsets))
-        for first in range(0, len(self), rays_per_chunk):
-            rays = slice(first, first + rays_per_chunk)
-            points = self.points[rays, None, :] + offsets[None, :, None] * self.directions[rays, None, :]
-            yield points.reshape(-1, 3)
-
 
 def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
     """Mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor itself, and no padding."""
