@@ -174,7 +174,7 @@ def test_encodings_forward(benchmark, step):
     points = samples.points.numpy()[: samples.num_near]
     known = step.field.occupied(samples.points[: samples.num_near]).numpy()
     assert known.mean() > 0.8
-    surface = Surface(step.field.cells.table, step.field.cells.features.detach())
+    surface = Surface(step.field.table, step.field.cells.features.detach())
     rows, weights = surface.rows_and_weights(points[known])
     expected = (surface.features.numpy()[rows] * weights[..., None]).sum(2).reshape(known.sum(), -1)
     found = cells[: samples.num_near].numpy()[known]
@@ -290,7 +290,7 @@ def test_matrix_products(benchmark, step):
 def test_whole(benchmark, step, rays):
     """`STEPS` steps of `Training` on one thread. The stage with frozen geometry follows one step of geometry."""
     field = NeuralField(
-        step.field.cells.table.leaf_keys(), CONFIG, with_intensity=step.stage != "geometry", num_threads=1
+        step.field.table.leaf_keys(), CONFIG, with_intensity=step.stage != "geometry", num_threads=1
     )
     field.initialise(torch.Generator().manual_seed(0))
     scale = IntensityScale.of(rays.intensities) if step.stage != "geometry" else None
@@ -308,7 +308,7 @@ def test_whole(benchmark, step, rays):
         config,
         surface_returns=len(rays),
         returns=len(rays),
-        vertices=field.cells.table.num_rows,
+        vertices=field.table.num_rows,
         with_intensity=scale is not None,
     )
     losses = []

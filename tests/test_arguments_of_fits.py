@@ -46,7 +46,7 @@ def test_fit_and_estimate(sizes, poses, far, data):
     assert radar_map.report["returns_used"] <= estimate.returns
     assert 0 < estimate.peak_memory_bytes <= 10**9
     assert 0 < estimate.seconds < 60
-    centres = (radar_map.field.cells.table.leaf_cells() + 0.5) * TINY.leaf_size_m + radar_map.origin
+    centres = (radar_map.field.table.leaf_cells() + 0.5) * TINY.leaf_size_m + radar_map.origin
     for values in (radar_map.sdf(centres), radar_map.gradient(centres), radar_map.confidence(centres)):
         assert np.isfinite(values).all()
 

@@ -73,7 +73,7 @@ def training() -> Training:
     field.initialise(torch.Generator().manual_seed(0))
     count = len(rays)
     schedule = Schedule.of(
-        config, surface_returns=count, returns=count, vertices=field.cells.table.num_rows, with_intensity=True
+        config, surface_returns=count, returns=count, vertices=field.table.num_rows, with_intensity=True
     )
     return Training(field, rays, rays, scale, schedule, config, Workers(1))
 

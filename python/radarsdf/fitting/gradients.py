@@ -193,7 +193,7 @@ class CoreGradients(GradientBackend):
         if self._moves_rows:
             return Gradients(losses, list(by_networks), [touched])
         by_features = torch.zeros_like(self._field.cells.features)
-        self._field.cells.table.scatter(
+        self._field.table.scatter(
             touched.points.numpy(),
             touched.located.numpy(),
             touched.gradient.numpy(),

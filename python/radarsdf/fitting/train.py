@@ -142,9 +142,7 @@ class _Stage:
     """A stage of the training."""
 
     name: str
-    """ "sdf" or "intensity"."""
     iterations: int
-    """Number of iterations of this stage."""
     iterations_before: int
     """Joint iterations of the sdf stage that count as iterations of this stage too."""
     counts: tuple[str, ...]
@@ -154,7 +152,6 @@ class _Stage:
     rows: RowAdam | None
     """Optimiser of the features if only the touched ones move."""
     draw: Callable[[], Batch]
-    """Draws a batch."""
     gradients_of: Callable[[Batch, Callable[[], Batch | None]], tuple[Gradients, Batch | None]]
     """Computes losses and gradients of a batch, and the result of what it runs meanwhile."""
 
