@@ -129,18 +129,15 @@ def _fit(
     contents = _contents(given, learnt, surface, leaf_keys, returns, field, report, config, num_threads)
     clock.lap("start_s")
 
+    scale = given.scale if config.trains_intensity else None
     closes = learnt.intensities is not None and config.closes_intensity
     of_intensity = (learnt, surface.surfels) if closes else None
+    surface_rays = surface.rays
+    del given, surface, returns, leaf_keys  # most of the memory, of which the training makes use again
     stop: KeyboardInterrupt | Diverged | None = None
     if isinstance(field, NeuralField):
-        scale = given.scale if config.trains_intensity else None
-        training = Training(field, surface.rays, learnt, scale, schedule, config, workers)
-        del (
-            given,
-            surface,
-            learnt,
-            returns,
-        )  # the training has a copy of the rays, which are most of the memory
+        training = Training(field, surface_rays, learnt, scale, schedule, config, workers)
+        del surface_rays, learnt  # of which the training has a copy
         if saved is not None:
             saved.resume(training)
         try:
