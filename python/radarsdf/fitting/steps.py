@@ -145,6 +145,7 @@ def _fit(
         except (KeyboardInterrupt, Diverged) as early:
             stop = early
         report.update(training.report())
+        del training  # rays and moments, of which the closed form has no need
     # What a network that diverged leaves of the intensities can be anything.
     if of_intensity is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
         field.reflectance = closed_form(contents, *of_intensity, num_threads)

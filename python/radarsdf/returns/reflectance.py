@@ -123,12 +123,14 @@ class Reflectance:
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         response = Response.of(unit, directions, ranges_m, incidence, kinds)
         left = unit - response.at(directions, ranges_m, incidence, kinds)
+        incidence = groups.means(incidence)
+        del plane, kinds  # of each return
         keys, means, explained = fit_cell_means(
             _in_metres(_KINDS, leaf_size_m),
             _TILINGS,
             groups.points,
             groups.directions,
-            groups.means(incidence),
+            incidence,
             groups.means(left),
             groups.weights,
             _SHRINKAGE,
