@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
 from radarsdf.evaluation import surface_metrics
-from radarsdf.returns.movers import Movers
+from radarsdf.returns.moving import Movers
 from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 

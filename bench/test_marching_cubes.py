@@ -211,11 +211,11 @@ def map_lattice():
     config = FitConfig(num_threads=1, returns={"max_range_m": 30.0}, training={"sdf_iterations": 100})
     radar_map = radarsdf.fit(scans.points, scans.poses, config=config, progress=False)
     part = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(8, 3)
-    cells = (2 * radar_map.field.cells.table.leaf_cells()[:, None] + part).reshape(-1, 3).astype(np.int32)
+    cells = (2 * radar_map.field.table.leaf_cells()[:, None] + part).reshape(-1, 3).astype(np.int32)
     cells, corners, _ = sparse_lattice(cells)
     points = corners.astype(np.float32) * np.float32(config.leaf_size_m / 2)
     with torch.no_grad():
-        values = radar_map.field.signed_distance(torch.from_numpy(points)).numpy()
+        values = radar_map.field.sdf(torch.from_numpy(points)).numpy()
     lower = corners.min(0)
     shape = corners.max(0) - lower + 1
     volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)

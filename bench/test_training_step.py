@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
-from radarsdf._core import CellSet
-from radarsdf.budget.schedule import Schedule
-from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.field.losses import intensity_loss, sdf_loss
-from radarsdf.field.widths import cells_width, fourier_width
+from radarsdf.field.neural_field import NeuralField, cells_width, fourier_width
+from radarsdf.fitting.average import near_leaf_keys
+from radarsdf.fitting.gradients import FEATURE_DROPOUT, FOURIER_DROPOUT
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.fitting.sampling import Dropout, RaySampler
-from radarsdf.fitting.training import Training
+from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.train import Training
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
 
@@ -45,7 +45,7 @@ class Step:
         self.size = (
             CONFIG.training.intensity_batch_size if self.frozen else CONFIG.training.batch_size
         ) // SHARE
-        self.field = Field(leaf_keys, CONFIG, with_intensity=stage != "geometry")
+        self.field = NeuralField(leaf_keys, CONFIG, with_intensity=stage != "geometry")
         self.field.initialise(torch.Generator().manual_seed(0))
         if self.frozen:
             self.field.cells.requires_grad_(False)
@@ -62,7 +62,7 @@ class Step:
         if self.stage == "geometry":
             return samples, None
         dims = (cells_width(CONFIG), fourier_width(CONFIG))
-        dropouts = (CONFIG.networks.feature_dropout, CONFIG.networks.fourier_dropout)
+        dropouts = (FEATURE_DROPOUT, FOURIER_DROPOUT)
         factors = [
             Dropout.draw(share, self.generator).factors(samples.num_near, dim)
             for dim, share in zip(dims, dropouts, strict=True)
@@ -127,10 +127,7 @@ def rays():
 
 @pytest.fixture(scope="module")
 def leaf_keys(rays):
-    cells = CellSet(CONFIG.leaf_size_m)
-    for chunk in rays.along(np.linspace(-CONFIG.near_band_m, CONFIG.near_band_m, 7)):
-        cells.insert(chunk)
-    return cells.sorted_keys()
+    return near_leaf_keys(rays, CONFIG, 1)
 
 
 @pytest.fixture(params=STAGES)
@@ -156,7 +153,7 @@ def test_samples(benchmark, step, rays):
     points = (samples.of_ray[:, :3] - samples.sdf_m[:, None] * samples.directions).numpy()
     off_m = np.linalg.norm(points - samples.points.numpy(), axis=1)
     # In the last stage, samples are spread across the beam.
-    spread_m = CONFIG.sampling.cross_range_noise_rad * samples.ranges_m.numpy() if step.frozen else 1e-5
+    spread_m = CONFIG.training.cross_range_noise_rad * samples.ranges_m.numpy() if step.frozen else 1e-5
     assert (off_m < 6 * spread_m).all()
     assert np.median(off_m / spread_m) > 1 or not step.frozen
     assert len(samples.points) == step.size
@@ -166,7 +163,7 @@ def test_samples(benchmark, step, rays):
     if dropout is not None:
         factors = torch.cat(dropout, 1)
         assert factors.mean().item() == pytest.approx(1, abs=0.05)
-        assert (factors == 0).float().mean().item() > CONFIG.networks.fourier_dropout
+        assert (factors == 0).float().mean().item() > FOURIER_DROPOUT
 
 
 def test_encodings_forward(benchmark, step):
@@ -175,9 +172,9 @@ def test_encodings_forward(benchmark, step):
     angles = fourier.double().view(len(fourier), 2, -1)
     assert ((angles**2).sum(1) - 1).abs().max() < 1e-5
     points = samples.points.numpy()[: samples.num_near]
-    known = step.field.cells.occupied(samples.points[: samples.num_near]).numpy()
+    known = step.field.occupied(samples.points[: samples.num_near]).numpy()
     assert known.mean() > 0.8
-    surface = Surface(step.field.cells.table, step.field.cells.features.detach())
+    surface = Surface(step.field.table, step.field.cells.features.detach())
     rows, weights = surface.rows_and_weights(points[known])
     expected = (surface.features.numpy()[rows] * weights[..., None]).sum(2).reshape(known.sum(), -1)
     found = cells[: samples.num_near].numpy()[known]
@@ -292,8 +289,8 @@ def test_matrix_products(benchmark, step):
 
 def test_whole(benchmark, step, rays):
     """`STEPS` steps of `Training` on one thread. The stage with frozen geometry follows one step of geometry."""
-    field = Field(
-        step.field.cells.table.leaf_keys(), CONFIG, with_intensity=step.stage != "geometry", num_threads=1
+    field = NeuralField(
+        step.field.table.leaf_keys(), CONFIG, with_intensity=step.stage != "geometry", num_threads=1
     )
     field.initialise(torch.Generator().manual_seed(0))
     scale = IntensityScale.of(rays.intensities) if step.stage != "geometry" else None
@@ -311,7 +308,7 @@ def test_whole(benchmark, step, rays):
         config,
         surface_returns=len(rays),
         returns=len(rays),
-        vertices=field.cells.table.num_rows,
+        vertices=field.table.num_rows,
         with_intensity=scale is not None,
     )
     losses = []

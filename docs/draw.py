@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import radarsdf
 from radarsdf.changes.changes import APPEARED, COLORS, GONE, MOVED, NAMES, SAME, UNSEEN
+from radarsdf.fitting import sampling
 from radarsdf.render.figures import new_figure, png_of, save_view_picture
 from radarsdf.render.picture import render, save_picture
 from radarsdf.simulate import Box, Scene, simulate
@@ -66,9 +67,11 @@ def samples(config: radarsdf.FitConfig, path: Path) -> None:
     x = np.linspace(0, range_m + 1.2, 500)
     occupied = 1 / (1 + np.exp((range_m - x) / config.sigma_m))
     axes.plot(x, occupied, color=BLUE, label="label: probability that the point is behind the surface")
-    near = range_m + rng.uniform(-1, 1, config.sampling.near_samples) * config.near_band_m
+    near = range_m + rng.uniform(-1, 1, sampling.NEAR_SAMPLES) * config.metres(sampling.NEAR_BAND_CELLS)
     free = rng.uniform(
-        config.sampling.free_from * range_m, range_m + config.free_beyond_m, config.sampling.free_samples
+        sampling.FREE_FROM * range_m,
+        range_m + config.metres(sampling.FREE_BEYOND_CELLS),
+        sampling.FREE_SAMPLES,
     )
     axes.plot(free, np.full(len(free), -0.12), "o", color=LIGHT, label="samples along the ray")
     axes.plot(near, np.full(len(near), -0.12), "o", color=DARK, label="samples near the return")

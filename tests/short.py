@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 import radarsdf
-from radarsdf.budget.schedule import Schedule
 from radarsdf.checking import frames
+from radarsdf.fitting.schedule import Schedule
 from radarsdf.render import picture
 
 from .poses.drift import first

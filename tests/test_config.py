@@ -21,7 +21,7 @@ from radarsdf.config import fit_config, groups
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import first_wrong
 
-GROUPS = ("returns", "encoding", "networks", "sampling", "training")
+GROUPS = ("returns", "encoding", "networks", "training")
 TINY = sys.float_info.min
 LARGE = 1e300
 MAX_COUNT, MAX_SAMPLES, MAX_WIDTH = 2**31 - 1, 2**24, 4096
@@ -37,11 +37,9 @@ WHOLE = {
     "encoding.bridge_cells": (0, 8, -1, 9),
     "encoding.fourier_count": (0, 24, -1, 25),
     "networks.geometry_feature_dim": (0, MAX_WIDTH, -1, MAX_WIDTH + 1),
-    "sampling.near_samples": (1, MAX_SAMPLES, 0, MAX_SAMPLES + 1),
-    "sampling.free_samples": (0, MAX_SAMPLES, -1, MAX_SAMPLES + 1),
     "training.batch_size": (1, MAX_SAMPLES, 0, MAX_SAMPLES + 1),
     "training.intensity_batch_size": (1, MAX_SAMPLES, 0, MAX_SAMPLES + 1),
-    "training.sdf_iterations": (0, MAX_COUNT, -3, MAX_COUNT + 1),
+    "training.sdf_iterations": (1, MAX_COUNT, -3, MAX_COUNT + 1),
     "training.intensity_iterations": (1, MAX_COUNT, 0, MAX_COUNT + 1),
 }
 REAL = {
@@ -54,24 +52,19 @@ REAL = {
     "returns.elevation_noise_rad": (TINY, 1.0, 0.0, 1.1),
     "returns.pose_sigma_m": (0.0, 100.0, -0.1, 100.1),
     "returns.pose_sigma_rad": (0.0, 1.0, -0.1, 1.1),
-    "encoding.fourier_half_width_cells": (TINY, LARGE, 0.0, None),
-    "networks.feature_dropout": (0.0, 0.95, -0.01, 0.96),
-    "networks.fourier_dropout": (0.0, 0.95, -0.01, 0.96),
-    "sampling.near_band_cells": (TINY, LARGE, 0.0, None),
-    "sampling.free_from": (0.0, 0.999, -0.01, 1.0),
-    "sampling.free_beyond_cells": (0.0, LARGE, -0.1, None),
-    "sampling.cross_range_noise_rad": (0.0, LARGE, -0.1, None),
-    "training.truncation_cells": (TINY, LARGE, 0.0, None),
+    "training.cross_range_noise_rad": (0.0, LARGE, -0.1, None),
     "training.sigma_cells": (TINY, LARGE, 0.0, None),
     "training.sdf_loss_weight": (0.0, LARGE, -0.1, None),
     "training.learning_rate": (TINY, LARGE, 0.0, None),
     "training.intensity_learning_rate": (TINY, LARGE, 0.0, None),
 }
 TRUTH = [
+    "train",
     "returns.drop_movers",
     "returns.drop_ghosts",
     "returns.passages",
     "returns.onto_planes",
+    "networks.dropout",
     "networks.normals",
     "networks.sdf_input",
     "networks.view_direction",
@@ -83,12 +76,10 @@ TRUTH = [
 ]
 WORDS = {
     "encoding.kind": ["tri-quadtree", "octree"],
-    "training.start": ["noise"],  # an average needs more: see below
-    "training.gradients": ["core", "autograd"],
     "training.optimiser": ["soap", "adam"],
     "networks.reflectance": ["network", "closed-form", "both"],
 }
-WIDTHS = ["networks.sdf_hidden", "networks.intensity_hidden"]
+WIDTHS = ["networks.intensity_hidden"]
 NONE = [
     "max_memory_bytes",
     "returns.max_range_m",
@@ -170,18 +161,6 @@ def test_types(name):
         refused(name, value)
 
 
-@pytest.mark.parametrize("name", REAL)
-def test_whole_numbers_are_numbers(name):
-    value = math.ceil(REAL[name][0])
-    assert get(FitConfig(**nested(name, value)), name) == value
-
-
-@pytest.mark.parametrize("name", TRUTH)
-def test_both_of_what_is_true_or_false(name):
-    for value in (True, False):
-        assert get(FitConfig(**nested(name, value)), name) is value
-
-
 @pytest.mark.parametrize("name", WORDS)
 def test_words(name):
     for value in WORDS[name]:
@@ -222,17 +201,13 @@ def test_limits_are_those_of_the_core():
     [
         (
             {"training": {"sdf_iterations": -3}},
-            "training.sdf_iterations must be greater than or equal to 0, not -3",
+            "training.sdf_iterations must be greater than or equal to 1, not -3",
         ),
         ({"leaf_size_m": 0}, "leaf_size_m must be greater than 0, not 0"),
         ({"training": {"bar": 1}}, "unknown setting training.bar"),
         ({"bar": 1}, "unknown setting bar"),
         ({"sdf_iterations": 1}, "unknown setting sdf_iterations"),
         ({"returns": {"max_range_m": 1.0}}, "returns.max_range_m must exceed min_range_m, 2.5, not 1.0"),
-        (
-            {"training": {"start": "average"}},
-            "training.start 'average' needs encoding.kind 'octree' and networks.sdf_hidden of at least 2",
-        ),
     ],
 )
 def test_messages(values, message):
@@ -250,7 +225,7 @@ def test_what_is_no_mapping_of_names(values):
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_groups_are_groups(group):
-    other = FitConfig().sampling if group != "sampling" else FitConfig().training
+    other = FitConfig().encoding if group != "encoding" else FitConfig().training
     for value in (None, 1, "a", [], other, FitConfig()):
         with pytest.raises(ValueError, match=group):
             FitConfig(**{group: value})
@@ -266,24 +241,11 @@ def test_settings_are_given_by_name():
     }
 
 
-def test_an_average_is_held_by_an_octree():
-    quick = FitConfig.quick()
-    for changes in (
-        {"encoding": {"kind": "tri-quadtree"}},
-        {"networks": {"sdf_hidden": (1,)}},
-        {"training": {"truncation_cells": 1.9}},
-        {"sampling": {"near_band_cells": 3.1}},
-    ):
-        with pytest.raises(ValueError, match=r"training\.(start|truncation_cells)"):
-            quick.override(**changes)
-    assert quick.override(training={"truncation_cells": 2.0}).truncation_m == 0.4
-
-
 def test_override_changes_what_it_names_alone():
     base = FitConfig.paper(seed=3, training={"sdf_iterations": 200}, networks={"normals": False})
-    changed = base.override(leaf_size_m=0.3, training={"batch_size": 77}, sampling={"near_samples": 2})
+    changed = base.override(leaf_size_m=0.3, training={"batch_size": 77}, returns={"drop_ghosts": True})
     differing = {name for name in names() if get(base, name) != get(changed, name)}
-    assert differing == {"leaf_size_m", "training.batch_size", "sampling.near_samples"}
+    assert differing == {"leaf_size_m", "training.batch_size", "returns.drop_ghosts"}
     assert (changed.seed, changed.training.sdf_iterations, changed.networks.normals) == (3, 200, False)
     assert base.training.batch_size == 8192
     assert base.override() == base
@@ -307,7 +269,10 @@ def test_override_checks_settings_together():
         FitConfig.quick(),
         FitConfig.paper(),
         FitConfig(
-            seed=9, max_memory_bytes=10**12, returns={"max_range_m": 99.5}, networks={"sdf_hidden": [3, 4]}
+            seed=9,
+            max_memory_bytes=10**12,
+            returns={"max_range_m": 99.5},
+            networks={"intensity_hidden": [3, 4]},
         ),
     ],
     ids=["default", "quick", "paper", "changed"],
@@ -340,14 +305,8 @@ def test_configurations_are_values():
 
 
 def test_lengths_go_with_the_cells():
-    lengths = ("near_band_m", "free_beyond_m", "sigma_m", "truncation_m", "fourier_half_width_m")
-    assert [getattr(FitConfig(), name) for name in lengths] == [0.3, 0.8, 0.1, 0.6, 409.6]
-    assert [getattr(FitConfig(leaf_size_m=0.4), name) for name in lengths] == [0.6, 1.6, 0.2, 1.2, 819.2]
-    config = FitConfig(leaf_size_m=0.5, sampling={"near_band_cells": 3.0, "free_beyond_cells": 0.0})
-    assert (config.near_band_m, config.free_beyond_m) == (1.5, 0.0)
-    for name in lengths:
-        with pytest.raises(ValueError, match=name):
-            FitConfig(**{name: 0.5})
+    assert (FitConfig().sigma_m, FitConfig(leaf_size_m=0.4).sigma_m) == (0.1, 0.2)
+    assert FitConfig().metres(1.5) == 0.3  # not 0.30000000000000004
 
 
 PUBLISHED = {
@@ -356,6 +315,7 @@ PUBLISHED = {
     "seed": 0,
     "num_threads": 0,
     "max_memory_bytes": None,
+    "train": True,
     "returns": {
         "min_range_m": 2.5,
         "max_range_m": None,
@@ -375,10 +335,8 @@ PUBLISHED = {
         "num_levels": 3,
         "bridge_cells": 0,
         "fourier_count": 16,
-        "fourier_half_width_cells": 2048.0,
     },
     "networks": {
-        "sdf_hidden": (32, 32),
         "intensity_hidden": (64, 64),
         "geometry_feature_dim": 15,
         "reflectance": "network",
@@ -386,20 +344,10 @@ PUBLISHED = {
         "sdf_input": True,
         "view_direction": True,
         "log_range": False,
-        "feature_dropout": 0.0,
-        "fourier_dropout": 0.0,
-    },
-    "sampling": {
-        "near_samples": 6,
-        "free_samples": 6,
-        "near_band_cells": 1.5,
-        "free_from": 0.3,
-        "free_beyond_cells": 4.0,
-        "cross_range_noise_rad": 0.0,
+        "dropout": False,
     },
     "training": {
-        "start": "noise",
-        "truncation_cells": 3.0,
+        "cross_range_noise_rad": 0.0,
         "sigma_cells": 0.1375,
         "sdf_loss_weight": 1.0,
         "intensity_in_free_space": True,
@@ -413,26 +361,15 @@ PUBLISHED = {
         "intensity_learning_rate": 1e-3,
         "cosine_schedule": False,
         "row_updates": False,
-        "gradients": "core",
     },
 }
 
 
-def test_paper_is_the_published_configuration():
-    paper = FitConfig.paper()
-    assert paper.to_dict() == PUBLISHED
-    lengths = (paper.near_band_m, paper.free_beyond_m, paper.sigma_m, paper.fourier_half_width_m)
-    assert lengths == (0.3, 0.8, 0.0275, 409.6)
-
-
-def test_quick_smooths_averages_and_trains_no_surface():
+def test_presets():
+    assert FitConfig.paper().to_dict() == PUBLISHED
     quick = FitConfig.quick(seed=4)
-    assert (quick.training.start, quick.training.sdf_iterations, quick.encoding.kind) == (
-        "smoothed",
-        0,
-        "octree",
-    )
-    assert (quick.near_band_m, quick.truncation_m, quick.seed) == (0.4, 0.6, 4)
+    assert (quick.train, quick.seed, quick.returns.passages) == (False, 4, False)
+    assert quick.override(train=True, seed=0, returns={"passages": True}) == FitConfig()
     assert quick.closes_intensity
     assert not quick.trains_intensity
     assert FitConfig().trains_intensity

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from radarsdf import FitConfig
 from radarsdf._core import count_looks
-from radarsdf.fitting.start import near_leaf_keys
+from radarsdf.fitting.average import near_leaf_keys
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
-from radarsdf.returns.surfels import Surfels
 
 from bench.memory import memory_bytes
 from bench.timing import timed

@@ -39,8 +39,8 @@ _LEVERS: tuple[Changes, ...] = (
     {"networks": {"normals": True}},
     {"networks": {"geometry_feature_dim": 15}},
     {"encoding": {"kind": "octree"}},
-    {"networks": {"feature_dropout": 0.0, "fourier_dropout": 0.0}},
-    {"sampling": {"cross_range_noise_rad": 0.0}},
+    {"networks": {"dropout": False}},
+    {"training": {"cross_range_noise_rad": 0.0}},
     {"networks": {"intensity_hidden": (64, 64)}},
     {"training": {"batch_size": 8192}},
 )

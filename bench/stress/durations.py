@@ -12,9 +12,9 @@ import sys
 import numpy as np
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.budget import durations
-from radarsdf.budget.schedule import Schedule
 from radarsdf.config.fit_config import flat_settings
+from radarsdf.fitting import estimate as durations
+from radarsdf.fitting.schedule import Schedule
 from scipy.optimize import nnls
 
 from bench.growth.street import street
@@ -34,7 +34,7 @@ CASES: list[tuple[int, bool, str, Changes]] = [
         30_000,
         True,
         "default",
-        SHORT | {"networks": {"sdf_hidden": (128, 128), "intensity_hidden": (128, 128, 128)}},
+        SHORT | {"networks": {"intensity_hidden": (128, 128, 128)}},
     ),
     (30_000, True, "default", SHORT | {"encoding": {"num_levels": 6, "fourier_count": 16}}),
     (

@@ -34,7 +34,7 @@ CASES: list[tuple[int, bool, Changes]] = [
     (3_000_000, True, {}),
 ]
 """Returns, whether with intensities, settings."""
-WITHIN = 1.5
+WITHIN = 2.0
 MAX_GROWTH_MB = 8.0  # from a tenth of the fits to the last
 SHORT: Changes = {"training": {"sdf_iterations": 20, "intensity_iterations": 24, "batch_size": 16384}}
 """Enough iterations for the peak: pages of zeros take no memory until the training writes to them."""

@@ -17,20 +17,20 @@ import radarsdf
 import torch
 import trimesh
 from radarsdf import FitConfig
-from radarsdf.budget.schedule import Schedule
-from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
+from radarsdf.field.neural_field import NeuralField
+from radarsdf.fitting.average import near_leaf_keys
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.start import near_leaf_keys
-from radarsdf.fitting.training import Training
+from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.train import Training
 from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import Workers
 
 _CONFIG = FitConfig(num_threads=1).override(
     training={"sdf_iterations": 2, "intensity_iterations": 2, "batch_size": 64, "intensity_batch_size": 64},
-    networks={"sdf_hidden": (4,), "intensity_hidden": (4, 3)},
+    networks={"intensity_hidden": (4, 3)},
     encoding={"num_levels": 2, "fourier_count": 2},
 )
 _VALUES: list[Any] = [
@@ -69,11 +69,11 @@ def training() -> Training:
     """The training of :func:`fit_of_checkpoints`, to which the files of :func:`checkpoints` belong."""
     rays, scale, config = fit_of_checkpoints()
     keys = near_leaf_keys(rays, config, 1)
-    field = Field(keys, config, with_intensity=True, num_threads=1)
+    field = NeuralField(keys, config, with_intensity=True, num_threads=1)
     field.initialise(torch.Generator().manual_seed(0))
     count = len(rays)
     schedule = Schedule.of(
-        config, surface_returns=count, returns=count, vertices=field.cells.table.num_rows, with_intensity=True
+        config, surface_returns=count, returns=count, vertices=field.table.num_rows, with_intensity=True
     )
     return Training(field, rays, rays, scale, schedule, config, Workers(1))
 

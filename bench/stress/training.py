@@ -23,16 +23,12 @@ CASES: dict[str, Changes] = {
     # Of 1 mm, 1 cm, 1 m and 10 m.
     **{f"sigma of {s:g} cells": {"training": {"sigma_cells": s}} for s in (0.005, 0.05, 5.0, 50.0)},
     # Labels of many sigmas, which saturate, and large logits.
-    "saturated": {
-        "training": {"sigma_cells": 0.005, "learning_rate": 0.1}, "sampling": {"free_beyond_cells": 250.0}
-    },
-    "no free space": {"sampling": {"free_samples": 0}},
+    "saturated": {"training": {"sigma_cells": 0.005, "learning_rate": 0.1}},
     "batches of one": {"training": {"batch_size": 1, "intensity_batch_size": 1}},
-    "one near sample": {"sampling": {"near_samples": 1, "free_samples": 1000}},
     "all of 3QFPI": {
         "networks": {"normals": True, "geometry_feature_dim": 15}, "training": {"intensity_in_free_space": True}
     },
-    "dropout of 95 %": {"networks": {"feature_dropout": 0.95, "fourier_dropout": 0.95}},
+    "no dropout": {"networks": {"dropout": False}},
 }  # fmt: skip
 """Settings that differ from the default."""
 

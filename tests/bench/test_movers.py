@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
-from radarsdf.returns.movers import Movers
+from radarsdf.returns.moving import Movers
 
 from bench import movers
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking.doppler import velocity_of_poses
-from radarsdf.returns.doppler import folding_interval_mps, sensor_velocity
+from radarsdf.returns.moving import folding_interval_mps, sensor_velocity
 
 from tests.conftest import recorded_scans
 

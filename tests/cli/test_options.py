@@ -39,7 +39,7 @@ def test_a_preset_then_a_file_then_single_settings(tmp_path):
 @pytest.mark.parametrize("preset", [[], ["--quick"], ["--paper"]])
 def test_what_config_prints_is_the_same_configuration(capsys, tmp_path, preset):
     path = tmp_path / "settings.toml"
-    words = [*preset, "--set", "networks.sdf_hidden=(8, 4)"]
+    words = [*preset, "--set", "networks.intensity_hidden=(8, 4)"]
     assert call("config", *words) == 0
     path.write_text(capsys.readouterr().out)
     assert call("config", "--config", path) == 0
@@ -56,7 +56,7 @@ def test_what_config_prints_is_the_same_configuration(capsys, tmp_path, preset):
         ("training.sigma_cells=-1", "training.sigma_cells must be greater than 0, not -1"),
         ("training.sigma_cells=1e999", "training.sigma_cells"),
         ("encoding.kind=tree", "'octree'"),
-        ("networks.sdf_hidden=wide", "networks.sdf_hidden"),
+        ("networks.intensity_hidden=wide", "networks.intensity_hidden"),
     ],
 )
 def test_settings_that_make_no_sense(capsys, tmp_path, setting, named):

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig, _core
-from radarsdf.field.field import Field
-from radarsdf.fitting.autograd_gradients import AutogradGradients
-from radarsdf.fitting.core_gradients import CoreGradients
-from radarsdf.fitting.gradients import RandomDropout
+from radarsdf.field.neural_field import NeuralField
+from radarsdf.fitting.average import near_leaf_keys
+from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, RandomDropout
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.returns.rays import prepare
 from radarsdf.threads import Workers
@@ -24,10 +23,10 @@ CONFIGS = {
     "default": {},
     "octree": {"kind": "octree", "geometry_feature_dim": 3, "fourier_count": 0},
     "features": {"geometry_feature_dim": 15, "num_levels": 2, "fourier_count": 4},
-    "free space": {"intensity_in_free_space": True, "feature_dropout": 0.0, "fourier_dropout": 0.0},
-    "one dropout": {"feature_dropout": 0.0, "sdf_loss_weight": 0.3},
+    "free space": {"intensity_in_free_space": True, "dropout": False},
+    "weighted": {"sdf_loss_weight": 0.3},
     "blind": {"sdf_input": False, "view_direction": False, "log_range": False, "intensity_hidden": (5,)},
-    "not all": {"sdf_input": False, "log_range": False, "sdf_hidden": (17, 16, 3)},
+    "not all": {"sdf_input": False, "log_range": False, "intensity_hidden": (17, 16, 3)},
     "intensities alone": {"sdf_loss_weight": 0.0},
 }
 STAGES = ("sdf", "joint", "intensity")
@@ -44,7 +43,7 @@ def rays():
 class Made:
     """A field, and a batch of samples in three parts."""
 
-    field: Field
+    field: NeuralField
     config: FitConfig
     batch: Batch
 
@@ -61,10 +60,7 @@ class Made:
 
 def make_batch(rays, dtype=torch.float32, batch_size=400, parts=3, **changes):
     config = FitConfig(**grouped(**changes))
-    cells = _core.CellSet(config.leaf_size_m)
-    for chunk in rays.along(np.linspace(-0.3, 0.3, 7)):
-        cells.insert(chunk)
-    field = Field(cells.sorted_keys(), config, with_intensity=True)
+    field = NeuralField(near_leaf_keys(rays, config, 1), config, with_intensity=True)
     field.initialise(torch.Generator().manual_seed(0))
     with torch.no_grad():
         field.cells.features.mul_(6)

@@ -8,7 +8,7 @@ import itertools
 
 import pytest
 import torch
-from radarsdf.field.mlp import mlp
+from radarsdf.field.kernels import mlp
 from radarsdf.threads import Workers
 
 # What it has to be cut into: tiles of 64 rows, pieces of 2048, 16 columns.

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 from radarsdf._core import find_passages
-from radarsdf.returns.passages import Passages
+from radarsdf.returns.free_space import Passages
 
 LEAF_M = 0.2
 LIMIT = 10**6

@@ -9,10 +9,8 @@ import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
-from radarsdf.field.field import Field
-from radarsdf.field.losses import intensity_loss, sdf_loss
-from radarsdf.field.networks import IntensityNetwork, SDFNetwork
-from radarsdf.field.widths import cells_width, fourier_width
+from radarsdf.field.losses import sdf_loss
+from radarsdf.field.neural_field import IntensityNetwork, NeuralField, cells_width, fourier_width
 
 BARE = FitConfig(networks={"sdf_input": False, "view_direction": False, "log_range": False})
 SMALL = {"num_levels": 1, "fourier_count": 1}  # 8 and 6 numbers
@@ -41,7 +39,7 @@ def make_field(config, seed=0):
     points = np.random.default_rng(seed).uniform(-1, 1, (2000, 3)).astype(np.float32)
     cells = CellSet(config.leaf_size_m)
     cells.insert(points)
-    field = Field(cells.sorted_keys(), config, with_intensity=True)
+    field = NeuralField(cells.sorted_keys(), config, with_intensity=True)
     field.initialise(generator)
     torch.nn.init.normal_(field.cells.features, generator=generator)
     return field, torch.from_numpy(points[:200])
@@ -55,23 +53,6 @@ def initialised(network):
 def views(points):
     rays = points - torch.tensor([0.0, 0.0, 8.0])
     return rays / rays.norm(dim=1, keepdim=True), rays.norm(dim=1)
-
-
-@pytest.mark.parametrize("geometry_feature_dim", [0, 15])
-def test_sdf_network(geometry_feature_dim):
-    networks = {"sdf_hidden": (7, 5), "geometry_feature_dim": geometry_feature_dim}
-    network = initialised(SDFNetwork(FitConfig(encoding=SMALL, networks=networks)))
-    logit, feature = network([torch.randn(4, 8), torch.randn(4, 6)])
-    assert logit.shape == (4,)
-    assert feature.shape == (4, geometry_feature_dim)
-    widths = [tuple(m.weight.shape) for m in network.layers if isinstance(m, torch.nn.Linear)]
-    assert widths == [(7, 14), (5, 7), (1 + geometry_feature_dim, 5)]
-
-
-def test_the_logit_has_both_signs():
-    # An activation behind the last layer would leave one side of the surface without a value.
-    logit, _ = initialised(SDFNetwork(FitConfig(encoding=SMALL)))([torch.randn(2000, 14) * 10])
-    assert logit.min() < 0 < logit.max()
 
 
 @pytest.mark.parametrize(
@@ -101,26 +82,13 @@ def test_the_intensity_network_sees_what_it_is_told_to(setting, arguments, width
         assert torch.equal(network(**changed), before) != seen, name
 
 
-def test_range_enters_as_its_logarithm():
-    config = BARE.override(encoding=SMALL, networks={"log_range": True, "intensity_hidden": (1,)})
-    network = initialised(IntensityNetwork(config))
-    with torch.no_grad():  # the identity of log10(range / 10 m) + 5
-        for layer in (network.layers[0], network.layers[2]):
-            layer.weight.fill_(1)
-            layer.bias.fill_(0)
-        network.layers[0].weight[0, :14] = 0
-        network.layers[0].bias.fill_(5)
-    given = inputs(config, 4) | {"ranges_m": torch.tensor([1.0, 10.0, 100.0, 0.0])}
-    np.testing.assert_allclose(network(**given).detach(), [4, 5, 6, 1], atol=1e-6)
-
-
 def intensity(field, points, *, frozen=True, encoding_factors=None):
     geometry = field.geometry(points, frozen=frozen)
-    return field.intensity(geometry, *views(points), encoding_factors=encoding_factors)
+    return field.intensity_of(geometry, *views(points), encoding_factors=encoding_factors)
 
 
 def test_normals_are_the_normalised_gradient():
-    config = FitConfig(networks={"normals": True, "sdf_hidden": (8,), "intensity_hidden": (8,)})
+    config = FitConfig(networks={"normals": True, "intensity_hidden": (8,)})
     field, points = make_field(config)
     seen = []
     field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[3]))
@@ -128,24 +96,6 @@ def test_normals_are_the_normalised_gradient():
     x = points.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(field.logit(x).sum(), x)
     np.testing.assert_allclose(seen[0], gradient / gradient.norm(dim=1, keepdim=True), atol=1e-5)
-
-
-@pytest.mark.parametrize("geometry_frozen", [False, True])
-def test_dropout_hides_the_encoding_from_the_intensity_network_alone(geometry_frozen):
-    field, points = make_field(BARE.override(networks={"sdf_input": True}))
-    seen = []
-    field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[:2]))
-    widths = (cells_width(BARE), fourier_width(BARE))
-    factors = [torch.ones(len(points), width) for width in widths]
-    for part in factors:
-        part[:, ::2] = 0
-        part[:, 1::2] = 3
-    for given in (None, factors):
-        intensity(field, points, frozen=geometry_frozen, encoding_factors=given)
-    (encoding, logit), (hidden, logit_with_dropout) = seen
-    for part, before, factor in zip(hidden, encoding, factors, strict=True):
-        assert torch.equal(part, before * factor)
-    assert torch.equal(logit, logit_with_dropout)
 
 
 @pytest.mark.parametrize("normals", [False, True])
@@ -161,7 +111,7 @@ def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geom
 def test_the_second_derivative_through_the_normals_is_right():
     # Double precision and smooth: no input but the normal depends on the features.
     config = BARE.override(
-        networks={"normals": True, "sdf_hidden": (6,), "intensity_hidden": (6,)},
+        networks={"normals": True, "intensity_hidden": (6,)},
         encoding={"fourier_count": 2},
     )
     field, points = make_field(config)
@@ -193,7 +143,3 @@ def test_the_sdf_loss_is_lowest_where_the_logit_is_the_label():
     entropy = -(p * p.log() + (1 - p) * (1 - p).log()).mean()
     assert loss.item() == pytest.approx(entropy.item(), rel=1e-5)
     assert sdf_loss(-logit, sdf_m, 0.1) > loss
-
-
-def test_the_intensity_loss_is_the_mean_absolute_error():
-    assert intensity_loss(torch.tensor([0.0, 1.0, 0.5]), torch.tensor([0.5, 1.0, 0.25])).item() == 0.25

@@ -13,7 +13,7 @@ from radarsdf import FitConfig
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import prepare
 
-from ..conftest import SEED, pose
+from ..conftest import SEED
 from ..conftest import ground_and_wall as any_ground_and_wall
 
 QUICK = FitConfig(
@@ -42,7 +42,7 @@ def scaled(config, factor):
 
 def finite(radar_map, sensor):
     """All answers at the map's own cells, and a mesh; both are given back."""
-    cells = radar_map.field.cells.table.leaf_cells()[:2000]
+    cells = radar_map.field.table.leaf_cells()[:2000]
     x = (cells + 0.5) * radar_map.config.leaf_size_m + radar_map.origin
     assert radar_map.observed(x).mean() > 0.99  # far out, float32 puts some centres into the next cell
     assert np.isfinite(radar_map.sdf(x)).all()
@@ -80,113 +80,11 @@ def test_anywhere(origin):
     assert np.abs(mesh.vertices - scene.poses[0, :3, 3]).max() < 30
 
 
-@pytest.mark.parametrize("scale", [0.005, 1.0, 500.0])  # a scene of 10 cm, of 20 m, of 10 km
-def test_of_any_size_where_the_lengths_of_the_configuration_go_along(scale):
-    scene = ground_and_wall()
-    poses = scene.poses.copy()
-    poses[:, :3, 3] *= scale
-    points = [p * scale for p in scene.points]
-    config = scaled(QUICK, scale).override(networks={"log_range": False})
-    radar_map = radarsdf.fit(points, poses, scene.intensities, config=config, progress=False)
-    finite(radar_map, poses[0, :3, 3])
-    assert wall_error_m(radar_map, np.eye(4), scale) < 0.1
-
-
-def test_of_ten_centimetres_with_the_lengths_of_a_street():
-    scene = ground_and_wall()
-    poses = scene.poses.copy()
-    poses[:, :3, 3] *= 0.005
-    points = [p * 0.005 for p in scene.points]
-    radar_map = radarsdf.fit(points, poses, scene.intensities, config=QUICK, progress=False)
-    finite(radar_map, poses[0, :3, 3])
-    assert radar_map.report["leaf_cells"] < 100  # all in a few cells: no shape, and nothing that fails
-
-
-def test_of_ten_kilometres_with_the_lengths_of_a_street():
-    scene = ground_and_wall(returns_per_scan=300)
-    poses = scene.poses.copy()
-    poses[:, :3, 3] *= 500
-    points = [p * 500.0 for p in scene.points]
-    radar_map = radarsdf.fit(points, poses, scene.intensities, config=QUICK, progress=False)
-    finite(radar_map, poses[0, :3, 3])
-    assert radar_map.report["leaf_cells"] < 12 * 1800  # along the beams of 1800 returns, and not between them
-    assert radar_map.observed(np.concatenate([p @ T[:3, :3].T + T[:3, 3] for p, T in zip(points, poses, strict=True)])).mean() > 0.99  # fmt: skip
-
-
 def rotation(seed):
     q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     T = np.eye(4)
     T[:3, :3] = q * np.sign(np.linalg.det(q))
     return T
-
-
-def test_a_tilted_world():
-    scene = moved(ground_and_wall(), rotation(3))
-    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK, progress=False)
-    finite(radar_map, scene.poses[0, :3, 3])
-    assert wall_error_m(radar_map, rotation(3)) < 0.1
-
-
-def test_a_translation_by_whole_blocks_changes_nothing_but_roundings():
-    """Tolerance: 1 mm and 0.05 dB in the median, after 80 iterations."""
-    T = np.eye(4)
-    T[:3, 3] = [-70400, 2e5, 1024]
-    scene = ground_and_wall()
-    maps = [
-        radarsdf.fit(s.points, s.poses, s.intensities, config=QUICK, progress=False)
-        for s in (scene, moved(scene, T))
-    ]
-    x = np.random.default_rng(0).uniform([8, -5, -0.2], [20, 5, 0.2], (500, 3))
-    assert (
-        np.median(np.abs(maps[1].sdf(x + T[:3, 3], extrapolate=True) - maps[0].sdf(x, extrapolate=True)))
-        < 1e-3
-    )
-    sensor = np.array([0.5, 0, 1.5])
-    differences = maps[1].intensity(x + T[:3, 3], sensor + T[:3, 3], extrapolate=True)
-    differences -= maps[0].intensity(x, sensor, extrapolate=True)
-    assert np.median(np.abs(differences)) < 0.05
-
-
-def test_a_rotation_changes_the_surface_by_less_than_its_noise():
-    """The lattice does not turn with the world, so not the same bits: zeros within 5 cm of each other, in the median."""
-    T = rotation(5)
-    scene = ground_and_wall()
-    maps = [radarsdf.fit(s.points, s.poses, config=QUICK, progress=False) for s in (scene, moved(scene, T))]
-    assert abs(wall_error_m(maps[0], np.eye(4)) - wall_error_m(maps[1], T)) < 0.05
-
-
-def test_centimetres_for_metres_change_nothing_but_roundings():
-    """Tolerance: 0.1 mm, and 0.1 dB, in the median. The range in log10(range / 10 m) is left out: it knows of metres.
-
-    The training is short. In 60 iterations roundings grow to a millimetre with half of the seeds.
-    """
-    scene = ground_and_wall()
-    # Cells that look for ghosts are of 0.4 m, whatever the units.
-    config = QUICK.override(
-        networks={"log_range": False},
-        returns={"drop_ghosts": False},
-        # SOAP's first steps make much of roundings.
-        training={"optimiser": "adam", "sdf_iterations": 20, "intensity_iterations": 20},
-    )
-    poses = scene.poses.copy()
-    poses[:, :3, 3] *= 100
-    origin = poses[:, :3, 3].mean(
-        axis=0
-    )  # blocks of 6.4 m and of 640 are not at the same places, to the last bit
-    metres = radarsdf.fit(
-        scene.points, scene.poses, scene.intensities, config=config, origin=origin / 100, progress=False
-    )
-    centimetres = radarsdf.fit(
-        [p.astype(np.float64) * 100 for p in scene.points], poses, scene.intensities,
-        config=scaled(config, 100), origin=origin, progress=False,
-    )  # fmt: skip
-    x = np.random.default_rng(0).uniform([8, -5, -0.2], [20, 5, 0.2], (500, 3))
-    distances_m = centimetres.sdf(100 * x, extrapolate=True) / 100
-    assert np.median(np.abs(distances_m - metres.sdf(x, extrapolate=True))) < 1e-4
-    sensor = np.array([0.5, 0, 1.5])
-    differences = centimetres.intensity(100 * x, 100 * sensor, extrapolate=True)
-    differences -= metres.intensity(x, sensor, extrapolate=True)
-    assert np.median(np.abs(differences)) < 0.1
 
 
 RNG = np.random.default_rng(SEED)
@@ -197,31 +95,6 @@ SHAPES = {
     "one return": np.array([[5.0, 0.3, 0.2]]),
     "one ray": np.column_stack([np.linspace(4, 6, 3000), np.zeros((3000, 2))]),
 }
-
-
-@pytest.mark.parametrize("name", SHAPES)
-@pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
-def test_returns_on_less_than_a_surface(name, encoding):
-    points = SHAPES[name]
-    values = None if len(points) == 1 else [np.linspace(0, 1, len(points))]
-    config = QUICK.override(encoding={"kind": encoding})
-    radar_map = radarsdf.fit([points], np.eye(4)[None], values, config=config, progress=False)
-    finite(radar_map, np.zeros(3))
-    assert radar_map.observed(points).all()
-    if name != "one ray":
-        towards = points / np.linalg.norm(points, axis=1, keepdims=True)
-        before_m, behind_m = (radar_map.sdf(points + s * 0.25 * towards, extrapolate=True) for s in (-1, 1))
-        assert np.median(before_m) > 0 > np.median(behind_m)
-
-
-def test_duplicates_weigh_but_add_nothing():
-    scene = ground_and_wall(scans=2, returns_per_scan=400)
-    twice = [np.concatenate([p] * 5) for p in scene.points]
-    # Whether there is a gap or a plane depends on how many returns there are.
-    config = QUICK.override(encoding={"bridge_cells": 0}, returns={"onto_planes": False})
-    maps = [radarsdf.fit(p, scene.poses, config=config, progress=False) for p in (scene.points, twice)]
-    assert maps[0].report["leaf_cells"] == maps[1].report["leaf_cells"]
-    assert abs(wall_error_m(maps[0], np.eye(4)) - wall_error_m(maps[1], np.eye(4))) < 0.1
 
 
 def test_very_many_returns_in_one_cell():
@@ -238,16 +111,6 @@ def test_very_many_returns_in_one_cell():
     assert evidence.information.max() == pytest.approx(len(points) / variance_m2, rel=0.01)
     assert evidence.detections.max() == evidence.looks.max() == 100  # scans, and not returns
     assert radar_map.confidence(points[:10]).min() > 0.99
-
-
-def test_returns_at_the_sensor_itself_are_dropped():
-    scene = ground_and_wall(scans=2, returns_per_scan=200)
-    points = [np.concatenate([p, np.zeros((50, 3))]) for p in scene.points]
-    radar_map = radarsdf.fit(points, scene.poses, config=QUICK, progress=False)
-    finite(radar_map, np.zeros(3))
-    assert (radar_map.report["returns"], radar_map.report["returns_used"]) == (500, 400)
-    with pytest.raises(ValueError, match="none of 50 returns"):
-        radarsdf.fit([np.zeros((50, 3))], np.eye(4)[None], config=QUICK)
 
 
 @pytest.mark.parametrize("distance_m", [1e5, 1e7, 1e11])
@@ -269,25 +132,13 @@ def test_an_outlier_far_away_opens_no_cells_on_its_way(distance_m):
     assert dropped.report["returns"] - dropped.report["returns_used"] == 1
 
 
-def test_scans_of_very_different_sizes():
-    scene = ground_and_wall(scans=3, returns_per_scan=4000)
-    points = [scene.points[0], scene.points[1][:1], scene.points[2][:40]]
-    values = [scene.intensities[0], scene.intensities[1][:1], scene.intensities[2][:40]]
-    for frames in (1, 2):
-        config = QUICK.override(returns={"accumulate_scans": frames})
-        radar_map = radarsdf.fit(points, scene.poses, values, config=config, progress=False)
-        finite(radar_map, scene.poses[0, :3, 3])
-        assert wall_error_m(radar_map, np.eye(4)) < 0.1
-
-
 @pytest.mark.parametrize(
-    "name", ["negative", "huge", "tiny spread", "skewed", "of both signs and huge", "nearly constant"]
+    "name", ["huge", "tiny spread", "skewed", "of both signs and huge", "nearly constant"]
 )
 def test_intensities_of_any_kind(name):
     scene = ground_and_wall(scans=2, returns_per_scan=600)
     rng = np.random.default_rng(0)
     values = {
-        "negative": [v - 1000 for v in scene.intensities],
         "huge": [v * np.float32(1e30) for v in scene.intensities],
         "tiny spread": [1e-30 * v for v in scene.intensities],
         "skewed": [np.exp(rng.normal(0, 8, len(v))) for v in scene.intensities],
@@ -304,20 +155,6 @@ def test_intensities_of_any_kind(name):
     kept = prepare(scene.points, scene.poses, values)
     predicted = radar_map.intensity(*kept.in_world(), extrapolate=True)
     assert np.isfinite(predicted).all()
-    if name in ("negative", "huge", "tiny spread"):  # a change of units: as well fitted as without
+    if name in ("huge", "tiny spread"):  # a change of units: as well fitted as without
         errors = np.abs(predicted - kept.intensities) / spread
         assert np.median(errors) < 0.1
-
-
-def test_intensities_beyond_float32_are_refused():
-    scene = ground_and_wall(scans=1, returns_per_scan=50)
-    with pytest.raises(ValueError, match="too far apart for float32"):
-        radarsdf.fit(scene.points, scene.poses, [np.linspace(-3e38, 3e38, 50)], config=QUICK)
-
-
-def test_one_pose_far_from_the_others_is_refused_with_advice():
-    scene = ground_and_wall(scans=3, returns_per_scan=50)
-    poses = scene.poses.copy()
-    poses[1] = pose([3e6, 0, 0])
-    with pytest.raises(ValueError, match="million cells"):
-        radarsdf.fit(scene.points, poses, config=QUICK)

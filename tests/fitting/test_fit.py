@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.budget.schedule import Schedule
-from radarsdf.fitting.sampling import Dropout, RaySampler
-from radarsdf.returns.cells import lattice_of
+from radarsdf.fitting.sampling import RaySampler
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.sums import lattice_of
 
 from ..conftest import ground_and_wall
 
@@ -34,22 +31,6 @@ def test_surface_and_free_space_are_where_they_should_be(radar_map):
     assert np.nanmedian(radar_map.sdf(wall + [0.3, 0, 0])) < -0.2
 
 
-def test_gradient_points_to_free_space_and_is_the_derivative(radar_map):
-    rng = np.random.default_rng(0)
-    ground = np.column_stack(
-        [rng.uniform(9, 18, 300), rng.uniform(-4, 4, 300), rng.uniform(-0.05, 0.05, 300)]
-    )
-    gradient = radar_map.gradient(ground)
-    normal = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-    assert np.median(normal[:, 2]) > 0.97
-    step = 1e-3
-    for axis in range(3):
-        offset = step * np.eye(3)[axis]
-        difference = (radar_map.sdf(ground + offset) - radar_map.sdf(ground - offset)) / (2 * step)
-        # Within a cell and a ReLU's linear piece they agree; a few percent of the steps cross a border.
-        assert np.median(np.abs(difference - gradient[:, axis])) < 0.01
-
-
 def test_intensity_follows_the_radar_equation(radar_map):
     rng = np.random.default_rng(0)
     wall = np.column_stack([np.full(500, 20.0), rng.uniform(-4, 4, 500), rng.uniform(0.5, 3, 500)])
@@ -57,13 +38,6 @@ def test_intensity_follows_the_radar_equation(radar_map):
         sensor = np.array([x, 0.0, 1.5])
         expected = 100 - 40 * np.log10(np.linalg.norm(wall - sensor, axis=1))
         assert np.median(np.abs(radar_map.intensity(wall, sensor, extrapolate=True) - expected)) < 0.5
-
-
-def test_observed_is_near_the_returns_only(scene, radar_map):
-    world = scene.points[0] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
-    assert radar_map.observed(world).mean() > 0.99  # some were moved onto a plane
-    assert not radar_map.observed(world + [0, 0, 30.0]).any()
-    assert not radar_map.observed(scene.poses[:, :3, 3]).any()
 
 
 def test_same_seed_same_bits_other_seed_other_bits(scene):
@@ -87,24 +61,6 @@ def test_the_number_of_threads_changes_no_bit(scene, config):
             assert torch.equal(value, other.field.state_dict()[name]), name
 
 
-def test_scans_may_come_one_after_another(scene):
-    config = FitConfig(num_threads=1, training={"sdf_iterations": 3, "intensity_iterations": 3})
-    given = scene.points, scene.poses, scene.intensities
-    streamed = (p for p in scene.points), scene.poses, (v for v in scene.intensities)
-    maps = [radarsdf.fit(*scans, config=config, progress=False) for scans in (given, streamed)]
-    for whole, part in zip(*(m.field.parameters() for m in maps), strict=True):
-        assert torch.equal(whole, part)
-    assert maps[0].report["returns"] == maps[1].report["returns"] == sum(map(len, scene.points))
-
-
-def test_a_fit_leaves_the_global_random_state_and_threads_alone(scene):
-    torch.manual_seed(3)
-    state, threads = torch.get_rng_state(), torch.get_num_threads()
-    radarsdf.fit(scene.points, scene.poses, config=QUICK.override(num_threads=1))
-    assert torch.equal(torch.get_rng_state(), state)
-    assert torch.get_num_threads() == threads
-
-
 def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
     radar_map = radarsdf.fit(scene.points, scene.poses, config=QUICK)
     assert radar_map.field.intensity_network is None
@@ -113,16 +69,6 @@ def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
     assert set(radar_map.report["losses"]) == {"sdf"}
     with pytest.raises(ValueError, match="without intensities"):
         radar_map.intensity(np.zeros((1, 3)), np.zeros(3))
-
-
-@pytest.mark.parametrize(("effort", "why"), [(1.0, "the others were enough"), (0.05, "effort is 0.05")])
-def test_why_samples_were_left_out(scene, monkeypatch, effort, why):
-    monkeypatch.setattr("radarsdf.budget.schedule._LEAST_SDF_ITERATIONS", 10)
-    monkeypatch.setattr("radarsdf.budget.schedule._MOST_SAMPLES_PER_VERTEX", 8.0)
-    config = FitConfig(effort=effort, num_threads=1)
-    skipped = radarsdf.fit(scene.points, scene.poses, config=config, progress=False).report["skipped"]
-    (said,) = (words for words in skipped if "of the samples" in words)
-    assert said.endswith(f" of the samples: {why}")
 
 
 def test_utm_coordinates_change_nothing():
@@ -138,110 +84,6 @@ def test_utm_coordinates_change_nothing():
     np.testing.assert_allclose(
         far.intensity(x + offset, sensor + offset), near.intensity(x, sensor), atol=0.05
     )
-
-
-@pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
-@pytest.mark.parametrize("joint", [False, True])
-def test_every_input_of_the_intensity_network_runs(scene, encoding, joint):
-    config = QUICK.override(
-        encoding={"kind": encoding},
-        training={"joint": joint, "intensity_iterations": 30},
-        networks={"normals": True, "geometry_feature_dim": 15},
-    )
-    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
-    assert np.isfinite(radar_map.intensity(np.array([[15.0, 0, 0]]), np.zeros(3))).all()
-    bare = config.override(
-        networks={"normals": False, "geometry_feature_dim": 0, "sdf_input": False, "view_direction": False}
-    )
-    assert radarsdf.fit(scene.points, scene.poses, scene.intensities, config=bare).has_intensity
-
-
-def test_frozen_geometry_does_not_move(scene):
-    # Without dropout, which depends on the number of iterations and reaches the joint beginning.
-    config = QUICK.override(
-        training={"joint": True}, networks={"feature_dropout": 0.0, "fourier_dropout": 0.0}
-    )
-    frozen = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
-    longer = radarsdf.fit(
-        scene.points,
-        scene.poses,
-        scene.intensities,
-        config=config.override(training={"intensity_iterations": 60}),
-    )
-    assert torch.equal(frozen.field.cells.features, longer.field.cells.features)
-    weights = [m.field.intensity_network.layers[0].weight for m in (frozen, longer)]
-    assert not torch.equal(*weights)
-
-
-def test_the_more_often_samples_are_seen_the_more_is_hidden(monkeypatch):
-    scene = ground_and_wall(scans=2, returns_per_scan=128)
-    shares = []
-
-    def record(dropout, generator):
-        shares.append(dropout)
-        return draw(dropout, generator)
-
-    draw = Dropout.draw
-    monkeypatch.setattr(Dropout, "draw", record)
-    samples = FitConfig().sampling.near_samples * sum(map(len, scene.points))
-    for passes in (1, 3, 27):
-        shares.clear()
-        config = QUICK.override(
-            training={
-                "intensity_batch_size": 128,
-                "intensity_iterations": math.ceil(passes * samples / 128),
-                "sdf_iterations": 1,
-            },
-            networks={"feature_dropout": 0.8, "fourier_dropout": 0.4},
-        )
-        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
-        expected = passes / (passes + 2.5)
-        assert min(shares) == pytest.approx(0.4 * expected, rel=0.02)
-        assert max(shares) == pytest.approx(0.8 * expected, rel=0.02)
-    shares.clear()
-    published = QUICK.override(networks={"feature_dropout": 0.0, "fourier_dropout": 0.0})
-    radarsdf.fit(scene.points, scene.poses, scene.intensities, config=published)
-    assert not shares
-
-
-def test_each_stage_of_the_schedule_begins_at_the_full_rate(scene):
-    # A joint fit's second stage once inherited the rate that the first had let fall to nothing.
-    config = QUICK.override(training={"joint": True, "intensity_iterations": 20})
-    after_first, after_second = (
-        radarsdf.fit(
-            scene.points,
-            scene.poses,
-            scene.intensities,
-            config=config.override(training={"intensity_iterations": n}),
-        )
-        .field.intensity_network.layers[0]
-        .weight
-        for n in (20, 40)
-    )
-    assert (after_second - after_first).abs().max() > config.training.intensity_learning_rate
-
-
-@pytest.mark.parametrize(
-    ("returns", "changes", "expected"),
-    [
-        (100_000, {}, 180),  # half a pass is nearly enough
-        (200_000, {}, 352),  # and here more than enough
-        (50_000, {}, 176),  # a pass is not enough, and still all that the data gives
-        (2_000, {}, 150),  # without so many iterations there is no surface
-        (100_000, {"effort": 2.0}, 360),
-        (200_000, {"effort": 0.5}, 176),
-        (2_000, {"effort": 0.25}, 38),
-        (2_000, {"effort": 1e-9}, 1),
-        (20_000, {"training": {"sdf_iterations": 7}}, 7),
-        (20_000, {"training": {"sdf_iterations": 7}, "effort": 3.0}, 7),
-    ],
-)
-def test_iterations_until_the_surface_is_finished_but_its_noise_not_learnt(returns, changes, expected):
-    schedule = Schedule.of(
-        FitConfig(**changes), surface_returns=returns, returns=returns, vertices=10**6, with_intensity=False
-    )
-    assert schedule.sdf_iterations == expected
-    assert schedule.batch_size == 4096
 
 
 class TestBadInput:
@@ -310,58 +152,6 @@ class TestBadInput:
         with pytest.raises(ValueError, match="none of 120 returns"):
             radarsdf.fit([p * 0.01 for p in points], poses)
 
-    def test_intensities_without_variation(self):
-        points, poses, intensities = self.scans()
-        with pytest.raises(ValueError, match="all intensities are 3"):
-            radarsdf.fit(points, poses, [np.full_like(i, 3) for i in intensities])
-
-    def test_too_far_apart_for_one_lattice(self):
-        points, poses, _ = self.scans()
-        poses[1, 0, 3] = 1e7
-        with pytest.raises(ValueError, match="within a million cells"):
-            radarsdf.fit(points, poses)
-
-
-def test_a_loss_that_stops_being_finite_stops_the_fit(scene):
-    with pytest.raises(FloatingPointError, match="sdf loss is"):
-        radarsdf.fit(
-            scene.points,
-            scene.poses,
-            config=FitConfig(
-                training={"learning_rate": 1e30, "sdf_iterations": 50, "cosine_schedule": False}
-            ),
-        )
-
-
-@pytest.mark.parametrize(
-    "training",
-    [
-        {},
-        {"joint": False},
-        {"intensity_iterations": 7},  # the joint beginning alone has more
-        {"sdf_iterations": 0},
-    ],
-)
-def test_a_complete_fit_has_done_all_its_iterations(scene, training):
-    config = QUICK.override(training={"intensity_iterations": 30}).override(training=training)
-    report = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config).report
-    assert report["iterations"] == {
-        "sdf": config.training.sdf_iterations, "intensity": config.training.intensity_iterations
-    }  # fmt: skip
-    assert report["iterations_done"] == report["iterations"]
-
-
-def test_effort_is_that_of_the_fit(scene):
-    """Of 150 and 1200 iterations, the first of which are of both networks."""
-    config = FitConfig(effort=0.02, training={"batch_size": 1024, "intensity_batch_size": 512})
-    report = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config).report
-    whole = radarsdf.estimate(
-        scene.points, scene.poses, scene.intensities, config=config.override(effort=1.0)
-    ).iterations
-    done = report["iterations_done"]
-    assert done["sdf"] == pytest.approx(0.02 * whole["sdf"], abs=1)
-    assert done["sdf"] < done["intensity"] < 0.05 * whole["intensity"]
-
 
 def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     is_ghost = np.zeros(0, bool)
@@ -373,7 +163,7 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
         is_ghost = high[surfels.cells_at(rays.points)]
         return high
 
-    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", upper_wall)
+    monkeypatch.setattr("radarsdf.fitting.average.find_ghosts", upper_wall)
     drawn_from = []
     spread = RaySampler.spread
     monkeypatch.setattr(
@@ -392,19 +182,3 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     without = radarsdf.fit(points, scene.poses, config=config)
     assert with_ghosts.report["leaf_cells"] == without.report["leaf_cells"]
     assert with_ghosts.evidence.detections.tolist() == without.evidence.detections.tolist()
-
-
-def test_the_number_of_threads_only_rounds_differently(scene):
-    """All see the same samples: a fit on a larger machine is the same fit."""
-    maps = [
-        radarsdf.fit(
-            scene.points,
-            scene.poses,
-            config=QUICK.override(num_threads=threads, training={"sdf_iterations": 20}),
-        )
-        for threads in (1, 2)
-    ]
-    x = np.random.default_rng(0).uniform([5, -6, -0.2], [20, 6, 2], (500, 3))
-    values = [radar_map.sdf(x, extrapolate=True) for radar_map in maps]
-    assert np.abs(values[0]).max() > 0.1
-    np.testing.assert_allclose(*values, atol=1e-3)

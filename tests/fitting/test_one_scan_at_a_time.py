@@ -12,7 +12,7 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import ScanSums
+from radarsdf.returns.sums import ScanSums
 
 from ..conftest import ground_and_wall
 

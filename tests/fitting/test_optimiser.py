@@ -9,7 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
-from radarsdf._core import CellSet, Crew
+from radarsdf._core import CellSet
 from radarsdf.field import kernels
 from radarsdf.field.encodings import Octree, TriQuadtree
 from radarsdf.fitting.optimiser import Adam, RowAdam, Soap, Touched
@@ -56,19 +56,6 @@ def network_and_gradients(seed):
     shapes = ((6, 9), (6,), (5, 6), (5,), (1, 5), (1,))
     network = [torch.randn(shape, generator=generator).requires_grad_() for shape in shapes]
     return network, [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(50)]
-
-
-def test_soap_moves_the_weights_of_hidden_layers_and_adam_the_rest():
-    ours, gradients = network_and_gradients(0)
-    theirs = [p.detach().clone().requires_grad_() for p in ours]
-    soap, adam = Soap(ours, 1e-2), Adam(theirs, 1e-2)
-    for step in gradients:
-        soap.learning_rate = adam.learning_rate = 5e-3
-        soap.step(step)
-        adam.step(step)
-    for a, b, hidden in zip(ours, theirs, (True, False, True, False, False, False), strict=True):
-        assert torch.equal(a, b) != hidden
-    assert soap.full_rate == 1e-2
 
 
 def test_soap_goes_on_from_its_state():
@@ -149,42 +136,3 @@ def test_what_a_batch_does_not_touch_stays_and_its_momentum_fades():
     second = -1e-2 * (mean / (1 - 0.9**4)) / (square / (1 - 0.999**4)) ** 0.5
     # Adam does not see the size of a row's gradient, which is the same both times but for its sign.
     np.testing.assert_allclose((after - start)[own], np.float32(-1e-2 + second), atol=2e-5)
-
-
-def test_by_rows_the_number_of_threads_changes_nothing():
-    results = []
-    for threads in (1, 2, 3):
-        cells, points, generator = cells_and_points(TriQuadtree)
-        batches = [[(points[:200], torch.randn(200, 24, generator=generator))] for _ in range(3)]
-        results.append(steps(cells, batches, threads))
-    assert torch.equal(results[0], results[1])
-    assert torch.equal(results[0], results[2])
-
-
-def test_a_step_refuses_what_does_not_fit():
-    cells, points, _ = cells_and_points(TriQuadtree)
-    rows = len(cells.features)
-    memory = kernels.AdamMemory(
-        torch.zeros(rows, 16),
-        torch.zeros(rows, 2, dtype=torch.int32),
-    )
-    _, located = kernels.encode(cells.features, points, cells.table)
-    decays, crew = torch.ones(5, 2), Crew(2)
-
-    def step(gradient, features=cells.features, number=1):
-        with kernels.adam_step(
-            cells.table, [(points, located, gradient)], features, memory, decays,
-            step=number, learning_rate=1e-2, epsilon=1e-15, crew=crew,
-        ):  # fmt: skip
-            pass
-
-    good = torch.zeros(len(points), 24)
-    step(good)
-    for gradient in (good[:-1], good[:, :-1]):
-        with pytest.raises(ValueError, match="out_grad"):
-            step(gradient)
-    with pytest.raises(ValueError, match="features"):
-        step(good, features=torch.zeros(rows - 1, 8))
-    for number in (0, 5):
-        with pytest.raises(ValueError, match=r"step|decays"):
-            step(good, number=number)

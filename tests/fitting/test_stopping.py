@@ -14,9 +14,7 @@ import time
 import numpy as np
 import pytest
 import radarsdf
-import torch
 from radarsdf import Diverged, FitConfig, Interrupted, _core
-from radarsdf.fitting.core_gradients import CoreGradients
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.npz import write_scans
@@ -95,33 +93,6 @@ def test_ctrl_c_while_training_hands_back_the_map(threads):
     assert interrupted_python(code) == ("a map\n", 0)
 
 
-def test_ctrl_c_before_the_training_has_no_map():
-    code = """
-import numpy as np
-import radarsdf
-from radarsdf.returns.surfels import Surfels
-rng = np.random.default_rng(0)
-points = rng.normal(size=(1_000_000, 3))
-points *= 300 / np.linalg.norm(points, axis=1, keepdims=True)
-ended = []
-find_surfels = Surfels.of_sums
-def announced(*arguments):
-    print("ready", flush=True)
-    surfels = find_surfels(*arguments)
-    ended.append(surfels)
-    return surfels
-Surfels.of_sums = announced
-try:
-    config = radarsdf.FitConfig(num_threads=1)
-    radarsdf.fit([points], np.eye(4)[None], config=config, progress=False)
-except radarsdf.Interrupted as error:
-    print("stopped", flush=True)
-    print("no map" if error.radar_map is None else error.radar_map)
-    print("after" if ended else "within", "the search for surfels")
-"""
-    assert interrupted_python(code, delay_s=0.05) == ("no map\nwithin the search for surfels\n", 0)
-
-
 def test_ctrl_c_ends_a_long_call_of_the_core():
     """An interrupted call leaves most of its work undone. Work is counted in seconds of this thread on a processor."""
     # Rays through thousands of cells with a plane each that none of them meets.
@@ -156,54 +127,6 @@ def test_ctrl_c_ends_a_long_call_of_the_core():
         signal.signal(signal.SIGVTALRM, before)
     assert interrupted
     assert work_s < 0.6 * whole_s
-
-
-def test_ctrl_c_ends_a_mesh():
-    code = """
-import radarsdf
-from tests.conftest import ground_and_wall
-scene = ground_and_wall()
-config = radarsdf.FitConfig(training={"sdf_iterations": 5})
-radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
-# The first mesh imports. Ctrl-C within an import's exec() of a string, as of a dataclass, is remembered by CPython:
-# the process then ends as if by the signal, although the exception was caught.
-radar_map.mesh(0.2)
-print("ready", flush=True)
-try:
-    while True:
-        radar_map.mesh(0.03)
-except KeyboardInterrupt:
-    print("stopped", flush=True)
-"""
-    assert interrupted_python(code, delay_s=0.3) == ("", 0)
-
-
-def test_ctrl_c_during_the_import_of_trimesh_is_not_taken_for_a_missing_part():
-    code = """
-import importlib.abc, os, signal, sys, torch
-class Press(importlib.abc.MetaPathFinder):
-    def find_spec(self, name, path, target=None):
-        if name == part and not presses:
-            presses.append(name)
-            signal.raise_signal(signal.SIGINT)
-presses = []
-import radarsdf
-for part in ("networkx", "scipy", "shapely"):
-    assert "trimesh" not in sys.modules and part not in sys.modules
-    if (child := os.fork()) == 0:  # PyTorch, which takes seconds, is imported for all three
-        sys.meta_path.insert(0, Press())
-        try:
-            import radarsdf.map.mesh
-        except KeyboardInterrupt:
-            print("stopped", *presses, flush=True)
-        import radarsdf.map.mesh  # and now it is whole
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        os._exit(17)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
-"""
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", code]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert done.stdout == "stopped networkx\nstopped scipy\nstopped shapely\n"
 
 
 def test_the_command_saves_the_map_so_far_and_says_so_in_one_line(tmp_path):
@@ -245,18 +168,6 @@ def test_a_deferred_interrupt_is_remembered_and_a_second_is_not():
     assert signal.getsignal(signal.SIGINT) is usual
 
 
-def test_someone_elses_handler_stays():
-    seen = []
-    usual = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
-    try:
-        with deferred_interrupts() as pressed:
-            signal.raise_signal(signal.SIGINT)
-            assert not pressed()
-    finally:
-        signal.signal(signal.SIGINT, usual)
-    assert seen == [1]
-
-
 @pytest.fixture
 def poisoned(monkeypatch):
     """Makes the n-th step see one gradient that is not a number."""
@@ -292,59 +203,11 @@ def test_a_gradient_that_is_not_finite_never_reaches_the_map(scene, poisoned):
     ).all()  # as learnt before, not as at the start
 
 
-def test_the_last_step_is_looked_at_too(scene, poisoned):
-    poisoned(20)
-    with pytest.raises(Diverged, match="iteration 19 of 20"):
-        radarsdf.fit(
-            scene.points, scene.poses, config=FitConfig(training={"sdf_iterations": 20, "batch_size": 512})
-        )
-
-
-@pytest.mark.parametrize("joint", [True, False])
-@pytest.mark.parametrize("name", ["sdf", "intensity"])
-def test_the_message_names_the_loss_the_stage_and_the_iteration(scene, monkeypatch, name, joint):
-    calls = 0
-    stage, of = ("sdf", 10) if joint or name == "sdf" else ("intensity", 20)
-    eighth = 8 if stage == "sdf" else 10 + 8
-
-    def failing(of_stage):
-        def gradients(backend, batch, meanwhile):
-            nonlocal calls
-            calls += 1
-            found, result = of_stage(backend, batch, meanwhile)
-            if calls == eighth:
-                found.losses[name] *= math.inf
-            return found, result
-
-        return gradients
-
-    for method in ("sdf", "joint", "intensity"):
-        monkeypatch.setattr(CoreGradients, method, failing(getattr(CoreGradients, method)))
-    config = FitConfig(
-        num_threads=1,
-        training={"sdf_iterations": 10, "intensity_iterations": 20, "batch_size": 512, "joint": joint},
-    )
-    expected = f"the {name} loss is inf at iteration 7 of {of} of the {stage} stage"
-    with pytest.raises(Diverged, match=expected) as caught:
-        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
-    assert isinstance(caught.value, FloatingPointError)
-    assert np.isfinite(caught.value.radar_map.sdf(np.zeros((1, 3)), extrapolate=True)).all()
-
-
-def test_the_map_after_a_divergence_has_no_gradients_and_threads_are_restored(scene):
-    threads = torch.get_num_threads()
-    config = FitConfig(training={"learning_rate": 1e30, "sdf_iterations": 50, "cosine_schedule": False})
-    with pytest.raises(Diverged) as caught:
-        radarsdf.fit(scene.points, scene.poses, config=config)
-    assert not any(p.requires_grad for p in caught.value.radar_map.field.parameters())
-    assert torch.get_num_threads() == threads
-
-
 def test_an_interrupted_fit_is_a_keyboard_interrupt_even_where_nobody_defers(scene, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("radarsdf.fitting.training.Training.run", interrupt)
+    monkeypatch.setattr("radarsdf.fitting.train.Training.run", interrupt)
     config = FitConfig().override(training={"sdf_iterations": 1})
     with pytest.raises(Interrupted, match="while training") as caught:
         radarsdf.fit(scene.points, scene.poses, config=config)

@@ -60,34 +60,6 @@ def test_their_values_do_not_matter(scans, config):
     assert errors(low, scans)[::100].mean() < 1.3 * errors(good, scans)[::100].mean()
 
 
-def test_the_surface_keeps_their_returns(scans):
-    config = CONFIGS["quick"]
-    good, low = (
-        radarsdf.fit(scans.points, scans.poses, values, config=config, progress=False)
-        for values in (scans.intensities, struck(scans, -9999.0))
-    )
-    assert low.report["returns_used"] == good.report["returns_used"]
-    for name, tensor in tensors(good).items():
-        if not name.startswith("reflectance."):
-            assert tensor.equal(tensors(low)[name]), name
-
-
-def test_a_given_range_does_not_bring_them_back(scans):
-    good, low = (
-        radarsdf.fit(
-            scans.points,
-            scans.poses,
-            values,
-            config=CONFIGS["quick"],
-            progress=False,
-            intensity_range=(70.0, 150.0),
-        )
-        for values in (scans.intensities, struck(scans, -9999.0))
-    )
-    assert low.report["wild_intensities"] > 0
-    assert errors(low, scans).mean() < 1.02 * errors(good, scans).mean()
-
-
 def test_all_tiles_leave_out_the_same(scans, tmp_path):
     """The plan decides for all, also where a tile has no other intensities."""
     whole = struck(scans, -9999.0)

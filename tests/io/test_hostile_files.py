@@ -128,8 +128,10 @@ def with_config(group, **changes):
 @pytest.mark.parametrize(
     ("group", "name", "value"),
     [
-        ("networks", "sdf_hidden", [30_000] * 3),
+        ("networks", "intensity_hidden", [30_000] * 3),
+        ("networks", "intensity_hidden", [4096] * 3),
         ("networks", "intensity_hidden", [2**62, 2**62]),
+        ("networks", "intensity_hidden", [1] * 1_000_000),
         ("networks", "geometry_feature_dim", 10**9),
         ("encoding", "num_levels", 12),
     ],

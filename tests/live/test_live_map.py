@@ -76,9 +76,7 @@ def test_a_mesh_that_grows_is_that_of_a_quick_fit():
         assert live.integrate(SCENE.points[i], SCENE.poses[i], SCENE.intensities[i]).scan_id == i
         grown = live.mesh()
         assert mesh_bits(grown) == mesh_bits(map_of(range(i + 1)).mesh())
-    quick = FitConfig.quick(
-        num_threads=1, returns=KNOWN, encoding={"bridge_cells": 4}, training={"start": "smoothed"}
-    )
+    quick = FitConfig.quick(num_threads=1, returns=KNOWN, encoding={"bridge_cells": 4})
     batch = radarsdf.fit(SCENE.points[:6], SCENE.poses[:6], config=quick, origin=ORIGIN, progress=False)
     whole = batch.mesh(quick.leaf_size_m)
     assert len(whole.faces) == len(grown.faces) > 1000
@@ -131,7 +129,7 @@ def test_map_and_finish_are_fits_of_all_scans():
         (live.finish(progress=False), config),
         (
             live.map(),
-            FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4}, training={"start": "smoothed"}),
+            FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4}),
         ),
     ):
         fitted = radarsdf.fit(

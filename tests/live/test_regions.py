@@ -12,8 +12,8 @@ from radarsdf._core import cell_keys
 from radarsdf.live.ghosts import means_of, surfels_of
 from radarsdf.live.regions import REGION_CELLS, RegionTable, cubes_of, regions_of, regions_round
 from radarsdf.map.mesh import Surface
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.ghosts import find_ghosts
+from radarsdf.returns.sums import lattice_of
 
 RNG = np.random.default_rng(3)
 CELLS = RNG.integers(-150, 150, (4000, 3))

@@ -71,7 +71,7 @@ def test_it_is_0_where_nothing_was_observed(radar_map):
     # An open cell without returns in the 27 cells round it knows nothing, too.
     unknown = Evidence(*(np.zeros_like(column) for column in dataclasses.astuple(radar_map.evidence)))
     contents = dataclasses.replace(radar_map._contents, evidence=unknown)
-    cells = radar_map.field.cells.table.leaf_cells()[:100]
+    cells = radar_map.field.table.leaf_cells()[:100]
     centres = (cells + 0.5) * radar_map.config.leaf_size_m + radar_map.origin
     assert radar_map.observed(centres).all()
     assert RadarMap(contents).confidence(centres).tolist() == [0] * 100
@@ -128,7 +128,7 @@ def test_twice_the_scans_make_surer_only_what_is_no_surface(radar_map, rough_sha
 def test_places_have_the_evidence_of_their_cells(radar_map):
     """In the middle of a cell, none of its neighbours counts."""
     contents, evidence = radar_map._contents, radar_map.evidence
-    centres = (radar_map.field.cells.table.leaf_cells() + 0.5) * radar_map.config.leaf_size_m
+    centres = (radar_map.field.table.leaf_cells() + 0.5) * radar_map.config.leaf_size_m
     found = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
     for column, expected in zip(found, dataclasses.astuple(evidence), strict=True):
         assert expected.max() > 0

@@ -26,7 +26,7 @@ LEAF_M = 0.2
 
 
 def occupied_voxels(radar_map, voxel_size):
-    return _voxels_of(radar_map.field.cells.table.leaf_cells(), voxel_size, radar_map.config)
+    return _voxels_of(radar_map.field.table.leaf_cells(), voxel_size, radar_map.config)
 
 
 def moved(radar_map, origin):
@@ -35,7 +35,6 @@ def moved(radar_map, origin):
             field=radar_map.field,
             origin=radar_map.origin + np.asarray(origin),
             intensity_scale=radar_map.intensity_scale,
-            reflectance=None,
             config=radar_map.config,
             evidence=radar_map.evidence,
             rough_share=radar_map.rough_share,
@@ -101,7 +100,7 @@ def test_any_voxel_size_gives_the_same_surface(sharp_map, mesh_of, voxel_size):
 
 
 def sharp_map_bounds(radar_map):
-    cells = radar_map.field.cells.table.leaf_cells()
+    cells = radar_map.field.table.leaf_cells()
     return cells.min(axis=0) * LEAF_M + radar_map.origin, (cells.max(axis=0) + 1) * LEAF_M + radar_map.origin
 
 
@@ -213,7 +212,7 @@ def test_where_there_is_no_surface_the_mesh_is_empty(sharp_map, viewpoint):
 def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
     sharp_map, mesh_of, voxel_size, monkeypatch
 ):
-    cells = sharp_map.field.cells.table.leaf_cells()
+    cells = sharp_map.field.table.leaf_cells()
     searched = crossed(cells, LEAF_M, functools.partial(_corner_distances, sharp_map._contents, LEAF_M))
     assert len(searched) < 0.8 * len(cells)
     mesh = mesh_of(voxel_size)

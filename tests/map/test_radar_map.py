@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
-from radarsdf.field.field import Field
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 
@@ -138,7 +137,7 @@ def test_many_threads_at_once_get_the_answers_of_one(sharp_map):
 def test_gradient_is_the_derivative_of_the_distance(sharp_map):
     x = on_surface(sharp_map, 400)
     local = torch.from_numpy((x - sharp_map.origin).astype(np.float32)).double()
-    field = Field(sharp_map.field.cells.table.leaf_keys(), sharp_map.config, with_intensity=True)
+    field = NeuralField(sharp_map.field.table.leaf_keys(), sharp_map.config, with_intensity=True)
     field.load_state_dict(sharp_map.field.state_dict(), assign=True)
     field.double()  # so that differences over a tiny step are exact enough
     step = 1e-6

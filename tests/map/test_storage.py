@@ -16,7 +16,7 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.io import files
 from radarsdf.io.tensors import open_tensors, tensor_bytes
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from ..settings import grouped
 
@@ -60,7 +60,7 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
         kind=encoding,
         normals=True,
         geometry_feature_dim=4,
-        sdf_hidden=(16,),
+        intensity_hidden=(16,),
         num_levels=2,
         max_range_m=70.0,
     )
@@ -81,7 +81,7 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
         np.testing.assert_array_equal(*(m.vertex_attributes["intensity"] for m in meshes))
 
     assert after.config == before.config
-    assert isinstance(after.config.networks.sdf_hidden, tuple)
+    assert isinstance(after.config.networks.intensity_hidden, tuple)
     np.testing.assert_array_equal(after.origin, before.origin)
     assert after.origin.dtype == np.float64
     assert after.intensity_scale == before.intensity_scale
@@ -105,7 +105,7 @@ def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "11"
+    assert metadata["format_version"] == "12"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -266,19 +266,6 @@ def test_what_the_network_leaves_is_added_and_kept(scene, saved):
     assert errors[1] < 0.9 * errors[0]
     again = radarsdf.load(saved[1])
     np.testing.assert_array_equal(again.intensity(*asked), both.intensity(*asked))
-
-
-def test_columns_of_features_that_are_zero_are_not_in_the_file(saved, tmp_path):
-    """A quick map uses one of eight. It is the same when it is read, and a map that uses all is written whole."""
-    scans = radarsdf.simulate.wall(frames=4)
-    quick = radarsdf.fit(scans.points, scans.poses, config=FitConfig.quick(), progress=False)
-    quick.save(tmp_path / "quick.safetensors")
-    tensors = load_file(tmp_path / "quick.safetensors")
-    assert tensors["field.cells.features"].shape == (quick.report["vertices"], 1)
-    again = radarsdf.load(tmp_path / "quick.safetensors")
-    assert again.field.cells.features.equal(quick.field.cells.features)
-    assert saved[2]["field.cells.features"].shape[1] == 8
-    assert again.nbytes == quick.nbytes > 3 * (tmp_path / "quick.safetensors").stat().st_size / 2
 
 
 def test_view_statistics_are_kept_bit_for_bit(saved):

@@ -103,7 +103,7 @@ def test_places_that_one_row_would_have_several_of_go_to_others():
 
 
 def test_memory_that_is_not_there_is_said_before_the_work(sharp_map, monkeypatch):
-    monkeypatch.setattr("radarsdf.budget.estimate.available_bytes", lambda: 100_000)
+    monkeypatch.setattr("radarsdf.memory.available_bytes", lambda: 100_000)
     with pytest.raises(MemoryError, match=r"would take about .* GB, of 0.00: ask for fewer"):
         sharp_map.render(POSE)
     unseen = pickle.loads(pickle.dumps(sharp_map))  # whose surface has yet to be made for rays

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.poses.rigid import between
-from radarsdf.returns.doppler import sensor_velocity
+from radarsdf.returns.moving import sensor_velocity
 
 from ..conftest import recorded_file
 

@@ -9,7 +9,7 @@ import pytest
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.normals import told_normals
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
-from radarsdf.returns.surfels import Surfels
+from radarsdf.returns.planes import Surfels
 
 
 def surfels_of(points):

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.returns.cells import ReturnCells, merged_keys
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.sums import ReturnCells, merged_keys
 
 
 @pytest.mark.parametrize("size_m", [0.1, 0.2, 0.37])

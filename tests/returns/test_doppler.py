@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.returns.doppler import without_filler
+from radarsdf.returns.moving import without_filler
 
 
 @pytest.fixture

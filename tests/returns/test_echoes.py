@@ -9,8 +9,8 @@ import dataclasses
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.returns.echoes import Echoes, rows_of_views
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.view_statistics import Echoes, rows_of_views
 
 LEAF_M = 0.2
 

@@ -11,11 +11,9 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import cell_keys
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import ScanSums
+from radarsdf.returns.sums import lattice_of
 
 from ..reference_looks import looks_at
 
@@ -142,33 +140,9 @@ def test_a_false_return_is_no_evidence_but_its_scan_looked(rays):
     assert at(Evidence.of(returns, real, leaf_keys, LEAF_M), leaf_keys, BEHIND) == (0, 0, 0)
 
 
-def test_returns_beside_the_leaf_cells_count_nowhere(rays):
-    wall_keys = keys_of(np.array([[25, y, 0] for y in range(-4, 5)]))
-    inside = within_a_cell(rays.points, wall_keys).any(axis=0) & (cells_of(rays.points)[:, 2] == 0)
-    assert 0 < inside.sum() < 0.5 * len(rays)
-    evidence = Evidence.of(returns_of(rays, np.full(len(rays), VARIANCE_M2)), rays, wall_keys, LEAF_M)
-    own = rays.select(np.isin(cell_keys(np.ascontiguousarray(rays.points), LEAF_M), wall_keys))
-    np.testing.assert_allclose(
-        evidence.information, within_a_cell(own.points, wall_keys).sum(axis=1) / VARIANCE_M2, rtol=1e-5
-    )
-    np.testing.assert_array_equal(evidence.detections, scans_round(own, wall_keys))
-    np.testing.assert_array_equal(evidence.looks, looks(rays, wall_keys))
-
-
-def test_mean_rays_know_how_many_scans_they_are_of(rays):
-    means = MeanRays.of_sums(ScanSums.of(rays, LEAF_M))
-    expected = returns_of(rays, np.ones(len(rays)))
-    np.testing.assert_array_equal(means.keys, expected.keys)
-    np.testing.assert_array_equal(means.scans, expected.scans)
-    assert means.scans.dtype == np.uint32
-    part = means.counts > 1
-    assert 0 < part.sum() < len(part)
-    np.testing.assert_array_equal(means.select(part).scans, expected.scans[part])
-
-
 STARTS = {
     "average": FitConfig.quick(),
-    "noise": FitConfig(training={"start": "noise", "sdf_iterations": 2, "batch_size": 64}),
+    "noise": FitConfig(training={"sdf_iterations": 2, "batch_size": 64}),
 }
 
 
@@ -182,7 +156,7 @@ def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeyp
         assert not set(cells[is_false(rays)]) & set(cells[~is_false(rays)])
         return np.isin(np.arange(len(surfels.keys)), cells[is_false(rays)])
 
-    monkeypatch.setattr("radarsdf.fitting.surface.find_ghosts", cells_of_ghosts)
+    monkeypatch.setattr("radarsdf.fitting.average.find_ghosts", cells_of_ghosts)
     config = STARTS[start].override(
         num_threads=2,
         returns={
@@ -197,7 +171,7 @@ def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeyp
     )
     radar_map = radarsdf.fit(*a_scene(), config=config, origin=(0, 0, 0), progress=False)
     assert radar_map.report["ghosts"] == drop_ghosts
-    leaf_keys = radar_map.field.cells.table.leaf_keys()
+    leaf_keys = radar_map.field.table.leaf_keys()
     own = rays.select(~is_false(rays)) if drop_ghosts else rays
     evidence = radar_map.evidence
     np.testing.assert_allclose(

@@ -6,16 +6,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import radarsdf
-from radarsdf import FitConfig
 from radarsdf._core import CellSet, cell_keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
-from radarsdf.returns.cells import ReturnCells
-from radarsdf.returns.gaps import _MAX_SUPPORT, _medians, bridged
+from radarsdf.returns.evidence import _MAX_SUPPORT, bridged, support_at
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.support import support_at
-
-from ..conftest import ground_and_wall
+from radarsdf.returns.sums import ReturnCells
 
 LEAF_M = 0.2
 
@@ -60,10 +55,6 @@ def test_the_cells_between_two_returns_and_no_others(direction, gap):
     assert added(rays, gap - 1) == set()
 
 
-def test_only_along_the_lines_of_the_lattice():
-    assert added(rays_to([(0, 0, 0), (3, 1, 0)]), 8) == set()
-
-
 def test_badly_supported_and_dense_ends_are_not_bridged():
     block = [(x, y, 0) for x in range(3) for y in range(3)]
     lone = (4, 1, 0)
@@ -96,34 +87,3 @@ def test_as_a_search_of_all_pairs_says(max_cells):
                 line = a + np.arange(1, distance)[:, None] * (way // distance)
                 expected |= set(cell_keys((line + 0.5) * LEAF_M, LEAF_M).tolist())
     assert added(rays, max_cells) == expected - set(leaf_keys.tolist())
-
-
-def test_a_sparse_surface_has_fewer_holes():
-    scene = ground_and_wall(scans=4, returns_per_scan=400)
-    area = {}
-    for cells in (0, 2):
-        config = FitConfig(num_threads=1, encoding={"bridge_cells": cells})
-        radar_map = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
-        mesh = radar_map.mesh(min_confidence=0)
-        area[cells] = mesh.area
-        off_m = np.minimum(np.abs(mesh.vertices[:, 2]), np.abs(mesh.vertices[:, 0] - 20))
-        assert np.percentile(off_m, 95) < 0.2
-    assert area[2] > 1.1 * area[0]
-
-
-def test_the_published_configuration_bridges_nothing():
-    assert FitConfig.paper().encoding.bridge_cells == 0
-    rays = rays_to([(0, 0, 0), (2, 0, 0)])
-    leaf_keys = leaf_keys_of(rays)
-    assert bridged(leaf_keys, leaf_keys, np.ones(len(leaf_keys)), 0) is leaf_keys
-
-
-def test_medians_are_those_of_the_cells_with_returns_in_each_block():
-    rng = np.random.default_rng(4)
-    keys = np.sort(rng.choice(4 * LATTICE_BLOCK_CELLS**3, 3000, replace=False)).astype(np.uint64)
-    support = rng.integers(0, 9, len(keys)).astype(float)
-    block = keys // LATTICE_BLOCK_CELLS**3
-    found = _medians(keys, support)
-    for one in np.unique(block):
-        rows = block == one
-        assert found[rows] == pytest.approx(np.median(support[rows & (support > 0)]))

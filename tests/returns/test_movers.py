@@ -10,7 +10,7 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
 from radarsdf.io.scans import Scans
-from radarsdf.returns.movers import Movers, Standing
+from radarsdf.returns.moving import Movers, Standing
 
 from tests.conftest import recorded_scans
 
@@ -70,14 +70,6 @@ def _too_near(scans, doppler):
     return sum(int((np.linalg.norm(points, axis=1) < 2.5).sum()) for points in left)
 
 
-def test_returns_without_doppler_stay(drive):
-    scans, doppler, moves = drive
-    half = [np.where(np.arange(len(v)) % 2, v, np.nan) for v in doppler]
-    found = Movers.of(scans.points, half)
-    assert not any(mask[::2].any() for mask in found.masks)
-    assert sum(int(mask[1::2].sum()) for mask in found.masks) > 0.9 * sum(int(m[1::2].sum()) for m in moves)
-
-
 def test_doppler_that_is_not_understood_leaves_nothing_out(drive):
     scans, doppler, _ = drive
     rng = np.random.default_rng(1)
@@ -100,19 +92,6 @@ def test_intensities_stay_with_their_returns(drive):
     kept = [~mask for mask in Movers.of(scans.points, doppler).masks]
     for values, all_values, mask in zip(standing.intensities, scans.intensities, kept, strict=True):
         np.testing.assert_array_equal(values, all_values[mask])
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda doppler: doppler[1:], "doppler_mps holds 11 scans, points 12"),
-        (lambda doppler: [doppler[0][1:], *doppler[1:]], "doppler_mps of scan 0 must have shape"),
-    ],
-)
-def test_doppler_that_does_not_fit(drive, change, said):
-    scans, doppler, _ = drive
-    with pytest.raises(ValueError, match=said):
-        radarsdf.fit(scans.points, scans.poses, doppler_mps=change(doppler), progress=False)
 
 
 @pytest.mark.parametrize("name", ["r0009_0024", "r0057_0068", "r0133_0142", "r0144_0167", "r0309_0320"])

@@ -9,9 +9,9 @@ import dataclasses
 import numpy as np
 import pytest
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.noise import sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import Surfels
 
 from ..conftest import ground_and_wall
 from .walls import a_wall
@@ -30,18 +30,6 @@ def test_the_noise_is_found_in_the_data(range_m, angle_rad):
     noise = noise_of(prepare(points, poses))
     assert noise.range_m == pytest.approx(range_m, rel=0.35)
     assert noise.angle_rad == pytest.approx(angle_rad, rel=0.35)
-
-
-def test_returns_far_beside_a_plane_are_no_noise_of_the_sensor():
-    points, poses, _ = a_wall(0.03, 0.001)
-    usual = noise_of(prepare(points, poses))
-    rng = np.random.default_rng(0)
-    for scan in points:
-        rows = rng.choice(len(scan), len(scan) // 25, replace=False)
-        ranges_m = np.linalg.norm(scan[rows], axis=1, keepdims=True)
-        scan[rows] *= 1 + 0.35 * rng.choice([-1, 1], (len(rows), 1)) / ranges_m
-    noise = noise_of(prepare(points, poses))
-    assert noise.range_m == pytest.approx(usual.range_m, rel=0.35)
 
 
 @pytest.mark.parametrize("roll_rad", [0.0, 0.5 * np.pi])
@@ -71,18 +59,3 @@ def test_what_the_user_knows_stays():
 def test_few_returns_give_a_guess():
     few = ground_and_wall(scans=2, returns_per_scan=20)
     assert dataclasses.astuple(noise_of(prepare(few.points, few.poses))) == pytest.approx((0.1, 0.01, 0.01))
-
-
-def test_variances_of_returns():
-    noise = SensorNoise(0.1, 0.003, 0.004)
-    ranges_m = np.array([0.0, 10.0, 50.0], np.float32)
-    expected = 0.1**2 + (0.003**2 + 0.004**2) / 2 * ranges_m.astype(np.float64) ** 2
-    np.testing.assert_allclose(noise.variances_m2(ranges_m), expected, rtol=1e-5)
-
-
-def test_a_median_of_noises_is_of_each_number():
-    noises = [SensorNoise(0.1, 0.02, 0.001), SensorNoise(0.3, 0.01, 0.002), SensorNoise(0.2, 0.03, 0.003)]
-    found = SensorNoise.median(noises)
-    assert found == SensorNoise(0.2, 0.02, 0.002)
-    assert ReturnsConfig(**found.settings).azimuth_noise_rad == 0.02
-    assert found.variances == pytest.approx([0.04, 4e-4, 4e-6])

@@ -5,40 +5,13 @@
 from __future__ import annotations
 
 import numpy as np
-import radarsdf
-from radarsdf import FitConfig
-from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.onto_surfels import onto_surfels
+from radarsdf.returns.noise import SensorNoise, onto_surfels
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import Surfels
 
-from ..conftest import ground_and_wall
 from .walls import a_wall
 
 LEAF_M = 0.2
-
-
-def test_returns_come_onto_the_planes_that_they_make():
-    points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01)
-    noise = SensorNoise(0.1, 0.01, 0.01)
-    rays = prepare(points, poses)
-    surfels = Surfels.of(rays, LEAF_M)
-    moved = onto_surfels(surfels, rays, noise)
-    np.testing.assert_array_equal(moved.points, onto_surfels(surfels, rays, noise, num_threads=3).points)
-
-    def error_m(rays):
-        x, _, z = rays.points.T + rays.origin[:, None]
-        wall = (
-            (np.abs(x - 15) < 0.6) & (z > 1) & (z < 3)
-        )  # far from where wall and ground meet, and from their ends
-        ground = (np.abs(z) < 0.6) & (x > 6) & (x < 13)
-        return np.sqrt(np.mean(np.concatenate([x[wall] - 15, z[ground]]) ** 2))
-
-    assert error_m(moved) < 0.35 * error_m(rays)
-    # Seen from where they were, and whole rays.
-    sensors = [r.points - r.directions * r.ranges_m[:, None] for r in (rays, moved)]
-    np.testing.assert_allclose(*sensors, atol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(moved.directions, axis=1), 1, atol=1e-6)
 
 
 def test_the_shift_is_the_best_linear_estimate():
@@ -65,43 +38,6 @@ def test_the_shift_is_the_best_linear_estimate():
         off_m = (expected[i] - surfels.centres[plane[i]]) @ normal
         expected[i] -= off_m * variance / (variance + rough) * normal
     np.testing.assert_allclose(onto_surfels(surfels, rays, noise).points, expected, atol=2e-6)
-
-
-def test_returns_that_make_no_plane_stay_where_they_are():
-    noise = SensorNoise(0.1, 0.01, 0.01)
-    points = np.random.default_rng(0).uniform([5, -3, -3], [11, 3, 3], (4000, 3))
-    rays = prepare([points], np.eye(4)[None])
-    surfels = Surfels.of(rays, LEAF_M)
-    moved = onto_surfels(surfels, rays, noise)
-    still = surfels.flat_planes_at(rays.points) < 0
-    assert still.mean() > 0.5
-    for name in ("points", "directions", "ranges_m"):
-        np.testing.assert_array_equal(getattr(moved, name)[still], getattr(rays, name)[still])
-    lone = prepare([[[5.0, 0, 0]]], np.eye(4)[None])
-    assert onto_surfels(Surfels.of(lone, LEAF_M), lone, noise).points.tolist() == [[5, 0, 0]]
-
-
-def test_a_return_straight_above_its_sensor_moves_a_finite_way():
-    rng = np.random.default_rng(1)
-    ceiling = np.column_stack([rng.uniform(-1, 1, (2000, 2)), rng.normal(8, 0.05, 2000)])
-    ceiling[0] = [0, 0, 8.05]
-    rays = prepare([ceiling], np.eye(4)[None])
-    moved = onto_surfels(Surfels.of(rays, LEAF_M), rays, SensorNoise(0.05, 0.01, 0.01))
-    assert np.isfinite(moved.points).all()
-    assert abs(moved.points[0, 2] - 8) < 0.03
-
-
-def test_a_fit_to_planes_is_nearer_to_the_surface():
-    scene = ground_and_wall(noise_m=0.15)
-    errors_m = []
-    for onto_planes in (False, True):
-        config = FitConfig(
-            num_threads=2, returns={"onto_planes": onto_planes}, training={"sdf_iterations": 150}
-        )
-        vertices = radarsdf.fit(scene.points, scene.poses, config=config).mesh().vertices
-        on_wall = (np.abs(vertices[:, 0] - 20) < 0.8) & (vertices[:, 2] > 1) & (vertices[:, 2] < 3)
-        errors_m.append(np.sqrt(np.mean((vertices[on_wall, 0] - 20) ** 2)))
-    assert errors_m[1] < 0.7 * errors_m[0]
 
 
 def test_a_rough_surface_keeps_its_shape():

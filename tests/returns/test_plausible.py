@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.returns import plausible
-from radarsdf.returns.plausible import Intensities, Plausible
+from radarsdf.returns import intensities as plausible
+from radarsdf.returns.intensities import Intensities, Plausible
 
 N = 20_000
 
@@ -64,24 +64,6 @@ def test_what_is_wild_is_left_out_and_nothing_else(case):
     intensities[rows] = rng.choice(values, len(rows))
     held = Plausible.of(intensities).holds(intensities)
     np.testing.assert_array_equal(np.flatnonzero(~held), np.sort(rows))
-
-
-@pytest.mark.parametrize("fourths", [3, 3.5, 5, 8])
-def test_an_exponential_tail_reaches_as_far_as_it_says(fourths):
-    distances = -3.0 * np.log1p(-(np.arange(4**6) / 4**6))
-    assert plausible._reach(distances, 4.0**-fourths) == pytest.approx(3 * np.log(4) * fourths)
-
-
-def test_few_returns_do_not_tell():
-    intensities = np.append(np.arange(100, dtype=np.float32), np.float32(1e9))
-    assert Plausible.of(intensities).holds(intensities).all()
-
-
-def test_none_is_no_intensity():
-    intensities = decibels(np.random.default_rng(0)).astype(np.float32)
-    with_none = np.insert(intensities, [5, 700], np.nan)
-    assert Plausible.of(with_none) == Plausible.of(intensities)
-    assert not Plausible.of(with_none).holds(with_none)[5]
 
 
 @pytest.mark.parametrize("most", [1 << 15, 2000], ids=["all", "some"])

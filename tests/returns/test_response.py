@@ -57,33 +57,8 @@ def test_where_no_scan_was_the_ground_is_known_by_its_height():
     assert error(truth(seen), seen, asked, truth(asked)) < 0.03
 
 
-def test_what_lies_on_no_plane_does_not_stand_for_places_that_no_scan_has_seen():
-    """Clutter is strong here. A place that is new is more likely one with a surface."""
-    seen = views(kinds=(LEVEL, STEEP, STEEP, STEEP, NO_SURFACE))
-    values = np.where(seen[3] == NO_SURFACE, np.float32(0.9), np.float32(0.2))
-    answers = Response.of(values, *seen).at(*views(1, kinds=(NO_SURFACE,)))
-    assert np.median(answers) < 0.4
-
-
-def test_few_returns_of_a_kind_are_answered_by_all():
-    seen = views(kinds=(STEEP,))
-    seen[3][:20] = LEVEL
-    values = (0.5 + 0.2 * seen[0][:, 2]).astype(np.float32)
-    values[:20] = np.linspace(0, 1, 20)
-    asked = views(1, kinds=(LEVEL,))
-    np.testing.assert_allclose(Response.of(values, *seen).at(*asked), 0.5 + 0.2 * asked[0][:, 2], atol=0.01)
-
-
 def test_a_kind_is_that_of_the_plane():
     normals = np.array([[0, 0, 1], [0.6, 0, -0.8], [0.8, 0, 0.6], [1, 0, 0]], np.float32)
     found = kinds_of(normals, np.array([0, 1, 2, 3, -1], np.int32))
     assert found.tolist() == [LEVEL, LEVEL, STEEP, STEEP, NO_SURFACE]
     assert kinds_of(normals[:0], np.array([-1], np.int32)).tolist() == [NO_SURFACE]
-
-
-def test_answers_are_numbers_everywhere():
-    seen = views()
-    directions = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0]], np.float32)
-    ranges_m = np.array([0, 1e30, 1e5], np.float32)
-    nowhere = directions, ranges_m, np.full(3, np.nan, np.float32), np.zeros(3, np.int8)
-    assert np.isfinite(Response.of(np.ones(COUNT, np.float32), *seen).at(*nowhere)).all()

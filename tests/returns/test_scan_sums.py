@@ -10,9 +10,8 @@ import operator
 
 import numpy as np
 import pytest
-from radarsdf.returns.cells import ReturnCells
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import QUANTA, UPPER, ScanSums
+from radarsdf.returns.sums import QUANTA, UPPER, ReturnCells, ScanSums
 
 from ..conftest import ground_and_wall
 
@@ -78,13 +77,3 @@ def test_moments_are_those_of_the_returns_in_cells_twice_as_large(rays):
     quantum_m = LEAF_M / QUANTA
     bound = quantum_m * (np.abs(points).max() + quantum_m) * expected[:, 0]
     assert (np.abs(moments - expected).max(axis=1) <= bound).all()
-
-
-def test_no_returns_have_no_moments(rays):
-    keys, moments = sums_of(rays.select(slice(0))).merged_moments()
-    assert (keys.shape, moments.shape) == ((0,), (0, 13))
-
-
-def test_cells_of_other_sizes_are_refused(rays):
-    with pytest.raises(ValueError, match="different sizes"):
-        sums_of(rays) + ScanSums.of(rays, 2 * LEAF_M)

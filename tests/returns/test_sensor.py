@@ -9,7 +9,6 @@ import json
 
 import numpy as np
 import pytest
-from radarsdf.io import Scans
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import Sensor
@@ -44,33 +43,6 @@ def test_limits_counts_and_thresholds():
     at_m = np.array([8.0, 20.0, 35.0])
     np.testing.assert_allclose(sensor.threshold(at_m), 50 - at_m / 2, atol=2.5)
     assert sensor.beam_rad == pytest.approx((0.02355, 0.0471), rel=1e-3)
-    assert sensor.resolution_m == pytest.approx(0.2355, rel=1e-3)
-
-
-def test_sentinels_are_no_threshold():
-    points, intensities = scans()
-    expected = Sensor.of(points, intensities)
-    for values in intensities:
-        values[::40] = -9999
-    for (at_m, weakest), (_, known) in zip(
-        Sensor.of(points, intensities).thresholds, expected.thresholds, strict=True
-    ):
-        assert 3 < at_m < 40
-        assert weakest == pytest.approx(known, abs=2)
-
-
-def test_ranges_limit_what_counts():
-    points, _ = scans()
-    sensor = Sensor.of(points, min_range_m=10.0, max_range_m=30.0)
-    np.testing.assert_allclose(sensor.range_m, [10, 30], atol=0.5)
-    assert sensor.returns_per_scan == pytest.approx(270, abs=30)
-    assert (sensor.threshold(np.array([1.0])) == -np.inf).all()
-
-
-def test_scans_bring_their_intensities():
-    points, intensities = scans()
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    assert Sensor.of(Scans(points, poses, intensities)) == Sensor.of(points, intensities)
 
 
 def test_rays_tell_what_their_scans_tell():
@@ -89,17 +61,6 @@ def test_rays_tell_what_their_scans_tell():
 def test_json_keeps_a_sensor():
     sensor = Sensor.of(*scans(), noise=NOISE)
     assert Sensor.from_dict(json.loads(json.dumps(sensor.to_dict()))) == sensor
-
-
-def test_one_return_is_enough():
-    sensor = Sensor.of([[[5.0, 0.0, 0.0]]], [[60.0]])
-    assert sensor.azimuth_rad[0] < sensor.azimuth_rad[1] <= 1e-3
-    assert sensor.threshold(np.array([5.0]))[0] == 60
-
-
-def test_no_return():
-    with pytest.raises(ValueError, match="no return"):
-        Sensor.of(scans()[0], min_range_m=100.0)
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import radarsdf
@@ -13,14 +11,10 @@ from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.ghosts import find_ghosts
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.scan_sums import ScanSums
-from radarsdf.returns.support import support_at
-from radarsdf.returns.surfels import Surfels
 
-from ..conftest import ground_and_wall
 from .walls import a_wall
 
 CELL_M = 0.4
@@ -43,37 +37,6 @@ def test_ghosts_are_found_and_the_surface_is_kept():
     assert dropped[~is_ghost].mean() < 0.005
     np.testing.assert_array_equal(dropped, ghosts_of(rays, surfels, num_threads=1))
     np.testing.assert_array_equal(dropped, ghosts_of(rays, surfels, num_threads=3))
-
-
-def test_the_mean_rays_of_leaf_cells_find_them_too():
-    points, poses, is_ghost = a_wall(ghosts=40)
-    rays = prepare(points, poses)
-    surfels, means = Surfels.of(rays, LEAF_M), MeanRays.of_sums(ScanSums.of(rays, LEAF_M))
-    assert len(means.keys) < 0.7 * len(rays)
-    cells = find_ghosts(surfels, means, NOISE)
-    dropped = cells[surfels.cells_at(rays.points)]
-    assert dropped[is_ghost].mean() > 0.9
-    assert dropped[~is_ghost].mean() < 0.005
-    # A mean counts as often as it has returns. If each counted less, too few of a cell would be behind a surface.
-    fewer = dataclasses.replace(means, counts=means.counts * np.float32(0.3))
-    assert not find_ghosts(surfels, fewer, NOISE).any()
-
-
-def test_planes_of_cells():
-    points, poses, _ = a_wall()
-    rays = prepare(points, poses)
-    surfels = Surfels.of(rays, LEAF_M)
-    plane, cells = surfels.flat_planes_at(rays.points), surfels.cells_at(rays.points)
-    assert (plane >= 0).mean() > 0.9
-    np.testing.assert_array_equal(surfels.cell_of_plane[plane[plane >= 0]], cells[plane >= 0])
-    np.testing.assert_array_equal(surfels.keys[cells], cell_keys(rays.points, CELL_M))
-    nowhere = np.array([[500, 500, 500]], np.float32)
-    assert (surfels.cells_at(nowhere).tolist(), surfels.flat_planes_at(nowhere).tolist()) == ([-1], [-1])
-    leaf_keys = cell_keys(rays.points, LEAF_M)
-    np.testing.assert_array_equal(surfels.cells_of_leaves(leaf_keys), cells)
-    np.testing.assert_array_equal(surfels.flat_planes_of_leaves(leaf_keys), plane)
-    on_ground = (np.abs(rays.in_world()[0][:, 2]) < 0.05) & (rays.in_world()[0][:, 0] < 14) & (plane >= 0)
-    assert np.median(surfels.normals[plane[on_ground], 2]) > 0.98
 
 
 def test_a_fit_drops_and_counts_them():
@@ -101,37 +64,6 @@ def test_a_hedge_that_rays_pass_is_no_mirror():
     surfels = Surfels.of(rays, LEAF_M)
     noise = sensor_noise(surfels, rays, ReturnsConfig())
     assert ghosts_of(rays, surfels, noise)[behind].mean() < 0.05
-
-
-def test_what_is_seen_beside_a_trunk_is_no_ghost():
-    """A trunk fills a part of its cells only. Rays through the rest of these end at what is there."""
-    rng = np.random.default_rng(2)
-
-    def strip(x_m, left_m, right_m, count):
-        return np.column_stack(
-            [
-                rng.normal(x_m, 0.02, count),
-                rng.uniform(left_m, right_m, count),
-                rng.uniform(-0.15, 0.15, count),
-            ]
-        )
-
-    def dropped(left_m, right_m):
-        things = strip(10, left_m, right_m, 400), strip(18, 0.47, 0.62, 60)
-        rays = prepare([np.concatenate(things).astype(np.float32)], np.eye(4)[None])
-        return ghosts_of(rays, Surfels.of(rays, LEAF_M), SensorNoise(0.02, 0.001, 0.001))
-
-    assert not dropped(0.02, 0.14).any()
-    behind_a_wall = dropped(0.02, 0.38)
-    assert not behind_a_wall[:400].any()
-    assert behind_a_wall[400:].mean() > 0.9
-
-
-def test_few_returns_make_no_plane():
-    few = ground_and_wall(scans=2, returns_per_scan=20)
-    rays = prepare(few.points, few.poses)
-    surfels = Surfels.of(rays, LEAF_M)
-    assert not find_ghosts(surfels, rays, NOISE).any()
 
 
 def one_surfel(normal=(-1.0, 0, 0), thickness_m=0.0, reach_m=np.inf):
@@ -166,71 +98,6 @@ def test_crossings_of_one_surfel():
     assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.0, 0.5)) == [
         0
     ]  # across the beam: no depth
-
-
-@pytest.mark.parametrize("sensor", [[0, 5, 3], [8, -9, 2], [2, 0.2, 0.2], [9.9, 0.25, 9]])
-def test_the_walk_finds_what_a_search_of_all_surfels_finds(sensor):
-    """A row of facing planes: a ray through any of them crosses the first on its way."""
-    x = np.arange(11, 14, CELL_M) + 0.05
-    centres = np.column_stack([x, np.full(len(x), 0.2), np.full(len(x), 0.2)]).astype(np.float32)
-    rows = np.concatenate([centres, np.tile([[-1.0, 0, 0, 0, np.inf]], (len(x), 1))], 1).astype(np.float32)
-    surfels = SurfelMap(cell_keys(centres, CELL_M), rows, CELL_M)
-    rng = np.random.default_rng(1)
-    targets = np.column_stack([rng.uniform(11, 14, 500), rng.uniform(0.05, 0.35, (500, 2))])
-    rays = targets - sensor
-    points = sensor + rays * 1.6
-    range_m = np.linalg.norm(points - sensor, axis=1)
-    found = surfels.first_crossings(
-        points.astype(np.float32),
-        ((points - sensor) / range_m[:, None]).astype(np.float32),
-        range_m.astype(np.float32),
-        0.0, 0.0, 0.1, 2.0,
-    )  # fmt: skip
-    # Where each ray meets each plane, and whether that is well inside the plane's cell.
-    t = (centres[None, :, 0] - sensor[0]) / rays[:, None, 0]
-    at = np.asarray(sensor) + t[..., None] * rays[:, None]
-    inside = (np.abs(at[..., 1:] - 0.2) < 0.19).all(axis=2) & (points[:, None, 0] > centres[None, :, 0] + 0.2)
-    surely = inside.any(axis=1)
-    assert surely.sum() > 20
-    first = np.argmax(inside, axis=1)
-    assert (found[surely] >= 0).all()
-    assert (found[surely] <= first[surely]).all()  # an earlier one may be met within the slack of its cell
-
-
-def test_rays_beyond_the_lattice_cross_nothing():
-    far = np.array([[1e9, 0, 0]], np.float32)
-    direction = np.array([[1.0, 0, 0]], np.float32)
-    for point, range_m in (
-        (far, 10.0),
-        (far, 1e9),
-        (far * np.nan, 1.0),
-        (np.zeros((1, 3), np.float32), np.nan),
-    ):
-        ranges = np.array([range_m], np.float32)
-        assert one_surfel().first_crossings(point, direction, ranges, 0.1, 0.1, 0.1, 2.0).tolist() == [-1]
-
-
-def test_shapes_are_checked():
-    with pytest.raises(ValueError, match="surfels"):
-        SurfelMap(np.zeros(2, np.uint64), np.zeros((2, 7), np.float32), CELL_M)
-    with pytest.raises(ValueError, match="cell_size_m"):
-        SurfelMap(np.zeros(0, np.uint64), np.zeros((0, 8), np.float32), 0.0)
-    with pytest.raises(ValueError, match="points"):
-        one_surfel().first_crossings(
-            np.zeros((2, 3), np.float32), np.zeros((1, 3), np.float32), np.zeros(1, np.float32), 0, 0, 0, 0
-        )
-
-
-def test_support_counts_the_returns_in_27_cells():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
-    cells = np.floor(points / np.float32(0.2)).astype(int)
-    leaf_keys, first = np.unique(cell_keys(points, 0.2), return_index=True)
-    expected = [(np.abs(cells - cell).max(axis=1) <= 1).sum() for cell in cells[first]]
-    counts = np.unique(cell_keys(points, 0.2), return_counts=True)[1].astype(float)
-    support = support_at(leaf_keys, leaf_keys, counts)
-    np.testing.assert_array_equal(support, expected)
-    assert support_at(leaf_keys[:1], leaf_keys[:1], np.array([70_000.0])).tolist() == [65535]
 
 
 def test_returns_per_cell_are_those_of_cells_that_hold_any():

@@ -14,7 +14,6 @@ TILE_M = 12.8
 CONFIG = FitConfig.quick(
     num_threads=1,
     encoding={"bridge_cells": 0},
-    training={"intensity_iterations": 40, "intensity_batch_size": 1024},
 )
 
 

@@ -22,12 +22,12 @@ def disputed(city, points_on_border, monkeypatch):
     """A city of which one tile knows nothing in every second cell in height, and says other distances than the rest."""
     tile = next(tile for tile in city.plan.grid.counting(points_on_border) if city.has(tile))
     contents = city.contents_of(tile)
-    cells, field, leaf_m = contents.field.cells, contents.field, city.config.leaf_size_m
-    occupied, signed_distance = cells.occupied, field.signed_distance
+    field, leaf_m = contents.field, city.config.leaf_size_m
+    occupied, sdf = field.occupied, field.sdf
     monkeypatch.setattr(
-        cells, "occupied", lambda p: occupied(p) & (torch.floor(p[:, 2] / (4 * leaf_m)) % 2 == 0)
+        field, "occupied", lambda p: occupied(p) & (torch.floor(p[:, 2] / (4 * leaf_m)) % 2 == 0)
     )
-    monkeypatch.setattr(field, "signed_distance", lambda p: signed_distance(p) + OFFSET_M)
+    monkeypatch.setattr(field, "sdf", lambda p: sdf(p) + OFFSET_M)
     return city
 
 
@@ -45,9 +45,9 @@ def quarrelling(city, points_on_border, monkeypatch):
     counting = [tile for tile in city.plan.grid.counting(points_on_border) if city.has(tile)]
     for number, tile in enumerate(counting):
         contents = city.contents_of(tile)
-        field, occupied = contents.field, contents.field.cells.occupied
+        field, occupied = contents.field, contents.field.occupied
         shift_m = number * OFFSET_M
-        distance = field.signed_distance
+        distance = field.sdf
 
         def knows(p, occupied=occupied, number=number, contents=contents):
             cells = torch.floor(p * np.float32(1 / leaf_m)).double()
@@ -56,8 +56,8 @@ def quarrelling(city, points_on_border, monkeypatch):
             lacks = (cells @ torch.tensor([3.0, 5.0, 7.0], dtype=torch.float64)) % 5 == number
             return occupied(p) & ~(lacks & ~near_border)
 
-        monkeypatch.setattr(contents.field.cells, "occupied", knows)
-        monkeypatch.setattr(field, "signed_distance", lambda p, d=distance, shift_m=shift_m: d(p) + shift_m)
+        monkeypatch.setattr(contents.field, "occupied", knows)
+        monkeypatch.setattr(field, "sdf", lambda p, d=distance, shift_m=shift_m: d(p) + shift_m)
     return city
 
 
@@ -128,7 +128,7 @@ def test_knowledge_is_the_distance_to_what_is_not_observed(city):
     tile = city.tiles[0].tile
     contents = city.contents_of(tile)
     leaf_m = city.config.leaf_size_m
-    cells = contents.field.cells.table.leaf_cells()[::50].astype(np.float32)
+    cells = contents.field.table.leaf_cells()[::50].astype(np.float32)
     points = torch.from_numpy(
         (cells + np.random.default_rng(0).uniform(0.05, 0.95, cells.shape)).astype(np.float32) * leaf_m
     )

@@ -21,7 +21,7 @@ def in_one_go(city, steps, min_triangles):
     voxel_m = city.config.leaf_size_m / steps
     parts = []
     for tile in city.tiles:
-        cells = city.contents_of(tile.tile).field.cells.table.leaf_cells() + plan.origin_cells(tile.tile)
+        cells = city.contents_of(tile.tile).field.table.leaf_cells() + plan.origin_cells(tile.tile)
         weights, _ = plan.grid.weights(tile.tile, city.config.lattice.position(cells + 0.5))
         parts.append(cells[weights > 0])
     owned = {tile.tile for tile in city.tiles}
@@ -149,7 +149,7 @@ def test_the_surface_is_where_one_map_has_it(city, drive):
 
 
 def test_a_mesh_that_memory_cannot_hold(city, tmp_path, monkeypatch):
-    monkeypatch.setattr("radarsdf.budget.estimate.available_bytes", lambda: 10**6)
+    monkeypatch.setattr("radarsdf.memory.available_bytes", lambda: 10**6)
     with pytest.raises(MemoryError, match="radarsdf tiles mesh"):
         city.mesh(0.2, progress=False)
     assert city.export(tmp_path / "mesh.ply", 0.2, progress=False)[1] > 10**6 / 320

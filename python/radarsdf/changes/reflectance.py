@@ -19,7 +19,7 @@ from radarsdf.changes.probability import (
     share_of_changes,
 )
 from radarsdf.products import turned
-from radarsdf.returns.echoes import PLACE_CELLS, EchoesAt, rows_of_views
+from radarsdf.returns.view_statistics import PLACE_CELLS, EchoesAt, rows_of_views
 
 _SAME_UNITS = np.sqrt(2)  # units differ by factors of 2 at least, as half decibels and decibels do
 _FEWEST_VIEWS = 10

@@ -6,15 +6,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from radarsdf.budget.estimate import estimate_rays
-from radarsdf.budget.extent import check_extent
 from radarsdf.checking.common_surfaces import check_poses_by_noise
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import Recording
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.fitting.estimate import check_extent, estimate_rays
 from radarsdf.returns.noise import sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.surfels import Surfels
 
 _CLOSE_M = 25.0  # farther returns are below the ground by their noise in elevation
 _BIN_M = 0.25

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from radarsdf.checking.finding import Finding
 from radarsdf.returns.noise import SensorNoise, variances_across
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.surfels import Surfels
 
 FloatArray = NDArray[np.float64]
 

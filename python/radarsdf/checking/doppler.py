@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import FloatArray, Recording
-from radarsdf.returns.doppler import MIN_DOPPLER_RETURNS, sensor_velocities
+from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _STILL_MPS = 0.3  # slower, the direction of a velocity tells nothing
 _MIN_SCANS = 4

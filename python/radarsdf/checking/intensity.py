@@ -8,7 +8,7 @@ import numpy as np
 
 from radarsdf.checking.finding import Finding
 from radarsdf.checking.recording import FloatArray, Recording
-from radarsdf.returns.plausible import Plausible
+from radarsdf.returns.intensities import Plausible
 
 _SOME, _MANY = 0.005, 0.05  # share of the returns at the highest value
 _ABOVE_NEXT = 5.0  # times the share at each of the next values

@@ -15,7 +15,7 @@ from radarsdf.checking.frames import FULL, Effort
 from radarsdf.checking.recording import FloatArray, Recording
 from radarsdf.checks import are_rigid
 from radarsdf.poses.rigid import steps, turned_by
-from radarsdf.returns.doppler import folding_interval_mps, sensor_velocity
+from radarsdf.returns.moving import folding_interval_mps, sensor_velocity
 
 _MAX_ROTATION_ERROR = 1e-3  # as of the poses that a fit accepts
 # No radar that gives points sees most of them from farther away, and none has most of them at its own housing.

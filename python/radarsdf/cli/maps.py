@@ -235,11 +235,11 @@ def render(
     """
     import numpy as np
 
-    from radarsdf.budget.estimate import check_views
     from radarsdf.io.clouds.writing import write_cloud
     from radarsdf.io.files import check_outputs
     from radarsdf.io.npz import write_scans
     from radarsdf.map.view import scans_of_views
+    from radarsdf.memory import check_views
     from radarsdf.render.figures import save_view_picture
 
     suffix = out.suffix.lower()

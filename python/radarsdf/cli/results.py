@@ -137,7 +137,7 @@ def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:
 def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: Scans) -> None:
     """Add the intensity errors on scans that a fit left out, and those of a kNN baseline on the scans that it used."""
     from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
-    from radarsdf.returns.movers import rays_as_measured
+    from radarsdf.returns.moving import rays_as_measured
     from radarsdf.tiles.any_map import predicted
 
     if not radar_map.has_intensity or test.intensities is None:

@@ -15,19 +15,18 @@ from radarsdf.config.groups import (
     EncodingConfig,
     NetworksConfig,
     ReturnsConfig,
-    SamplingConfig,
     TrainingConfig,
 )
+from radarsdf.config.presets import PAPER, QUICK
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import by_name, settings
 
-LATTICE_BLOCK_CELLS = (
-    32  # edge of a block, leaf cells: a multiple of that of the cubes in which looks are counted
-)
+# Edge of a block, leaf cells: a multiple of that of the cubes of visibility counts.
+LATTICE_BLOCK_CELLS = 32
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
 
-_Group = ReturnsConfig | EncodingConfig | NetworksConfig | SamplingConfig | TrainingConfig
+_Group = ReturnsConfig | EncodingConfig | NetworksConfig | TrainingConfig
 
 
 def _from_mapping(group: Any) -> Callable[[Any], Any]:
@@ -51,8 +50,8 @@ class FitConfig:
     Examples
     --------
     >>> config = FitConfig(leaf_size_m=0.3, training={"sdf_iterations": 200})
-    >>> config.training.sdf_iterations, config.near_band_m
-    (200, 0.45)
+    >>> config.training.sdf_iterations, config.sigma_m
+    (200, 0.15)
     """
 
     leaf_size_m: _Length = 0.2
@@ -65,14 +64,15 @@ class FitConfig:
     """Threads of the fit. 0: as many as PyTorch uses."""
     max_memory_bytes: Annotated[int, Field(ge=1, lt=2**63)] | None = None
     """A fit or mesh that takes more is refused with a MemoryError, bytes. None: what the system has left."""
+    train: bool = True
+    """Whether a field is trained (stage 2). Otherwise the surface is the smoothed average of the rays (stage 1), intensities
+    are in closed form, and of the groups only `returns` and `encoding.bridge_cells` count."""
     returns: Annotated[ReturnsConfig, BeforeValidator(_from_mapping(ReturnsConfig))] = ReturnsConfig()
     """Which returns are used, and how they are cleaned."""
     encoding: Annotated[EncodingConfig, BeforeValidator(_from_mapping(EncodingConfig))] = EncodingConfig()
     """How a position is encoded for the networks."""
     networks: Annotated[NetworksConfig, BeforeValidator(_from_mapping(NetworksConfig))] = NetworksConfig()
     """The two networks and their inputs."""
-    sampling: Annotated[SamplingConfig, BeforeValidator(_from_mapping(SamplingConfig))] = SamplingConfig()
-    """Where on the rays the training samples are."""
     training: Annotated[TrainingConfig, BeforeValidator(_from_mapping(TrainingConfig))] = TrainingConfig()
     """Losses, schedule and optimiser."""
 
@@ -86,47 +86,21 @@ class FitConfig:
             seed: int = ...,
             num_threads: int = ...,
             max_memory_bytes: int | None = ...,
+            train: bool = ...,
             returns: ReturnsConfig | Mapping[str, Any] = ...,
             encoding: EncodingConfig | Mapping[str, Any] = ...,
             networks: NetworksConfig | Mapping[str, Any] = ...,
-            sampling: SamplingConfig | Mapping[str, Any] = ...,
             training: TrainingConfig | Mapping[str, Any] = ...,
         ) -> None: ...
 
-    def __post_init__(self) -> None:
-        if self.training.start != "noise":
-            if self.encoding.kind != "octree" or min(self.networks.sdf_hidden) < 2:
-                msg = f"training.start {self.training.start!r} needs encoding.kind 'octree' and networks.sdf_hidden of at least 2"
-                raise ValueError(msg)
-            # A vertex of the map that no ray counts at would keep the distance 0, that of the surface.
-            if self.training.truncation_cells < self.sampling.near_band_cells:
-                msg = f"training.truncation_cells must be at least sampling.near_band_cells, {self.sampling.near_band_cells}"
-                raise ValueError(msg)
-
-    @property
-    def near_band_m(self) -> float:
-        """`sampling.near_band_cells`, m."""
-        return self._metres(self.sampling.near_band_cells)
-
-    @property
-    def free_beyond_m(self) -> float:
-        """`sampling.free_beyond_cells`, m."""
-        return self._metres(self.sampling.free_beyond_cells)
-
-    @property
-    def truncation_m(self) -> float:
-        """`training.truncation_cells`, m."""
-        return self._metres(self.training.truncation_cells)
+    def metres(self, cells: float) -> float:
+        """A length in leaf cells, m."""
+        return float(f"{cells * self.leaf_size_m:.12g}")  # 1.5 · 0.2 gives 0.3, not 0.30000000000000004
 
     @property
     def sigma_m(self) -> float:
         """`training.sigma_cells`, m."""
-        return self._metres(self.training.sigma_cells)
-
-    @property
-    def fourier_half_width_m(self) -> float:
-        """`encoding.fourier_half_width_cells`, m."""
-        return self._metres(self.encoding.fourier_half_width_cells)
+        return self.metres(self.training.sigma_cells)
 
     @property
     def lattice(self) -> WorldLattice:
@@ -142,12 +116,12 @@ class FitConfig:
     @property
     def trains_intensity(self) -> bool:
         """Whether intensities, where there are any, train a network."""
-        return self.networks.reflectance != "closed-form"
+        return self.train and self.networks.reflectance != "closed-form"
 
     @property
     def closes_intensity(self) -> bool:
         """Whether intensities, or what a network leaves of them, are in closed form."""
-        return self.networks.reflectance != "network"
+        return not self.train or self.networks.reflectance != "network"
 
     def moves_rows(self, with_intensity: bool) -> bool:
         """Whether an iteration changes only the features that its samples use: see `training.row_updates`."""
@@ -156,31 +130,16 @@ class FitConfig:
         through_normals = with_intensity and self.training.joint and self.networks.normals
         return self.training.row_updates and not through_normals
 
-    def differentiates_in_core(self, with_intensity: bool) -> bool:
-        """Whether the gradients come from the compiled core: see `training.gradients`."""
-        # Normals are gradients, and the core does not differentiate twice.
-        normals = with_intensity and self.networks.normals
-        return self.training.gradients == "core" and not normals
-
-    def _metres(self, cells: float) -> float:
-        return float(f"{cells * self.leaf_size_m:.12g}")  # 1.5 · 0.2 gives 0.3, not 0.30000000000000004
-
     @classmethod
     def quick(cls, **changes: Any) -> FitConfig:
-        """Settings for a surface that is averaged over the rays and smoothed, instead of trained.
+        """Settings for stage 1 only: a surface that is averaged over the rays and smoothed, instead of trained.
 
         The fit takes a fraction of the time; the map is larger. Mesh it with voxels of the size of its leaf cells, since
         smaller ones show no more detail. Intensities are in closed form, and take a quarter to a half of the time
         without them. Free space is not kept: for that, change ``returns.passages``.
         `changes`: as for :meth:`override`.
         """
-        return cls(
-            returns=ReturnsConfig(passages=False),
-            encoding=EncodingConfig(kind="octree", num_levels=1, fourier_count=0),
-            networks=NetworksConfig(sdf_hidden=(2,), reflectance="closed-form"),
-            sampling=SamplingConfig(near_band_cells=2.0),
-            training=TrainingConfig(start="smoothed", sdf_iterations=0, joint=False),
-        ).override(**changes)
+        return cls().override(**QUICK).override(**changes)
 
     @classmethod
     def paper(cls, **changes: Any) -> FitConfig:
@@ -188,35 +147,7 @@ class FitConfig:
 
         For a mesh as published, call ``mesh(min_confidence=0, max_uncertainty=math.inf, min_component_triangles=300)``.
         """
-        return cls(
-            returns=ReturnsConfig(
-                accumulate_scans=5, drop_movers=False, drop_ghosts=False, onto_planes=False, passages=False
-            ),
-            encoding=EncodingConfig(bridge_cells=0, fourier_count=16),
-            networks=NetworksConfig(
-                intensity_hidden=(64, 64),
-                geometry_feature_dim=15,
-                reflectance="network",
-                normals=True,
-                log_range=False,
-                feature_dropout=0.0,
-                fourier_dropout=0.0,
-            ),
-            sampling=SamplingConfig(cross_range_noise_rad=0.0),
-            training=TrainingConfig(
-                sigma_cells=0.1375,  # 0.55 · 0.05 m
-                intensity_in_free_space=True,
-                batch_size=8192,
-                intensity_batch_size=8192,
-                sdf_iterations=1000,
-                intensity_iterations=4000,
-                optimiser="adam",
-                learning_rate=1e-3,
-                intensity_learning_rate=1e-3,
-                cosine_schedule=False,
-                row_updates=False,
-            ),
-        ).override(**changes)
+        return cls().override(**PAPER).override(**changes)
 
     def override(self, /, **changes: Any) -> FitConfig:
         """This configuration with some settings changed.

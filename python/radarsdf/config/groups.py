@@ -31,7 +31,6 @@ _NoiseRad = Annotated[float, Field(gt=0, le=_MAX_NOISE_RAD)]
 _Positive = Annotated[float, Field(gt=0)]
 _NotNegative = Annotated[float, Field(ge=0)]
 _Count = Annotated[int, Field(ge=1, le=MAX_ITERATIONS)]
-_Dropout = Annotated[float, Field(ge=0, le=0.95)]
 _Widths = Annotated[
     tuple[Annotated[int, Field(ge=1, le=_MAX_WIDTH)], ...],
     Field(min_length=1, max_length=MAX_LAYERS, strict=False),  # TOML and JSON have lists, not tuples
@@ -75,8 +74,9 @@ class ReturnsConfig:
     up to 1 % more error of intensities."""
 
     passages: bool = True
-    """Whether the map keeps which cells rays passed, for :func:`radarsdf.grid` and :func:`radarsdf.compare`. It takes
-    about 1 µs of a processor for each return, and 0.3 kB for each block of 8 × 8 × 8 leaf cells that rays went through."""
+    """Whether the map keeps which cells rays crossed, and mean intensities by place and view, for :func:`radarsdf.grid`
+    and :func:`radarsdf.compare`. It takes about 1 µs of a processor for each return, and 0.3 kB for each block of
+    8 × 8 × 8 leaf cells that rays crossed."""
 
     def __post_init__(self) -> None:
         if self.max_range_m is not None and self.max_range_m <= self.min_range_m:
@@ -100,16 +100,12 @@ class EncodingConfig:
     fourier_count: Annotated[int, Field(ge=0, le=MAX_FREQUENCIES)] = 10
     """Number of Fourier frequencies (3QFP: 16). The tenth has a wavelength of 8 leaf cells, twice the edge of
     the coarsest cells; details inside these are left to the features. Shorter wavelengths fit the noise."""
-    fourier_half_width_cells: _Positive = 2048.0
-    """Half of the longest Fourier wavelength, in leaf cells (3QFP: 409.6 m)."""
 
 
 @settings
 class NetworksConfig:
     """The two networks and their inputs."""
 
-    sdf_hidden: _Widths = (32, 32)
-    """Widths of the hidden layers of the SDF network (3QFP)."""
     intensity_hidden: _Widths = (64, 64, 64)
     """Widths of the hidden layers of the intensity network (3QFPI: 64, 64). Measured: the third gives 1 to 3
     % less error."""
@@ -128,51 +124,18 @@ class NetworksConfig:
     """Whether the intensity network sees the signed distance (3QFPI)."""
     view_direction: bool = True
     """Whether the intensity network sees the viewing direction (3QFPI)."""
+    dropout: bool = True
+    """Whether features and Fourier encoding are dropped at random before the intensity network (3QFPI: no). Measured: 0 to
+    2 % less error on long simulated scenes, 7 to 8 % on short ones, 1 to 3 % on real ones."""
     log_range: bool = True
     """Whether the intensity network sees log10(range / 10 m), since the received power falls with r^-4
     (3QFPI: no). Measured: 5 to 10 % less error, and no loss for a sensor that compensates for the range."""
-    feature_dropout: _Dropout = 0.85
-    """Dropout of the cells' features before the intensity network (3QFPI: 0). If the training uses each
-    sample n times, this is multiplied by n / (n + 2.5): the more often a sample is used, the more easily the
-    network memorises it. Measured together with `fourier_dropout`: 0 to 2 % less error on long simulated
-    scenes, 7 to 8 % on short ones, 1 to 3 % on real ones."""
-    fourier_dropout: _Dropout = 0.25
-    """The same for the Fourier encoding (3QFPI: 0)."""
-
-
-@settings
-class SamplingConfig:
-    """Where on the rays the training samples are."""
-
-    near_samples: Annotated[int, Field(ge=1, le=MAX_SAMPLES)] = 6
-    """Samples near the surface for each return in one pass (3QFPI: 6)."""
-    free_samples: Annotated[int, Field(ge=0, le=MAX_SAMPLES)] = 6
-    """Samples in free space for each return in one pass (3QFPI: 6)."""
-    near_band_cells: _Positive = 1.5
-    """Samples near the surface are uniform within this distance of the return, in leaf cells (3QFP: 0.3
-    m)."""
-    free_from: Annotated[float, Field(ge=0, lt=1)] = 0.3
-    """Samples in free space begin at this share of the range (3QFP: 0.3)."""
-    free_beyond_cells: _NotNegative = 4.0
-    """Samples in free space end this far behind the return, in leaf cells (3QFP: 0.8 m)."""
-    cross_range_noise_rad: _NotNegative = 0.005
-    """Noise across the beam that is added to the samples of the intensity stage, as the sensor's noise
-    displaces returns: standard deviation, rad (3QFPI: 0)."""
 
 
 @settings
 class TrainingConfig:
     """Losses, schedule and optimiser."""
 
-    start: Literal["noise", "average", "smoothed"] = "noise"
-    """What the training starts from: random numbers (3QFP), the average of the rays' truncated signed distances (Curless
-    and Levoy, 1996), or that average moved towards distances that agree with the planes of returns and bend little
-    (thin plates). The last two need an octree. Measured of the last, without training: 1.4 points of F-score more than
-    the average on simulated scenes, 1.8 on recorded drives; of every sixth scan 3.5 and 0.6."""
-    truncation_cells: _Positive = 3.0
-    """For that average: distances are truncated here, and a ray counts up to this far before and behind its
-    return, in leaf cells (VDBFusion: 3 voxels). Measured: 4 and 5 are as good on simulated scenes, 0.5 and
-    1.2 points worse on real ones."""
     sigma_cells: _Positive = 0.5
     """Scale of the sigmoid from signed distance to occupancy, in leaf cells (3QFP: 0.0275 m). Measured: 0.4
     to 0.75 differ by 0.2 points of F-score on simulated scenes; on real ones 0.4 to 0.5 are 0.4 to 2 points
@@ -193,11 +156,14 @@ class TrainingConfig:
     """Samples that the intensity network sees in an iteration, unless it sees free space in joint ones (3QFPI:
     8192). Measured: likewise; 2048 take 1.5 to 1.8 times as long, and have 0.3 to 0.7 % less error on simulated
     scenes."""
-    sdf_iterations: Annotated[int, Field(ge=0, le=MAX_ITERATIONS)] | None = None
+    sdf_iterations: _Count | None = None
     """Iterations of the sdf stage. It trains features and SDF network, which are then frozen (3QFPI: 1000).
-    None: from the size of the data and `effort`. 0: the field stays as it is at the start."""
+    None: from the size of the data and `effort`."""
     intensity_iterations: _Count | None = None
     """Iterations that train the intensity network, joint ones included (3QFPI: 4000). None: likewise."""
+    cross_range_noise_rad: _NotNegative = 0.005
+    """Noise across the beam that is added to the samples of the intensity stage, as the sensor's noise displaces
+    returns: standard deviation, rad (3QFPI: 0)."""
     optimiser: Literal["soap", "adam"] = "soap"
     """What moves the weights of the networks: SOAP (Vyas et al., ICLR 2025) or Adam (3QFPI). Features always have Adam.
     Measured: with SOAP, the networks learn as much in a quarter to a half of the iterations."""
@@ -212,6 +178,3 @@ class TrainingConfig:
     row_updates: bool = True
     """Whether an iteration changes only the features that its samples use. Otherwise Adam's momentum changes
     the others too (3QFP). Joint iterations with `normals` always change all features."""
-    gradients: Literal["core", "autograd"] = "core"
-    """What computes losses and gradients: the compiled core in one call, or PyTorch's autograd, which is the
-    reference and takes two to three times as long. With `normals` it is always autograd."""

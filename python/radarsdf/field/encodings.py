@@ -58,10 +58,6 @@ class VertexFeatures(nn.Module):
     def combine(self, interpolated: Tensor) -> Tensor:
         """The encoding (N, width) from the interpolated features (N, `interpolated_dim`)."""
 
-    def occupied(self, points: Tensor) -> Tensor:
-        """Whether each point (N, 3), local frame, m, lies in an occupied leaf cell: (N,) bool."""
-        return kernels.locate(points, self.table)[:, 0] >= 0
-
 
 class TriQuadtree(VertexFeatures):
     """Features on quadtrees in the planes xy, xz and yz (3QFP, ICRA 2024).

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Autograd functions over the compiled core.
+"""Autograd functions over the compiled core: interpolation in cells, Fourier encoding, multi-layer perceptrons.
 
 They are :class:`torch.autograd.Function`, not ``torch.library`` operators. Measured at 16, 1024 and 8192
 points, forward and backward of an operator take 10 to 17 µs more (at 16 points 40 to 47 instead of 30 µs).
@@ -13,32 +13,19 @@ threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
-from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Crew, VertexTable
-from radarsdf._core import fourier as _fourier
-from radarsdf._core import spherical_harmonics as _spherical_harmonics
+from radarsdf import _core
+from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, VertexTable
 
 _CACHE_LINE = 64  # bytes
-
-
-@dataclass(frozen=True)
-class AdamMemory:
-    """What :func:`adam_step` remembers of each row of features between steps."""
-
-    moments: Tensor
-    """(num_rows, 16): mean (8) and mean square (8) of the row's gradients."""
-    marks: Tensor
-    """(num_rows, 2) int32: the last step that changed the row, 0 for none; then a mark that the core uses
-    during a step, and that is 0 between steps."""
 
 
 def view(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -53,11 +40,9 @@ def rows_view(tensor: Tensor) -> np.ndarray[Any, Any]:
 
 
 def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Zeros of this shape in huge memory pages, for random access.
-
-    NumPy asks for huge pages from 4 MB on, PyTorch does not. With small pages, a step of Adam on a map of a
-    million rows takes 1.5 times as long.
-    """
+    """Zeros of this shape in huge memory pages, for random access."""
+    # NumPy asks for huge pages from 4 MB on, PyTorch does not. With small pages, a step of Adam on a map of a million rows
+    # takes 1.5 times as long.
     like = torch.empty(0, dtype=dtype, device="cpu").numpy()
     numbers = np.zeros(math.prod(shape) + _CACHE_LINE, like.dtype)
     first = -numbers.ctypes.data % _CACHE_LINE // numbers.itemsize  # else a row would lie in two lines
@@ -166,9 +151,7 @@ class _InterpolateBackward(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None]:
         ctx.save_for_backward(out_grad, features, points, located)
         ctx.table = table
-        ctx.set_materialize_grads(
-            False
-        )  # an unused gradient is then None: no time is spent on interpolating zeros
+        ctx.set_materialize_grads(False)  # an unused gradient is then None, not zeros to interpolate
         return (
             scatter(table, points, located, None, out_grad) if needs_features else None,
             _coordinate_gradient(table, features, points, located, None, out_grad) if needs_points else None,
@@ -206,7 +189,7 @@ class _Fourier(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, half_width_m: float, first: int, count: int) -> Tensor:
         out = points.new_empty((points.shape[0], 6 * count))
-        _fourier(view(points), half_width_m, first, count, out.numpy(), threads())
+        _core.fourier(view(points), half_width_m, first, count, out.numpy(), threads())
         ctx.save_for_backward(out)
         ctx.frequencies = (half_width_m, first, count)
         return out
@@ -256,60 +239,6 @@ def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor
     return out, located
 
 
-@contextmanager
-def adam_step(
-    table: VertexTable,
-    batches: Sequence[tuple[Tensor, Tensor, Tensor]],
-    features: Tensor,
-    memory: AdamMemory,
-    decays: Tensor,
-    *,
-    step: int,
-    learning_rate: float,
-    epsilon: float,
-    crew: Crew,
-) -> Iterator[None]:
-    """A step of Adam, in place, on the rows of features that batches touch. Other rows do not change.
-
-    The other threads of `crew` do it during the ``with`` block. At its end, the calling thread helps them.
-
-    Parameters
-    ----------
-    table : VertexTable
-        The rows of `features` at the vertices of each cell.
-    batches : sequence of (points, located, gradient)
-        Points (N, 3), local frame, m; their cells (N, num_levels) int32, from :func:`locate`; and the
-        gradient of the loss with respect to the interpolated features (N, 8 · num_levels).
-    features : Tensor
-        (num_rows, 8).
-    memory : AdamMemory
-        State of Adam from the steps before.
-    decays : Tensor
-        (more than `step`, 2): both betas of Adam to the powers 0, 1, …
-    step : int
-        Number of this step, from 1 on.
-    learning_rate, epsilon : float
-        Adam's.
-    crew : Crew
-        Threads.
-    """
-    table.begin_adam_step(
-        [(view(points), located.numpy(), rows_view(grad)) for points, located, grad in batches],
-        view(features),
-        memory.moments.numpy(),
-        memory.marks.numpy(),
-        decays.numpy(),
-        step,
-        learning_rate,
-        epsilon,
-        crew,
-    )
-    try:
-        yield
-    finally:
-        crew.finish()
-
-
 def locate(points: Tensor, table: VertexTable) -> Tensor:
     """Row of the occupied cell that holds each point (N, 3), local frame, m, at each level.
 
@@ -321,10 +250,7 @@ def locate(points: Tensor, table: VertexTable) -> Tensor:
 
 
 def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequencies: int) -> Tensor:
-    """Sines, then cosines, of 2^k·π·points / half_width_m from k = first_frequency on.
-
-    (N, 6 · num_frequencies).
-    """
+    """Sines, then cosines, of 2^k·π·points / half_width_m from k = first_frequency on: (N, 6 · num_frequencies)."""
     return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-any-return, no-untyped-call]
 
 
@@ -334,5 +260,88 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
         msg = "spherical_harmonics has no gradient with respect to the directions"
         raise NotImplementedError(msg)
     out = directions.new_empty((directions.shape[0], NUM_SPHERICAL_HARMONICS))
-    _spherical_harmonics(view(directions), out.numpy(), threads())
+    _core.spherical_harmonics(view(directions), out.numpy(), threads())
     return out
+
+
+def mlp(inputs: Sequence[Tensor], layers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """Linear layers with ReLU between them.
+
+    The core takes a few rows at a time through all layers. PyTorch, which takes all rows through one layer
+    after the other, needs 1.5 times as long. It also makes a dozen calls, each of which waits for the
+    interpreter's lock, so two threads would train hardly faster than one.
+
+    Parameters
+    ----------
+    inputs : sequence of Tensor
+        (N, width) each. Side by side they are the input of the first layer.
+    layers : sequence of (weight, bias)
+        (outputs, inputs) and (outputs,) of each layer, like those of ``torch.nn.Linear``.
+
+    Returns
+    -------
+    Tensor
+        (N, outputs of the last layer). It can be differentiated any number of times. The bits of a row do not
+        depend on the other rows. Gradients have the same bits with any number of threads.
+    """
+    return _MLP.apply(len(layers), *(t for layer in layers for t in layer), *inputs)  # type: ignore[no-any-return, no-untyped-call]
+
+
+class _MLP(torch.autograd.Function):
+    # `tensors` are weight and bias of each layer, then the inputs.
+    @staticmethod
+    def forward(ctx: Any, num_layers: int, *tensors: Tensor) -> Tensor:
+        inputs = tensors[2 * num_layers :]
+        out = inputs[0].new_empty((inputs[0].shape[0], tensors[2 * num_layers - 1].shape[0]))
+        keep = any(ctx.needs_input_grad)
+        views = _views(num_layers, tensors)
+        ctx.hidden = _core.mlp(*views, out.numpy(), keep, threads())
+        ctx.views = views
+        ctx.save_for_backward(*tensors)
+        ctx.num_layers = num_layers
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, out_grad: Tensor) -> tuple[Tensor | None, ...]:
+        tensors: tuple[Tensor, ...] = ctx.saved_tensors
+        wanted: tuple[bool, ...] = ctx.needs_input_grad[1:]
+        if torch.is_grad_enabled():  # the gradient may be differentiated again, which the core cannot do
+            chosen = [t for t, w in zip(tensors, wanted, strict=True) if w]
+            found = iter(
+                torch.autograd.grad(_plain(ctx.num_layers, tensors), chosen, out_grad, create_graph=True)
+            )
+            return None, *(next(found) if w else None for w in wanted)
+        split = 2 * ctx.num_layers
+        by_layers = any(wanted[:split])  # the core computes all of them: that takes little longer than one
+        grads = [
+            torch.empty_like(t, memory_format=torch.contiguous_format)
+            if w or (by_layers and i < split)
+            else None
+            for i, (t, w) in enumerate(zip(tensors, wanted, strict=True))
+        ]
+        views: list[Any] = [None if g is None else g.numpy() for g in grads]
+        given: tuple[list[Any], list[Any], list[Any]] = ctx.views
+        _core.mlp_backward(
+            *given,
+            ctx.hidden,
+            rows_view(out_grad),
+            views[:split:2] if by_layers else None,
+            views[1:split:2] if by_layers else None,
+            views[split:],
+            threads(),
+        )
+        return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
+
+
+def _views(num_layers: int, tensors: Sequence[Tensor]) -> tuple[list[Any], list[Any], list[Any]]:
+    """Inputs, weights and biases as the core takes them."""
+    layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
+    return [rows_view(x) for x in inputs], [view(w) for w in layers[::2]], [view(b) for b in layers[1::2]]
+
+
+def _plain(num_layers: int, tensors: Sequence[Tensor]) -> Tensor:
+    """The same network in PyTorch operations, which autograd can differentiate any number of times."""
+    x = torch.cat(list(tensors[2 * num_layers :]), 1)
+    for i in range(num_layers):
+        x = functional.linear(x if i == 0 else torch.relu(x), tensors[2 * i], tensors[2 * i + 1])
+    return x

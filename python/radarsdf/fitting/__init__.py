@@ -1,3 +1,5 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From returns to a map: sampling, gradients, optimisers, the training loop and checkpoints."""
+"""From scans with poses to a map: the steps of a fit, its two stages, and what it will cost."""
+
+import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime

@@ -17,9 +17,9 @@ from torch import Tensor
 from radarsdf import _core
 from radarsdf.checks import path_of
 from radarsdf.config.fit_config import FitConfig, flat_settings, settings_of_results
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 
 FORMAT = "radarsdf.checkpoint"
@@ -29,13 +29,11 @@ _SHARE = 0.02  # largest share of the time that is spent on writing
 
 
 class Resumable(Protocol):
-    """What can go on from a state: a training."""
+    """A training."""
 
-    def state(self) -> dict[str, Tensor]:
-        """All that the rest depends on."""
+    def state(self) -> dict[str, Tensor]: ...
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of the same fit gave. Raises an exception if it is impossible."""
+    def restore(self, state: dict[str, Tensor]) -> None: ...
 
 
 class Checkpoint:
@@ -126,36 +124,31 @@ class Checkpoint:
             raise ValueError(msg) from error
 
     def _check_identity(self) -> None:
-        identity: Any = None
+        ours, found = self._identity, self._identity_of_file()
+        if found is None:
+            msg = f"{self._path} is not a checkpoint of a fit: it is left as it is"
+            raise ValueError(msg)
+        mine, other = flat_settings(ours["config"]), flat_settings(found["config"])
+        changed = sorted(k for k in mine.keys() | other.keys() if mine.get(k, _NONE) != other.get(k, _NONE))
+        for name, what in (
+            ("version", f"was written by radarsdf {found['version']!r:.50}: remove it to begin again"),
+            ("config", f"is a checkpoint of another configuration: {', '.join(changed)!s:.200} differ"),
+            ("scans", "is a checkpoint of other scans, poses or intensities"),
+        ):
+            if found[name] != ours[name]:
+                msg = f"{self._path} {what}"
+                raise ValueError(msg)
+
+    def _identity_of_file(self) -> dict[str, Any] | None:
+        """None: it is no checkpoint."""
         try:
             with open_tensors(self._path) as file:
                 metadata = file.metadata
-            if metadata.get("format") == FORMAT:
-                identity = json.loads(metadata["identity"])
+            found: Any = json.loads(metadata["identity"]) if metadata.get("format") == FORMAT else None
         except (SafetensorError, KeyError, ValueError, RecursionError):
-            pass
-        if (
-            not isinstance(identity, dict)
-            or identity.keys() != self._identity.keys()
-            or not isinstance(identity["config"], dict)
-        ):
-            msg = f"{self._path} is not a checkpoint of a fit: it is left as it is"
-            raise ValueError(msg)
-        if identity["version"] != self._identity["version"]:
-            msg = (
-                f"{self._path} was written by radarsdf {identity['version']!r:.50}: remove it to begin again"
-            )
-            raise ValueError(msg)
-        if identity["config"] != self._identity["config"]:
-            ours, theirs = flat_settings(self._identity["config"]), flat_settings(identity["config"])
-            names = sorted(
-                k for k in ours.keys() | theirs.keys() if ours.get(k, _NONE) != theirs.get(k, _NONE)
-            )
-            msg = f"{self._path} is a checkpoint of another configuration: {', '.join(names)!s:.200} differ"
-            raise ValueError(msg)
-        if identity["scans"] != self._identity["scans"]:
-            msg = f"{self._path} is a checkpoint of other scans, poses or intensities"
-            raise ValueError(msg)
+            return None
+        whole = isinstance(found, dict) and found.keys() == self._identity.keys()
+        return found if whole and isinstance(found["config"], dict) else None
 
 
 def _digest(rays: Rays, scale: IntensityScale | None) -> str:

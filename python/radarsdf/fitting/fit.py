@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import MISSING_POSES, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.scans import Scans, filled
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.movers import Standing
+from radarsdf.returns.intensities import IntensityScale
+from radarsdf.returns.moving import Standing
 from radarsdf.returns.rays import prepare
 
 
@@ -68,8 +68,7 @@ def fit(
     -------
     RadarMap
         Its ``report`` has the times and counts of the fit. The same input and seed give the same bits, with any
-        number of threads. Only where the gradients are PyTorch's (``training.gradients``, ``networks.normals``) does
-        the rounding depend on it.
+        number of threads. Only where the gradients are PyTorch's (``networks.normals``) does the rounding depend on it.
 
     Raises
     ------

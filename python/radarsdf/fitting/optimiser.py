@@ -12,8 +12,8 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf._core import FEATURE_DIM
-from radarsdf.field import kernels
 from radarsdf.field.encodings import VertexFeatures
+from radarsdf.field.kernels import large_zeros, rows_view, view
 from radarsdf.fitting.gradients import Touched
 from radarsdf.threads import Workers
 
@@ -22,17 +22,7 @@ _EPSILON = 1e-15  # 3QFP
 
 
 class Optimiser(ABC):
-    """Changes tensors by their gradients.
-
-    Attributes
-    ----------
-    parameters : list of Tensor
-        The tensors that are optimised.
-    learning_rate : float
-        Learning rate of the next step.
-    full_rate : float
-        Learning rate at the start.
-    """
+    """Changes `parameters` by their gradients. `learning_rate` is that of the next step, `full_rate` that of the start."""
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         self.parameters = list(parameters)
@@ -44,13 +34,7 @@ class Optimiser(ABC):
 
     @abstractmethod
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of an optimiser of the same parameters gave.
-
-        Raises
-        ------
-        ValueError
-            If no optimiser can have that state.
-        """
+        """Restores what :meth:`state` of an optimiser of the same parameters returned. ValueError: none can have that state."""
 
     @abstractmethod
     def step(self, gradients: Sequence[Tensor]) -> None:
@@ -115,7 +99,7 @@ class Soap(Optimiser):
         self._others = [i for i, yes in enumerate(is_matrix) if not yes]
         self._adam = Adam(_at(self._others, self.parameters), learning_rate)
         matrices = _at(self._matrices, self.parameters)
-        self._weights = [kernels.view(p) for p in matrices]
+        self._weights = [view(p) for p in matrices]
         self._memories = [p.new_zeros(_core.soap_memory_size(*p.shape)) for p in matrices]
 
     def state(self) -> dict[str, Tensor]:
@@ -156,13 +140,6 @@ class RowAdam:
     The mean and mean square of an untouched row decay as with a gradient of zero, but the row does not
     change. Adam would go on to move it along its last gradient, by up to thirty times the learning rate.
     Measured: the surface is as good without that (``bench/history/time.md``).
-
-    Attributes
-    ----------
-    learning_rate : float
-        Learning rate of the next step.
-    full_rate : float
-        Learning rate at the start.
     """
 
     def __init__(self, cells: VertexFeatures, learning_rate: float) -> None:
@@ -170,10 +147,9 @@ class RowAdam:
         self.step_count = 0
         self._cells = cells
         rows, dtype = len(cells.features), cells.features.dtype
-        self._memory = kernels.AdamMemory(
-            moments=kernels.large_zeros(rows, 2 * FEATURE_DIM, dtype=dtype),
-            marks=kernels.large_zeros(rows, 2, dtype=torch.int32),
-        )
+        # Of each row: mean and mean square of its gradients; the last step that changed it, and a mark of the core's.
+        self._moments = large_zeros(rows, 2 * FEATURE_DIM, dtype=dtype)
+        self._marks = large_zeros(rows, 2, dtype=torch.int32)
         self._decays = torch.zeros(0, 2, dtype=dtype, device="cpu")
 
     @property
@@ -183,54 +159,41 @@ class RowAdam:
 
     def state(self) -> dict[str, Tensor]:
         """All that the next steps depend on, except the features. The tensors are not copied."""
-        memory = self._memory
         count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
-        return {"moments": memory.moments, "last_step": memory.marks[:, :1], "step_count": count}
+        return {"moments": self._moments, "last_step": self._marks[:, :1], "step_count": count}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of an optimiser of the same features gave.
-
-        Raises
-        ------
-        ValueError
-            If a row changed later than the last step.
-        """
+        """Restores what :meth:`state` returned. ValueError: a row changed later than the last step."""
         count, last_step = int(state["step_count"]), state["last_step"]
-        if count < 0 or (
-            last_step.numel() and not 0 <= int(last_step.min()) <= int(last_step.max()) <= count
-        ):
+        first, last = (int(last_step.min()), int(last_step.max())) if last_step.numel() else (0, 0)
+        if not 0 <= first <= last <= count:
             msg = f"a row cannot have moved after step {count}"  # the core does not check it
             raise ValueError(msg)
-        self._memory.moments.copy_(state["moments"])
-        self._memory.marks[:, :1].copy_(last_step)
+        self._moments.copy_(state["moments"])
+        self._marks[:, :1].copy_(last_step)
         self.step_count = count
 
     @torch.no_grad()
-    def step(
-        self,
-        touched: Sequence[Touched],
-        workers: Workers,
-        meanwhile: Callable[[], None],
-    ) -> None:
-        """Changes the rows that batches touched.
-
-        The calling thread runs `meanwhile` first, and then helps the other threads with the rows.
-        """
+    def step(self, touched: Sequence[Touched], workers: Workers, meanwhile: Callable[[], None]) -> None:
+        """Changes the rows that batches touched. The calling thread runs `meanwhile` first, and then helps the others."""
         self.step_count += 1
         if self.step_count >= len(self._decays):
             powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64, device="cpu")[:, None]
             decays = torch.tensor([_BETAS], dtype=torch.float64, device="cpu") ** powers
             # Denormal numbers would be slow, and make no difference beside a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
-        with kernels.adam_step(
-            self._cells.table,
-            [(t.points, t.located, t.gradient) for t in touched],
-            self._cells.features,
-            self._memory,
-            self._decays,
-            step=self.step_count,
-            learning_rate=self.learning_rate,
-            epsilon=_EPSILON,
-            crew=workers.crew,
-        ):
+        self._cells.table.begin_adam_step(
+            [(view(t.points), t.located.numpy(), rows_view(t.gradient)) for t in touched],
+            view(self._cells.features),
+            self._moments.numpy(),
+            self._marks.numpy(),
+            self._decays.numpy(),
+            self.step_count,
+            self.learning_rate,
+            _EPSILON,
+            workers.crew,
+        )
+        try:
             meanwhile()
+        finally:
+            workers.crew.finish()

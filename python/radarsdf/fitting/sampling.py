@@ -21,11 +21,34 @@ from radarsdf._core import (
     random_bytes,
     stable_order,
 )
-from radarsdf.budget.schedule import near_and_labelled
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import Rays
 
+NEAR_SAMPLES, FREE_SAMPLES = 6, 6
+"""Samples near the surface and in free space for each return in one pass (3QFPI: 6 and 6)."""
+NEAR_BAND_CELLS = 1.5
+"""Samples near the surface are uniform within this distance of the return, leaf cells (3QFP: 0.3 m)."""
+FREE_FROM = 0.3
+"""Samples in free space begin at this share of the range (3QFP: 0.3)."""
+FREE_BEYOND_CELLS = 4.0
+"""Samples in free space end this far behind the return, leaf cells (3QFP: 0.8 m)."""
 _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly over an interval of length 1
+
+
+def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
+    """How many samples of a batch of the sdf stage are near the surface, and how many of these have intensities as labels.
+
+    The intensity network needs no more of them in a large batch than in a batch of its own stage.
+    """
+    near = max(1, round(batch_size * (NEAR_SAMPLES / (NEAR_SAMPLES + FREE_SAMPLES))))
+    training = config.training
+    # With labels in free space, a sample without a label of its own would have that of free space.
+    return near, near if training.intensity_in_free_space else min(near, training.intensity_batch_size)
+
+
+def seen_jointly(config: FitConfig, batch_size: int) -> int:
+    """How many samples of a batch of the sdf stage the intensity network sees in a joint iteration."""
+    return batch_size if config.training.intensity_in_free_space else near_and_labelled(config, batch_size)[1]
 
 
 @dataclass(frozen=True)
@@ -94,25 +117,25 @@ class Batch:
 
 
 class RaySampler:
-    """Draws batches of samples from rays. The memory grows with the returns, not with the samples.
+    """Draws batches of samples from rays.
 
-    Rays are taken in random order without replacement, so all are used equally often. The positions on the
-    rays are random. A batch has one sample near the surface and one in free space on each of its rays,
-    instead of all twelve on a twelfth of the rays: so its gradient covers more of the scene.
+    Rays are taken in random order without replacement, and positions on them are random. A batch has one sample near the
+    surface and one in free space on each of its rays, instead of all twelve on a twelfth of the rays: so its gradient
+    covers more of the scene.
 
     Parameters
     ----------
     rays : Rays
         N rays.
     config : FitConfig
-        Its sampling and its lengths are used.
+        Settings of the fit.
     batch_size : int
         Samples in a batch.
     generator : torch.Generator
         Random numbers. The caller saves and restores its state.
     neighbours : int
-        So many rays that follow each other in Morton order of their returns are always taken together. In a
-        large map, the rays of a batch would otherwise be far apart, and share no cache lines.
+        So many rays that follow each other in Morton order of their returns are taken together. In a large map, the rays
+        of a batch would otherwise share no cache lines.
     intensities : Tensor, optional
         (N,) scaled intensities of the rays.
     num_threads : int
@@ -134,10 +157,8 @@ class RaySampler:
         self._generator = generator
         rows = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
         self._rays = torch.from_numpy(rows)
-        self._order = np.zeros(0, np.int64)
-        self._order_from = generator.get_state()
-        """State of the generator before `_order` was drawn."""
-        self._next = 0
+        self._order, self._next = np.zeros(0, np.int64), 0
+        self._order_from = generator.get_state()  # before the order was drawn
         near, labelled = near_and_labelled(config, batch_size)
         # Samples with labels come first, and a batch without them is in Morton order.
         self._counts = (near if intensities is None else labelled, near, batch_size - near)
@@ -171,10 +192,7 @@ class RaySampler:
         self._next = 0
 
     def _take(self, count: int) -> Tensor:
-        """Rows of the next `count` rays of the random order, ascending: in Morton order of their returns.
-
-        After the last ray, a new order is drawn.
-        """
+        """Rows of the next `count` rays of the random order, ascending: in Morton order of their returns."""
         # A whole pass takes every ray once, in any order: of few rays, a batch would draw hundreds of orders.
         passes, count = divmod(count, len(self._rays))
         parts = [np.repeat(np.arange(len(self._rays)), passes)] if passes else []
@@ -191,19 +209,15 @@ class RaySampler:
         return torch.rand(count, generator=self._generator, dtype=torch.float32, device="cpu")
 
     def spread(self, count: int, parts: int = 1) -> Batch:
-        """`count` samples near the surface, in `parts`.
-
-        They are uniform within `near_band_m` along the beam, and have the sensor's angular noise across it.
-        """
-        config = self._config
-        places = self._take(count)
-        sdf_m = (2 * self._uniform(count) - 1) * config.near_band_m
+        """`count` samples in the near band, in `parts`, with the sensor's angular noise across the beam."""
+        places, noise_rad = self._take(count), self._config.training.cross_range_noise_rad
+        sdf_m = (2 * self._uniform(count) - 1) * self._config.metres(NEAR_BAND_CELLS)
         ray = self._rays.index_select(0, places)
         points = _returns(ray) - sdf_m[:, None] * _directions(ray)
-        if config.sampling.cross_range_noise_rad > 0:
+        if noise_rad > 0:
             # Noise in all directions is simpler. Along the beam it is small beside the width of the band.
             noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
-            points += noise * (config.sampling.cross_range_noise_rad * ray[:, RAY_RANGE, None])
+            points += noise * (noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
         return Batch(points, sdf_m, ray, list(zip(near, near, strict=True)), near)
 
@@ -227,10 +241,8 @@ class RaySampler:
 def _in_morton_order(
     rays: Rays, intensities: Tensor | None, leaf_size_m: float, num_threads: int
 ) -> NDArray[np.float32]:
-    """(N, 7 or 8) numbers of the rays in Morton order of their returns; see :attr:`Samples.of_ray`.
-
-    All numbers of a ray are in one row of 32 bytes, half a cache line: a batch reads them by one index_select.
-    """
+    """:attr:`Samples.of_ray` of all rays, in Morton order of their returns."""
+    # All numbers of a ray are in one row of 32 bytes, half a cache line: a batch reads them by one index_select.
     order = stable_order(cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
     columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
     if intensities is not None:
@@ -255,18 +267,14 @@ def share(count: int, part: int, parts: int) -> int:
 
 @dataclass(frozen=True)
 class _Layout:
-    """The order of the B samples of a batch: part by part, with the near samples of each part first.
-
-    A sample is drawn uniformly from a segment of its ray.
-    """
+    """The order of the B samples of a batch, each drawn uniformly from a segment of its ray: part by part, near ones first."""
 
     index: Tensor
     """(B,) int64, row of each sample's ray among the rays that were taken."""
     order: Tensor
     """(B,) int64, row of each sample if all near samples of the batch came first, then all free ones."""
     start: tuple[Tensor, Tensor]
-    """(B,) each: c and d. The segment starts c + d · range in front of the return, m; behind it if
-    negative."""
+    """(B,) each: c and d. The segment starts c + d · range in front of the return, m."""
     length: tuple[Tensor, Tensor]
     """(B,) each: c and d. The segment has the length c + d · range, m, towards the sensor."""
     parts: list[tuple[int, int]]
@@ -291,9 +299,9 @@ class _Layout:
         index = torch.from_numpy(np.concatenate(of_kinds))[order]
         # From the sensor: near samples in range ± near_band, free ones in [free_from · range, range +
         # free_beyond].
-        band_m, before = config.near_band_m, 1 - config.sampling.free_from
+        band_m, beyond_m = config.metres(NEAR_BAND_CELLS), config.metres(FREE_BEYOND_CELLS)
         ends = torch.tensor(
-            [[-band_m, 0, 2 * band_m, 0], [-config.free_beyond_m, 0, config.free_beyond_m, before]],
+            [[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]],
             dtype=torch.float32,
             device="cpu",
         )[(kinds == 2).long()]
@@ -315,11 +323,7 @@ def _spread(count: int, of: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Dropout:
-    """Which numbers of a matrix are kept.
-
-    PyTorch's dropout draws from the global generator, so the same seed would not give the same bits. And the threads of
-    the core each make the bytes of their own rows.
-    """
+    """Which numbers of a matrix are kept. PyTorch's own dropout draws from the global generator."""
 
     seed: int
     """Of the random bytes, one for each number of the matrix."""
@@ -328,7 +332,7 @@ class Dropout:
 
     @classmethod
     def draw(cls, dropout: float, generator: torch.Generator) -> Dropout:
-        """Draws a dropout. `dropout`: probability that a number is dropped."""
+        """`dropout`: probability that a number is dropped."""
         seed = torch.empty((), dtype=torch.int64, device="cpu").random_(generator=generator)
         return cls(int(seed), round(256 * (1 - dropout)))
 

@@ -15,28 +15,23 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.budget.estimate import check_fit
-from radarsdf.budget.extent import check_extent
-from radarsdf.budget.schedule import Schedule
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
+from radarsdf.field.neural_field import NeuralField
+from radarsdf.fitting.average import SurfaceReturns, average_surface, closed_form, occupied_cells
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.closed_form import ClosedForm
-from radarsdf.fitting.skipped import Skipped, skipped_parts
-from radarsdf.fitting.start import STARTS, Start
-from radarsdf.fitting.stopping import Diverged, Interrupted
-from radarsdf.fitting.surface import SurfaceReturns
-from radarsdf.fitting.training import Training
+from radarsdf.fitting.estimate import check_extent, check_fit, skipped_parts
+from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.train import Diverged, Interrupted, Training
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence, Looks, ReturnsOfCells
-from radarsdf.returns.gaps import bridged
-from radarsdf.returns.passages import Passages
+from radarsdf.returns.free_space import Passages
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.scan_sums import ScanSums
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sums import ScanSums
+from radarsdf.returns.view_statistics import Echoes
 from radarsdf.threads import Workers
 
 
@@ -53,10 +48,9 @@ class FitInput:
     movers: int = 0
     """Number of returns that were left out because they move."""
     why_no_movers: str | None = None
-    """See :class:`radarsdf.returns.movers.Movers`."""
+    """See :class:`radarsdf.returns.moving.Movers`."""
     inside: NDArray[np.bool_] | None = None
-    """(N,) returns that the map is learnt from, whole leaf cells of them. The other rays only tell what they passed. None:
-    all."""
+    """(N,) returns that the map is made of, whole leaf cells of them. The other rays only show what they crossed. None: all."""
     rough_share: float | None = None
     """Share of the returns that lie on no thin surface. None: of these returns."""
     returns_per_cell: float | None = None
@@ -64,11 +58,11 @@ class FitInput:
     sensor: Sensor | None = None
     """The radar. None: as these rays and poses show it."""
     box_cells: NDArray[np.int64] | None = None
-    """(2, 3) leaf cells from the origin of the rays; what they passed outside [lower, upper) is not kept. None: all is."""
+    """(2, 3) leaf cells from the origin of the rays; what they crossed outside [lower, upper) is not kept. None: all is."""
     sums: ScanSums | None = None
     """Over the scans of the rays, if they were kept up scan by scan. None: made here, of all at once."""
     looks: Looks | None = None
-    """Likewise."""
+    """Visibility counts, likewise."""
 
 
 def fit_rays(
@@ -78,178 +72,131 @@ def fit_rays(
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
 ) -> RadarMap:
-    """Fits a map to what `read` gives. See :func:`radarsdf.fit`, also for errors.
-
-    `read` is called here, so that nobody else holds the rays: they are let go before the training.
-    """
+    """Fits a map to what `read` returns. See :func:`radarsdf.fit`, also for errors."""
     clock = Clock()
     try:
         # A map that is made in inference mode could not give gradients later.
         with torch.inference_mode(mode=False), Workers(config.num_threads) as workers:
-            trained = _train(read, config, progress, checkpoint, clock, workers)
-            contents = trained.contents
-            # What a network that diverged leaves of the intensities can be anything.
-            diverged = isinstance(trained.stop, Diverged) and config.trains_intensity
-            if trained.closed_form is not None and not diverged:
-                contents = trained.closed_form.added_to(contents, workers.num_threads)
+            contents, stop = _fit(read, config, progress, checkpoint, clock, workers)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption
-    clock.lap("training_s")
-    contents.report.update(clock.laps)
-    contents.field.requires_grad_(False)
     radar_map = RadarMap(contents)
-    if isinstance(trained.stop, Diverged):
-        trained.stop.radar_map = radar_map
-        raise trained.stop
-    if trained.stop is not None:
-        raise Interrupted(radar_map) from trained.stop
+    if isinstance(stop, Diverged):
+        stop.radar_map = radar_map
+        raise stop
+    if stop is not None:
+        raise Interrupted(radar_map) from stop
     return radar_map
 
 
-@dataclass(frozen=True)
-class _Known:
-    """What is known without training, and what the training learns the rest from."""
-
-    contents: MapContents
-    """The map, with the field that the training starts from."""
-    closed_form: ClosedForm | None
-    """What intensities in closed form are found from."""
-    surface: Rays
-    """Returns that the surface is learnt from."""
-    returns: Rays
-    """Returns that intensities are learnt from: ghosts too."""
-    schedule: Schedule
-    """Of the training."""
-    checkpoint: Checkpoint | None
-    """Of the training."""
-
-
-@dataclass(frozen=True)
-class _Trained:
-    """What is left of a training."""
-
-    contents: MapContents
-    """The map, but for intensities in closed form."""
-    closed_form: ClosedForm | None
-    """What they are found from."""
-    stop: KeyboardInterrupt | Diverged | None
-    """Why it ended early."""
-
-
-def _train(
+def _fit(
     read: Callable[[], FitInput],
     config: FitConfig,
     progress: bool | None,
     checkpoint: str | PathLike[str] | None,
     clock: Clock,
     workers: Workers,
-) -> _Trained:
-    """All but intensities in closed form. The training has a copy of its rays, 32 bytes a return, which is let go here."""
-    contents, closed_form, training, saved = _begin(read, config, checkpoint, clock, workers)
-    stop: KeyboardInterrupt | Diverged | None = None
-    try:
-        training.run(progress, saved)
-    except (KeyboardInterrupt, Diverged) as early:
-        stop = early
-    contents.report.update(training.report())
-    return _Trained(contents, closed_form, stop)
-
-
-def _begin(
-    read: Callable[[], FitInput],
-    config: FitConfig,
-    checkpoint: str | PathLike[str] | None,
-    clock: Clock,
-    workers: Workers,
-) -> tuple[MapContents, ClosedForm | None, Training, Checkpoint | None]:
-    """All before the first iteration. The rays that the training has a copy of are let go here."""
-    known = _learn_directly(read, config, checkpoint, clock, workers.num_threads)
-    training = Training(
-        known.contents.field,
-        known.surface,
-        known.returns,
-        known.contents.intensity_scale if config.trains_intensity else None,
-        known.schedule,
-        config,
-        workers,
-    )
-    if known.checkpoint is not None:
-        known.checkpoint.resume(training)
-    return known.contents, known.closed_form, training, known.checkpoint
-
-
-def _learn_directly(
-    read: Callable[[], FitInput],
-    config: FitConfig,
-    checkpoint: str | PathLike[str] | None,
-    clock: Clock,
-    num_threads: int,
-) -> _Known:
-    """What the returns tell without training: noise, ghosts, cells, the field at first, evidence, and the radar."""
+) -> tuple[MapContents, KeyboardInterrupt | Diverged | None]:
+    """The contents of the map, and why the training ended early, if it did."""
+    num_threads = workers.num_threads
     given = read()
-    rays, inside, scale = given.rays, given.inside, given.scale
-    check_extent(rays, config)
-    check_fit(rays, config, inside)
-    saved = None if checkpoint is None else Checkpoint(checkpoint, rays, scale, config)
+    check_extent(given.rays, config)
+    check_fit(given.rays, config, given.inside)
+    saved = None if checkpoint is None else Checkpoint(checkpoint, given.rays, given.scale, config)
     clock.lap("prepare_s")
-    surface = SurfaceReturns.of(rays, config, num_threads, inside, given.sums)
-    learnt = rays if inside is None else rays.select(inside)
+
+    surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
+    learnt = given.rays if given.inside is None else given.rays.select(given.inside)
     clock.lap("ghosts_s")
-    start = STARTS[config.training.start](surface, config, num_threads)
-    returns = start.returns_of_cells()
-    field = _open_cells(start.leaf_keys(), returns, learnt, config, num_threads)
-    leaf_keys = field.cells.table.leaf_keys()
+
+    leaf_keys, returns = occupied_cells(surface, config, num_threads)
+    with_network = config.trains_intensity and learnt.intensities is not None
+    field: Field
+    if surface.means is None:
+        field = _untrained(leaf_keys, with_network, config, num_threads)
+    else:
+        field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
     clock.lap("occupied_cells_s")
-    _initialise(field, start, config)
-    evidence = Evidence.of(returns, rays, leaf_keys, config.leaf_size_m, num_threads, given.looks)
-    passages = _passages(given, surface, config, num_threads)
-    echoes = _echoes(learnt, scale, config)
-    clock.lap("start_s")
+
     schedule = Schedule.of(
         config,
         surface_returns=len(surface.rays),
         returns=len(learnt),
-        vertices=field.cells.table.num_rows,
-        with_intensity=scale is not None and config.trains_intensity,
+        vertices=field.table.num_rows,
+        with_intensity=with_network,
     )
-    sensor, rough_share = given.sensor, given.rough_share
+    report = _report(given, learnt, surface, field, schedule, config, num_threads)
+    contents = _contents(given, learnt, surface, leaf_keys, returns, field, report, config, num_threads)
+    clock.lap("start_s")
+
+    scale = given.scale if config.trains_intensity else None
+    closes = learnt.intensities is not None and config.closes_intensity
+    of_intensity = (learnt, surface.surfels) if closes else None
+    surface_rays = surface.rays
+    del given, surface, returns, leaf_keys  # most of the memory, of which the training makes use again
+    stop: KeyboardInterrupt | Diverged | None = None
+    if isinstance(field, NeuralField):
+        training = Training(field, surface_rays, learnt, scale, schedule, config, workers)
+        del surface_rays, learnt  # of which the training has a copy
+        if saved is not None:
+            saved.resume(training)
+        try:
+            training.run(progress, saved)
+        except (KeyboardInterrupt, Diverged) as early:
+            stop = early
+        report.update(training.report())
+        del training  # rays and moments, of which the closed form has no need
+    # What a network that diverged leaves of the intensities can be anything.
+    if of_intensity is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
+        field.reflectance = closed_form(contents, *of_intensity, num_threads)
+    field.requires_grad_(False)
+    clock.lap("training_s")
+    report.update(clock.laps)
+    return contents, stop
+
+
+def _untrained(
+    leaf_keys: NDArray[np.uint64], with_intensity: bool, config: FitConfig, num_threads: int
+) -> NeuralField:
+    """Random networks and features (3QFP)."""
+    field = NeuralField(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
+    field.initialise(torch.Generator("cpu").manual_seed(config.seed))
+    return field
+
+
+def _contents(
+    given: FitInput,
+    learnt: Rays,
+    surface: SurfaceReturns,
+    leaf_keys: NDArray[np.uint64],
+    returns: ReturnsOfCells,
+    field: Field,
+    report: dict[str, Any],
+    config: FitConfig,
+    num_threads: int,
+) -> MapContents:
+    """The map, with the field as it is before the training."""
+    sensor, rough_share, returns_per_cell = given.sensor, given.rough_share, given.returns_per_cell
     if sensor is None:
         assert given.poses is not None
-        sensor = Sensor.of_rays(rays, given.poses, surface.noise)
-    if rough_share is None:
-        rough_share = surface.surfels.rough_share()
-    returns_per_cell = given.returns_per_cell
-    if returns_per_cell is None:
-        returns_per_cell = surface.surfels.returns_per_cell()
-    contents = MapContents(
+        sensor = Sensor.of_rays(given.rays, given.poses, surface.noise)
+    return MapContents(
         field=field,
-        origin=rays.origin,
-        intensity_scale=scale,
-        reflectance=None,
+        origin=given.rays.origin,
+        intensity_scale=given.scale,
         config=config,
-        evidence=evidence,
-        passages=passages,
-        echoes=echoes,
-        rough_share=rough_share,
-        returns_per_cell=returns_per_cell,
+        evidence=Evidence.of(returns, given.rays, leaf_keys, config.leaf_size_m, num_threads, given.looks),
+        passages=_passages(given, surface, config, num_threads),
+        echoes=_echoes(learnt, given.scale, config),
+        rough_share=surface.surfels.rough_share() if rough_share is None else rough_share,
+        returns_per_cell=surface.surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
         sensor=sensor,
-        report=_report(given, learnt, surface, field, schedule, config, num_threads),
+        report=report,
     )
-    closed_form = ClosedForm.of(learnt, surface, config)
-    return _Known(contents, closed_form, surface.rays, learnt, schedule, saved)
-
-
-def _open_cells(
-    leaf_keys: NDArray[np.uint64], returns: ReturnsOfCells, rays: Rays, config: FitConfig, num_threads: int
-) -> Field:
-    """The field on the leaf cells in which a surface can lie, and on those that bridge gaps between them."""
-    leaf_keys = bridged(leaf_keys, returns.keys, returns.counts, config.encoding.bridge_cells, num_threads)
-    with_intensity = rays.intensities is not None and config.trains_intensity
-    return Field(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
 
 
 def _passages(given: FitInput, surface: SurfaceReturns, config: FitConfig, num_threads: int) -> Passages:
-    """What the rays passed, of those that end at no ghost."""
+    """What the rays crossed, of those that end at no ghost."""
     if not config.returns.passages:
         return Passages.none()
     rays = given.rays if surface.true is None else given.rays.select(surface.true)
@@ -257,22 +204,13 @@ def _passages(given: FitInput, surface: SurfaceReturns, config: FitConfig, num_t
 
 
 def _echoes(rays: Rays, scale: IntensityScale | None, config: FitConfig) -> Echoes:
-    """How strong the returns were, for comparisons, which need passages, too."""
+    """Mean intensities by place and view, for comparisons, which need free space too."""
     known = rays.with_intensity
     if not config.returns.passages or scale is None or not known.any():
         return Echoes.none()
     chosen = rays if known.all() else rays.select(known)
     assert chosen.intensities is not None
     return Echoes.of(chosen, scale.to_unit(chosen.intensities), config.leaf_size_m)
-
-
-def _initialise(field: Field, start: Start, config: FitConfig) -> None:
-    """Sets the parameters that the training starts from. Raises Diverged if one is not finite."""
-    start.initialise(field, torch.Generator("cpu").manual_seed(config.seed))
-    # A sum is finite only if all that it adds up is. To ask each takes ten times as long.
-    if not all(parameter.detach().sum().isfinite() for parameter in field.parameters()):
-        msg = "what the training starts from is not finite: training.sigma_cells may be too small"
-        raise Diverged(msg)
 
 
 def _report(
@@ -285,32 +223,35 @@ def _report(
     num_threads: int,
 ) -> dict[str, Any]:
     """What the map's report says before the training."""
-    cells = field.cells.table
+    cells = len(field.table.leaf_keys())
     skipped = skipped_parts(
         config,
         schedule,
         returns=len(learnt),
-        cells=len(cells.leaf_keys()),
-        rows=cells.num_rows,
-        with_intensity=field.intensity_network is not None,
+        cells=cells,
+        rows=field.table.num_rows,
+        with_intensity=given.scale is not None,
         threads=num_threads,
-        closed_form=given.scale is not None and not config.trains_intensity,
     )
     if given.why_no_movers is not None:
-        skipped.insert(0, Skipped(f"leaving out what moves: {given.why_no_movers}", None))
-    wild = 0 if learnt.intensities is None else len(learnt) - int(learnt.with_intensity.sum())
+        skipped.insert(0, (f"leaving out what moves: {given.why_no_movers}", None))
+    outliers = 0 if learnt.intensities is None else len(learnt) - int(learnt.with_intensity.sum())
     return {
         "scans": len(given.rays.up_of_scan),
         "returns": given.rays.num_given + given.movers,
         "returns_used": len(surface.rays),
         "ghosts": len(learnt) - len(surface.rays),
         "movers": given.movers,
-        "wild_intensities": wild,
+        "wild_intensities": outliers,
         "noise": dataclasses.asdict(surface.noise),
-        "leaf_cells": len(cells.leaf_keys()),
-        "vertices": cells.num_rows,
-        "skipped": [part.words for part in skipped],
-        "skipped_s": [part.seconds for part in skipped],
+        "leaf_cells": cells,
+        "vertices": field.table.num_rows,
+        "skipped": [words for words, _ in skipped],
+        "skipped_s": [seconds for _, seconds in skipped],
+        "iterations": schedule.iterations,
+        "iterations_done": {"sdf": 0, "intensity": 0},
+        "losses": {},
+        "loss_history": {},
     }
 
 

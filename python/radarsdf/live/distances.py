@@ -13,15 +13,19 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, Encoding, VertexTable
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.start import average_at_vertices, cells_smoothed, told_by
+from radarsdf.fitting.average import (
+    BAND_CELLS,
+    CELLS_SMOOTHED,
+    TRUNCATION_CELLS,
+    average_at_corners,
+    returns_of_means,
+)
 from radarsdf.live.ghosts import means_of
 from radarsdf.live.regions import REGION_BITS, RegionTable, regions_of, regions_round
 from radarsdf.live.rows import ROUND, Keys, Replacement, between, leaves_of, shifted, steps_round
-from radarsdf.returns.cells import merged_keys
-from radarsdf.returns.evidence import BLOCK_BITS, ReturnsOfCells, sums_round
-from radarsdf.returns.gaps import bridged
-from radarsdf.returns.mean_rays import MeanRays
+from radarsdf.returns.evidence import BLOCK_BITS, ReturnsOfCells, bridged, sums_round
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.sums import MeanRays, merged_keys
 
 _LARGE_BITS = np.uint64(3)  # by which the key of a block is longer than that of a large one
 _LARGE_CELLS = 16  # along its edge
@@ -53,7 +57,7 @@ class TrueReturns:
         cell_of_leaf = CellBlocks(cells["keys"]).rows(merged_keys(rows["keys"]), num_threads)
         is_true = ~cells["ghosts"][cell_of_leaf]
         means = means_of(rows).select(is_true)
-        return cls(means, rows["normals"][is_true], told_by(means, noise, config.returns))
+        return cls(means, rows["normals"][is_true], returns_of_means(means, noise, config.returns))
 
     def within(self, blocks: Keys) -> TrueReturns:
         """Those in these blocks."""
@@ -87,9 +91,8 @@ class GrowingDistances:
 
     def blocks_reached(self, leaf_keys: Keys) -> Keys:
         """Keys of the blocks with a corner at which the returns of these leaf cells count, before distances are smoothed."""
-        config = self._config
         # A ray ends in a cell of its band. The corners of that cell have others round them.
-        cells = math.ceil(max(config.truncation_m, config.near_band_m) / config.leaf_size_m - 1e-9) + 1
+        cells = math.ceil(max(TRUNCATION_CELLS, BAND_CELLS)) + 1
         inside = range(-cells, cells, 8)  # no more than a block apart
         steps = np.array(list(itertools.product([*inside, cells], repeat=3)), np.int64)
         return np.unique(shifted(leaf_keys, steps) >> BLOCK_BITS)
@@ -149,7 +152,7 @@ class GrowingDistances:
         """Keys of the leaf cells of the regions `around` that rays cross near their returns: found anew in blocks `reached`."""
         first, last = leaves_of(reached)
         rays = means.select(between(means.keys, *leaves_of(_blocks_round(reached))))
-        found = rays.leaf_keys(self._config.leaf_size_m, self._config.near_band_m, num_threads)
+        found = rays.leaf_keys(self._config.leaf_size_m, self._config.metres(BAND_CELLS), num_threads)
         before = self._crossed.gather(around)["keys"]
         crossed = Replacement.of(before, found[between(found, first, last)], first, last).keys
         self._crossed.put(around, {"keys": crossed})
@@ -166,11 +169,8 @@ class GrowingDistances:
 
     def _blocks_smoothed_with(self, blocks: Keys) -> Keys:
         """Keys of these blocks, and of those that smoothing may reach from them, or them from."""
-        reach = cells_smoothed(self._config)
-        if reach == 0:
-            return blocks
         # By larger blocks, of 16³ leaf cells: to step from all to all takes longer than what is smoothed too far away.
-        steps = steps_round(math.ceil(reach / _LARGE_CELLS))
+        steps = steps_round(math.ceil(CELLS_SMOOTHED / _LARGE_CELLS))
         large = shifted(np.unique(blocks >> _LARGE_BITS) << (BLOCK_BITS + _LARGE_BITS), steps * _LARGE_CELLS)
         large = np.unique(large >> (BLOCK_BITS + _LARGE_BITS))
         found: Keys = ((large << _LARGE_BITS)[:, None] | np.arange(8, dtype=np.uint64)).reshape(-1)
@@ -186,11 +186,9 @@ class GrowingDistances:
         config = self._config
         own = between(leaf_keys, *leaves_of(blocks))
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
-        distances_m = average_at_vertices(
+        distances_m = average_at_corners(
             table, returns.means, returns.told, returns.normals, config, num_threads
         )
-        # As the field's features hold it.
-        distances_m = distances_m / np.float32(config.sigma_m) * np.float32(config.sigma_m)
         _, vertices = table.leaf_vertices()
         values = distances_m[vertices[own]]
         crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)

@@ -21,8 +21,8 @@ from radarsdf.poses.drive import LEAST_TOLD, Drive, followed, rates_of
 from radarsdf.poses.rates import Rate
 from radarsdf.poses.rigid import Floats, rotation_vector
 from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begun
-from radarsdf.returns.doppler import SensorVelocity, sensor_velocities
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL
+from radarsdf.returns.moving import SensorVelocity, sensor_velocities
+from radarsdf.returns.planes import LEAVES_PER_SURFEL
 
 _STEPS = 100  # of the motion so far, that habits are learnt from
 _START = 8  # scans of a start, of which all are placed again once 2, 4 and 8 are there

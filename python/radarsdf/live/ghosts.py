@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from radarsdf._core import CellBlocks
 from radarsdf.live.regions import REGION_CELLS, RegionTable, Rows, cubes_of, regions_round
 from radarsdf.live.rows import Keys
-from radarsdf.returns.cells import merged_keys
 from radarsdf.returns.ghosts import are_behind, are_opaque, first_crossed, mostly_behind
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels
+from radarsdf.returns.sums import MeanRays, merged_keys
 
 NOWHERE = np.uint64(2**64 - 1)
 """In the place of the key of a cell: a ray crosses no plane."""

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.fitting.fit import fit
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.live.scan_log import LoggedScan, ScanLog
 from radarsdf.live.scans import joined
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Looks
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.noise import SensorNoise, sensor_noise
-from radarsdf.returns.scan_sums import ScanSums
-from radarsdf.returns.surfels import Surfels
+from radarsdf.returns.planes import Surfels
+from radarsdf.returns.sums import ScanSums
 
 _NO_SCANS = "there are no scans to learn from: integrate some first"
 _RETURNS_ASKED = 100_000  # for the noise: as many as those on flat surfels that are wanted, and more

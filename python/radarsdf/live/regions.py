@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
 from radarsdf.live.rows import Keys, steps_round
-from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.sums import lattice_of
 
 Rows = dict[str, NDArray[Any]]
 

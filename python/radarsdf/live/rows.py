@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import BLOCK_BITS
+from radarsdf.returns.sums import lattice_of
 
 Keys = NDArray[np.uint64]
 _Column = TypeVar("_Column", bound=NDArray[Any])

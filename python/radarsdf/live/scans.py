@@ -16,8 +16,8 @@ from radarsdf.checks import MAX_TIME_S, check_values_of_scan, number, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.live.scan_log import LoggedScan, ScanId, compact
-from radarsdf.returns.movers import Movers
-from radarsdf.returns.plausible import Plausible
+from radarsdf.returns.intensities import Plausible
+from radarsdf.returns.moving import Movers
 from radarsdf.returns.rays import Rays, check_scans, prepare
 
 

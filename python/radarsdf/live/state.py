@@ -20,10 +20,9 @@ from radarsdf.live.scans import rays_of
 from radarsdf.live.shelf import Shelf
 from radarsdf.live.storage import Stored
 from radarsdf.live.surface import ChangedSums, GrowingSurface
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.scan_sums import QUANTA, ScanSums
+from radarsdf.returns.sums import QUANTA, ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
 _NONE = np.zeros(0, np.uint64)

@@ -11,18 +11,16 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.start import normals_at
+from radarsdf.fitting.average import normals_at
 from radarsdf.live.distances import GrowingDistances
 from radarsdf.live.ghosts import NOWHERE, GrowingGhosts, means_of, surfels_of
 from radarsdf.live.regions import RegionTable, Rows, regions_of, regions_round
 from radarsdf.live.rows import ROUND, Keys, Replacement, between, changed_rows, leaves_of, shifted
 from radarsdf.live.triangles import GrowingTriangles, Triangles
-from radarsdf.returns.cells import merged_keys
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.scan_sums import ScanSums
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL, MIN_SUPPORT, planes_round, support_round
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, planes_round, support_round
+from radarsdf.returns.sums import MeanRays, ScanSums, merged_keys
 
 _NONE = np.zeros(0, np.uint64)
 _PLANE = 9  # numbers of a surfel: centre, normal, variances

@@ -18,8 +18,8 @@ from radarsdf.map.contents import WholeMap
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from radarsdf.map.mesh import Surface, local
 from radarsdf.map.threshold import areas_round
-from radarsdf.returns.cells import lattice_of
 from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks
+from radarsdf.returns.sums import lattice_of
 
 _ON_BORDER = 1e-4  # leaf cells: vertices are at least 1e-3 from the corners of their edges
 

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
-from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.passages import Passages
-from radarsdf.returns.reflectance import Reflectance
+from radarsdf.returns.free_space import Passages
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.view_statistics import Echoes
 
 
 @dataclass(frozen=True)
@@ -36,13 +35,14 @@ class WholeMap:
 class MapContents(WholeMap):
     """The parts of a map."""
 
-    field: Field  # in the local frame
+    field: Field
+    """Signed distance and intensity, in the local frame."""
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
-    reflectance: Reflectance | None
-    """Intensities in closed form, or what the network leaves of them. None: the network alone, or no intensities."""
-    evidence: Evidence  # of each leaf cell
-    sensor: Sensor  # the radar, estimated from the scans of the fit
+    evidence: Evidence
+    """What the returns tell of each leaf cell."""
+    sensor: Sensor
+    """The radar, as the scans of the fit show it."""
     report: dict[str, Any]
     """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
     passages: Passages = dataclasses.field(default_factory=Passages.none)

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from radarsdf.checks import MAX_POSITION_M, check_pose, instance, real_array
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
-from radarsdf.returns.echoes import EchoesAt
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.view_statistics import EchoesAt
 
 if TYPE_CHECKING:
     import trimesh

@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.budget.estimate import check_mesh
 from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.threshold import LIMITS, Limits, Tally, Threshold, TriangleLimits, areas_round
+from radarsdf.memory import check_mesh
+from radarsdf.returns.intensities import IntensityScale
 
 with whole_import():
     import trimesh
@@ -229,9 +229,10 @@ def sample_lattice(
     if box is not None:
         lower, upper = box
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
-    if voxel_size == leaf_size_m and box is None and _is_of_vertices(config):
-        return SampledLattice(*queries.vertex_distances(contents, progress), len(cells))
-    if voxel_size < leaf_size_m and _smooth_in_cells(config):
+    stored = contents.field.leaf_corners() if voxel_size == leaf_size_m and box is None else None
+    if stored is not None:
+        return SampledLattice(*stored, len(cells))
+    if voxel_size < leaf_size_m and contents.field.smooth_in_cells:
         cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
     voxels = _voxels_of(cells, voxel_size, config)
     if box is not None:
@@ -242,27 +243,6 @@ def sample_lattice(
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return SampledLattice(corners, voxel_corners, distances_m, len(cells))
-
-
-def _smooth_in_cells(config: FitConfig) -> bool:
-    """Whether no wavelength of the encoding is shorter than two leaf cells.
-
-    Otherwise the field could change its sign inside a cell without doing so at its corners.
-    """
-    finest = config.encoding.fourier_count - 1
-    return (
-        config.encoding.fourier_count == 0
-        or 2 * config.fourier_half_width_m / 2**finest >= 2 * config.leaf_size_m
-    )
-
-
-def _is_of_vertices(config: FitConfig) -> bool:
-    """Whether the field at a vertex of the leaf cells depends only on the feature of that vertex."""
-    return (
-        config.encoding.kind == "octree"
-        and config.encoding.num_levels == 1
-        and config.encoding.fourier_count == 0
-    )
 
 
 def crossed(

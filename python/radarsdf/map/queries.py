@@ -20,9 +20,9 @@ from tqdm import tqdm
 from radarsdf._core import CellBlocks
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.progress import hides_bar
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN, lattice_of
 from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence
-from radarsdf.returns.passages import MOST_SCANS
+from radarsdf.returns.free_space import MOST_SCANS
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
 
 VOXEL_M = 0.1
@@ -67,19 +67,12 @@ def signed_distance(
     contents: MapContents, points: Tensor, *, description: str = "", progress: bool | None = False
 ) -> Tensor:
     """(N,) signed distance, m, positive in free space."""
-    return evaluate(contents.field.signed_distance, points, description=description, progress=progress)
+    return evaluate(contents.field.sdf, points, description=description, progress=progress)
 
 
 def gradient(contents: MapContents, points: Tensor) -> Tensor:
     """(N, 3) gradient of the signed distance, towards free space."""
-    field = contents.field
-
-    def of_chunk(chunk: Tensor) -> Tensor:
-        with torch.enable_grad():
-            chunk = chunk.detach().requires_grad_()
-            return torch.autograd.grad(field.signed_distance(chunk).sum(), chunk)[0]
-
-    return evaluate(of_chunk, points)
+    return evaluate(contents.field.gradient, points)
 
 
 @torch.inference_mode(mode=False)
@@ -94,50 +87,24 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
         directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
         # Nothing tells how the intensity continues beyond the ranges of the returns: a regression would extrapolate.
         ranges_m = ranges_m.clamp(*contents.sensor.range_m)
-        closed, share = contents.reflectance, 1.0
-        unit = torch.zeros_like(ranges_m)
-        if closed is not None:
-            unit += torch.from_numpy(closed.at(positions.numpy(), directions.numpy(), ranges_m.numpy(), 1))
-            share = closed.network_share
-        if share > 0:
-            unit += share * field.intensity(field.geometry(positions), directions, ranges_m)
-        # The closed form is not limited to what was measured.
-        return scale.to_sensor(unit if closed is None else unit.clamp(0, 1))
+        return scale.to_sensor(field.intensity(positions, directions, ranges_m))
 
     return evaluate(of_chunk, torch.cat([points, sensors], 1))
 
 
 def occupied(contents: MapContents, points: Tensor) -> Tensor:
     """(N,) bool, whether each point lies in an occupied leaf cell."""
-    return evaluate(contents.field.cells.occupied, points)
+    return evaluate(contents.field.occupied, points)
 
 
 def leaf_keys(contents: MapContents) -> NDArray[np.uint64]:
     """(C,) Morton keys of the leaf cells, ascending."""
-    return contents.field.cells.table.leaf_keys()
+    return contents.field.table.leaf_keys()
 
 
 def leaf_cells(contents: MapContents) -> NDArray[np.int32]:
     """(C, 3) leaf cells, counted from the origin."""
-    return contents.field.cells.table.leaf_cells()
-
-
-def vertex_distances(
-    contents: MapContents, progress: bool | None
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-    """Vertices of the leaf cells (V, 3), rows of them for each cell (C, 8), and signed distances (V,), m.
-
-    For a field that depends on the feature of the vertex alone: it needs no interpolation, and is fast.
-    """
-    field = contents.field
-    vertices, cell_vertices = field.cells.table.leaf_vertices()
-    distances_m: NDArray[np.float32] = evaluate(
-        lambda features: field.sdf_network([features])[0] * field.sigma_m,
-        field.cells.features.detach(),
-        description="mesh",
-        progress=progress,
-    ).numpy()
-    return vertices, cell_vertices, distances_m
+    return contents.field.table.leaf_cells()
 
 
 @torch.inference_mode(mode=False)

@@ -17,9 +17,9 @@ from radarsdf.field.field import Field
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
-from radarsdf.returns.cells import lattice_of
-from radarsdf.returns.echoes import EchoesAt
 from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.sums import lattice_of
+from radarsdf.returns.view_statistics import EchoesAt
 
 if TYPE_CHECKING:
     import trimesh
@@ -103,7 +103,7 @@ class RadarMap(Map):
 
     @property
     def extent(self) -> NDArray[np.float64]:
-        cells = lattice_of(queries.leaf_keys(self._contents))
+        cells = lattice_of(self.field.table.leaf_keys())
         corners = np.stack([cells.min(axis=0), cells.max(axis=0) + 1])
         return corners * self.config.leaf_size_m + self.origin
 
@@ -117,7 +117,7 @@ class RadarMap(Map):
 
     @property
     def nbytes(self) -> int:
-        """Size of features and networks, bytes: 3QFP's size of the map."""
+        """Size of the parameters of the field, bytes. 3QFP calls this the size of the map."""
         return sum(p.numel() * p.element_size() for p in self.field.parameters())
 
     @property
@@ -127,7 +127,7 @@ class RadarMap(Map):
 
     @property
     def field(self) -> Field:
-        """The learnt field, a PyTorch module in the local frame."""
+        """Signed distance and intensity as a PyTorch module, in the local frame."""
         return self._contents.field
 
 

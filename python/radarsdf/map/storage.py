@@ -20,24 +20,24 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 from typing_extensions import TypedDict
 
-from radarsdf._core import FEATURE_DIM
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.field.intensity_scale import IntensityScale
+from radarsdf.field.grid_field import GridField
+from radarsdf.field.neural_field import NeuralField
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.contents import MapContents
 from radarsdf.map.queries import leaf_keys
-from radarsdf.returns.echoes import Echoes
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.passages import Passages
+from radarsdf.returns.free_space import Passages
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.view_statistics import Echoes
 from radarsdf.settings import by_name, first_wrong
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 11
-_FEATURES = "field.cells.features"
+FORMAT_VERSION = 12
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
@@ -139,19 +139,19 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors: dict[str, Tensor] = {
         f"field.{name}": value for name, value in contents.field.state_dict().items()
     }
-    tensors[_FEATURES] = _without_empty_columns(tensors[_FEATURES])
     tensors["origin"] = torch.from_numpy(contents.origin)
     tensors["leaf_keys"] = torch.from_numpy(leaf_keys(contents).astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
     tensors |= _tensors_of("passages", contents.passages)
     tensors |= _tensors_of("echoes", contents.echoes)
-    if contents.reflectance is not None:
-        tensors |= _tensors_of("reflectance", contents.reflectance)
+    reflectance = contents.field.reflectance
+    if reflectance is not None:
+        tensors |= _tensors_of("reflectance", reflectance)
     scale = contents.intensity_scale
     description = {
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
-        "network_share": None if contents.reflectance is None else contents.reflectance.network_share,
+        "network_share": None if reflectance is None else reflectance.network_share,
         "echo_sigma": contents.echoes.sigma,
         "rough_share": contents.rough_share,
         "returns_per_cell": contents.returns_per_cell,
@@ -187,11 +187,12 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         (trained or reflectance is not None) == (scale is not None),
         "what answers for intensities is missing, or there are none",
     )
+    field = _field_of(tensors, keys.numpy().astype(np.uint64), config, trained)
+    field.reflectance = reflectance
     return MapContents(
-        field=_field_of(tensors, keys.numpy().astype(np.uint64), config, trained),
+        field=field,
         origin=origin.numpy(),
         intensity_scale=scale,
-        reflectance=reflectance,
         config=config,
         report=checked_report(description["report"]),
         evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
@@ -207,35 +208,19 @@ def _field_of(
     tensors: dict[str, Tensor], keys: NDArray[np.uint64], config: FitConfig, with_intensity: bool
 ) -> Field:
     """The field with these leaf cells, of all tensors that are left."""
-    # A damaged description could ask for networks of any size. So the number of layers is limited, and the
-    # field is made without memory: it only serves to check the shapes of the tensors.
-    layers = len(config.networks.sdf_hidden + config.networks.intensity_hidden)
-    _check(layers <= len(tensors), "there are fewer tensors than layers")
+    # Without memory, for shapes alone: a damaged description could ask for networks of any size.
     with torch.device("meta"):
-        field = Field(keys, config, with_intensity=with_intensity)
+        if config.train:
+            field: Field = NeuralField(keys, config, with_intensity=with_intensity)
+        else:
+            field = GridField(keys, config.leaf_size_m)
     for name, tensor in tensors.items():
         finite = tensor.dtype == torch.float32 and tensor.isfinite().all()
         _check(finite, f"{name} holds something other than finite float32 numbers")
     state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
-    state[_FEATURES.removeprefix("field.")] = _with_empty_columns(tensors[_FEATURES])
     field.load_state_dict(state, assign=True)  # raises a RuntimeError for wrong names or shapes
     field.requires_grad_(False)
     return field
-
-
-def _without_empty_columns(features: Tensor) -> Tensor:
-    """Without columns of zeros at the end: a quick map uses one of eight, and its file is a quarter as large."""
-    used = torch.nonzero((features != 0).any(dim=0))
-    return features[:, : int(used.max()) + 1 if len(used) else 0]
-
-
-def _with_empty_columns(features: Tensor) -> Tensor:
-    """The inverse of :func:`_without_empty_columns`."""
-    fits = features.ndim == 2 and features.shape[1] <= FEATURE_DIM
-    _check(fits, f"the features are not up to {FEATURE_DIM} numbers for each vertex")
-    if features.shape[1] == FEATURE_DIM:
-        return features
-    return torch.cat([features, features.new_zeros(len(features), FEATURE_DIM - features.shape[1])], 1)
 
 
 def _tensors_of(part: str, owner: Passages | Echoes | Reflectance) -> dict[str, Tensor]:
@@ -286,7 +271,7 @@ def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
         raise _OtherFileError(msg)
     version = metadata.get("format_version", "")
     if version != str(FORMAT_VERSION):
-        msg = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}"
+        msg = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}: fit it again (CHANGELOG, 0.2.0)"
         raise _OtherFileError(msg)
 
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf.poses.motion import Motion, spans_of
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector, steps
-from radarsdf.returns.doppler import MIN_DOPPLER_RETURNS, sensor_velocities
+from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _ASKED = 400  # returns of a scan, and
 _PAIRS = 40  # pairs of neighbouring scans, that tell the sign

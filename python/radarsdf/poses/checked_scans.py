@@ -14,8 +14,7 @@ from radarsdf.checks import MAX_TIME_S, real_array
 from radarsdf.io.scans import Scans, filled
 from radarsdf.poses.by_doppler import NOT_USED, NoVelocityError, SensorVelocities
 from radarsdf.poses.rigid import Floats
-from radarsdf.returns.doppler import without_filler
-from radarsdf.returns.movers import checked_doppler
+from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
 
 _MOST_M = 500.0  # median range, m. Imaging radars reach 300 m

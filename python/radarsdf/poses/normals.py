@@ -8,9 +8,8 @@ import numpy as np
 
 from radarsdf._core import CellBlocks
 from radarsdf.poses.rigid import Floats
-from radarsdf.returns.cells import merged_keys
-from radarsdf.returns.scan_sums import UPPER
-from radarsdf.returns.surfels import NEIGHBOUR_WEIGHT, Surfels
+from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
+from radarsdf.returns.sums import UPPER, merged_keys
 
 # The edge of a region is 2 to the power of this, in cells. Wide regions have many planes, and know well what is error: with
 # 8 cells, the way along simulated walls was told 5 times too surely, with 16 to 64 not.

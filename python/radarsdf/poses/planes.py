@@ -17,8 +17,8 @@ from radarsdf.poses.groups import Groups
 from radarsdf.poses.normals import told_normals
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
 
 # Scans in the band that is factored. 16 to 128 take the same time, since fewer need more iterations.
 _TOGETHER = 32

@@ -23,8 +23,8 @@ from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.rigid import Floats, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
+from radarsdf.returns.planes import LEAVES_PER_SURFEL
 from radarsdf.returns.rays import LeftOut
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL
 from radarsdf.threads import Workers
 
 # The least errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees

@@ -18,7 +18,7 @@ from radarsdf.poses.expected import ExpectedStep
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.rigid import Floats, moved, rotation_vector
 from radarsdf.returns.noise import SensorNoise, sensor_noise
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 
 WINDOW = 25
 """Scans whose planes are kept. With 60, nothing was better on simulated drives, and wrong poses were remembered longer."""

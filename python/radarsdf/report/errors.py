@@ -14,7 +14,7 @@ from radarsdf.evaluation import KNNIntensity, intensity_metrics, surface_metrics
 from radarsdf.report import plots
 from radarsdf.report.subject import Subject
 from radarsdf.report.surface import colored, picture
-from radarsdf.returns.movers import rays_as_measured
+from radarsdf.returns.moving import rays_as_measured
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.any_map import predicted

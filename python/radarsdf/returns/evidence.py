@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Evidence of a surface in each leaf cell: what the returns tell, and how many scans looked there."""
+"""Evidence of a surface in each leaf cell, and the leaf cells that bridge gaps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, count_looks
+from radarsdf._core import CellBlocks, bridge_cells, count_looks
+from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
 
@@ -48,22 +49,10 @@ class Evidence:
         num_threads: int = 0,
         looks: Looks | None = None,
     ) -> Evidence:
-        """Evidence in the leaf cells with these Morton keys (C,), ascending.
+        """Evidence in the leaf cells with these keys (C,), ascending.
 
-        Parameters
-        ----------
-        returns : ReturnsOfCells
-            What the returns tell, cell by cell. Without those that are known to be false.
-        rays : Rays
-            All rays, scan by scan. A ray to a false return looked, too.
-        leaf_keys : ndarray
-            (C,) uint64.
-        leaf_size_m : float
-            Edge of a leaf cell, m.
-        num_threads : int
-            0: as many as OpenMP uses.
-        looks : Looks, optional
-            If they were counted scan by scan. Default: counted here, along all rays.
+        `returns` are those that are not known to be false; `rays` are all, scan by scan, since a ray to a false return also
+        looked. `looks`: visibility counts, if they were kept up scan by scan.
         """
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
         information, detections = sums_round(returns.select(near), leaf_keys, num_threads)
@@ -99,8 +88,8 @@ class ReturnsOfCells:
     def with_uncertain_poses(self, ranges_m: NDArray[np.float32], config: ReturnsConfig) -> ReturnsOfCells:
         """The same with the errors of the poses in `config`. `ranges_m` (M,): of a return in each cell, m.
 
-        The error of a pose is common to the returns of a scan, in a cell and in those round it. So the variance
-        of a cell gets that of a pose over the number of scans, as many times as a surface has cells among 27.
+        The error of a pose is common to the returns of a scan. So the variance of a cell gets that of a pose over the number
+        of scans, as many times as a surface has cells among 27.
         """
         if config.pose_sigma_m == 0 and config.pose_sigma_rad == 0:
             return self
@@ -140,3 +129,63 @@ def sums_round(
         sums = cells.sum_round(leaf_keys[part], columns, 1.0, num_threads)
         information[part], detections[part] = sums.T
     return information, detections
+
+
+_MOST = float(np.iinfo(np.uint16).max)
+
+
+def support_at(
+    leaf_keys: NDArray[np.uint64], keys: NDArray[np.uint64], counts: NDArray[np.float64], num_threads: int = 0
+) -> NDArray[np.float64]:
+    """Support (C,) of leaf cells: returns in each and the 26 cells around it, up to 65535. `counts` (M,): of cells with `keys` (M,)."""
+    sums = CellBlocks(keys).sum_round(leaf_keys, np.ascontiguousarray(counts)[:, None], 1.0, num_threads)
+    return np.minimum(sums[:, 0], _MOST)
+
+
+# Measured on simulated and real scans; see bench/history/surface.md.
+# Share of the median support of the block. Returns with less are too often false to tell where a surface goes on.
+_MIN_SUPPORT = 0.5
+# Mean support of the two ends of a bridge, at most. A surface crosses about nine of the 27 cells. With one
+# return in each of these or more, an empty cell is most likely a real gap.
+_MAX_SUPPORT = 9.0
+
+
+def bridged(
+    leaf_keys: NDArray[np.uint64],
+    keys: NDArray[np.uint64],
+    counts: NDArray[np.float64],
+    max_cells: int,
+    num_threads: int = 0,
+) -> NDArray[np.uint64]:
+    """Adds to `leaf_keys` (C,), ascending, the cells on the line between two cells with returns.
+
+    Lines run along the axes and the diagonals, in 13 directions, over at most `max_cells`. `counts` (M,): returns in the cells
+    with `keys` (M,), ascending.
+    """
+    if max_cells == 0:
+        return leaf_keys
+    near = CellBlocks(leaf_keys).rows(keys, num_threads) >= 0
+    keys, counts = keys[near], counts[near]
+    of_leaves = support_at(leaf_keys, keys, counts, num_threads)
+    rows = CellBlocks(leaf_keys).rows(keys, num_threads)
+    least = np.maximum(1.0, _MIN_SUPPORT * _medians(leaf_keys, of_leaves)[rows])
+    support = of_leaves[rows]
+    # With more than the most, the mean with any other end is too high.
+    used = (support >= least) & (support + least < 2 * _MAX_SUPPORT)
+    return bridge_cells(leaf_keys, keys[used], support[used], max_cells, 2 * _MAX_SUPPORT, num_threads)
+
+
+def _medians(leaf_keys: NDArray[np.uint64], support: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(C,) median of the `support` (C,) of the leaf cells with returns around them in the block of each cell."""
+    # Of a block, not of the map: what is added must not depend on how many returns there are elsewhere.
+    block = leaf_keys >> np.uint64(3 * (LATTICE_BLOCK_CELLS.bit_length() - 1))
+    starts = np.flatnonzero(np.diff(block, prepend=~block[:1]))  # cells of a block follow each other
+    # Sorted within blocks: the number of the block counts more than the support.
+    number = np.repeat(np.arange(len(starts), dtype=np.uint64), np.diff(starts, append=len(block)))
+    ordered = np.sort(number << np.uint64(16) | support.astype(np.uint64)) & np.uint64(0xFFFF)
+    ends = np.append(starts[1:], len(block))
+    zeros = np.add.reduceat(ordered == 0, starts)
+    first = starts + zeros  # of those with returns; if there are none, medians are of no use
+    last = np.maximum(ends - 1, first)
+    middle = np.minimum([(first + last) // 2, (first + last + 1) // 2], len(block) - 1)
+    return ordered[middle].mean(axis=0)[number.astype(np.int64)]  # type: ignore[no-any-return]

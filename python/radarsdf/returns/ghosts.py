@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import SurfelMap
-from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.surfels import NEIGHBOUR_WEIGHT, Surfels
+from radarsdf.returns.sums import MeanRays
 
 # Measured on simulated and real scans; see bench/history/surface.md.
 # A ghost is farther behind the surface than these two together, since noise puts returns of the surface
@@ -35,24 +35,7 @@ _MIN_SHARE = 0.5
 def find_ghosts(
     surfels: Surfels, rays: Rays | MeanRays, noise: SensorNoise, num_threads: int = 0
 ) -> NDArray[np.bool_]:
-    """Finds the cells of surfels whose returns are ghosts.
-
-    Parameters
-    ----------
-    surfels : Surfels
-        Surfels of the returns of `rays`.
-    rays : Rays or MeanRays
-        All rays, or the mean rays of leaf cells, which are fewer.
-    noise : SensorNoise
-        Noise of the returns.
-    num_threads : int
-        0: as many as OpenMP uses.
-
-    Returns
-    -------
-    ndarray
-        (C,) bool, True for the cells of `surfels` with ghosts.
-    """
+    """(C,) bool, which cells of `surfels` hold ghosts. `rays`: all, or the mean rays of leaf cells, which are fewer."""
     cell_of_ray, weights = (
         (surfels.cells_of_leaves(rays.keys, num_threads), rays.counts)
         if isinstance(rays, MeanRays)

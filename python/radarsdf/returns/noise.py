@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Estimates the noise of the sensor from its returns: along the beam, in azimuth and in elevation."""
+"""Noise of the sensor, estimated from its returns, and returns moved onto planes as far as it explains."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf._core import move_onto_planes
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.surfels import Surfels
 
 NOISE_SETTINGS = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
 """Settings of returns that say the numbers of :class:`SensorNoise`, in their order."""
@@ -90,17 +91,6 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
 
     A surfel of leaf cells of 0.2 m is 1.2 m wide, so noise of more than some 0.4 m is underestimated. The
     roughness of a surface counts as noise. Measured on simulated scenes: 0.7 to 1.2 times the true deviation.
-
-    Parameters
-    ----------
-    surfels : Surfels
-        Surfels of the returns of `rays`.
-    rays : Rays
-        N rays. About `_RETURNS` of those on a flat surfel are used, evenly spread.
-    config : ReturnsConfig
-        Deviations that the user knows.
-    num_threads : int
-        0: as many as OpenMP uses.
     """
     known = np.array([getattr(config, name) for name in NOISE_SETTINGS], np.float64)
     free = np.isnan(known)
@@ -141,10 +131,7 @@ def variances_across(
 
 
 def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, M) factors of the variances along the beam, in azimuth and in elevation, across planes.
-
-    A return straight above the sensor has no azimuth: its factors of the angles are 0.
-    """
+    """(3, M) factors of the variances along the beam, in azimuth and in elevation, across planes. Above the sensor, 0 of angles."""
     ranges2 = np.square(rays.ranges_m[rows].astype(np.float64))
     up, normal = rays.up_of_scan[rays.scans[rows]].T, normals.T
     along = rays.directions[rows].T.astype(np.float64)
@@ -165,3 +152,26 @@ def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])
+
+
+def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: int = 0) -> Rays:
+    """The rays with each return moved towards the surfel of its cell, if there is a flat one.
+
+    A plane through dozens of returns has much less noise than one return. But a surface is no plane: where
+    the returns scatter more than their noise explains, the rest is the shape of the surface. So a return keeps
+    the share τ² / (τ² + σ²) of its distance from the plane, with the variance σ² of its noise across the plane
+    and the variance τ² of the surface, which is that of the returns less their mean σ². This is the best linear
+    estimate of its true distance (Wiener, 1949). Along the plane, the return keeps its position.
+    """
+    points, directions, ranges_m = move_onto_planes(
+        *rays.in_c_order(),
+        np.ascontiguousarray(rays.scans),
+        rays.up_of_scan,
+        surfels.flat_planes_at(rays.points, num_threads),
+        surfels.centres,
+        surfels.normals,
+        np.ascontiguousarray(surfels.variances[:, 0]),
+        noise.variances,
+        num_threads,
+    )
+    return dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)

@@ -20,17 +20,15 @@ from radarsdf.checks import (
     check_scan_shape,
     check_scan_shapes,
     check_values_of_scan,
-    number,
     one_for_each_scan,
     pose_matrices,
     real_array,
     usable_poses,
-    whole_number,
 )
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
 from radarsdf.products import turned
-from radarsdf.returns.plausible import Plausible
+from radarsdf.returns.intensities import Plausible
 
 _LOG = logging.getLogger("radarsdf.returns")
 _PADDING = 8  # rows that repeat the one before. Sensors with coarse cells repeat some
@@ -73,18 +71,13 @@ class Rays:
 
     def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
         """The rays of a slice, a mask (N,) bool, or row numbers (M,), in that order."""
-        if isinstance(
-            part, np.ndarray
-        ):  # `take` with row numbers needs a third of the time of an index or a mask
-            rows = np.flatnonzero(part) if part.dtype == np.bool_ else part
+        rows = part
+        if isinstance(part, np.ndarray) and part.dtype == np.bool_:
+            rows = np.flatnonzero(part)
 
-            def chosen(array: NDArray[Any]) -> NDArray[Any]:
-                return array.take(rows, axis=0)
-
-        else:
-
-            def chosen(array: NDArray[Any]) -> NDArray[Any]:
-                return array[part]
+        def chosen(array: NDArray[Any]) -> NDArray[Any]:
+            # `take` with row numbers needs a third of the time of an index or a mask.
+            return array[rows] if isinstance(rows, slice) else array.take(rows, axis=0)
 
         return dataclasses.replace(
             self,
@@ -107,25 +100,11 @@ class Rays:
         points = self.points.astype(np.float64) + self.origin
         return points, points - self.directions.astype(np.float64) * self.ranges_m[:, None]
 
-    def along(self, offsets_m: ArrayLike, chunk: int = 1 << 20) -> Iterator[NDArray[np.float32]]:
-        """Points at fixed offsets from the return along each ray, in chunks (M, 3), local, m.
-
-        Positive offsets are behind the return. A chunk has about `chunk` points.
-        """
-        offsets = np.asarray(offsets_m, np.float32)
-        rays_per_chunk = max(1, chunk // len(offsets))
-        for first in range(0, len(self), rays_per_chunk):
-            rays = slice(first, first + rays_per_chunk)
-            points = self.points[rays, None, :] + offsets[None, :, None] * self.directions[rays, None, :]
-            yield points.reshape(-1, 3)
-
 
 def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor itself, and no padding.
-
-    Drivers fill a cloud of fixed size with one point: a row that is repeated at once, many times, among others.
-    """
+    """Mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor itself, and no padding."""
     returns: NDArray[np.bool_] = (np.abs(scan) <= MAX_POSITION_M).all(axis=1) & scan.any(axis=1)
+    # Drivers fill a cloud of fixed size with one point: a row that is repeated at once, many times, among others.
     again = scan[1:, 0] == scan[:-1, 0]
     if np.count_nonzero(again) >= _PADDING:
         again &= (scan[1:] == scan[:-1]).all(axis=1)
@@ -152,18 +131,16 @@ class LeftOut:
     @property
     def notes(self) -> list[str]:
         """A sentence if anything is left out."""
-        parts = [
-            f"{self.rows} of {self.given} returns (not finite, at the sensor, or padding)"
-            if self.rows
-            else "",
-            _named(self.empty, "without returns"),
-            _named(self.poses, "whose pose is not a rigid transform"),
-        ]
-        return [f"Left out: {', '.join(filter(None, parts))}."] if any(parts) else []
-
-
-def _named(scans: list[int], what: str) -> str:
-    return f"{len(scans)} scans {what} (the first is scan {scans[0]})" if scans else ""
+        parts = []
+        if self.rows:
+            parts.append(f"{self.rows} of {self.given} returns (not finite, at the sensor, or padding)")
+        for scans, what in (
+            (self.empty, "without returns"),
+            (self.poses, "whose pose is not a rigid transform"),
+        ):
+            if scans:
+                parts.append(f"{len(scans)} scans {what} (the first is scan {scans[0]})")
+        return [f"Left out: {', '.join(parts)}."] if parts else []
 
 
 def check_scans(
@@ -171,8 +148,7 @@ def check_scans(
 ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None, LeftOut]:
     """Scans (N_i, 3) and intensities (N_i,) as arrays, if :func:`prepare` takes them; else its ValueError.
 
-    Rows that are no returns become 0 0 0, so that all arrays of a scan keep their length; intensities that are not
-    finite become NaN.
+    Rows that are no returns become 0 0 0, and intensities that are not finite NaN: arrays of a scan keep their length.
     """
     left_out = LeftOut()
     checked = list(_checked(points, intensities, left_out))
@@ -261,35 +237,27 @@ def prepare(
     poses : array_like
         (F, 4, 4) T_world_sensor, m.
     intensities : iterable of F arrays, optional
-        (N_i,) each, sensor units.
-    min_range_m, max_range_m : float
-        Returns outside these ranges are dropped, m. `max_range_m` None: no limit.
-    accumulate_scans : int
-        So many consecutive scans are treated as seen from the position of the middle one.
+        (N_i,) each, sensor units. Those that are not finite become NaN.
+    min_range_m, max_range_m, accumulate_scans
+        See :class:`~radarsdf.config.groups.ReturnsConfig`.
     origin : array_like, optional
-        (3,) origin of the local frame, world, m. By default the mean sensor position.
-    lattice : WorldLattice, optional
-        That default is moved to the next corner of a block of it, so that different scans share their cells.
+        (3,) origin of the local frame, world, m. By default the mean sensor position, moved to the next corner of a block
+        of the `lattice` if there is one, so that different scans share their cells.
     whole : bool
-        False: these are a part of the scans. None of their returns need be within the ranges, and their intensities are
-        as they are. Of whole scans, intensities that cannot belong to the others become NaN: see
-        :class:`~radarsdf.returns.plausible.Plausible`.
+        False: these are a part of the scans, of which none need be within the ranges. Of whole scans, intensities that are
+        outliers become NaN.
 
     Returns
     -------
     Rays
-        The returns that are kept, scan by scan.
+        The returns that are kept, scan by scan. Rows that are no returns (not finite, 0 0 0, padding), and scans whose pose
+        is not rigid, are left out, and counted in a warning of the logger ``radarsdf.returns``.
 
     Raises
     ------
     ValueError
         If lengths or shapes do not match, half of the poses or more are not rigid, all intensities are equal or are too
         far apart for float32, or no return is within the ranges.
-
-    Notes
-    -----
-    Rows that are no returns (not finite, 0 0 0, padding), and scans whose pose is not rigid, are left out. They are counted
-    in a warning of the logger ``radarsdf.returns``. Intensities that are not finite are NaN.
     """
     # Of an iterator, the number of scans is known only in the end.
     points = one_for_each_scan(points, "points")
@@ -304,10 +272,6 @@ def prepare(
         local_origin = positions.mean(axis=0)
         if lattice is not None:
             local_origin = lattice.position(lattice.nearest_block(local_origin))
-    min_range_m = number(min_range_m, "min_range_m")
-    max_range_m = None if max_range_m is None else number(max_range_m, "max_range_m")
-    whole_number(accumulate_scans, "accumulate_scans", 1)
-
     kept: list[list[Any]] = [[], [], [], []]
     number_of_scan, left_out = 0, LeftOut(poses=np.flatnonzero(~rigid).tolist())
     for i, (scan, of_scan) in enumerate(_checked(points, intensities, left_out)):

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.response import NUM_COEFFICIENTS, NUM_KINDS, TABLE_SHAPE, Response, kinds_of
-from radarsdf.returns.surfels import LEAVES_PER_SURFEL, Surfels
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 
 Float32 = NDArray[np.float32]
 
@@ -95,16 +95,43 @@ class Reflectance:
         _ = self._planes, self._cells  # which check the keys
 
     @classmethod
-    def of(cls, residuals: Residuals, num_threads: int = 0) -> Reflectance:
-        """The reflectance that explains `residuals`. The same bits with any number of threads; 0: as many as OpenMP uses."""
-        groups, response = residuals.groups, residuals.response
+    def of(
+        cls,
+        rays: Rays,
+        unit: Float32,
+        surfels: Surfels,
+        leaf_size_m: float,
+        ask: Ask | None = None,
+        num_threads: int = 0,
+    ) -> Reflectance:
+        """The reflectance of `rays`, with ghosts: a sensor sees these again. The same bits with any number of threads.
+
+        `unit` (N,): their intensities, scaled to [0, 1]. `surfels`: of the same returns, or of more. `ask`: what a network
+        answers, intensities (M,) at points (M, 3) seen along directions (M, 3) from ranges (M,). None: there is no network.
+        """
+        flat = np.flatnonzero(surfels.is_flat())
+        normals = surfels.normals.astype(np.float32)
+        points, directions, ranges_m = rays.in_c_order()
+        plane = surfels.flat_planes_at(points, num_threads)
+        incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
+        most = _MOST_RETURNS if ask is None else _MOST_ASKED
+        groups = _Groups.of(points, directions, incidence, leaf_size_m, most)
+        times, share = 1.0, 0.0
+        if ask is not None:
+            answers = ask(groups.points, _unit_vectors(groups.directions), groups.means(ranges_m))
+            unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
+            times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
+        response = Response.of(unit, directions, ranges_m, incidence, kinds)
+        left = unit - response.at(directions, ranges_m, incidence, kinds)
+        incidence = groups.means(incidence)
+        del plane, kinds  # of each return
         keys, means, explained = fit_cell_means(
-            _in_metres(_KINDS, residuals.leaf_size_m),
+            _in_metres(_KINDS, leaf_size_m),
             _TILINGS,
             groups.points,
             groups.directions,
-            residuals.incidence_rad,
-            groups.means(residuals.left),
+            incidence,
+            groups.means(left),
             groups.weights,
             _SHRINKAGE,
             _ROUNDS,
@@ -113,16 +140,13 @@ class Reflectance:
         )
         # The cells have means, and the error that counts is the absolute one, whose centre is the median.
         coefficients = response.coefficients.copy()
-        coefficients[:, 0] += np.median(residuals.left - groups.of_returns(explained))
-        times, share = 1.0, 0.0
-        if residuals.has_network:
-            times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
+        coefficients[:, 0] += np.median(left - groups.of_returns(explained))
         return cls(
-            residuals.leaf_size_m,
+            leaf_size_m,
             times * coefficients,
             np.float32(times) * response.table,
-            residuals.plane_keys,
-            residuals.normals,
+            surfels.keys[surfels.cell_of_plane[flat]],
+            normals[flat],
             keys,
             (np.float32(times) * means).astype(np.float16),
             share,
@@ -139,79 +163,6 @@ class Reflectance:
         found = self._response.at(directions, ranges_m, incidence, kinds_of(self.normals, rows))
         found += self._cells.sums(near, directions, incidence, num_threads)
         return found
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """What regressions leave of a quantity of returns. It holds no rays: of ten million, these are half a gigabyte."""
-
-    leaf_size_m: float
-    """Edge of a leaf cell, m."""
-    response: Response
-    """The regressions."""
-    plane_keys: NDArray[np.uint64]
-    """See :class:`Reflectance`."""
-    normals: Float32
-    """Likewise."""
-    groups: _Groups
-    """Of the returns."""
-    incidence_rad: Float32
-    """(G,) mean of each group, NaN without a plane."""
-    left: Float32
-    """(N,) of each return."""
-    has_network: bool
-    """Whether they are what a network leaves."""
-
-    @classmethod
-    def of(
-        cls,
-        rays: Rays,
-        unit: Float32,
-        surfels: Surfels,
-        leaf_size_m: float,
-        ask: Ask | None = None,
-        num_threads: int = 0,
-    ) -> Residuals:
-        """The residuals of `rays`.
-
-        Parameters
-        ----------
-        rays : Rays
-            All returns, with ghosts: a sensor sees these again.
-        unit : (N,) float32
-            Their intensities, scaled to [0, 1].
-        surfels : Surfels
-            Surfels of the same returns, or of more.
-        leaf_size_m : float
-            Edge of a leaf cell, m.
-        ask : callable, optional
-            What a network answers: intensities (M,) float32, scaled alike, at points (M, 3), local frame, m, seen along
-            directions (M, 3), unit vectors, from ranges (M,), m. Default: there is no network.
-        num_threads : int
-            0: as many as OpenMP uses.
-        """
-        flat = np.flatnonzero(surfels.is_flat())
-        normals = surfels.normals.astype(np.float32)
-        points = np.ascontiguousarray(rays.points)
-        plane = surfels.flat_planes_at(points, num_threads)
-        directions = np.ascontiguousarray(rays.directions)
-        incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
-        most = _MOST_RETURNS if ask is None else _MOST_ASKED
-        groups = _Groups.of(points, directions, incidence, leaf_size_m, most)
-        if ask is not None:
-            answers = ask(groups.points, _unit_vectors(groups.directions), groups.means(rays.ranges_m))
-            unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
-        response = Response.of(unit, directions, rays.ranges_m, incidence, kinds)
-        return cls(
-            leaf_size_m,
-            response,
-            surfels.keys[surfels.cell_of_plane[flat]],
-            normals[flat],
-            groups,
-            groups.means(incidence),
-            unit - response.at(directions, rays.ranges_m, incidence, kinds),
-            ask is not None,
-        )
 
 
 def _in_metres(kinds: NDArray[np.float64], leaf_size_m: float) -> NDArray[np.float64]:

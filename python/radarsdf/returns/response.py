@@ -83,10 +83,7 @@ class Response:
     def at(
         self, directions: Float32, ranges_m: Float32, incidence_rad: Float32, kinds: NDArray[np.int8]
     ) -> Float32:
-        """The quantity (N,) seen along directions (N, 3) from ranges (N,), m.
-
-        `incidence_rad` (N,): angle to the normal of the surface, not used without one. `kinds` (N,): of the surface.
-        """
+        """The quantity (N,) seen along directions (N, 3) from ranges (N,), m, at an incidence (N,) on a kind of surface (N,)."""
         of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
         tables = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in self.coefficients]
         found = np.empty(len(kinds), np.float32)

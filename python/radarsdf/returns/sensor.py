@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import number, real_array, usable_poses
 from radarsdf.io.scans import Scans
+from radarsdf.returns.intensities import Plausible
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.plausible import Plausible
 from radarsdf.returns.rays import Rays
 
 # Of the returns: what lies beyond in azimuth, in elevation or in range is taken for a stray one.
@@ -86,11 +86,6 @@ class Sensor:
     def beam_rad(self) -> tuple[float, float]:
         """Width of a beam in azimuth and elevation, rad: the full width at half maximum of the noise."""
         return _FWHM * self.noise.azimuth_rad, _FWHM * self.noise.elevation_rad
-
-    @property
-    def resolution_m(self) -> float:
-        """Resolution along the beam, m: the full width at half maximum of the noise. It is told; nothing in the package uses it."""
-        return _FWHM * self.noise.range_m
 
     def threshold(self, ranges_m: NDArray[Any]) -> NDArray[np.float64]:
         """(N,) the weakest intensity that is detected at ranges (N,), m, sensor units. -inf without `thresholds`."""

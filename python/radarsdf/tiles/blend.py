@@ -19,11 +19,11 @@ from torch import Tensor
 
 from radarsdf.checks import positive
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
-from radarsdf.returns.cells import lattice_of
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sums import lattice_of
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.knowledge import cells_of, holds, knowledge
 from radarsdf.tiles.plan import Plan, TilePlan, failure_of, map_path
@@ -139,7 +139,7 @@ class TileBlend:
         with self._lock:
             if tile not in self._held:
                 contents = contents_of_tile(self.folder, self.plan, self.plan.by_tile[tile])
-                size = round(_OF_FEATURES * contents.field.cells.features.nbytes)
+                size = round(_OF_FEATURES * sum(p.nbytes for p in contents.field.parameters()))
                 while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
                     self._held.popitem(last=False)
                 self._held[tile] = contents, size

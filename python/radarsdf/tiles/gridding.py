@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.map.queries import CellsInBox, dense_cells
-from radarsdf.returns.echoes import EchoesAt
+from radarsdf.returns.view_statistics import EchoesAt
 from radarsdf.tiles.blend import TileBlend
 
 

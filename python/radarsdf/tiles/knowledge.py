@@ -24,16 +24,16 @@ _LEAST = 1e-6  # of points on the border itself, which are observed, and which w
 
 def cells_of(contents: MapContents, points: Tensor) -> _Cells:
     """(M, 3) the leaf cells of points (M, 3), local frame, m, from the origin of their map."""
-    size_m = contents.field.cells.table.leaf_size_m
+    size_m = contents.field.table.leaf_size_m
     return np.floor(_places(points, size_m)).astype(np.int64)
 
 
 def holds(contents: MapContents, cells: _Cells) -> NDArray[np.bool_]:
     """(M,) whether a tile observed these leaf cells (M, 3), from its origin."""
-    size_m = contents.field.cells.table.leaf_size_m
+    size_m = contents.field.table.leaf_size_m
     centres = (cells + 0.5).astype(np.float32) * np.float32(size_m)
     # The core looks them up on all threads: queries would start threads of their own.
-    return contents.field.cells.occupied(torch.from_numpy(centres)).numpy()
+    return contents.field.occupied(torch.from_numpy(centres)).numpy()
 
 
 def knowledge(
@@ -48,7 +48,7 @@ def knowledge(
     """
     known, slopes = np.zeros(len(points)), np.zeros((len(points), 3))
     inside = np.flatnonzero(queries.occupied(contents, points).numpy())
-    size_m = contents.field.cells.table.leaf_size_m
+    size_m = contents.field.table.leaf_size_m
     place = _places(points[torch.from_numpy(inside)], size_m)
     cell = np.floor(place)
     _, first, of_point = np.unique(

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.budget.estimate import check_triangles
 from radarsdf.checks import check_box, path_of, positive
 from radarsdf.io.files import whole_file
 from radarsdf.io.ply import face_records, ply_header, records
 from radarsdf.map.mesh import described_mesh
 from radarsdf.map.threshold import Limits, Threshold
+from radarsdf.memory import check_triangles
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.pieces import PieceSettings, divides, mesh_tile, piece_path, write_piece
 from radarsdf.tiles.running import Task, run_tasks

@@ -19,10 +19,10 @@ from pydantic import Field
 
 from radarsdf.checks import MAX_POSITION_M
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.intensity_scale import IntensityScale
 from radarsdf.io.files import check_regular_file, write_whole
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.settings import by_name, settings
 from radarsdf.tiles.grid import Tile, TileGrid
 

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.budget.estimate import estimate_rays
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.surface import SurfaceReturns
+from radarsdf.fitting.average import SurfaceReturns
+from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.scans import Scan, scans_in_memory
-from radarsdf.returns.movers import Standing
+from radarsdf.returns.intensities import Intensities
+from radarsdf.returns.moving import Standing
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.plausible import Intensities
 from radarsdf.returns.rays import Rays, check_range, middle_scan, prepare
 from radarsdf.returns.sensor import Sensor
 from radarsdf.threads import Workers

@@ -13,9 +13,9 @@ from radarsdf._core import cell_keys
 from radarsdf.checks import MAX_POSITION_M
 from radarsdf.io.files import check_regular_file
 from radarsdf.io.npz import array_in
-from radarsdf.returns.cells import lattice_of
-from radarsdf.returns.plausible import Plausible
+from radarsdf.returns.intensities import Plausible
 from radarsdf.returns.rays import Rays, rays_from
+from radarsdf.returns.sums import lattice_of
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.plan import Plan, TilePlan, folder_of, within
 

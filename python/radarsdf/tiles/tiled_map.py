@@ -20,7 +20,7 @@ from radarsdf.checks import path_of
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
-from radarsdf.returns.echoes import EchoesAt
+from radarsdf.returns.view_statistics import EchoesAt
 from radarsdf.tiles.blend import Share, TileBlend, averages, distance
 from radarsdf.tiles.drive_poses import DrivePoses
 from radarsdf.tiles.plan import map_path

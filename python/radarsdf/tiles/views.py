@@ -9,11 +9,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.budget.estimate import check_views
 from radarsdf.map import queries
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Limits
 from radarsdf.map.view import TracedSurface, ViewedMap
+from radarsdf.memory import check_views
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.pieces import PieceSettings, piece_of

@@ -1,31 +1,35 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The velocity of the sensor from the Doppler of a scan, and which returns stand still.
+"""Velocity of the sensor from the Doppler of a scan, and the returns that move.
 
-A return that stands still, in direction d of a sensor with velocity v, has the Doppler ``-d·v``: negative if the sensor
-comes nearer. Three returns give v; the v on which most returns agree is refined by least squares. The method is that of
-C. Doer and G. Trommer, "An EKF Based Approach to Radar Inertial Odometry", MFI 2020, written anew.
+A static return in direction d of a sensor with velocity v has the Doppler ``-d·v``, negative where the sensor approaches.
+Three returns give v; the v on which most returns agree is refined by least squares. The method is that of C. Doer and
+G. Trommer, "An EKF Based Approach to Radar Inertial Odometry", MFI 2020, written anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.checks import check_values_of_scans, one_for_each_scan, real_array
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.groups import ReturnsConfig
+from radarsdf.io.scans import Scans
 from radarsdf.products import normal_matrix, product
+from radarsdf.returns.rays import Rays, check_scans, prepare
 
 FloatArray = NDArray[np.float64]
 
 MIN_DOPPLER_RETURNS = 10
 """Fewer returns of a scan tell no velocity."""
 
-_DRAWS = (
-    64  # of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999
-)
+# Of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999.
+_DRAWS = 64
 _SIGMA_MPS = 0.15  # a return is off if its Doppler differs by three times the noise, and by at least this
 _LEAST_SIGMA_MPS = 1e-3
 _ROUNDS = 4
@@ -58,22 +62,11 @@ class SensorVelocity:
 def sensor_velocity(
     points: NDArray[Any], doppler_mps: NDArray[Any], *, interval_mps: float | None = None
 ) -> SensorVelocity:
-    """Finds the velocity of the sensor from one scan. The same scan gives the same bits.
+    """The velocity of the sensor in one scan of returns (N, 3) with `doppler_mps` (N,), positive away from the sensor.
 
-    Parameters
-    ----------
-    points : ndarray
-        (N, 3) returns, sensor frame; their unit does not matter.
-    doppler_mps : ndarray
-        (N,) speed along the ray, m/s, positive away from the sensor.
-    interval_mps : float, optional
-        Width of the interval into which the sensor folds speeds, m/s. None: it folds none.
-
-    Returns
-    -------
-    SensorVelocity
-        Without a velocity if there are fewer than 10 returns, or if less than 40 % of them agree. A component that no
-        return measures is 0 m/s, with a deviation of 100 m/s.
+    None if there are fewer than 10 returns, or if less than 40 % of them agree. A component that no return measures is 0 m/s,
+    with a deviation of 100 m/s. `interval_mps`: width of the interval into which the sensor folds speeds. The same scan gives
+    the same bits.
     """
     x, speeds = np.asarray(points, np.float64), np.asarray(doppler_mps, np.float64)
     ranges = np.linalg.norm(x, axis=1)
@@ -135,14 +128,12 @@ def _most_agreed(
 
 
 def folding_interval_mps(doppler_mps: Sequence[NDArray[Any]]) -> float | None:
-    """Width of the interval into which the sensor seems to fold speeds, m/s: None if the speeds do not fill one.
-
-    Folded speeds reach both ends of the interval, which lie about as far from 0.
-    """
+    """Width of the interval into which the sensor seems to fold speeds, m/s: None if the speeds do not fill one."""
     speeds = np.concatenate([np.asarray(values, np.float64) for values in doppler_mps])
     speeds = speeds[np.isfinite(speeds)]
     if len(speeds) < 100:
         return None
+    # Folded speeds reach both ends of the interval, which lie about as far from 0.
     low, high = float(speeds.min()), float(speeds.max())
     if not 0 < -low < 1.25 * high or not high < -1.25 * low:
         return None
@@ -160,15 +151,7 @@ def sensor_velocities(
     doppler_mps: Sequence[NDArray[Any]],
     others_mps: Sequence[NDArray[Any]] = (),
 ) -> list[SensorVelocity]:
-    """The velocity in each of K scans of one sensor, which may fold speeds into an interval.
-
-    Parameters
-    ----------
-    points, doppler_mps : sequences of K arrays
-        (N_i, 3) and (N_i,) each, as for :func:`sensor_velocity`.
-    others_mps : sequence of arrays
-        Speeds of other scans, that help to find the interval.
-    """
+    """The velocity in each of K scans of one sensor. `others_mps`: speeds of other scans, which help to find the folding interval."""
     interval = folding_interval_mps([*others_mps, *doppler_mps]) if points else None
     choices = [
         [sensor_velocity(x, v, interval_mps=folded) for x, v in zip(points, doppler_mps, strict=True)]
@@ -198,12 +181,8 @@ def without_filler(
         filled = (v == filler) & x.any(axis=1)
         if velocity.found and filled.any():
             away = -x[filled] / np.linalg.norm(x[filled], axis=1)[:, None]
-            contradicting += int(
-                (
-                    np.abs(product(velocity.velocity_mps[None], np.ascontiguousarray(away.T)) - filler)
-                    > 3 * _SIGMA_MPS
-                ).sum()
-            )
+            expected = product(velocity.velocity_mps[None], np.ascontiguousarray(away.T))
+            contradicting += int((np.abs(expected - filler) > 3 * _SIGMA_MPS).sum())
             asked += int(filled.sum())
     if 2 * contradicting > asked or (asked == 0 and share > _ONLY_FILLER):
         return (
@@ -211,3 +190,109 @@ def without_filler(
             f"{share:.0%} of the Doppler values are {filler:g} m/s: they were not measured, and are left out",
         )
     return speeds, None
+
+
+_MIN_SHARE_WITH_VELOCITY = 0.5  # of the scans that have enough returns
+_MAX_MOVING = 0.4  # share of the returns; if more disagree, it is the Doppler that is not understood
+
+
+@dataclass(frozen=True)
+class Movers:
+    """Which returns of F scans move."""
+
+    masks: list[NDArray[np.bool_]]
+    """F arrays (N_i,). All False where a scan tells no velocity of the sensor, or a return has no Doppler."""
+    why_none: str | None
+    """Why none are named although there is Doppler, in words. None: they were looked for in all scans that tell."""
+
+    @classmethod
+    def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> Movers:
+        """Finds the returns whose Doppler disagrees with a world that stands still.
+
+        `points`, `doppler_mps`: F arrays (N_i, 3), sensor frame, m, and (N_i,), m/s, of either sign, folded or not; NaN where it
+        was not measured. TypeError or ValueError: they are no numbers, or do not fit together.
+        """
+        scans, _, _ = check_scans(points)
+        speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
+        none = [np.zeros(len(scan), bool) for scan in scans]
+        tried = [i for i, scan in enumerate(scans) if len(scan) >= MIN_DOPPLER_RETURNS]
+        found = sensor_velocities([scans[i] for i in tried], [speeds[i] for i in tried])
+        telling = [(i, velocity) for i, velocity in zip(tried, found, strict=True) if velocity.found]
+        if len(telling) < max(1, _MIN_SHARE_WITH_VELOCITY * len(tried)):
+            return cls(
+                none, filler or f"only {len(telling)} of {len(scans)} scans agree on a velocity of the sensor"
+            )
+        masks = list(none)
+        for i, velocity in telling:
+            masks[i] = ~velocity.static & np.isfinite(speeds[i]) & scans[i].any(axis=1)
+        share = sum(int(masks[i].sum()) for i, _ in telling) / sum(len(masks[i]) for i, _ in telling)
+        if share > _MAX_MOVING:
+            return cls(none, f"{share:.0%} of the returns disagree with the sensor's own motion")
+        return cls(masks, None)
+
+    @property
+    def count(self) -> int:
+        """Number of returns that move."""
+        return sum(int(mask.sum()) for mask in self.masks)
+
+    def without(self, arrays: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+        """F arrays (N_i, ...) without the rows of what moves."""
+        return [np.asarray(array)[~mask] for array, mask in zip(arrays, self.masks, strict=True)]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The returns of F scans without those that move, as far as Doppler tells them."""
+
+    points: Iterable[ArrayLike]
+    """F arrays (N_i, 3), sensor frame, m."""
+    intensities: Iterable[ArrayLike] | None
+    """F arrays (N_i,), sensor units."""
+    movers: int
+    """Number of returns that were left out."""
+    why_none: str | None
+    """As of :class:`Movers`."""
+
+    @classmethod
+    def of(
+        cls,
+        points: Iterable[ArrayLike],
+        intensities: Iterable[ArrayLike] | None,
+        doppler_mps: Sequence[ArrayLike] | None,
+        config: ReturnsConfig,
+    ) -> Standing:
+        """All returns, if there is no Doppler or ``config.drop_movers`` says so; else see :meth:`Movers.of`."""
+        if doppler_mps is None or not config.drop_movers:
+            return cls(points, intensities, 0, None)
+        points = list(one_for_each_scan(points, "points"))
+        intensities = None if intensities is None else list(one_for_each_scan(intensities, "intensities"))
+        if intensities is not None:
+            check_scans(points, intensities)
+        movers = Movers.of(points, doppler_mps)
+        values = None if intensities is None else movers.without(intensities)
+        return cls(movers.without(points), values, movers.count, movers.why_none)
+
+
+def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+    """F arrays (N_i,) of numbers. Raises TypeError or ValueError where they are none, or do not fit to the scans."""
+    speeds = [
+        real_array(values, f"doppler_mps of scan {i}")
+        for i, values in enumerate(one_for_each_scan(doppler_mps, "doppler_mps"))
+    ]
+    check_values_of_scans(speeds, scans, "doppler_mps")
+    return speeds
+
+
+def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
+    """The returns that a fit with this configuration accepts, of a range and of what does not move, each seen from where its scan was taken.
+
+    An intensity that cannot belong to the others of these scans is NaN.
+    """
+    standing = Standing.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
+    return prepare(
+        standing.points,
+        scans.poses,
+        standing.intensities,
+        min_range_m=config.returns.min_range_m,
+        max_range_m=config.returns.max_range_m,
+    )

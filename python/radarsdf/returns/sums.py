@@ -1,18 +1,83 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Sums over scans: what is kept of the returns in each cell, whatever becomes of the scans."""
+"""Integer sums over the returns of each leaf cell, and the mean rays that follow from them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import DIRECTION_QUANTA, count_scans, sum_returns
-from radarsdf.returns.cells import ReturnCells, lattice_of, merged_keys
+from radarsdf._core import DIRECTION_QUANTA, CellBlocks, CellSet, cell_keys, count_scans, sum_returns
 from radarsdf.returns.rays import Rays
+
+MAX_CELLS_FROM_ORIGIN = 1_000_000
+"""Farthest cell along each axis. A Morton key has 21 bits for each axis."""
+
+_AXIS_BITS = 21  # of a key, interleaved with those of the other axes
+_QUARTER = np.uint64(
+    0b111 << (3 * (_AXIS_BITS - 2))
+)  # of the bits of a key: those that say in which quarter of the axes
+_COMPACTED = (
+    (2, 0x10C30C30C30C30C3),
+    (4, 0x100F00F00F00F00F),
+    (8, 0x001F0000FF0000FF),
+    (16, 0x001F00000000FFFF),
+    (32, 0x1FFFFF),
+)  # how far to shift, and which bits to keep then
+
+
+def lattice_of(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Lattice coordinates (N, 3) of the cells with these Morton keys (N,)."""
+    coordinates = np.empty((len(keys), 3), np.int64)
+    for axis in range(3):
+        bits = keys >> np.uint64(axis) & np.uint64(0x1249249249249249)
+        for shift, kept in _COMPACTED:
+            bits = (bits | bits >> np.uint64(shift)) & np.uint64(kept)
+        coordinates[:, axis] = bits.astype(np.int64) - (1 << (_AXIS_BITS - 1))
+    return coordinates
+
+
+def merged_keys(keys: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Morton keys (N,) of the cells twice as large that the cells with these keys (N,) are in. Their order stays."""
+    halved = keys >> np.uint64(3)
+    # Coordinates count from -2²⁰, of these cells, too: half of that was shifted out.
+    quarters = halved & _QUARTER
+    merged: NDArray[np.uint64] = (halved ^ _QUARTER) | quarters << np.uint64(3)
+    return merged
+
+
+@dataclass(frozen=True)
+class ReturnCells:
+    """The cells that hold returns."""
+
+    keys: NDArray[np.uint64]
+    """(C,) Morton keys of the cells, ascending."""
+    blocks: CellBlocks
+    """Finds the row of a cell from its key."""
+    cell_of_ray: NDArray[np.int32]
+    """(N,) row of each return's cell."""
+
+    @classmethod
+    def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> ReturnCells:
+        """The cells of this size, m, that hold returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
+        points = np.ascontiguousarray(rays.points)
+        occupied = CellSet(cell_size_m)
+        occupied.insert(points, num_threads)
+        keys = occupied.sorted_keys(num_threads)
+        del occupied  # frees memory: it can be as large as everything below
+        blocks = CellBlocks(keys)
+        rows = blocks.rows(cell_keys(points, cell_size_m, num_threads), num_threads)
+        return cls(keys, blocks, rows)
+
+    @cached_property
+    def counts(self) -> NDArray[np.float64]:
+        """(C,) number of returns in each cell."""
+        return np.bincount(self.cell_of_ray, minlength=len(self.keys)).astype(np.float64)
+
 
 QUANTA = 1 << 16
 """Quanta in the edge of a leaf cell: 3 µm of 0.2 m, as float32 coordinates have at 50 m. Products of 10⁸ returns have room."""
@@ -102,14 +167,9 @@ class ScanSums:
         return means
 
     def merged_moments(self) -> tuple[NDArray[np.uint64], NDArray[np.float64]]:
-        """Sums over the returns of each cell twice as large.
+        """Keys (P,), ascending, of the cells twice as large, and sums (P, 13) over their returns.
 
-        Returns
-        -------
-        ndarray
-            (P,) uint64, Morton keys of these cells, ascending.
-        ndarray
-            (P, 13) float64, sums of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m², and of the direction (3).
+        Sums are of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m², and of the direction (3).
         """
         keys = merged_keys(self.keys)
         first = np.flatnonzero(np.diff(keys, prepend=keys[:1] + np.uint64(1)))
@@ -141,3 +201,62 @@ def _moved(sums: NDArray[Any], steps: NDArray[Any]) -> NDArray[Any]:
 def _corners(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
     """(C, 3) lower corners of leaf cells, quanta."""
     return lattice_of(keys) * QUANTA
+
+
+_MIN_LENGTH = 1e-6  # of the mean of unit directions. A shorter one has no meaningful direction
+
+
+@dataclass(frozen=True)
+class MeanRays:
+    """The mean ray of each cell.
+
+    Measured: as a start of the training, the average over mean rays is as good as over all rays, of which
+    there are two to three times as many.
+    """
+
+    keys: NDArray[np.uint64]
+    """(M,) Morton keys of the cells, ascending."""
+    points: NDArray[np.float32]
+    """(M, 3) mean of the returns in each cell, local, m."""
+    directions: NDArray[np.float32]
+    """(M, 3) mean direction of their rays, unit vectors. Downwards where rays from opposite sides leave none."""
+    counts: NDArray[np.float32]
+    """(M,) number of returns in each cell."""
+    scans: NDArray[np.uint32]
+    """(M,) number of different scans that they are of."""
+    ranges_m: NDArray[np.float32]
+    """(M,) mean range of the returns in each cell, m."""
+
+    @classmethod
+    def of_sums(cls, sums: ScanSums) -> MeanRays:
+        """The mean rays of scans that are known by their `sums`."""
+        directions = sums.mean_directions
+        lengths = np.linalg.norm(directions, axis=1)[:, None]
+        directions = np.where(
+            lengths > _MIN_LENGTH, directions / np.maximum(lengths, _MIN_LENGTH), [0.0, 0.0, -1.0]
+        )
+        return cls(
+            keys=sums.keys,
+            points=sums.mean_points.astype(np.float32),
+            directions=directions.astype(np.float32),
+            counts=sums.counts.astype(np.float32),
+            scans=sums.scans,
+            ranges_m=sums.mean_ranges_m.astype(np.float32),
+        )
+
+    def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
+        """The mean rays of some of the cells: a mask (M,) bool, or row numbers."""
+        return MeanRays(
+            self.keys[part],
+            self.points[part],
+            self.directions[part],
+            self.counts[part],
+            self.scans[part],
+            self.ranges_m[part],
+        )
+
+    def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
+        """(C,) uint64, ascending Morton keys of the leaf cells that rays cross within `reach_m` of their returns."""
+        cells = CellSet(leaf_size_m)
+        cells.insert_rays(self.points, self.directions, reach_m, num_threads)
+        return cells.sorted_keys(num_threads)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Surfels: planes through the returns of a cell and the cells round it."""
+"""Planes through the returns of a cell and its neighbourhood (surfels)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, cell_keys, principal_axes
-from radarsdf.returns.cells import merged_keys
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.scan_sums import UPPER, ScanSums
+from radarsdf.returns.sums import UPPER, ScanSums, merged_keys
 
 # Measured on simulated and real scans; see bench/history/surface.md.
 LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m with leaf cells of 0.2 m

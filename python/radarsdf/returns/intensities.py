@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Which intensities can belong to the others. A driver's sentinel, or garbage, would stretch the scale of all of them."""
+"""Which intensities are outliers, and the scale of the others."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from radarsdf.checks import real_array
 
 # An intensity is left out if it lies beyond a gap, and farther than the tail of the others reaches but by chance.
 _GAP = 3.0  # times as far from the median as any other. Tails have gaps, too
@@ -108,3 +111,39 @@ def _reach(distances: NDArray[Any], share: float) -> float:
         return third + length * steps
     with np.errstate(over="ignore"):
         return float(third + length * growth * (np.float64(growth) ** steps - 1) / (growth - 1))
+
+
+@dataclass(frozen=True)
+class IntensityScale:
+    """The range of the training intensities, which becomes [0, 1]."""
+
+    low: float
+    """Lowest training intensity, sensor units."""
+    high: float
+    """Highest training intensity, sensor units."""
+
+    @classmethod
+    def of(cls, intensities: NDArray[np.float32] | None) -> IntensityScale | None:
+        """The range of `intensities` (N,), sensor units, NaN where there is none. None if there are none at all."""
+        return (
+            None if intensities is None else cls(float(np.nanmin(intensities)), float(np.nanmax(intensities)))
+        )
+
+    @classmethod
+    def between(cls, intensity_range: ArrayLike) -> IntensityScale:
+        """A range (low, high) that is given. Raises a ValueError unless it is finite and ascending."""
+        ends = real_array(intensity_range, "intensity_range")
+        if ends.shape != (2,) or not -np.inf < ends[0] < ends[1] < np.inf:
+            msg = "intensity_range must be two finite numbers, the lower one first"
+            raise ValueError(msg)
+        return cls(*ends.tolist())
+
+    def to_unit(self, intensities: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Intensities (N,) from sensor units to [0, 1]. Those beyond the range are moved to its ends, NaN stays."""
+        unit = (intensities - np.float32(self.low)) / np.float32(self.high - self.low)
+        clipped: NDArray[np.float32] = np.clip(unit, 0, 1).astype(np.float32)
+        return clipped
+
+    def to_sensor(self, unit: Tensor) -> Tensor:
+        """Intensities (N,) from [0, 1] to sensor units."""
+        return self.low + (self.high - self.low) * unit

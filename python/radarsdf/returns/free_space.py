@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Passages: which leaf cells rays passed on the way to their returns. All that a map knows of free space."""
+"""Free-space crossings: the leaf cells that rays crossed before their returns."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import find_passages
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN, lattice_of
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 
 BLOCK_CELLS = 8
 """Edge of a block, leaf cells."""
@@ -44,23 +44,10 @@ class Passages:
         box_cells: NDArray[np.int64] | None = None,
         num_threads: int = 0,
     ) -> Passages:
-        """What `rays` passed.
+        """What `rays`, without those to false returns, crossed in the box [lower, upper), (2, 3) leaf cells. None: anywhere.
 
         A ray tells of cells up to two standard deviations of its return before it, and only where the angles of a return
-        are known to one cell: beyond that it cannot be said which cell a ray passed.
-
-        Parameters
-        ----------
-        rays : Rays
-            Without those to returns that are known to be false.
-        noise : SensorNoise
-            Of the returns.
-        leaf_size_m : float
-            Edge of a leaf cell, m.
-        box_cells : ndarray, optional
-            (2, 3) leaf cells; blocks outside [lower, upper) are left out. None: all are kept.
-        num_threads : int
-            0: as many as OpenMP uses.
+        are known to one cell: beyond that it cannot be said which cell a ray crossed.
         """
         before_m = rays.ranges_m - np.float32(_SIGMAS) * np.sqrt(noise.variances_m2(rays.ranges_m))
         known_m = np.float32(leaf_size_m / noise.angle_rad)
@@ -95,13 +82,7 @@ class Passages:
     def dense(
         self, lower: ArrayLike, shape: tuple[int, int, int]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Passages as arrays of leaf cells, of which the first is `lower` (3,).
-
-        Returns
-        -------
-        tuple
-            Number of scans that passed each cell, up to 7, and whether it holds returns; both of this shape.
-        """
+        """Scans that crossed, up to 7, and whether there are returns, for leaf cells from `lower` (3,) on, in arrays of this shape."""
         first = np.asarray(lower, np.int64)
         last = first + np.asarray(shape)
         begin, end = first // BLOCK_CELLS, -(-last // BLOCK_CELLS)  # blocks that the box touches

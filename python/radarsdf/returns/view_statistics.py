@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Echoes: how strong the returns of a fit were, place by place and view by view. What two maps can compare."""
+"""View statistics of intensity: mean intensities by place and view, which two maps can compare."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_rows
-from radarsdf.returns.cells import MAX_CELLS_FROM_ORIGIN
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 
 Float32 = NDArray[np.float32]
 Floating = NDArray[np.floating]

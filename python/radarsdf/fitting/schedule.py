@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_SAMPLES
 
 # The sdf stage makes so many passes over the samples, within these limits. If they contradict each other, the least
 # number of iterations wins over the most passes and the most samples. Measured: bench/history/time.md.
@@ -57,8 +58,10 @@ class Schedule:
         cls, config: FitConfig, *, surface_returns: int, returns: int, vertices: int, with_intensity: bool
     ) -> Schedule:
         """The schedule for `surface_returns` returns without ghosts, `returns` with them."""
-        sampling, training = config.sampling, config.training
-        samples = surface_returns * (sampling.near_samples + sampling.free_samples)
+        training = config.training
+        if not config.train:
+            return cls(0, 1, 0, 0, 0, 0.0, 0.0)
+        samples = surface_returns * (NEAR_SAMPLES + FREE_SAMPLES)
         batch_size, sdf_iterations = training.batch_size, training.sdf_iterations
         if sdf_iterations is None:
             batch_size, sdf_iterations = _sdf_schedule(config, samples, vertices)
@@ -67,7 +70,7 @@ class Schedule:
         passes = sdf_iterations * batch_size / samples
         if not with_intensity:
             return cls(batch_size, neighbours, sdf_iterations, 0, 0, 0.0, passes)
-        samples = returns * sampling.near_samples
+        samples = returns * NEAR_SAMPLES
         intensity_batch_size, intensity_iterations = (
             training.intensity_batch_size,
             training.intensity_iterations,
@@ -95,25 +98,6 @@ class Schedule:
     def iterations(self) -> dict[str, int]:
         """Iterations of both stages by name, for reports."""
         return {"sdf": self.sdf_iterations, "intensity": self.intensity_iterations}
-
-
-def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
-    """How many samples of a batch of the sdf stage are near the surface, and how many of these have labels.
-
-    A label is the intensity of the return. The intensity network needs no more of them in a large batch than in a batch of
-    its own stage.
-    """
-    sampling, training = config.sampling, config.training
-    near = max(
-        1, round(batch_size * (sampling.near_samples / (sampling.near_samples + sampling.free_samples)))
-    )
-    # With labels in free space, a sample without a label of its own would have that of free space.
-    return near, near if training.intensity_in_free_space else min(near, training.intensity_batch_size)
-
-
-def seen_jointly(config: FitConfig, batch_size: int) -> int:
-    """How many samples of a batch of the sdf stage the intensity network sees in a joint iteration."""
-    return batch_size if config.training.intensity_in_free_space else near_and_labelled(config, batch_size)[1]
 
 
 def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, int]:

@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The field of stage 1: signed distances at the corners of leaf cells."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from radarsdf._core import Encoding, VertexTable
+from radarsdf.field import kernels
+from radarsdf.field.field import Field, LeafCorners
+
+
+class GridField(Field):
+    """Signed distances at the corners of leaf cells, interpolated trilinearly. 0 outside the cells.
+
+    Parameters
+    ----------
+    leaf_keys : ndarray
+        (C,) uint64, Morton keys of the occupied leaf cells, ascending (``CellSet.sorted_keys``).
+    leaf_size_m : float
+        Edge of a leaf cell, m.
+    num_threads : int
+        Threads that build the table of corners. 0: as many as OpenMP uses.
+
+    Attributes
+    ----------
+    distances_m : Parameter
+        (V,) float32, at the corners of the cells, in the order of `table`. It is not initialised.
+    """
+
+    def __init__(self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_threads: int = 0) -> None:
+        super().__init__()
+        self.table = VertexTable(leaf_keys, leaf_size_m, 1, Encoding.OCTREE, num_threads)
+        self.distances_m = nn.Parameter(torch.empty(self.table.num_rows, dtype=torch.float32, device="cpu"))
+
+    def sdf(self, points: Tensor) -> Tensor:
+        cells = kernels.locate(points, self.table)[:, 0]
+        inside = cells >= 0
+        corners = self._corners_of_cells.index_select(0, cells.clamp(min=0)).view(-1)
+        values = self.distances_m.index_select(0, corners).view(-1, 2, 2, 2)
+        place = points * (
+            1 / self.table.leaf_size_m
+        )  # as the core divides, or a point could be in another cell
+        x, y, z = (place - place.detach().floor()).unbind(1)
+        values = torch.lerp(values[:, 0], values[:, 1], x[:, None, None])
+        values = torch.lerp(values[:, 0], values[:, 1], y[:, None])
+        return torch.where(inside, torch.lerp(values[:, 0], values[:, 1], z), 0.0)
+
+    def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
+        # The closed form knows no limits, and what is beyond those of the returns was never measured.
+        return self._closed_form(points, directions, ranges_m).clamp(0, 1)
+
+    def leaf_corners(self) -> LeafCorners:
+        corners, of_cells = self.table.leaf_vertices()
+        return LeafCorners(corners, of_cells, self.distances_m.detach().numpy())
+
+    @cached_property
+    def _corners_of_cells(self) -> Tensor:
+        """(C, 8) int32, rows of `distances_m`, in C order of the corners."""
+        return torch.from_numpy(self.table.leaf_vertices()[1])

@@ -1,0 +1,285 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The field of stage 2: encodings and networks, and their widths as functions of the configuration."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.field.encodings import Fourier, Octree, SphericalHarmonics, TriQuadtree
+from radarsdf.field.field import Field
+from radarsdf.field.kernels import mlp
+
+SDF_HIDDEN = (32, 32)  # widths of the hidden layers of the SDF network (3QFP)
+# Half of the longest Fourier wavelength, leaf cells (3QFP: 409.6 m).
+FOURIER_HALF_WIDTH_CELLS = 2048.0
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Inputs and outputs of the SDF network at N points."""
+
+    encoding: tuple[Tensor, ...]
+    """Inputs, (N, width) each: the encoding by the cells, then the Fourier encoding if there is one."""
+    logit: Tensor
+    """(N,) signed distance / sigma, positive in free space."""
+    feature: Tensor
+    """(N, geometry_feature_dim), an input of the intensity network."""
+    normals: Tensor | None
+    """(N, 3) unit vectors towards free space. None if the intensity network does not use them."""
+
+    def first(self, count: int) -> Geometry:
+        """The part for the first `count` points."""
+        normals = None if self.normals is None else self.normals[:count]
+        encoding = tuple(part[:count] for part in self.encoding)
+        return Geometry(encoding, self.logit[:count], self.feature[:count], normals)
+
+
+class NeuralField(Field):
+    """Features of cells and a Fourier encoding, from which two networks compute signed distance and intensity.
+
+    Parameters
+    ----------
+    leaf_keys : ndarray
+        (C,) uint64, Morton keys of the occupied leaf cells, ascending (``CellSet.sorted_keys``).
+    config : FitConfig
+        Its encoding, its networks and its lengths are used.
+    with_intensity : bool
+        Whether the field has an intensity network.
+    num_threads : int
+        Threads that build the table of vertices. 0: as many as OpenMP uses.
+    """
+
+    def __init__(
+        self, leaf_keys: NDArray[np.uint64], config: FitConfig, *, with_intensity: bool, num_threads: int = 0
+    ) -> None:
+        super().__init__()
+        encoding = TriQuadtree if config.encoding.kind == "tri-quadtree" else Octree
+        self.sigma_m = config.sigma_m
+        self.cells = encoding(leaf_keys, config.leaf_size_m, config.encoding.num_levels, num_threads)
+        self.table = self.cells.table
+        half_width_m = config.metres(FOURIER_HALF_WIDTH_CELLS)
+        self.fourier = Fourier(half_width_m, config.encoding.fourier_count)
+        self.sdf_network = SDFNetwork(config)
+        self.intensity_network = IntensityNetwork(config) if with_intensity else None
+
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draws the weights of the networks, then the features (3QFP)."""
+        self.sdf_network.initialise(generator)
+        if self.intensity_network is not None:
+            self.intensity_network.initialise(generator)
+        self.cells.initialise(generator)
+
+    @property
+    def smooth_in_cells(self) -> bool:
+        # No wavelength of the encoding is shorter than two leaf cells.
+        shortest_m = 2 * self.fourier.half_width_m / 2 ** (self.fourier.num_frequencies - 1)
+        return self.fourier.num_frequencies == 0 or shortest_m >= 2 * self.table.leaf_size_m
+
+    def encode(self, points: Tensor, interpolated: Tensor | None = None) -> tuple[Tensor, ...]:
+        """The inputs of the SDF network, (N, width) each, at points (N, 3), local frame, m.
+
+        `interpolated`: the features of the cells at the points, (N, interpolated_dim), if they are known
+        already.
+        """
+        cells = self.cells(points) if interpolated is None else self.cells.combine(interpolated)
+        return (cells, self.fourier(points)) if self.fourier.num_frequencies else (cells,)
+
+    def logit(self, points: Tensor, interpolated: Tensor | None = None) -> Tensor:
+        """Signed distance / sigma (N,), positive in free space. `interpolated`: see :meth:`encode`."""
+        return self.sdf_network(self.encode(points, interpolated))[0]  # type: ignore[no-any-return]
+
+    def sdf(self, points: Tensor) -> Tensor:
+        return self.logit(points) * self.sigma_m
+
+    def geometry(
+        self, points: Tensor, *, frozen: bool = True, interpolated: Tensor | None = None
+    ) -> Geometry:
+        """The inputs of the intensity network at points (N, 3), local frame, m.
+
+        `frozen`: no gradient reaches features and SDF network. `interpolated`: see :meth:`encode`.
+        """
+        wants_normals = self.intensity_network is not None and self.intensity_network.normals
+        # A normal is the gradient of the logit, so it needs an autograd graph even if the field is frozen.
+        with torch.set_grad_enabled((torch.is_grad_enabled() and not frozen) or wants_normals):
+            if wants_normals:
+                points = points.detach().requires_grad_()
+            encoding = self.encode(points, interpolated)
+            logit, feature = self.sdf_network(encoding)
+            normals = None
+            if wants_normals:
+                (gradient,) = torch.autograd.grad(logit.sum(), points, create_graph=not frozen)
+                normals = functional.normalize(gradient, dim=1)
+        if frozen:
+            encoding = tuple(part.detach() for part in encoding)
+            logit, feature = logit.detach(), feature.detach()
+        return Geometry(encoding, logit, feature, normals)
+
+    def intensity_of(
+        self,
+        geometry: Geometry,
+        directions: Tensor,
+        ranges_m: Tensor,
+        *,
+        encoding_factors: Sequence[Tensor] | None = None,
+    ) -> Tensor:
+        """What the intensity network answers (N,) for the result of :meth:`geometry`.
+
+        `directions`, `ranges_m`: see :meth:`intensity`. `encoding_factors`: dropout, what each part of the encoding is
+        multiplied by.
+        """
+        assert self.intensity_network is not None
+        encoding = geometry.encoding
+        if encoding_factors is not None:
+            encoding = tuple(part * kept for part, kept in zip(encoding, encoding_factors, strict=True))
+        return self.intensity_network(  # type: ignore[no-any-return]
+            encoding, geometry.logit, geometry.feature, geometry.normals, directions, ranges_m
+        )
+
+    def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
+        unit = self._closed_form(points, directions, ranges_m)
+        closed = self.reflectance
+        share = 1.0 if closed is None else closed.network_share
+        if share > 0:
+            unit += share * self.intensity_of(self.geometry(points), directions, ranges_m)
+        # The closed form knows no limits, and what is beyond those of the training was never measured.
+        return unit if closed is None else unit.clamp(0, 1)
+
+
+class Network(nn.Module):
+    """Linear layers with ReLU between them. They have no memory until they are initialised or loaded."""
+
+    def __init__(self, widths: Sequence[int]) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
+            layers.append(nn.Linear(inputs, outputs, device="meta", dtype=torch.float32))
+            if i < len(widths) - 2:
+                layers.append(nn.ReLU())
+        self.layers = nn.Sequential(*layers)
+
+    @torch.no_grad()
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draws weights and biases like ``torch.nn.Linear``, but from `generator`."""
+        for layer in self._linear():
+            # Not to_empty(), which imports SymPy: a second.
+            layer.weight, layer.bias = (
+                nn.Parameter(torch.empty(p.shape, dtype=p.dtype, device="cpu"))
+                for p in (layer.weight, layer.bias)
+            )
+            nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=generator)
+            bound = 1 / math.sqrt(layer.in_features)
+            nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
+
+    def _linear(self) -> list[nn.Linear]:
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+
+    def _run(self, inputs: Sequence[Tensor]) -> Tensor:
+        """Output of the layers for `inputs`, (N, width) each, side by side."""
+        layers = [(layer.weight, layer.bias) for layer in self._linear()]
+        return mlp([x for x in inputs if x.shape[1] > 0], layers)
+
+
+class SDFNetwork(Network):
+    """From the encoding of a point to signed distance / sigma, positive in free space, and a feature."""
+
+    def __init__(self, config: FitConfig) -> None:
+        super().__init__(sdf_widths(config))
+
+    def forward(self, encoding: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Logit (N,) and geometry feature (N, geometry_feature_dim) of encodings (N, width), side by side."""
+        out = self._run(encoding)
+        # The gradient of out[:, 0] is a matrix filled up with zeros. squeeze avoids it if there is only one
+        # column.
+        return out.squeeze(1) if out.shape[1] == 1 else out[:, 0], out[:, 1:]
+
+
+class IntensityNetwork(Network):
+    """Intensity of the return that a sensor gets from a point, scaled to about [0, 1].
+
+    By the radar equation, P ∝ σ / r⁴, it depends on the range as well as on the direction. In dB it is linear
+    in log r, so log r is the input.
+    """
+
+    def __init__(self, config: FitConfig) -> None:
+        super().__init__(intensity_widths(config))
+        networks = config.networks
+        self.sdf_input = networks.sdf_input
+        self.view_direction = networks.view_direction
+        self.log_range = networks.log_range
+        self.normals = networks.normals
+        self.harmonics = SphericalHarmonics()
+
+    def forward(
+        self,
+        encoding: Sequence[Tensor],
+        logit: Tensor,
+        geometry_feature: Tensor,
+        normals: Tensor | None,
+        directions: Tensor,
+        ranges_m: Tensor,
+    ) -> Tensor:
+        """Scaled intensity (N,). Inputs are those of :class:`Geometry` and :meth:`Field.intensity`."""
+        inputs = [*encoding, geometry_feature]
+        if self.sdf_input:
+            inputs.append(logit[:, None])
+        if self.normals:
+            assert normals is not None
+            inputs.append(normals)
+        if self.view_direction:
+            inputs.append(self.harmonics(directions))
+        if self.log_range:
+            inputs.append(torch.log10(ranges_m.clamp_min(1e-3) / 10.0)[:, None])
+        return self._run(inputs).squeeze(1)
+
+
+def cells_width(config: FitConfig) -> int:
+    """Width of the encoding by the cells. A tri-quadtree puts levels side by side, an octree adds them."""
+    return FEATURE_DIM * (config.encoding.num_levels if config.encoding.kind == "tri-quadtree" else 1)
+
+
+def fourier_width(config: FitConfig) -> int:
+    """Width of the Fourier encoding: sine and cosine of three coordinates for each frequency."""
+    return 6 * config.encoding.fourier_count
+
+
+def sdf_widths(config: FitConfig) -> tuple[int, ...]:
+    """Widths of the input, the hidden layers and the output of the SDF network."""
+    inputs = cells_width(config) + fourier_width(config)
+    return (inputs, *SDF_HIDDEN, 1 + config.networks.geometry_feature_dim)
+
+
+def intensity_widths(config: FitConfig) -> tuple[int, ...]:
+    """Widths of the input, the hidden layers and the output of the intensity network."""
+    networks = config.networks
+    inputs = (
+        cells_width(config)
+        + fourier_width(config)
+        + networks.geometry_feature_dim
+        + networks.sdf_input
+        + 3 * networks.normals
+        + NUM_SPHERICAL_HARMONICS * networks.view_direction
+        + networks.log_range
+    )
+    return (inputs, *networks.intensity_hidden, 1)
+
+
+def weights_of(widths: tuple[int, ...]) -> int:
+    """Number of weights of a network without its biases. So many multiplications it takes for one point."""
+    return sum(inputs * outputs for inputs, outputs in itertools.pairwise(widths))
+
+
+def parameters_of(widths: tuple[int, ...]) -> int:
+    """Number of weights and biases of a network."""
+    return weights_of(widths) + sum(widths[1:])

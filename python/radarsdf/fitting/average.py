@@ -1,0 +1,235 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Stage 1: what follows from the returns without training. Cells, distances at their corners, evidence, reflectance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from radarsdf._core import CellSet, VertexTable, count_scans
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.groups import ReturnsConfig
+from radarsdf.field.grid_field import GridField
+from radarsdf.fitting.sampling import NEAR_BAND_CELLS
+from radarsdf.map import queries
+from radarsdf.map.contents import MapContents
+from radarsdf.returns.evidence import ReturnsOfCells, bridged
+from radarsdf.returns.ghosts import find_ghosts
+from radarsdf.returns.noise import SensorNoise, onto_surfels, sensor_noise
+from radarsdf.returns.planes import Surfels
+from radarsdf.returns.rays import Rays
+from radarsdf.returns.reflectance import Float32, Reflectance
+from radarsdf.returns.sums import MeanRays, ReturnCells, ScanSums
+
+BAND_CELLS = 2.0
+"""Leaf cells from a return, along its ray, up to which cells belong to the map of stage 1."""
+TRUNCATION_CELLS = 3.0
+"""Distances are truncated here, and a ray counts up to this far before and behind its return, leaf cells (VDBFusion: 3
+voxels). Measured: 4 and 5 are as good on simulated scenes, 0.5 and 1.2 points of F-score worse on real ones."""
+# Iterations of smoothing. Measured: twice as many are 0.0 to 0.1 points of F-score better on whole simulated scenes, half as
+# many 0.0 to 0.3 worse. See bench/history/live.md.
+_SMOOTHINGS = 24
+CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
+"""Leaf cells, along each axis, over which :func:`average_at_corners` carries what is known."""
+
+
+@dataclass(frozen=True)
+class SurfaceReturns:
+    """The returns that the surface is made of, and what is known of them."""
+
+    rays: Rays
+    """Without ghosts. If a field is trained on them, they are moved towards the flat surfel of their cell."""
+    surfels: Surfels
+    """Surfels of all returns."""
+    noise: SensorNoise
+    """Noise of the returns."""
+    means: MeanRays | None
+    """Mean rays of the leaf cells, without ghosts, which are averaged. None: a field is trained on `rays`."""
+    true: NDArray[np.bool_] | None
+    """(N,) which of all rays end at no ghost. None: ghosts were not looked for."""
+
+    @classmethod
+    def of(
+        cls,
+        rays: Rays,
+        config: FitConfig,
+        num_threads: int,
+        inside: NDArray[np.bool_] | None = None,
+        sums: ScanSums | None = None,
+    ) -> SurfaceReturns:
+        """Cleans `rays` as ``config.returns`` says, and keeps those that are `inside`, (N,). None: all.
+
+        `sums`: of the same rays, if they are known.
+        """
+        sums = ScanSums.of(rays, config.leaf_size_m, num_threads) if sums is None else sums
+        surfels = Surfels.of_sums(sums, num_threads)
+        means = None if config.train else MeanRays.of_sums(sums)
+        del sums  # frees memory: a hundred bytes a cell
+        noise = sensor_noise(surfels, rays, config.returns, num_threads)
+        kept, true = inside, None
+        if means is not None and inside is not None:
+            leaf_cells = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
+            means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
+        if config.returns.drop_ghosts:
+            of_ghosts = find_ghosts(surfels, rays if means is None else means, noise, num_threads)
+            true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)]
+            kept = true if inside is None else true & inside
+            if means is not None:
+                means = means.select(~of_ghosts[surfels.cells_of_leaves(means.keys, num_threads)])
+        if config.train and config.returns.onto_planes:
+            rays = onto_surfels(surfels, rays, noise, num_threads)
+        return cls(rays if kept is None else rays.select(kept), surfels, noise, means, true)
+
+
+def occupied_cells(
+    surface: SurfaceReturns, config: FitConfig, num_threads: int
+) -> tuple[NDArray[np.uint64], ReturnsOfCells]:
+    """Keys (C,), ascending, of the leaf cells in which a surface can lie, and what the returns of cells tell.
+
+    These are the cells that rays cross near their returns, and those that bridge gaps between them.
+    """
+    if surface.means is None:
+        keys = near_leaf_keys(surface.rays, config, num_threads)
+        returns = _returns_of_rays(surface, config, num_threads)
+    else:
+        keys = surface.means.leaf_keys(config.leaf_size_m, config.metres(BAND_CELLS), num_threads)
+        returns = returns_of_means(surface.means, surface.noise, config.returns)
+    bridges = config.encoding.bridge_cells
+    return bridged(keys, returns.keys, returns.counts, bridges, num_threads), returns
+
+
+def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
+    """(C,) uint64, Morton keys of the leaf cells that a sample near the surface can fall into, ascending.
+
+    Points every half cell along the near band of each ray find the cells. Random samples would make the map's
+    cells depend on the seed.
+    """
+    band_m = config.metres(NEAR_BAND_CELLS)
+    steps = math.ceil(2 * band_m / (config.leaf_size_m / 2))
+    cells = CellSet(config.leaf_size_m)
+    offsets_m = np.linspace(-band_m, band_m, steps + 1).astype(np.float32)
+    points, directions = np.ascontiguousarray(rays.points), np.ascontiguousarray(rays.directions)
+    cells.insert_along(points, directions, offsets_m, num_threads)
+    return cells.sorted_keys(num_threads)
+
+
+def _returns_of_rays(surface: SurfaceReturns, config: FitConfig, num_threads: int) -> ReturnsOfCells:
+    """What the returns of each leaf cell tell, return by return."""
+    rays = surface.rays
+    cells = ReturnCells.of(rays, config.leaf_size_m, num_threads)
+    information = 1 / surface.noise.variances_m2(rays.ranges_m)
+    found = ReturnsOfCells(
+        keys=cells.keys,
+        information=np.bincount(cells.cell_of_ray, information, len(cells.keys)).astype(np.float32),
+        scans=count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads),
+        counts=cells.counts,
+    )
+    ranges_m = np.zeros(len(cells.keys), np.float32)
+    ranges_m[cells.cell_of_ray] = rays.ranges_m  # any return of the cell
+    return found.with_uncertain_poses(ranges_m, config.returns)
+
+
+def returns_of_means(means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> ReturnsOfCells:
+    """What the returns of each leaf cell tell, by their mean rays."""
+    # The returns of a cell are at nearly the same range if they are of the same sensor position.
+    information = means.counts / noise.variances_m2(means.ranges_m)
+    counts = means.counts.astype(np.float64)
+    found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans, counts)
+    return found.with_uncertain_poses(means.ranges_m, config)
+
+
+@torch.no_grad()
+def average_surface(
+    leaf_keys: NDArray[np.uint64],
+    means: MeanRays,
+    returns: ReturnsOfCells,
+    surfels: Surfels,
+    config: FitConfig,
+    num_threads: int,
+) -> GridField:
+    """The average of the rays' truncated signed distances (Curless and Levoy, 1996), smoothed.
+
+    Parameters
+    ----------
+    leaf_keys : ndarray
+        (C,) uint64, Morton keys of the leaf cells of the field, ascending.
+    means, returns : MeanRays, ReturnsOfCells
+        The mean ray of each cell with returns, and what these tell, in the same order.
+    surfels : Surfels
+        Planes of the returns.
+    """
+    field = GridField(leaf_keys, config.leaf_size_m, num_threads)
+    normals = normals_at(means, surfels, num_threads)
+    distances_m = average_at_corners(field.table, means, returns, normals, config, num_threads)
+    field.distances_m.copy_(torch.from_numpy(distances_m))
+    return field
+
+
+def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> NDArray[np.float32]:
+    """(M, 3) of the planes at the ends of rays: of the surfel there if it is flat, else towards the sensor."""
+    plane = surfels.flat_planes_of_leaves(rays.keys, num_threads)
+    of_planes = surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0
+    normals: NDArray[np.float32] = np.where(plane[:, None] >= 0, of_planes, -rays.directions)
+    # A surfel of returns from both sides of a thin wall faces one of them alone.
+    away = np.einsum("ij,ij->i", normals, rays.directions) > 0
+    normals[away] *= -1
+    return normals
+
+
+def average_at_corners(
+    table: VertexTable,
+    rays: MeanRays,
+    returns: ReturnsOfCells,
+    normals: NDArray[np.float32],
+    config: FitConfig,
+    num_threads: int,
+) -> NDArray[np.float32]:
+    """(V,) smoothed average over rays of the distances to their planes, at the corners of the leaf cells of `table`, m.
+
+    A ray counts at the corners of the cells that it crosses, up to `TRUNCATION_CELLS` before and behind its return. Its
+    value there is the corner's distance to the plane through its return with this normal, (M, 3). Smoothing moves the
+    average towards distances that agree with these planes and bend little (thin plates). Measured: 1.4 points of F-score
+    more than the average on simulated scenes, 1.8 on recorded drives; of every sixth scan 3.5 and 0.6.
+
+    Distances depend on what is within `CELLS_SMOOTHED` of the cells of their rays, to the bit.
+    """
+    normals = np.ascontiguousarray(normals, np.float32)
+    distances_m, sides = table.average_rays(
+        rays.points, rays.directions, normals, rays.counts, config.metres(TRUNCATION_CELLS), num_threads
+    )
+    return table.smoothed(
+        distances_m, rays.points, normals, returns.information, sides, _SMOOTHINGS, num_threads
+    )
+
+
+def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads: int) -> Reflectance:
+    """Intensities in closed form, or what the network of a map leaves of them.
+
+    Parameters
+    ----------
+    contents : MapContents
+        The map, with what its field answers for intensities so far.
+    rays : Rays
+        Returns that the map is made of, with ghosts.
+    surfels : Surfels
+        Of all returns.
+    """
+    scale = contents.intensity_scale
+    assert scale is not None
+    known = rays.with_intensity
+    if known.any() and not known.all():  # a tile may have none: its returns then count as the lowest
+        rays = rays.select(known)
+    assert rays.intensities is not None
+
+    def network(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
+        sensors = torch.from_numpy(points - directions * ranges_m[:, None])
+        return scale.to_unit(queries.intensity(contents, torch.from_numpy(points), sensors).numpy())
+
+    unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False)
+    ask = network if contents.config.trains_intensity else None
+    return Reflectance.of(rays, unit, surfels, contents.config.leaf_size_m, ask, num_threads)

@@ -1,0 +1,427 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Stage 2: trains the parameters of a field. First the surface, then reflectance on the frozen surface."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.field.neural_field import NeuralField
+from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, RandomDropout
+from radarsdf.fitting.optimiser import Adam, Optimiser, RowAdam, Soap
+from radarsdf.fitting.sampling import Batch, RaySampler
+from radarsdf.fitting.schedule import Schedule
+from radarsdf.interrupts import deferred_interrupts
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.progress import hides_bar
+from radarsdf.returns.intensities import IntensityScale
+from radarsdf.returns.rays import Rays
+from radarsdf.threads import Workers
+
+_OPTIMISERS: dict[str, type[Optimiser]] = {"adam": Adam, "soap": Soap}
+_GENERATORS = 2  # random generators of a fit: for samples, for dropout
+_CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
+_MOST_SPANS = 200  # of the history of each loss: enough for a plot, little in the file of a map
+_KEPT = 0.99  # of the sums that show a divergence, in each iteration: they are of about the last hundred
+_WORST = {
+    "sdf": "more than if all distances had the wrong sign",
+    "intensity": "more than the whole range of intensities",
+}
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a fit.
+
+    Attributes
+    ----------
+    radar_map : RadarMap or None
+        The map so far, which can be used like any other. None if the training had not begun. In its
+        ``report``, ``iterations_done`` is less than ``iterations``.
+    """
+
+    def __init__(self, radar_map: RadarMap | None = None) -> None:
+        super().__init__("interrupted while training" if radar_map else "interrupted before the training")
+        self.radar_map = radar_map
+
+
+class Diverged(FloatingPointError):
+    """A loss or a parameter is not finite, or a loss is worse than any answer of the right size.
+
+    The message names it, the stage and the iteration.
+
+    Attributes
+    ----------
+    radar_map : RadarMap or None
+        The last state that was checked and good, at most 100 iterations before.
+    """
+
+    radar_map: RadarMap | None = None
+
+
+class LossHistory:
+    """Mean losses in each of some equal spans of the iterations, and whether they show a divergence."""
+
+    def __init__(self, iterations: Mapping[str, int], config: FitConfig) -> None:
+        self._iterations = dict(iterations)
+        self._sigma_m, self._joint_weight = config.sigma_m, config.training.sdf_loss_weight
+        # A row for each span: iterations done, sum of their losses, seconds of training at their end.
+        self._spans: dict[str, NDArray[np.float64]] = {
+            name: np.zeros((min(count, _MOST_SPANS), 3)) for name, count in iterations.items()
+        }
+        # A row for each loss: iterations, their losses, and those of the worst answers, fading.
+        self._recent = np.zeros((len(_WORST), 3))
+        self._started_s = time.perf_counter()
+
+    def start(self) -> None:
+        """The training begins, or goes on."""
+        before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
+        self._started_s = time.perf_counter() - before_s
+
+    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: Tensor) -> None:
+        """Adds the losses of an iteration, after which so many are `done`, of samples with these labels (B,), m."""
+        now_s = time.perf_counter() - self._started_s
+        # Distances with the wrong sign have a cross-entropy of less than 1 + distance / sigma, and intensities from 0 to
+        # 1 an absolute error of at most 1.
+        weight = self._joint_weight if len(losses) > 1 else 1
+        worst = {"sdf": (1 + float(sdf_m.abs().mean()) / self._sigma_m) * weight, "intensity": 1.0}
+        self._recent *= _KEPT
+        for row, name in enumerate(_WORST):
+            if name in losses:
+                self._recent[row] += (1, losses[name], worst[name])
+                spans = self._spans[name]
+                span = spans[(done[name] - 1) * len(spans) // self._iterations[name]]
+                span += (1, losses[name], 0)
+                span[2] = now_s
+
+    def fault(self) -> str | None:
+        """A loss that is worse than any answer of the right size over about a hundred iterations: trainings get over a few."""
+        for (count, loss, worst), (name, words) in zip(self._recent, _WORST.items(), strict=True):
+            if loss > worst:
+                return f"the {name} loss is {loss / count:.3g}, {words},"
+        return None
+
+    def to_report(self) -> dict[str, dict[str, list[Any]]]:
+        """For each loss and span: iterations done at its end, mean loss, seconds of training."""
+        found = {}
+        for name, spans in self._spans.items():
+            begun = spans[spans[:, 0] > 0]
+            if len(begun):
+                found[name] = {
+                    "iterations": np.cumsum(begun[:, 0]).astype(int).tolist(),
+                    "losses": (begun[:, 1] / begun[:, 0]).tolist(),
+                    "seconds": begun[:, 2].tolist(),
+                }
+        return found
+
+    def state(self) -> dict[str, Tensor]:
+        """For a checkpoint. Not copied."""
+        return {name: torch.from_numpy(a) for name, a in (*self._spans.items(), ("recent", self._recent))}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restores what :meth:`state` of the same fit returned."""
+        for name, tensor in self.state().items():
+            tensor.copy_(state[name])
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """A stage of the training."""
+
+    name: str
+    iterations: int
+    iterations_before: int
+    """Joint iterations of the sdf stage that count as iterations of this stage too."""
+    counts: tuple[str, ...]
+    """The stages that an iteration counts for. Joint iterations count for both."""
+    optimisers: list[Optimiser]
+    """Of the parameters that are trained, in the order of their gradients."""
+    rows: RowAdam | None
+    """Optimiser of the features if only the touched ones move."""
+    draw: Callable[[], Batch]
+    gradients_of: Callable[[Batch, Callable[[], Batch | None]], tuple[Gradients, Batch | None]]
+    """Computes losses and gradients of a batch, and the result of what it runs meanwhile."""
+
+
+class Training:
+    """Trains `field` in place: the sdf stage on `surface`, then the intensity stage on all `returns`.
+
+    Ghosts are not part of the surface, but the sensor will see them again, so their intensities are learnt. Without a `scale`
+    there are no intensities.
+    """
+
+    def __init__(
+        self,
+        field: NeuralField,
+        surface: Rays,
+        returns: Rays,
+        scale: IntensityScale | None,
+        schedule: Schedule,
+        config: FitConfig,
+        workers: Workers,
+    ) -> None:
+        self._field, self._schedule, self._config, self._workers = field, schedule, config, workers
+        self.iterations = schedule.iterations
+        self.iterations_done = {"sdf": 0, "intensity": 0}
+        self.losses: dict[str, float] = {}
+        self.history = LossHistory(self.iterations, config)
+        with_normals = field.intensity_network is not None and config.networks.normals
+        kind = AutogradGradients if with_normals else CoreGradients
+        of_dropout, self._generator = (
+            torch.Generator("cpu").manual_seed(config.seed * _GENERATORS + i) for i in (1, 0)
+        )
+        self._backend = kind(field, config, RandomDropout(schedule.dropout_scale, of_dropout), workers)
+        self._scale = None if field.intensity_network is None else scale
+        # A sampler has its own copy of the rays: there is one at a time.
+        self._sampler = self._sampler_of(surface)
+        self._later = None if returns is surface or self._scale is None else returns
+        """Returns from which the intensity stage draws. None: those of the sampler."""
+        self._rows: RowAdam | None = None
+        self._optimisers: dict[str, Optimiser] = {}
+        training = config.training
+        of_network = _OPTIMISERS[training.optimiser]
+        if config.moves_rows(field.intensity_network is not None):
+            self._rows = RowAdam(field.cells, training.learning_rate)
+        else:
+            self._optimisers["features"] = Adam(field.cells.parameters(), training.learning_rate)
+        self._optimisers["sdf"] = of_network(field.sdf_network.parameters(), training.learning_rate)
+        if field.intensity_network is not None:
+            self._optimisers["intensity"] = of_network(
+                field.intensity_network.parameters(), training.intensity_learning_rate
+            )
+
+    def _sampler_of(self, rays: Rays) -> RaySampler:
+        unit = None
+        if self._scale is not None and rays.intensities is not None:
+            unit = torch.from_numpy(self._scale.to_unit(rays.intensities))
+        schedule = self._schedule
+        return RaySampler(
+            rays,
+            self._config,
+            schedule.batch_size,
+            self._generator,
+            schedule.neighbours,
+            unit,
+            self._workers.num_threads,
+        )
+
+    def _draw_from_all_returns(self) -> None:
+        if self._later is not None:
+            del self._sampler
+            self._sampler, self._later = self._sampler_of(self._later), None
+
+    def state(self) -> dict[str, Tensor]:
+        """All that the rest of the training depends on, between two iterations. Tensors are not copied."""
+        losses = [self.losses.get(name, 0.0) for name in self.iterations_done]
+        state = {
+            "done": torch.tensor(list(self.iterations_done.values()), dtype=torch.int64, device="cpu"),
+            "losses": torch.tensor(losses, dtype=torch.float64, device="cpu"),
+            "of_all_returns": torch.tensor(self._later is None, dtype=torch.int64, device="cpu"),
+            "generator": self._generator.get_state(),
+        }
+        state |= {f"field.{name}": p.detach() for name, p in self._field.named_parameters()}
+        for name, part in self._parts():
+            state |= {f"{name}.{key}": value for key, value in part.state().items()}
+        return state
+
+    def _parts(self) -> Iterable[tuple[str, Any]]:
+        """What has a state of its own, by name."""
+        yield "history", self.history
+        yield "backend", self._backend
+        yield "sampler", self._sampler
+        if self._rows is not None:
+            yield "rows", self._rows
+        for name, optimiser in self._optimisers.items():
+            yield f"optimiser.{name}", optimiser
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Restores what :meth:`state` of the same fit returned. Raises a ValueError if it is impossible."""
+        done = dict(zip(self.iterations_done, state["done"].tolist(), strict=True))
+        if not all(0 <= done[name] <= self.iterations[name] for name in done):
+            msg = f"{done} iterations of {self.iterations}"
+            raise ValueError(msg)
+        self.iterations_done.update(done)
+        losses = zip(done, state["losses"].tolist(), strict=True)
+        self.losses.update({name: loss for name, loss in losses if done[name]})
+        for name, parameter in self._field.named_parameters():
+            parameter.data.copy_(state[f"field.{name}"])
+        if state["of_all_returns"]:
+            self._draw_from_all_returns()
+        for name, part in self._parts():
+            own = {k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")}
+            part.restore(own)
+        self._generator.set_state(state["generator"])  # last, because the sampler changes it
+
+    def report(self) -> dict[str, Any]:
+        """What the map's report says of the training."""
+        return {
+            "iterations": self.iterations,
+            "iterations_done": self.iterations_done,
+            "losses": self.losses,
+            "loss_history": self.history.to_report(),
+        }
+
+    def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
+        """Runs all iterations that are left.
+
+        Raises
+        ------
+        Diverged
+            If a loss or a parameter is not finite, or a loss is worse than any answer of the right size. The
+            field then has the last parameters that were checked and good.
+        KeyboardInterrupt
+            After Ctrl-C, between two iterations.
+        """
+        stages = self._stages()
+        self.history.start()
+        with (
+            tqdm(
+                total=sum(stage.iterations for stage in stages),
+                initial=sum(self._done(stage) for stage in stages),
+                desc="fit",
+                unit="it",
+                disable=hides_bar(progress),
+            ) as bar,
+            deferred_interrupts() as interrupted,
+        ):
+            for stage in stages:
+                if stage.name == "intensity":
+                    self._field.cells.requires_grad_(False)
+                    self._field.sdf_network.requires_grad_(False)
+                self._run_stage(stage, bar, interrupted, checkpoint)
+            if checkpoint is not None:
+                checkpoint.write(self.state())
+            if interrupted():  # the training is done, but the program that called the fit should stop too
+                raise KeyboardInterrupt
+
+    def _stages(self) -> list[_Stage]:
+        """The sdf stage, then the intensity stage if it has iterations."""
+        sdf_iterations, intensity_iterations = self.iterations["sdf"], self.iterations["intensity"]
+        of_surface = [o for name, o in self._optimisers.items() if name != "intensity"]
+        of_intensity = [o for name, o in self._optimisers.items() if name == "intensity"]
+        joint = sdf_iterations if of_intensity and self._config.training.joint else 0
+        surface = _Stage(
+            name="sdf",
+            iterations=sdf_iterations,
+            iterations_before=0,
+            counts=("sdf", "intensity") if joint else ("sdf",),
+            optimisers=of_surface + of_intensity if joint else of_surface,
+            rows=self._rows,
+            draw=self._batch,
+            gradients_of=self._backend.joint if joint else self._backend.sdf,
+        )
+        if not of_intensity or intensity_iterations <= joint:
+            return [surface]
+        intensity = _Stage(
+            name="intensity",
+            iterations=intensity_iterations - joint,
+            iterations_before=joint,
+            counts=("intensity",),
+            optimisers=of_intensity,
+            rows=None,
+            draw=self._labelled_batch,
+            gradients_of=self._backend.intensity,
+        )
+        return [surface, intensity]
+
+    def _batch(self) -> Batch:
+        """A batch of the sdf stage."""
+        return self._sampler.batch(self._backend.num_parts(self._schedule.batch_size))
+
+    def _labelled_batch(self) -> Batch:
+        """A batch of the intensity stage, after the last one of the sdf stage."""
+        self._draw_from_all_returns()
+        if self._config.training.intensity_in_free_space:
+            return self._batch()
+        count = self._schedule.intensity_batch_size
+        return self._sampler.spread(count, self._backend.num_parts(count))
+
+    def _done(self, stage: _Stage) -> int:
+        """Iterations of this stage that are done, without joint ones of an earlier stage."""
+        return max(0, self.iterations_done[stage.name] - stage.iterations_before)
+
+    def _run_stage(
+        self, stage: _Stage, bar: Any, interrupted: Callable[[], bool], checkpoint: Checkpoint | None
+    ) -> None:
+        rows, iterations = stage.rows, stage.iterations
+        changing = [p for optimiser in stage.optimisers for p in optimiser.parameters]
+        if rows is not None:
+            changing.append(rows.features)
+        good = [p.detach().clone() for p in changing]
+
+        def give_up(fault: str) -> NoReturn:
+            for parameter, value in zip(changing, good, strict=True):
+                parameter.data.copy_(value)
+            msg = f"{fault} at iteration {i} of {iterations} of the {stage.name} stage: a lower learning rate may help"
+            raise Diverged(msg)
+
+        ahead: Batch | None = None
+        for i in range(self._done(stage), iterations):
+            # Each stage starts at the full learning rate, also for an optimiser that an earlier stage has
+            # used.
+            cosine = 0.5 * (1 + math.cos(math.pi * i / iterations))
+            share = cosine if self._config.training.cosine_schedule else 1.0
+            stop = interrupted()
+            write = checkpoint is not None and (stop or checkpoint.due())
+            judge = i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
+            look = stop or write or judge
+            # No samples are drawn ahead before the state is written: it would contain the draw after the
+            # next.
+            batch = ahead or stage.draw()
+            found, ahead = stage.gradients_of(batch, _nothing if look else stage.draw)
+            loss = sum(found.losses.values())
+            if not math.isfinite(loss):
+                bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
+                give_up(f"the {' and '.join(bad)} loss is {loss}")
+            move_networks = functools.partial(_move_networks, found, stage.optimisers, share)
+            if rows is None:
+                move_networks()
+            else:
+                rows.learning_rate = share * rows.full_rate
+                rows.step(found.touched or [], self._workers, meanwhile=move_networks)
+            self.losses[stage.name] = loss
+            for name in stage.counts:
+                before = stage.iterations_before if name == stage.name else 0
+                self.iterations_done[name] = min(before + i + 1, self.iterations[name])
+            self.history.add(found.losses, self.iterations_done, batch.sdf_m)
+            # Gradients of all features are as large as these: not two at once.
+            del batch, found, move_networks
+            bar.set_postfix_str(f"{stage.name} loss {loss:.3g}", refresh=False)
+            bar.update()
+            if look:
+                # A sum is finite only if all numbers are. A sum that overflows is no better.
+                if not all(math.isfinite(float(p.detach().sum())) for p in changing):
+                    give_up("a parameter is not finite")
+                if judge and (fault := self.history.fault()):
+                    give_up(fault)
+                for parameter, value in zip(changing, good, strict=True):
+                    value.copy_(parameter.detach())
+            if write and checkpoint is not None:
+                checkpoint.write(self.state())
+            if stop:
+                raise KeyboardInterrupt
+
+
+def _move_networks(found: Gradients, optimisers: list[Optimiser], share: float) -> None:
+    """Changes the networks by the gradients."""
+    total = iter(found.by_parameters)
+    for optimiser in optimisers:
+        optimiser.learning_rate = share * optimiser.full_rate
+        optimiser.step(list(itertools.islice(total, len(optimiser.parameters))))
+
+
+def _nothing() -> None:
+    """Runs meanwhile where no samples are drawn ahead."""

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The memory that is left, and errors where meshes and views need more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+# Bytes, measured.
+_PER_VOXEL = 220.0
+_PER_TRIANGLE = 320.0  # of a welded mesh and its normals: measured on hugin in tiles
+# Of a view of a map: peaks of maps of 1e5 to 2e5 leaf cells.
+_PER_CELL_TRACED = 300.0  # the surface that rays meet, made once for a map
+_PER_PATCH_SEEN = 100.0
+_PER_BEAM = 100.0
+_PER_RETURN_SEEN = 50.0  # of all views that are kept
+
+
+def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> None:
+    """Raises a MemoryError if so many voxels of `voxel_size`, m, need more memory than there is."""
+    _check(f"voxels of {voxel_size} m", voxels * _PER_VOXEL, max_memory_bytes, "use larger ones")
+
+
+def check_triangles(count: int, max_memory_bytes: int | None) -> None:
+    """Raises a MemoryError if the mesh of a map in tiles has more triangles than memory holds."""
+    way_out = "take a part, by a box, or write it tile by tile (radarsdf tiles mesh)"
+    _check(f"a mesh of {count} triangles", count * _PER_TRIANGLE, max_memory_bytes, way_out)
+
+
+def check_views(
+    max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0, returns: float = 0
+) -> None:
+    """Raises a MemoryError if views of a map need more memory than there is.
+
+    `cells`: leaf cells of a map whose surface has yet to be made for views; `patches` of that surface; `beams` of one
+    view; `returns` of all views that are kept.
+    """
+    needed = (
+        cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM + returns * _PER_RETURN_SEEN
+    )
+    way_out = "ask for fewer poses or returns, or make the map of a part of the scans"
+    _check("these views", needed, max_memory_bytes, way_out)
+
+
+def _check(what: str, needed_bytes: float, max_memory_bytes: int | None, way_out: str) -> None:
+    available = limit_bytes(max_memory_bytes)
+    if available is not None and needed_bytes > available:
+        msg = f"{what} would take about {needed_bytes / 1e9:.2f} GB, of {available / 1e9:.2f}: {way_out}"
+        raise MemoryError(msg)
+
+
+def limit_bytes(max_memory_bytes: int | None) -> int | None:
+    return available_bytes() if max_memory_bytes is None else max_memory_bytes
+
+
+def available_bytes(root: Path = Path("/")) -> int | None:
+    """Memory that this process can still get, bytes: the least of what system and control groups have left.
+
+    None if it cannot be found out, as on systems other than Linux. `root` is the root of the file system, for
+    tests.
+    """
+    found = []
+    try:
+        lines = (root / "proc/meminfo").read_text().splitlines()
+        found.append(next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable")))
+        groups = (root / "proc/self/cgroup").read_text().splitlines()
+    except (OSError, StopIteration):
+        groups = []
+    top = root / "sys/fs/cgroup"
+    folders = [(top, "memory.max", "memory.current")]
+    for line in groups:
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            folders.append((top / path.lstrip("/"), "memory.max", "memory.current"))
+        elif "memory" in controllers.split(","):
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes")
+            folders += [(top / "memory" / path.lstrip("/"), *names), (top / "memory", *names)]
+    for folder, limit, usage in folders:
+        try:
+            left = int((folder / limit).read_text()) - int((folder / usage).read_text())
+            stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        except (OSError, ValueError):  # there is no such group, or its limit is "max"
+            continue
+        found.append(
+            max(0, left + int(stat.get("inactive_file", 0)))
+        )  # cached files, which the system can drop
+    return min(found) if found else None

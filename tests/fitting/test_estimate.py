@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Estimates of memory, size and work hold, and what cannot be done is refused before it is begun."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf import FitConfig
+from radarsdf.cli import main
+from radarsdf.fitting import estimate
+from radarsdf.fitting.schedule import Schedule
+from radarsdf.io.npz import write_scans
+from radarsdf.io.scans import Scans
+from radarsdf.returns.rays import prepare
+
+from bench.stress.memory import peak_of_a_fit
+
+from ..settings import grouped
+from ..warm_python import warm_python
+
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+SHORT = FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 6, "batch_size": 512})
+BOTH = FitConfig(
+    training={
+        "sdf_iterations": 100,
+        "intensity_iterations": 300,
+        "batch_size": 1000,
+        "intensity_batch_size": 500,
+    }
+)
+NORMALS = {"networks": {"normals": True}, "training": {"sdf_iterations": 10, "intensity_iterations": 12}}
+
+
+@LINUX
+@pytest.mark.parametrize(
+    ("count", "with_intensities", "changes"),
+    [
+        (100_000, True, {}),
+        (25_000, False, {"encoding": {"kind": "octree"}}),
+        (12_000, True, FitConfig.quick().to_dict()),
+        (12_000, True, NORMALS | {"num_threads": 4}),
+        (12_000, True, {"training": {"row_updates": False}, "num_threads": 1}),
+    ],
+)
+def test_the_peak_is_within_a_factor_of_two(count, with_intensities, changes):
+    found, peak = peak_of_a_fit(count, with_intensities, changes, warm_python())
+    assert 1 / 2 < found.peak_memory_bytes / peak < 2
+
+
+@pytest.mark.parametrize("leaf_size_m", [0.1, 0.2])
+@pytest.mark.parametrize(
+    "config", [FitConfig(), FitConfig.quick(), FitConfig(encoding={"kind": "octree"})], ids=["default", "quick", "octree"]
+)  # fmt: skip
+@pytest.mark.parametrize("scene", ["hugin", "oculii", "wall"])
+def test_sizes_are_within_a_factor_of_two(scene, config, leaf_size_m):
+    scans = getattr(radarsdf.simulate, scene)(frames=12, seed=5)
+    config = config.override(leaf_size_m=leaf_size_m, training={"sdf_iterations": 1, "batch_size": 16})
+    found = radarsdf.estimate(scans.points, scans.poses, config=config)
+    report = radarsdf.fit(scans.points, scans.poses, config=config, progress=False).report
+    assert found.returns == report["returns_used"] + report["ghosts"]
+    assert found.iterations == report["iterations"]
+    assert 1 / 2 < found.leaf_cells / report["leaf_cells"] < 2
+    assert 1 / 2 < found.vertices / report["vertices"] < 2
+
+
+def test_a_fit_beyond_the_budget_is_refused_before_anything_is_allocated(scene, monkeypatch):
+    config = SHORT.override(max_memory_bytes=30_000_000)
+    monkeypatch.setattr("radarsdf.fitting.steps.SurfaceReturns.of", lambda *_: pytest.fail("began"))
+    with pytest.raises(MemoryError, match=r"leaf cells and 9000 returns, of 0\.03"):
+        radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
+
+
+def test_the_quick_bound_is_one(scene):
+    """Just enough for the estimate: then the bound, being above it, must not be what decides."""
+    rays = prepare(scene.points, scene.poses)
+    for changes in ({}, {"encoding": {"kind": "octree"}}, {"leaf_size_m": 0.05}, {"train": False}):
+        config = SHORT.override(**changes)
+        enough = estimate.estimate_rays(rays, config).peak_memory_bytes
+        estimate.check_fit(rays, config.override(max_memory_bytes=enough))
+        with pytest.raises(MemoryError):
+            estimate.check_fit(rays, config.override(max_memory_bytes=enough - 1))
+
+
+def test_what_a_fit_refuses_is_not_estimated(scene):
+    for function in (radarsdf.fit, radarsdf.estimate):
+        with pytest.raises(ValueError, match="are not within a million cells"):
+            function(scene.points, scene.poses, scene.intensities, config=FitConfig(leaf_size_m=1e-9))
+        with pytest.raises(ValueError, match="no scans"):
+            function([], np.zeros((0, 4, 4)))
+
+
+def test_a_dry_run_prints_and_writes_nothing(scene, tmp_path, capsys, monkeypatch):
+    write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
+    monkeypatch.setattr("radarsdf.fit", lambda *_, **__: pytest.fail("a fit"))
+    assert main(["fit", str(tmp_path / "scans.npz"), "--dry-run"]) == 0
+    assert "9000 returns, about" in capsys.readouterr().out
+    assert [p.name for p in tmp_path.iterdir()] == ["scans.npz"]
+
+
+def work(config=BOTH, *, returns=1000, cells=3000, rows=2000, with_intensity=True, **changes):
+    config = config.override(**grouped(**changes))
+    schedule = Schedule.of(
+        config, surface_returns=returns, returns=returns, vertices=rows, with_intensity=with_intensity
+    )
+    return estimate.work_of(
+        config, schedule, returns=returns, cells=cells, rows=rows, with_intensity=with_intensity
+    )
+
+
+def test_what_makes_more_work():
+    base = work()
+    assert base.keys() == estimate.SECONDS.keys()
+    assert work(sdf_iterations=200, intensity_iterations=600)["iteration"] == 2 * base["iteration"]
+    assert base["iteration"] == 300  # the first 100 are of both networks
+    assert work(joint=False)["iteration"] == 400
+    assert work(with_intensity=False)["iteration"] == 100
+    for changes in ({"batch_size": 2000}, {"intensity_hidden": (128, 128)}, {"normals": True}):
+        assert work(**changes)["multiplication"] > base["multiplication"], changes
+    assert work(fourier_count=16)["encoded number"] > base["encoded number"]
+    assert base["moved row"] == 0 < work(row_updates=False)["moved row"] == 100 * 2000
+    assert work(returns=5000)["return"] == 5 * base["return"]
+    assert work(FitConfig.quick())["iteration"] == 0
+
+
+def skipped_of(config, with_intensity):
+    sizes = {"returns": 500_000, "with_intensity": with_intensity}
+    schedule = Schedule.of(config, surface_returns=sizes["returns"], vertices=10**9, **sizes)
+    found = estimate.skipped_parts(config, schedule, cells=10**6, rows=10**6, threads=1, **sizes)
+    return schedule, dict(found)
+
+
+def test_each_part_that_was_skipped_has_a_time():
+    parts = {
+        "default": ["the normals", "the geometry feature", "40% of the samples", "in each iteration"],
+        "quick": ["training of the surface", "free space", "the intensity network"],
+        "paper": ["free space"],
+    }
+    for preset, expected in parts.items():
+        config = FitConfig() if preset == "default" else getattr(FitConfig, preset)()
+        saved_s = skipped_of(config, with_intensity=True)[1]
+        assert len(saved_s) == len(expected)
+        for words, start in zip(saved_s, expected, strict=True):
+            assert words.startswith(start)
+            assert saved_s[words] > 0

@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Losses of a training: their history, what they show of a divergence, and which parts a batch is divided into."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import radarsdf
+import torch
+from radarsdf import FitConfig
+from radarsdf.field.losses import sdf_loss
+from radarsdf.fitting import train
+from radarsdf.fitting.gradients import AutogradGradients
+from radarsdf.fitting.sampling import RaySampler
+from radarsdf.fitting.train import LossHistory
+from radarsdf.returns.rays import prepare
+
+from bench.stress.training import CASES, fitted, free_and_solid
+
+NONE = torch.zeros(1)
+
+
+def history(config=None, **iterations):
+    found = LossHistory(iterations or {"sdf": 10**6, "intensity": 10**6}, config or FitConfig())
+    found.start()
+    return found
+
+
+def test_spans_have_the_means_of_all_iterations(monkeypatch):
+    monkeypatch.setattr(train, "_MOST_SPANS", 4)
+    losses = history(sdf=10, intensity=0)
+    for done in range(1, 11):
+        losses.add({"sdf": float(done)}, {"sdf": done}, NONE)
+    found = losses.to_report()
+    assert list(found) == ["sdf"]
+    assert found["sdf"]["iterations"] == [3, 5, 8, 10]
+    assert found["sdf"]["losses"] == [2.0, 4.5, 7.0, 9.5]
+    assert found["sdf"]["seconds"] == sorted(found["sdf"]["seconds"])
+
+
+def test_the_bound_of_the_distances_is_one():
+    labels = torch.linspace(-30, 30, 500)
+    for scale in (0.01, 1.0, 10.0):
+        distances_m, config = scale * labels, FitConfig()
+        for wrong in (-distances_m, torch.zeros(500)):
+            loss = float(sdf_loss(wrong / config.sigma_m, distances_m, config.sigma_m))
+            losses = history()
+            losses.add({"sdf": loss}, {"sdf": 1}, distances_m)
+            assert losses.fault() is None
+        longer = float(sdf_loss(-2 * distances_m / config.sigma_m - 9, distances_m, config.sigma_m))
+        losses.add({"sdf": 2 * longer}, {"sdf": 2}, distances_m)
+        assert "wrong sign" in losses.fault()
+
+
+def test_a_few_bad_iterations_are_no_divergence_and_the_count_goes_on():
+    sdf_m = torch.full((8,), 0.1)  # one sigma: at worst 2
+    losses, again = history(), history()
+    for i in range(100):
+        found = {"sdf": 50.0 if i in (3, 4) else 0.3, "intensity": 20.0 if i == 5 else 0.02}
+        losses.add(found, dict.fromkeys(found, i + 1), sdf_m)
+    assert losses.fault() is None
+    again.restore({name: tensor.clone() for name, tensor in losses.state().items()})
+    for i in range(100, 104):
+        for one in (losses, again):
+            one.add({"intensity": 40.0}, {"intensity": i + 1}, sdf_m)
+    assert losses.fault() == again.fault()
+    assert "range of intensities" in losses.fault()
+    reports = [one.to_report()["intensity"] for one in (losses, again)]
+    assert reports[0]["losses"] == reports[1]["losses"]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_number_stays_finite(name):
+    _, end = fitted(CASES[name], 40)
+    if name.startswith("learning rates 1"):  # too much: answers beyond all measure
+        assert "more than if all distances had the wrong sign, at iteration 39 of 40" in end
+    else:
+        assert end == "done"
+
+
+@pytest.mark.parametrize("joint", [True, False])
+@pytest.mark.parametrize(
+    ("rate", "loss"), [("learning_rate", "sdf"), ("intensity_learning_rate", "intensity")]
+)
+def test_answers_beyond_all_measure_are_a_divergence_although_finite(rate, loss, joint):
+    radar_map, end = fitted({"training": {rate: 1e3, "joint": joint}}, 40)
+    assert "more than" in end
+    assert loss in end or joint  # jointly, one network ruins the other too
+    assert radar_map.sdf([[0.0, 0.0, 0.0]], extrapolate=True)[0] > -1
+    assert abs(radar_map.intensity([[4.0, 0.0, 0.0]], [0.0, 0.0, 0.0], extrapolate=True)[0]) < 1000
+
+
+def test_the_default_finds_the_walls():
+    assert min(free_and_solid(fitted(CASES["default"], 200)[0])) > 0.9
+
+
+STAGES = {  # of one iteration: a step of Adam makes much of a rounding
+    "joint": {},
+    "joint in free space": {"intensity_in_free_space": True},
+    "one after the other": {"joint": False},
+}
+
+
+@pytest.mark.parametrize("autograd", [False, True])
+@pytest.mark.parametrize("batch_size", [1, 3, 5])
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_loss_of_a_small_batch_does_not_depend_on_the_threads(
+    scene, monkeypatch, autograd, batch_size, stage
+):
+    """Batches that give the threads parts of different sizes, or none: the loss is the mean over the whole batch."""
+    if autograd:
+        monkeypatch.setattr(train, "CoreGradients", AutogradGradients)
+    sizes = {"batch_size": batch_size, "intensity_batch_size": batch_size}
+    iterations = {"sdf_iterations": 1, "intensity_iterations": 1}
+    few = [values[:2] for values in (scene.points, scene.poses, scene.intensities)]
+    found = []
+    for threads in (1, 3, 16):
+        config = FitConfig(
+            num_threads=threads,
+            returns={"drop_ghosts": False, "onto_planes": False},
+            training=sizes | iterations | STAGES[stage],
+        )
+        report = radarsdf.fit(*few, config=config, progress=False).report
+        assert report["iterations_done"] == report["iterations"]
+        found.append(report["losses"])
+    assert all(math.isfinite(value) for one in found for value in one.values())
+    for one in found[1:]:
+        assert one == pytest.approx(found[0], rel=1e-5)
+
+
+@pytest.mark.parametrize("batch_size", [1, 5, 101])
+@pytest.mark.parametrize("parts", [1, 3, 16])
+def test_parts_count_by_their_samples(scene, batch_size, parts):
+    rays = prepare(scene.points, scene.poses)
+    draw = RaySampler(rays, FitConfig(), batch_size, torch.Generator().manual_seed(0))
+    for batch in (draw.batch(parts).split(), draw.spread(batch_size, parts).split()):
+        sizes, labelled = [len(part.points) for part in batch], [part.num_labelled for part in batch]
+        assert [part.share for part in batch] == [size / sum(sizes) for size in sizes]
+        assert [part.labelled_share for part in batch] == [count / sum(labelled) for count in labelled]
+
+
+def test_frozen_geometry_does_not_move(scene):
+    # Without dropout, which depends on the number of iterations and reaches the joint beginning.
+    config = FitConfig(
+        training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024},
+        networks={"dropout": False},
+    )
+    fields = [
+        radarsdf.fit(
+            scene.points,
+            scene.poses,
+            scene.intensities,
+            config=config.override(training={"intensity_iterations": n}),
+        ).field
+        for n in (20, 40)
+    ]
+    assert torch.equal(*(field.cells.features for field in fields))
+    change = np.subtract(*(field.intensity_network.layers[0].weight.detach().numpy() for field in fields))
+    # A second stage once inherited the rate that the first had let fall to nothing.
+    assert np.abs(change).max() > config.training.intensity_learning_rate
