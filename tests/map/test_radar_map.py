@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 import torch
+from radarsdf.field.neural_field import NeuralField
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 
