@@ -13,6 +13,7 @@ from radarsdf.checking.recording import Recording
 from radarsdf.io import Scans
 from radarsdf.simulate import drifted
 
+from bench.breakages.__main__ import slow
 from tests.conftest import recorded_file
 
 SCANS = 36
@@ -72,3 +73,9 @@ def test_the_drift_is_that_of_the_ends():
     found = poses.copy()
     found[-1, :3, 3] = [3, 4, 0]
     assert drift._drift(poses, found) == (5.0, 0.0)
+
+
+@pytest.mark.parametrize("kind", ["hugin", "forest"])
+def test_a_drift_below_the_noise_of_a_coarse_sensor_is_none(kind):
+    creep = slow(kind, 0.02, seed=6, cell=0.5)
+    assert check_drift(Recording.of(creep.points, creep.poses, None, None, None), CONFIG) == []

@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking.check import check_cheaply
+from radarsdf.checking.recording import Recording
+from radarsdf.checking.trajectory import check_jumps
+
+from bench.breakages.__main__ import slow
 
 
 @pytest.fixture(scope="module")
@@ -147,3 +151,8 @@ def test_a_jump_among_scans_of_few_returns_is_no_crash(good, returns):
     few = [scan[:returns] if 10 <= i < 21 else scan for i, scan in enumerate(points)]
     assert "fit_refuses" not in names(radarsdf.check(few, poses))
     assert names(radarsdf.check([scan[:returns] for scan in points], poses)) in ([], ["pose_jumps"])
+
+
+def test_a_sensor_that_begins_to_creep_does_not_jump():
+    creep = slow("oculii", 0.02, seed=6, cell=0.5)
+    assert check_jumps(Recording.of(creep.points, creep.poses, None, None, None)) == []

@@ -53,6 +53,17 @@ def only(drive, rows):
     return [drive.points[i] for i in rows], drive.poses[rows]
 
 
+def test_returns_alone_are_not_counted_twice():
+    """Steps that were tracked by the same returns are no evidence beside them: NEES / 3 was 8 and more."""
+    street = radarsdf.simulate.oculii(seed=6, frames=30)
+    found = radarsdf.odometry(street.points, times_s=measured_motion(street).times_s)
+    T = street.poses[15] @ np.linalg.inv(found.poses[15])
+    off = (np.einsum("ij,fjk->fik", T, found.poses) - street.poses)[:, :3, 3]
+    covariance = np.einsum("ij,fjk,lk->fil", T[:3, :3], found.covariance[:, :3, :3], T[:3, :3])
+    nees = [e @ np.linalg.solve(C, e) / 3 for e, C in zip(off, covariance, strict=True) if e.any()]
+    assert 0.1 < np.median(nees) < 3
+
+
 def test_doppler_and_returns_find_the_poses(drive, found):
     position_m, turn_rad = errors(found.poses, drive.poses)
     assert position_m < 0.003 * length_m(drive.poses)

@@ -67,6 +67,10 @@ class Agreement:
             found[:, p] = 0.5 * (self._one_way(i, j, T_j_i[:, p]) + self._one_way(j, i, back[:, p]))
         return found
 
+    def spacing_m(self, i: int) -> float:
+        """Median distance between neighbouring returns of scan i, m. 0 if it has too few."""
+        return float(np.median(self._tree(i)[1])) if len(self._scans[i]) >= MIN_RETURNS else 0.0
+
     def _one_way(self, i: int, j: int, T_j_i: FloatArray) -> FloatArray:
         """Mean logarithms (H,) of the quotients of returns of scan i in scan j."""
         queries = self._tree(i)[2]

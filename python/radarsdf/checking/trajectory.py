@@ -23,6 +23,7 @@ _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
 _COARSE_M = 0.01  # steps of positions. Smaller ones are less than the noise of any radar
 _FAST_MPS = 100.0  # faster than cars and drones
 _JUMP = 3.0  # times the steps round it
+_LEAST_JUMP = 0.2  # in distances between returns of a scan: smaller ones are below what scans measure
 _ROUND = 3  # steps before and after
 _JUMPS_TRIED = 12
 _MIN_GAIN, _MIN_SIGNIFICANCE = 0.1, 3.0  # as in frames.py; few pairs lie across a jump
@@ -253,8 +254,9 @@ def check_jumps(recording: Recording, effort: Effort = FULL) -> list[Finding]:
     changes = _changes(recording, durations)
     usual = float(np.median(changes))
     suspects = np.flatnonzero(changes > _JUMP * max(usual, 0.1 * float(np.median(sizes)))).tolist()
-    suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
     agreement = Agreement(recording.points, effort.returns, 2 * effort.queries)
+    suspects = [k for k in suspects if changes[k] * durations[k] > _LEAST_JUMP * agreement.spacing_m(k)]
+    suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
     interval = None if recording.doppler_mps is None else folding_interval_mps(recording.doppler_mps)
     confirmed = [
         k

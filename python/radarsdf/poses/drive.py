@@ -89,10 +89,15 @@ class Drive:
         times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
         # The tracked steps begin the estimate; it finds how good they are. Where something else was measured, that tells.
         motion = Motion.of(poses, _TRACKED_M, _TRACKED_RAD, times_s)
+        duration_s = float(np.median(np.diff(times_s)))
+        # No evidence beside the returns that they were tracked by, but for how this sensor usually moves.
+        least = duration_s**2 * np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
         if self.gyroscope is not None:
+            least[1] = 0.0
             motion = motion.with_turns(
                 np.stack([self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)])
             )
+        motion = dataclasses.replace(motion, least_variances=least)
         if self.velocities is None:
             return [motion]
         turns = np.stack([found.turn for found in tracked[rows][1:]])
@@ -100,7 +105,7 @@ class Drive:
         common = np.full((2, 3), [[0.0], [self.usual_turn_rad_s]])
         if self.gyroscope is not None:
             common[1] = np.sqrt(self.gyroscope.bias.covariance.diagonal())
-        common = common.ravel() * np.median(np.diff(times_s))
+        common = common.ravel() * duration_s
         # Tracked translations beside Doppler, or in its place, double the errors of positions on simulated drives.
         return [
             dataclasses.replace(motion.rotations_only(), bias_sigma=common),

@@ -81,7 +81,8 @@ class PosesEstimate:
             if finest and decrement < _SETTLED**2 * increments.size:
                 break
         assert noise is not None
-        diagonal, below, gradient = _prior(motions, poses)
+        evidence = [motion.as_evidence() for motion in motions]
+        diagonal, below, gradient = _prior(evidence, poses)
         diagonal[len(given) // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
 
@@ -90,7 +91,7 @@ class PosesEstimate:
                 diagonal, below, gradient + more, _EXACT, _MOST_ITERATIONS, False, num_threads
             )[0]
 
-        return cls(poses, covariance + _by_biases(motions, poses, solved), motions, noise, rounds)
+        return cls(poses, covariance + _by_biases(evidence, poses, solved), motions, noise, rounds)
 
 
 def _by_biases(

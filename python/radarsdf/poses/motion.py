@@ -34,6 +34,8 @@ class Motion:
     """(F - 1,) duration of each step over the median. Biases grow with it."""
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
     """(6,) deviation of the part of the bias that no measurement of this source can find."""
+    least_variances: Floats = field(default_factory=lambda: np.zeros(2), kw_only=True)
+    """(2,) as `variances`, at least, where the covariance is computed."""
 
     @classmethod
     def of(
@@ -72,6 +74,14 @@ class Motion:
         shares = self.shares.copy()
         shares[:, :3] = np.inf
         return dataclasses.replace(self, shares=shares)
+
+    def as_evidence(self) -> Motion:
+        """With the variances that the covariance of poses is computed with.
+
+        Steps that were tracked by the same returns have the errors of these. As independent measurements, they would halve the
+        deviations.
+        """
+        return dataclasses.replace(self, variances=np.maximum(self.variances, self.least_variances))
 
     def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
         """As measured by a sensor with these poses (F, 4, 4). Most measurements are the same for all."""
