@@ -40,13 +40,6 @@ def test_a_displacement_from_one_scan_on_is_a_jump(lap):
     assert "after scan 29" in found[0].evidence
 
 
-def test_one_pose_beside_the_others_is_a_jump(good):
-    points, poses = good
-    poses = poses.copy()
-    poses[15, :3, 3] += poses[15, :3, 1] * 4
-    assert names(radarsdf.check(points, poses)) == ["pose_jumps"]
-
-
 @pytest.mark.usefixtures("right_frames")
 def test_a_pause_of_the_recording_is_no_jump(good):
     points, poses = good
@@ -107,7 +100,7 @@ def test_what_a_fit_leaves_out_is_noted(good):
     poses[9] = np.nan
     found = radarsdf.check([*padded, hole, hole[:0], *points[5:]], poses)
     assert names(found) == ["poses_not_rigid"]
-    assert found[0].evidence.startswith("1 of 30 poses are not finite or not rigid, the first is pose 9")
+    assert found[0].evidence.startswith("1 of 30 poses are no rigid transforms, the first is pose 9")
     assert {"returns_not_finite", "padding", "empty_scans"} <= {f.name for f in found if f.severity == "note"}
     none = radarsdf.check([scan[:0] for scan in points], good[1])
     assert [(finding.name, finding.severity) for finding in none] == [("empty_scans", "error")]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import MAX_TIME_S, real_array
 from radarsdf.io.scans import Scans, filled
-from radarsdf.poses.by_doppler import NOT_USED, NoVelocityError, SensorVelocities
+from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.doppler import without_filler
 from radarsdf.returns.movers import checked_doppler

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses of all scans at once, from common planes and what was measured of the motion."""
+"""Poses of all scans at once, from common planes and measured motion."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.groups import Groups
 from radarsdf.poses.motion import Motion
-from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
+from radarsdf.poses.planes import Groups, PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, moved
 from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import SensorNoise

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses from the radar alone."""
+"""Radar odometry: poses of scans from returns, Doppler and an IMU."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from radarsdf.checks import MAX_TIME_S, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
-from radarsdf.poses.by_doppler import NOT_USED, doppler_sign
 from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.doppler import NOT_USED, doppler_sign
 from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
-from radarsdf.poses.inertial import Inertial, implausible_rates, levelled
+from radarsdf.poses.imu import Inertial, implausible_rates, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
@@ -77,7 +77,7 @@ def odometry(
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> Odometry:
-    """Finds the poses of scans from the radar alone.
+    """Estimates the poses of scans from the radar alone.
 
     Each scan is moved onto the planes of the scans before it, near where its Doppler, a gyroscope or the motion so far lead.
     Over a gap, where it may be is searched. Then all scans are moved at once, as by :func:`refine_poses`. How this sensor turns
@@ -172,7 +172,7 @@ def odometry(
         float(np.linalg.norm(steps(poses[rows])[:, :3, 3], axis=1).sum()) for rows in pieces_of(tracked)
     )
     report = {
-        "verdict": _words(pieces, length_m, velocities is not None, inertial),
+        "verdict": _verdict(pieces, length_m, velocities is not None, inertial),
         "length_m": length_m,
         "pieces": int(pieces[-1]) + 1,
         "told": told[0],
@@ -199,7 +199,7 @@ def _together(
     covariance = np.zeros((len(poses), 6, 6))
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for rows in pieces_of(tracked):
-        returns = SensorReturns.of(drive.told_anew(tracked, rows), limits.min_range_m, limits.max_range_m)
+        returns = SensorReturns.of(drive.new_returns(tracked, rows), limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
         motions = drive.motions(tracked, rows)
@@ -210,29 +210,23 @@ def _together(
 
 
 def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tuple[float, float]:
-    """What the returns tell of translations and rotations. Raises a NotToldError where nothing does; notes what is assumed."""
+    """The shares of variance that returns took away. Raises a NotToldError where nothing measures a motion; notes assumptions."""
     if len(tracked) < 2:
         return 0.0, 0.0
     way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
     dropped = any(note.startswith(NOT_USED) for note in notes)
     doppler = "Doppler that most returns of a scan agree on" if dropped else "their Doppler (doppler_mps)"
+    turns_known = drive.gyroscope is not None or drive.turns_slowly
     for told, least, measured, moved, missing in (
         (way, LEAST_TOLD, drive.velocities is not None, "moved", doppler),
-        (
-            turn,
-            _LEAST_TOLD_TURN,
-            drive.gyroscope is not None or drive.turns_slowly,
-            "turned",
-            "its angular_velocity",
-        ),
+        (turn, _LEAST_TOLD_TURN, turns_known, "turned", "its angular_velocity"),
     ):
         if not measured and told < least:
             msg = (
                 f"the returns alone do not tell how the sensor {moved}: of a step's variance, they take away {told:.1%}, and "
                 f"{least:.0%} is needed. Give {missing}, or poses"
             )
-            msg = ". ".join([msg, *(note.rstrip(".") for note in notes)])
-            raise NotToldError(msg)
+            raise NotToldError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
     if drive.gyroscope is None and turn < _LEAST_TOLD_TURN:
         notes.append(
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
@@ -241,16 +235,19 @@ def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tup
     return way, turn
 
 
-def _words(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
+def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
     sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
     by = " and ".join(filter(None, [", ".join(sources[:-1]), sources[-1]]))
-    whole = f"{len(pieces)} scans along {length_m:.1f} m were placed by {by}."
+    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by {by}."]
     if inertial.alignment is not None:
-        whole = f"{whole} {inertial.alignment.words}"
+        sentences.append(inertial.alignment.words)
     begins = np.flatnonzero(np.diff(pieces)) + 1
-    if len(begins) == 0:
-        return whole
-    return f"{whole} The drive was lost before the scans {', '.join(map(str, begins))}: {len(begins) + 1} pieces, which do not belong together."
+    if len(begins):
+        before = ", ".join(map(str, begins))
+        sentences.append(
+            f"The drive was lost before the scans {before}: {len(begins) + 1} pieces, which do not belong together."
+        )
+    return " ".join(sentences)
 
 
 def _checked_rates(

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from radarsdf.checks import MISSING_POSES, instance, not_negative, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
-from radarsdf.poses.by_doppler import NOT_USED, DopplerMotion, unexplained_motion
 from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.doppler import NOT_USED, DopplerMotion, unexplained_motion
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import SensorReturns

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Motion from the Doppler of scans: velocities of the sensor, and the way from scan to scan."""
+"""Velocities of the sensor by Doppler, and the motion from scan to scan that they imply."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.poses.motion import Motion, spans_of
-from radarsdf.poses.rigid import Floats, rotation, rotation_vector, steps
+from radarsdf.poses.motion import Motion, spans_of, way
+from radarsdf.poses.rigid import Floats, rotation_vector, steps
 from radarsdf.returns.doppler import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _ASKED = 400  # returns of a scan, and
@@ -128,15 +128,6 @@ def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
     gain = np.where(weak[:, None], covariance[:, :, 2] / (covariance[:, 2, 2] + variance)[:, None], 0.0)
     mean = mean_mps - gain * mean_mps[:, 2:]
     return mean, covariance - np.einsum("fi,fj->fij", gain, covariance[:, 2]), int(weak.sum())
-
-
-def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
-    """(..., 3) of a sensor that turns evenly by the rotation vectors `turn` (..., 3) while its velocity changes evenly, in its
-    first frame, m."""
-    middle = np.einsum("...ij,j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
-    end = np.einsum("...ij,j->...i", rotation(turn), end_mps)
-    found: Floats = duration_s / 6 * (begin_mps + 4 * middle + end)
-    return found
 
 
 @dataclass(frozen=True)
