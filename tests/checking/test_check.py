@@ -1,6 +1,5 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses that refinement would mend, as a finding."""
 
 """The input of a check, errors of poses by noise, and drift."""
 
