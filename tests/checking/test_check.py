@@ -1,6 +1,5 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-
 """The input of a check, errors of poses by noise, and drift."""
 
 from __future__ import annotations

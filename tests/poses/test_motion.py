@@ -61,12 +61,12 @@ def test_a_bias_is_believed_as_far_as_it_is_told():
     motion = Motion.of(trajectory(6), 0.1, 0.02)
     bias = np.array([0.05, 0.1, 0.2, 0.01, 0.02, 0.05])
     shares = np.stack(
-        [motion._told(bias, share * np.repeat(motion.variances, 3)) for share in (0, 0.3, 0.6, 1, 2)]
+        [motion._believed(bias, share * np.repeat(motion.variances, 3)) for share in (0, 0.3, 0.6, 1, 2)]
     )
     np.testing.assert_allclose(shares[[0, -2, -1]], [[1] * 6, [0] * 6, [0] * 6], atol=1e-12)
     assert (np.diff(shares[:4], axis=0) < 0).all()
     # One that is as large as the errors of steps, half of whose variance is left.
-    half = motion._told(np.sqrt(np.repeat(motion.variances, 3)), 0.5 * np.repeat(motion.variances, 3))
+    half = motion._believed(np.sqrt(np.repeat(motion.variances, 3)), 0.5 * np.repeat(motion.variances, 3))
     np.testing.assert_allclose(half, 0.5)
 
 

@@ -1,6 +1,5 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-
 """The verdict, and what a map keeps of refined poses."""
 
 from __future__ import annotations
