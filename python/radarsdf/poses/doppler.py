@@ -200,16 +200,13 @@ def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
 
 def _likely_turns(velocities: SensorVelocities, durations_s: Floats, given: Floats) -> Floats:
     """(F - 1, 3) rotation vectors of given steps: of those that differ by whole turns, the one whose way ends nearest."""
-    found = []
+    found, means = [], velocities.mean_mps
     for i, step in enumerate(given):
         shortest = rotation_vector(step[:3, :3])
         angle = float(np.linalg.norm(shortest))
         longer = shortest * (1 - 2 * np.pi / angle) if angle > 0 else shortest
-        ways = [
-            way(turn, velocities.mean_mps[i], velocities.mean_mps[i + 1], float(durations_s[i]))
-            for turn in (shortest, longer)
-        ]
-        off = [float(np.linalg.norm(end - step[:3, 3])) for end in ways]
+        ends = (way(turn, means[i], means[i + 1], float(durations_s[i])) for turn in (shortest, longer))
+        off = [float(np.linalg.norm(end - step[:3, 3])) for end in ends]
         found.append(longer if off[1] < off[0] else shortest)
     return np.array(found).reshape(-1, 3)
 

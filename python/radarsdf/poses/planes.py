@@ -130,11 +130,7 @@ class SensorReturns:
 
     def every(self, step: int) -> SensorReturns:
         """The first one, and each that comes `step` later."""
-        return SensorReturns(
-            np.ascontiguousarray(self.directions[::step]),
-            np.ascontiguousarray(self.ranges_m[::step]),
-            np.ascontiguousarray(self.scans[::step]),
-        )
+        return self.select(np.arange(len(self)) % step == 0)
 
     def posed(self, poses: Floats) -> Rays:
         """As rays of sensors with these poses (F, 4, 4). Their local frame begins at the mean position."""

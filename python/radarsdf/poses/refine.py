@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import MISSING_POSES, instance, not_negative, usable_poses
 from radarsdf.config.fit_config import FitConfig
@@ -21,7 +20,7 @@ from radarsdf.poses.doppler import NOT_USED, DopplerMotion, unexplained_motion
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.rigid import Floats, moved_by, steps
+from radarsdf.poses.rigid import Floats, increments, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.rays import LeftOut
 from radarsdf.returns.surfels import LEAVES_PER_SURFEL
@@ -64,9 +63,9 @@ def refine_poses(
 ) -> RefinedPoses:
     """Refines the poses of scans, so that their returns lie on common surfaces.
 
-    All scans at once: a return's distance from a plane that scans have in common is a residual, in which the planes are
-    unknown, too; the given motions from scan to scan are others. The noise of the sensor, the errors of the given steps and
-    their bias are found from the data. Scans that see the same place again close a loop, whatever the time between them.
+    Adjusts all scans at once: residuals are the distances of returns from planes that scans have in common, which are unknown,
+    too, and the given motions from scan to scan. The noise of the sensor, the errors of the given steps and their bias are
+    estimated. Scans that see the same place again close a loop, whatever the time between them.
 
     Parameters
     ----------
@@ -178,11 +177,8 @@ def _squared_differences(given: Floats, found: Floats) -> Floats:
     """(F, 6, 6) outer products of the increments from given poses to others, once the scans in the middle coincide."""
     middle = len(given) // 2
     placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found[middle]), found)
-    turns = np.einsum("fij,fkj->fik", placed[:, :3, :3], given[:, :3, :3])
-    increments = np.concatenate(
-        [placed[:, :3, 3] - given[:, :3, 3], Rotation.from_matrix(turns).as_rotvec()], axis=1
-    )
-    squares: Floats = np.einsum("fi,fj->fij", increments, increments)
+    off = increments(given, placed)
+    squares: Floats = np.einsum("fi,fj->fij", off, off)
     return squares
 
 

@@ -20,7 +20,17 @@ from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scan, Scans, scans_in_memory
 from radarsdf.poses.odometry import NotToldError, Odometry, odometry
 from radarsdf.poses.refine import RefinedPoses, refine_poses
-from radarsdf.poses.rigid import Floats, aligned, alignment, covariance_in, moved, moved_by, placed, steps
+from radarsdf.poses.rigid import (
+    Floats,
+    aligned,
+    alignment,
+    covariance_in,
+    increments,
+    moved,
+    moved_by,
+    placed,
+    steps,
+)
 from radarsdf.progress import hides_bar
 
 _NOWHERE = -1  # piece of a scan that has no pose
@@ -124,9 +134,7 @@ def _about_z(T: Floats) -> Floats:
 
 def _between(first: Floats, second: Floats, shares: Floats) -> Floats:
     """Poses (K, 4, 4) between two: shares (K,) of the way to the second."""
-    turns = np.einsum("fij,fkj->fik", second[:, :3, :3], first[:, :3, :3])
-    ways = np.concatenate([(second - first)[:, :3, 3], Rotation.from_matrix(turns).as_rotvec()], axis=1)
-    return moved(first, shares[:, None] * ways)
+    return moved(first, shares[:, None] * increments(first, second))
 
 
 @dataclass(frozen=True)
