@@ -10,7 +10,6 @@ import itertools
 import numpy as np
 import pytest
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
-from radarsdf.poses.drive import Drive
 from radarsdf.poses.motion import Motion, MotionPrior, Rate
 from radarsdf.poses.rigid import moved, steps, transform
 from radarsdf.simulate import drifted
@@ -90,21 +89,6 @@ def test_velocities_lead_from_pose_to_pose():
     np.testing.assert_allclose(found.steps, steps(poses), atol=2e-3)
 
 
-def test_what_a_source_does_not_tell_is_left_to_others():
-    poses = trajectory(8)
-    turns = Motion.of(poses, 0.1, 0.01).rotations_only()
-    diagonal, below, gradient = turns.prior(drifted(poses, 0.1, 0.01, 5))
-    assert np.abs(diagonal[:, :3]).max() == 0
-    assert np.abs(below[:, :3]).max() == 0
-    assert np.abs(gradient[:, :3]).max() == 0
-    assert np.abs(gradient[:, 3:]).max() > 0
-    others = drifted(poses, 0.1, 0.01, 5)
-    learnt = turns.learnt(others, others, np.zeros((8, 6, 6)), np.zeros((7, 6, 6)))
-    assert learnt.sigma_m == turns.sigma_m
-    assert learnt.sigma_rad != turns.sigma_rad
-    assert learnt.bias[:3].tolist() == [0, 0, 0]
-
-
 TURNS = MotionPrior(np.array([0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.15]), True)
 MOVES = MotionPrior(np.array([20.0, 10.0, 5.0]), np.array([2.0, 1.0, 0.5]), False)
 RATE = Rate(np.array([0.3, -0.2, 0.1]), np.diag([0.01, 0.02, 0.03]))
@@ -135,18 +119,3 @@ def test_habits_are_learnt_from_a_drive_that_has_them(habits):
     # Of 8000 squares; turns settle within 4 s, so that a step of 0.1 s changes them by 2.5 % less.
     np.testing.assert_allclose(found.change, habits.change, rtol=4 * np.sqrt(2 / 8000) + 0.025)
     assert first.learnt([None, None], durations_s[:2]) == first
-
-
-def test_a_step_is_expected_from_the_middle_of_the_one_before():
-    times_s = np.array([0.0, 0.1, 0.4])
-    drive = Drive([], times_s, None, None, TURNS, MOVES)
-    found, turn, move = drive.expected(2, RATE, RATE), TURNS.after(RATE, 0.2), MOVES.after(RATE, 0.2)
-    np.testing.assert_allclose(found.turn.mean, 0.3 * turn.mean)
-    np.testing.assert_allclose(found.turn.covariance, 0.09 * turn.covariance)
-    np.testing.assert_array_equal((found.begin_mps, found.end_mps), [move.mean] * 2)
-    np.testing.assert_allclose(found.way_covariance, 0.09 * move.covariance)
-    assert found.duration_s == pytest.approx(0.3)
-    for nothing in (drive.expected(1, None, None), drive.expected(2, None, None)):
-        np.testing.assert_array_equal(nothing.turn.mean, 0)
-        np.testing.assert_allclose(nothing.turn.covariance, nothing.duration_s**2 * np.diag(TURNS.usual))
-        np.testing.assert_allclose(nothing.way_covariance, nothing.duration_s**2 * np.diag(MOVES.usual))

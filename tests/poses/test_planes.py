@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.estimate import Groups
 from radarsdf.poses.motion import Motion
-from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, unbiased_normals
+from radarsdf.poses.planes import Groups, PlaneGrid, SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.rigid import aligned, moved
 from radarsdf.returns.surfels import Surfels
 from radarsdf.simulate import Leg, drifted
