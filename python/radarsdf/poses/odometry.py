@@ -36,28 +36,29 @@ _MAX_RATE_RAD_S = 1e4  # more than any gyroscope measures, even in degrees
 
 
 class NotToldError(ValueError):
-    """Neither the returns nor anything else tells how the sensor moved."""
+    """Neither the returns nor anything else measures how the sensor moved."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Poses that were found without any being given."""
+    """Poses that were estimated without any being given."""
 
     poses: Floats
-    """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, turned so that z points up."""
+    """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, rotated so that z points up."""
     covariance: Floats
     """(F, 6, 6) as of :class:`RefinedPoses`, relative to the scan in the middle of each piece."""
     pieces: NDArray[np.int64]
-    """(F,) number of the piece of the drive that each scan belongs to. Where the drive was lost, over a gap in time mostly, a new
-    piece begins: its place relative to the one before is dead reckoning, and no map should join them."""
+    """(F,) number of the piece of the drive that each scan belongs to. Where tracking was lost, mostly over a gap in time, a new
+    piece begins: its position relative to the one before is dead reckoning, and no map should join them."""
     agreeing: Floats
     """(F,) share of the returns of each scan that lie on planes of the scans before it. NaN where a piece begins."""
     report: dict[str, Any]
-    """`verdict` in words; `length_m` of the way; `pieces`, their number; `told` and `told_turn`, the share of the variance of a
-    step's translation and rotation that the returns took away, in the direction that they tell least of, median; `doppler` and
-    `gyroscope`, whether they were used; `doppler_sign`, -1 if the radar's Doppler is positive as the sensor comes nearer;
-    `gyroscope_bias`, rad/s; `imu`, None or how it was found to sit: `R_sensor_imu`, its deviation `sigma_rad`, `late_s`, by which the
-    times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes; `movers`, returns that were left out; `notes` on what was not used and what was assumed; `scans`, `seconds`."""
+    """`verdict` in words; `length_m` of the trajectory; `pieces`, their number; `told` and `told_turn`, the median share of the
+    variance of a step's translation and rotation that the returns removed, in the least certain direction; `doppler` and
+    `gyroscope`, whether they were used; `doppler_sign`, -1 if Doppler is positive for what comes nearer; `gyroscope_bias`,
+    rad/s; `imu`, None or its `R_sensor_imu` with `sigma_rad`, `late_s`, by which the times of scans are too late in its clock, and
+    `lever_m`, from it to the radar in its axes; `movers`, returns that were excluded; `notes` on what was not used or was assumed;
+    `scans`, `seconds`."""
 
     def longest_piece(self) -> slice:
         """The scans of the piece with the most scans: those to make a map of."""
@@ -79,9 +80,9 @@ def odometry(
 ) -> Odometry:
     """Estimates the poses of scans from the radar alone.
 
-    Each scan is moved onto the planes of the scans before it, near where its Doppler, a gyroscope or the motion so far lead.
-    Over a gap, where it may be is searched. Then all scans are moved at once, as by :func:`refine_poses`. How this sensor turns
-    and moves, its noise and the bias of its gyroscope are found from the drive.
+    Fits each scan to the planes of the scans before it, starting from Doppler, a gyroscope or the motion so far; over a gap, by a
+    search. Then adjusts all scans at once, as :func:`refine_poses` does. The motion prior, the noise of the sensor and the bias of
+    its gyroscope are estimated from the drive.
 
     Parameters
     ----------
@@ -97,9 +98,9 @@ def odometry(
     angular_velocity_times_s : (G,) array_like, optional
         When it was measured, s, in the clock of `times_s`. Default: at the times of the scans.
     imu : Imu, optional
-        An IMU in axes of its own, in place of `angular_velocity`; of Scans, theirs. How it sits on the radar and what time is
-        between their clocks is found, from its accelerometer and the Doppler, or from turns that the returns tell; the accelerometer
-        also tells which way is up.
+        An IMU in axes of its own, in place of `angular_velocity`; of Scans, theirs. Its rotation on the radar and the offset of
+        its clock are estimated from its accelerometer and the Doppler, or from turns that returns measure. The accelerometer
+        also gives the direction of up.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
     progress : bool, optional
@@ -113,14 +114,14 @@ def odometry(
     Raises
     ------
     ValueError
-        If scans, Doppler, times or rates are invalid, if there are no times, or if the returns do not tell what nothing
-        else measures: without Doppler, the way along a wall, say; without a gyroscope, the turns of a radar with few returns
-        that is slower than 20 m/s. If Doppler was given and not used, the error says why.
+        If scans, Doppler, times or rates are invalid, if there are no times, or if nothing measures a part of the motion:
+        without Doppler, the position along a wall; without a gyroscope, the turns of a radar with few returns that is slower
+        than 20 m/s. If Doppler was given and not used, the error says why.
 
     Notes
     -----
-    The scale is that of the radar's ranges and, with Doppler, of its speeds. Without an accelerometer, where gravity points is
-    not known: the first scan is taken to be level.
+    The scale is that of the radar's ranges and, with Doppler, of its speeds. Without an accelerometer, the first scan is assumed
+    to be level.
 
     Examples
     --------
