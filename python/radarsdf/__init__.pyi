@@ -10,7 +10,7 @@ from .budget.estimate import estimate as estimate
 from .changes.changes import Changes as Changes
 from .changes.compare import compare as compare
 from .checking.check import check as check
-from .checking.finding import Finding as Finding
+from .checking.recording import Finding as Finding
 from .config.fit_config import FitConfig as FitConfig
 from .fitting.fit import fit as fit
 from .fitting.stopping import Diverged as Diverged
