@@ -22,7 +22,7 @@ import numpy as np
 import radarsdf
 from numpy.typing import NDArray
 from radarsdf.changes.changes import UNSEEN, Changes
-from radarsdf.poses.way import pose_sigmas
+from radarsdf.poses.posed import pose_sigmas
 from radarsdf.simulate import KINDS, Box, Scene, Simulation, drifted, materials, simulate
 from scipy.spatial.transform import Rotation
 

@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 import radarsdf
 from numpy.typing import NDArray
-from radarsdf.checking.drift import check_drift
+from radarsdf.checking.noise import check_drift
 from radarsdf.checking.recording import Recording
 from radarsdf.simulate import measured_motion
 

@@ -14,7 +14,7 @@ import numpy as np
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.poses import drive
-from radarsdf.poses.expected import ExpectedStep
+from radarsdf.poses.motion import ExpectedStep
 from radarsdf.poses.rigid import Floats
 from radarsdf.poses.tracking import Tracked, Tracker
 from radarsdf.simulate import measured_motion

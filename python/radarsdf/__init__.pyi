@@ -8,7 +8,7 @@ from . import simulate as simulate
 from .changes.changes import Changes as Changes
 from .changes.compare import compare as compare
 from .checking.check import check as check
-from .checking.finding import Finding as Finding
+from .checking.recording import Finding as Finding
 from .config.fit_config import FitConfig as FitConfig
 from .fitting.estimate import Estimate as Estimate
 from .fitting.estimate import estimate as estimate

@@ -1,13 +1,22 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The check takes arrays, or scans as they are read."""
+"""The input of a check, errors of poses by noise, and drift."""
 
 from __future__ import annotations
+
+import re
 
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf.checking import noise
+from radarsdf.checking.noise import check_drift
+from radarsdf.checking.recording import Recording
 from radarsdf.io import Scans
+from radarsdf.simulate import drifted
+
+from bench.breakages.__main__ import slow
+from tests.conftest import recorded_file
 
 
 def test_scans_are_taken_as_they_are():
@@ -23,3 +32,90 @@ def test_scans_are_taken_as_they_are():
 def test_arrays_need_poses():
     with pytest.raises(ValueError, match="poses are missing"):
         radarsdf.check([np.ones((3, 3))])
+
+
+def added_m(points, poses):
+    """What the note says that the poses add, m. None without a note."""
+    notes = [f.evidence for f in radarsdf.check(points, poses) if f.name == "poses_disagree"]
+    return float(re.search(r"about ([0-9.]+) m", notes[0])[1]) if notes else None
+
+
+@pytest.mark.usefixtures("right_frames")
+@pytest.mark.parametrize(("kind", "frames"), [("hugin", 30), ("wall", 20), ("oculii", 50)])
+def test_exact_poses_add_nothing(kind, frames):
+    scans = getattr(radarsdf.simulate, kind)(frames=frames, seed=1)
+    assert added_m(scans.points, scans.poses) is None
+
+
+def test_heights_that_are_off_from_scan_to_scan_are_found_in_metres():
+    scans = radarsdf.simulate.wall(frames=40, seed=1)
+    poses = scans.poses.copy()
+    poses[:, :3, 3] += np.random.default_rng(0).normal(0, 0.03, (40, 3))
+    assert added_m(scans.points, poses) == pytest.approx(0.03, rel=0.5)
+
+
+def test_a_way_back_that_has_drifted_is_found():
+    scans = radarsdf.simulate.wall(frames=20, seed=1)
+    points, rng = list(scans.points), np.random.default_rng(0)
+    points += [scan + rng.normal(0, 1e-3, scan.shape) for scan in reversed(scans.points)]
+    poses = np.concatenate([scans.poses, scans.poses[::-1]])
+    poses[:, :3, 3] += 0.4 * np.linspace(0, 1, 40)[:, None] * poses[0, :3, 1]
+    assert added_m(points, poses) > 0.02
+
+
+SCANS = 36
+CONFIG = radarsdf.FitConfig(num_threads=1)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    whole = radarsdf.simulate.wall(seed=62)
+    return Scans(whole.points[:SCANS], whole.poses[:SCANS])
+
+
+def recording(drive, poses, rows=slice(None)):
+    return Recording.of(drive.points[rows], poses[rows], None, None, None)
+
+
+def test_a_drift_is_found_with_its_figures(drive):
+    findings = radarsdf.check(drive.points, drifted(drive.poses, 0.05, 0.004, 1))
+    (found,) = [finding for finding in findings if finding.name == "poses_drift"]
+    assert found.severity == "warning"
+    assert "denser where returns that took no part lie" in found.evidence
+    assert f"{SCANS} scans end off by" in found.evidence
+    assert "radarsdf poses" in found.mend
+
+
+def test_true_poses_do_not_drift(drive):
+    assert check_drift(recording(drive, drive.poses), CONFIG) == []
+    assert check_drift(recording(drive, drive.poses, slice(0, 3)), CONFIG) == []
+
+
+def test_a_gain_without_effect_is_no_drift():
+    with np.load(recorded_file("aimotive_motorway/radar.npz")) as drive:
+        points = np.split(drive["F_LRR_C_points"], np.cumsum(drive["F_LRR_C_counts"])[:-1])
+        poses = drive["F_LRR_C_poses"]
+    assert check_drift(Recording.of(points, poses, None, None, None), CONFIG) == []
+
+
+def test_large_recordings_are_looked_at_in_windows(drive, monkeypatch):
+    asked = []
+    refine = noise.refine_poses
+
+    def counted(points, poses, **settings):
+        asked.append((len(poses), sum(map(len, points))))
+        return refine(points, poses, **settings)
+
+    monkeypatch.setattr(noise, "refine_poses", counted)
+    monkeypatch.setattr(noise, "_SCANS", 12)
+    monkeypatch.setattr(noise, "_RETURNS", 8000)
+    (found,) = check_drift(recording(drive, drifted(drive.poses, 0.05, 0.004, 1)), CONFIG)
+    assert [scans for scans, _ in asked] == [12, 12, 12]
+    assert max(returns for _, returns in asked) <= 8500
+    assert "of 3 windows of the recording" in found.evidence
+
+
+@pytest.mark.parametrize("kind", ["hugin", "forest"])
+def test_a_drift_below_the_noise_of_a_coarse_sensor_is_none(kind):
+    creep = slow(kind, 0.02, seed=6, cell=0.5)
+    assert check_drift(Recording.of(creep.points, creep.poses, None, None, None), CONFIG) == []

@@ -73,12 +73,6 @@ def test_what_is_wild_is_counted_and_named(good):
     assert {f.name for f in radarsdf.check(*good)} == set(found) - set(counts)
 
 
-def test_steps_are_in_numbers(good):
-    points, poses, intensities = good
-    found = radarsdf.check(points, poses, BROKEN["intensity_steps"][1](intensities))
-    assert any("steps of 0.5" in finding.evidence for finding in found)
-
-
 def test_reflections_in_the_ground_are_named(good):
     points, poses, _ = good
     mirrored = []

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
-from radarsdf.poses.by_doppler import SensorVelocities
+from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope, UnknownAxesError
-from radarsdf.poses.imu_alignment import ImuAlignment
-from radarsdf.poses.imu_motion import cumulated
-from radarsdf.poses.inertial import Inertial, levelled
+from radarsdf.poses.imu import ImuAlignment, Inertial, cumulated, levelled
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation

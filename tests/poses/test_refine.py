@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.io import Scans
 from radarsdf.poses.rigid import aligned, turned_by
 from radarsdf.simulate import drifted
 
@@ -42,16 +41,6 @@ def test_a_drift_is_mended(street, refined):
     assert refined.report["moved_m"] > 0.5 * before
     assert "sharper map" in refined.report["verdict"]
     assert refined.report["scans"] == 24
-
-
-def test_the_whole_is_neither_moved_nor_turned(street, refined):
-    given = drifted(street.poses, 0.05, 0.004, 1)
-    np.testing.assert_allclose(refined.poses, aligned(refined.poses, given), atol=1e-9)
-    np.testing.assert_allclose(
-        np.einsum("fij,fkj->fik", refined.poses[:, :3, :3], refined.poses[:, :3, :3]),
-        np.tile(np.eye(3), (24, 1, 1)),
-        atol=1e-9,
-    )
 
 
 def test_a_bias_is_no_noise(street):
@@ -133,16 +122,6 @@ def test_along_a_corridor_poses_stay():
     assert np.abs(along - along_given).max() < 0.05
 
 
-def test_scans_that_share_nothing_keep_their_poses():
-    rng = np.random.default_rng(0)
-    scans = [rng.normal(0, 1, (200, 3)) + [5, 0, 0] for _ in range(3)]
-    given = np.tile(np.eye(4), (3, 1, 1))
-    given[:, 0, 3] = [0, 1000, 2000]
-    found = radarsdf.refine_poses(scans, given)
-    assert not found.improved
-    np.testing.assert_array_equal(found.poses, given)
-
-
 @pytest.mark.parametrize("counts", [[50], [0, 5], [1, 1], [5, 5, 0]])
 def test_hardly_any_returns_keep_their_poses(counts):
     rng = np.random.default_rng(1)
@@ -153,25 +132,6 @@ def test_hardly_any_returns_keep_their_poses(counts):
     assert found.report.get("gain", 0.0) == 0
     assert found.covariance.shape == (len(counts), 6, 6)
     np.testing.assert_array_equal(found.poses, given)
-
-
-def test_scans_have_their_own_poses_and_times(street):
-    given = drifted(street.poses, 0.05, 0.004, 1)
-    scans = Scans(street.points, given, times_s=np.arange(24.0))
-    np.testing.assert_array_equal(
-        radarsdf.refine_poses(scans).poses,
-        radarsdf.refine_poses(street.points, given, times_s=np.arange(24.0)).poses,
-    )
-
-
-def test_two_scans_may_have_one_time(street):
-    found = radarsdf.refine_poses(street.points[:3], street.poses[:3], times_s=[0.0, 1, 1])
-    assert np.isfinite(found.poses).all()
-
-
-def test_known_deviations_stay(street):
-    found = radarsdf.refine_poses(street.points[:6], street.poses[:6], sigma_m=0.02, sigma_rad=0.001)
-    assert (found.report["sigma_m"], found.report["sigma_rad"]) == pytest.approx((0.02, 0.001))
 
 
 def test_wrong_arguments_are_refused(street):

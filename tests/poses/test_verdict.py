@@ -1,10 +1,18 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Tests of what decides whether poses are better."""
+"""The verdict, and what a map keeps of refined poses."""
+
+from __future__ import annotations
+
+import json
 
 import numpy as np
+import pytest
 import radarsdf
+from radarsdf import RefinedPoses
+from radarsdf.map.storage import checked_report
 from radarsdf.poses.planes import SensorReturns
+from radarsdf.poses.posed import way_of
 from radarsdf.poses.verdict import Verdict
 from radarsdf.returns.noise import SensorNoise
 
@@ -46,3 +54,30 @@ def _verdict(things: int) -> Verdict:
     held = rng.random(len(returns)) < 0.2
     noise = SensorNoise(0.2, 0.001, 0.001)
     return Verdict.of(returns.select(held), returns.select(~held), before, after, noise)
+
+
+def refined(scans):
+    poses = np.tile(np.eye(4), (scans, 1, 1))
+    poses[:, 0, 3] = np.arange(scans)
+    covariance = np.tile(np.diag([1.0, 4, 4, 0.01, 0.01, 0.04]), (scans, 1, 1))
+    return RefinedPoses(poses, covariance, True, {"verdict": "Better.", "sigma_m": 0.1, "sigma_rad": 0.02})
+
+
+def test_it_is_kept_with_the_map():
+    found = refined(1201)
+    given = found.poses + 0.0
+    given[:, 1, 3] = 1
+    way = json.loads(json.dumps(way_of(found, given)))
+    assert len(way["scans"]) == len(way["before"]) == len(way["after"]) == len(way["sigma_m"]) == 500
+    assert way["after"][-1] == [1200, 0, 0]
+    assert way["before"][-1] == [1200, 1, 0]
+    assert (way["verdict"], way["improved"], way["step_m"]) == ("Better.", True, 0.1)
+    assert checked_report({"poses": way})["poses"] == way
+    for wrong in (
+        {"after": way["after"][1:]},
+        {"sigma_m": [-1.0] * 500},
+        {"after": [[0.0, 0.0]] * 500},
+        {"verdict": 3},
+    ):
+        with pytest.raises(ValueError, match=r"report\.poses|do not fit together"):
+            checked_report({"poses": way | wrong})

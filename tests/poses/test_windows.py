@@ -10,10 +10,9 @@ import radarsdf
 from radarsdf.evaluation import trajectory_metrics
 from radarsdf.io import Scan
 from radarsdf.poses import windows
-from radarsdf.poses.joining import JoinedPoses
 from radarsdf.poses.odometry import NotToldError
 from radarsdf.poses.rigid import moved, transform
-from radarsdf.poses.windows import find_in_windows, refine_in_windows
+from radarsdf.poses.windows import JoinedPoses, find_in_windows, refine_in_windows
 
 from .drift import drifting_drive, trajectory
 
@@ -111,14 +110,6 @@ def test_drift_is_mended_window_by_window():
     before, after = (trajectory_metrics(poses, true)["absolute_m"] for poses in (given, refined.poses))
     assert after < 0.4 * before
     assert refined.covariance.shape == (48, 6, 6)
-
-
-def test_a_drive_of_one_window_is_refined_as_a_whole():
-    scans, _ = drifting_drive()
-    one, _ = refine_in_windows(scans.select(np.arange(20)), CONFIG, False)
-    other = radarsdf.refine_poses(scans.select(np.arange(20)), config=CONFIG)
-    np.testing.assert_array_equal(one.poses, other.poses)
-    assert one.report["verdict"] == other.report["verdict"]
 
 
 @pytest.mark.usefixtures("short_windows")

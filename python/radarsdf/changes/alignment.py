@@ -22,8 +22,7 @@ from radarsdf.changes.probability import (
     share_of_changes,
 )
 from radarsdf.map.threshold import across_triangles
-from radarsdf.poses.expected import ExpectedStep
-from radarsdf.poses.rates import Rate
+from radarsdf.poses.motion import ExpectedStep, Rate
 from radarsdf.poses.rigid import moved, rotation_vector, skew
 from radarsdf.poses.tracking import thinned
 from radarsdf.poses.verdict import Verdict

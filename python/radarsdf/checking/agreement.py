@@ -1,24 +1,20 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How well the returns of different scans agree, if one scan is moved into the frame of another.
-
-A return of scan i is moved into the frame of scan j. Its distance to the nearest return of scan j is divided by the
-distances between returns of scan j at that place. So neither the density of the returns, nor their noise, nor the
-unit of length matters: 1 means that the returns of the two scans mix as the returns of one scan do. The score of a
-pair of scans is the mean logarithm of these quotients. The smaller, the better the scans agree.
-"""
+"""Agreement of returns of different scans, and hypotheses about mistakes in the data."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from radarsdf.poses.rigid import between
+from radarsdf.poses.rigid import between, turned_by
 
 FloatArray = NDArray[np.float64]
 
@@ -66,6 +62,10 @@ class Agreement:
         for p, (i, j) in enumerate(pairs.tolist()):
             found[:, p] = 0.5 * (self._one_way(i, j, T_j_i[:, p]) + self._one_way(j, i, back[:, p]))
         return found
+
+    def spacing_m(self, i: int) -> float:
+        """Median distance between neighbouring returns of scan i, m. 0 if it has too few."""
+        return float(np.median(self._tree(i)[1])) if len(self._scans[i]) >= MIN_RETURNS else 0.0
 
     def _one_way(self, i: int, j: int, T_j_i: FloatArray) -> FloatArray:
         """Mean logarithms (H,) of the quotients of returns of scan i in scan j."""
@@ -161,3 +161,184 @@ def inverse(T_a_b: FloatArray) -> FloatArray:
     found[..., :3, 3] = -np.einsum("...ab,...b->...a", transposed, T_a_b[..., :3, 3])
     found[..., 3, 3] = 1
     return found
+
+
+_AXES = "xyz"
+_UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}
+# Of radar axes (x forward, y left, z up) in a camera frame (x right, y down, z forward).
+_CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+# Of a sensor on its vehicle, in yaw; in pitch up to 20.
+_TURNS_DEG = {"z": (5, 10, 15, 20, 25, 30, 35, 40, 45), "y": (5, 10, 15, 20)}
+# A sensor that turns more between scans may have poses of degrees taken for radians.
+_FAST_RAD = np.radians(3)
+_LOST_TURNS = 29  # whole turns tried
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One way to read the data."""
+
+    finding: str
+    """Name of the finding, if this is right."""
+    what: str
+    """What the data are, in words that follow "the scans agree better if"."""
+    mend: str
+    """What to do, if this is right."""
+    T_j_i: FloatArray
+    """(P, 4, 4) motions of the pairs of scans, between the frames of the points as given."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """The axis of the points as given that is up then."""
+
+
+def hypotheses(
+    T_world_sensor: FloatArray, pairs: NDArray[np.int64], *, all_axes: bool = True
+) -> list[Hypothesis]:
+    """Hypotheses about rigid poses (F, 4, 4) for pairs (P, 2) of scans i and j. The more common a mistake, the earlier.
+
+    `all_axes`: whether to try all 47 ways to swap and turn axes, of points and of positions, or only the most common eight.
+    """
+    return list(_hypotheses(T_world_sensor, pairs, all_axes))
+
+
+def _hypotheses(poses: FloatArray, pairs: NDArray[np.int64], all_axes: bool) -> Iterator[Hypothesis]:
+    motions = relative(poses, pairs)
+    yield Hypothesis(
+        "poses_inverted",
+        "the poses are inverted",
+        "Invert each pose: np.linalg.inv(poses).",
+        relative(inverse(poses), pairs),
+    )
+    yield Hypothesis(
+        "points_in_world_frame",
+        "the points are in the world frame already",
+        "Move them back: (points - pose[:3, 3]) @ pose[:3, :3], or pass the points of the sensor frame.",
+        np.tile(np.eye(4), (len(pairs), 1, 1)),
+    )
+    yield from _axes(poses, pairs, all_axes)
+    for factor, word in _UNITS.items():
+        yield Hypothesis(
+            "units",
+            f"the positions of the poses are multiplied by {word}",
+            f"Use metres for both: multiply the positions by {word}, or divide the points by it.",
+            relative(_with(poses, positions=poses[:, :3, 3] * factor), pairs),
+        )
+    for what, rotations in _angles(poses):
+        yield Hypothesis(
+            "angles_in_degrees",
+            what,
+            "Make the rotations of the poses anew, from angles in rad.",
+            relative(_with(poses, rotations=rotations), pairs),
+        )
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    for shift, order, other in ((-1, "w x y z", "x y z w"), (1, "x y z w", "w x y z")):
+        read = Rotation.from_quat(np.roll(quaternions, shift, axis=1))
+        yield Hypothesis(
+            "quaternion_order",
+            f"the quaternions of the poses are {order}, and were read as {other}",
+            f"Make the rotations of the poses anew, from quaternions in the order {order}.",
+            relative(_with(poses, rotations=read), pairs),
+        )
+    for axis, name in (("z", "yaw"), ("y", "pitch")):
+        for degrees in (sign * turn for turn in _TURNS_DEG[axis] for sign in (1, -1)):
+            T_vehicle_sensor = np.eye(4)
+            T_vehicle_sensor[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+            yield Hypothesis(
+                "sensor_turned",
+                f"the sensor is turned by {degrees} degrees of {name} on what the poses are of",
+                "Pass poses of the sensor: poses @ T_vehicle_sensor, by its calibration.",
+                T_vehicle_sensor.T @ motions @ T_vehicle_sensor,
+            )
+
+
+def standing_still(guesses: list[Hypothesis]) -> int:
+    """Number of the hypothesis under which the sensor does not move between scans: points in the world frame."""
+    return next(k for k, guess in enumerate(guesses) if guess.finding == "points_in_world_frame")
+
+
+def _with(
+    poses: FloatArray, *, positions: FloatArray | None = None, rotations: Rotation | None = None
+) -> FloatArray:
+    """Poses (F, 4, 4) with other positions (F, 3), m, or rotations (F,)."""
+    found = poses.copy()
+    if positions is not None:
+        found[:, :3, 3] = positions
+    if rotations is not None:
+        found[:, :3, :3] = rotations.as_matrix()
+    return found
+
+
+def _signed_permutations() -> Iterator[FloatArray]:
+    """The 47 matrices that swap axes or change their signs, the identity left out."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            if not np.array_equal(matrix, np.eye(3)):
+                yield matrix
+
+
+def _written(matrix: FloatArray) -> str:
+    """A signed permutation as a user would write it: x, -y, -z."""
+    axes = np.argmax(np.abs(matrix), axis=1)
+    return ", ".join(
+        ("-" if row[axis] < 0 else "") + _AXES[axis] for row, axis in zip(matrix, axes, strict=True)
+    )
+
+
+def _surprise(matrix: FloatArray) -> tuple[bool, float]:
+    """To sort matrices by: where z stays up, the mistake is more common. Few signs before many."""
+    return (matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum()))
+
+
+def _kind(matrix: FloatArray) -> str:
+    """Name of the finding that the axes have to be mapped by this matrix."""
+    if any(np.array_equal(matrix, m) for m in (_CAMERA_OF_RADAR, _CAMERA_OF_RADAR.T)):
+        return "camera_frame"
+    keeps_axes = np.array_equal(np.abs(matrix), np.eye(3))
+    return "mirrored" if keeps_axes and np.linalg.det(matrix) < 0 else "axes_swapped"
+
+
+def _axes(poses: FloatArray, pairs: NDArray[np.int64], all_axes: bool) -> Iterator[Hypothesis]:
+    motions = relative(poses, pairs)
+    for matrix in sorted(_signed_permutations(), key=_surprise):
+        words, kind = _written(matrix), _kind(matrix)
+        camera = kind == "camera_frame"
+        # z up or down, x and y in any order; and the frame of a camera
+        if not (all_axes or camera or matrix[2, 2] == 1 or words == "x, -y, -z"):
+            continue
+        turned = np.eye(4)
+        turned[:3, :3] = matrix
+        yield Hypothesis(
+            kind,
+            f"the points are read as ({words})",
+            f"Pass points with the columns ({words}): x forward, y left, z up.",
+            turned.T @ motions @ turned,
+            up=(float(matrix[2, 0]), float(matrix[2, 1]), float(matrix[2, 2])),
+        )
+        if all_axes or not camera:
+            yield Hypothesis(
+                kind,
+                f"the positions of the poses are read as ({words})",
+                "Make positions and rotations of the poses in one right-handed world frame with z up.",
+                relative(_with(poses, positions=poses[:, :3, 3] @ matrix.T), pairs),
+            )
+
+
+def _angles(poses: FloatArray) -> Iterator[tuple[str, Rotation]]:
+    """Rotations (F,) if their angles had been taken for another unit, and what that means in words."""
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    # Angles in rad, taken for degrees, are 57 times too small.
+    vectors = np.degrees(rotations.as_rotvec())
+    if np.linalg.norm(vectors, axis=1).max() < 2 * np.pi:
+        yield "the angles of the poses are taken for rad, not degrees", Rotation.from_rotvec(vectors)
+    if len(rotations) < 3 or np.median(turned_by(poses[:-1], poses[1:])) < _FAST_RAD:
+        return
+    # Angles in degrees, taken for rad, have lost whole turns. Steps are small, so the turns between scans are known.
+    angles = np.radians(np.unwrap(rotations.as_euler("ZYX"), axis=0))
+    turn = np.radians(2 * np.pi)  # what a lost turn was
+    for turns in range(-_LOST_TURNS, _LOST_TURNS + 1):
+        lost = np.array([turns * turn, 0.0, 0.0])
+        yield (
+            "the angles of the poses are taken for degrees, not rad",
+            Rotation.from_euler("ZYX", angles + lost),
+        )

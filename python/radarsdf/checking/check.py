@@ -9,12 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checking import before_fit, frames, trajectory
+from radarsdf.checking import frames, noise, trajectory
 from radarsdf.checking.doppler import check_doppler
-from radarsdf.checking.drift import check_drift
-from radarsdf.checking.finding import SEVERITIES, Finding
 from radarsdf.checking.intensity import check_intensities
-from radarsdf.checking.recording import Recording
+from radarsdf.checking.recording import SEVERITIES, Finding, Recording
 from radarsdf.checks import MISSING_POSES, are_rigid, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans, filled
@@ -30,11 +28,10 @@ def check(
     times_s: ArrayLike | None = None,
     config: FitConfig | None = None,
 ) -> list[Finding]:
-    """Tells what is wrong with scans and poses, and what a fit of them will cost.
+    """Finds mistakes in scans and poses, and estimates what a fit of them will cost.
 
-    Most of it is decided by how well returns of different scans agree when the poses move them into one frame: as the
-    data are given, and as they would be if one common mistake were mended. Samples are taken at equal steps, so the
-    same data give the same findings.
+    Most findings compare how well returns of different scans agree in the world frame: with the data as they are, and as if
+    one common mistake were corrected. Samples are taken at equal steps, so the same data give the same findings.
 
     Parameters
     ----------
@@ -83,7 +80,7 @@ def check(
 def check_cheaply(
     points: Sequence[ArrayLike], poses: ArrayLike, intensities: Sequence[ArrayLike] | None = None
 ) -> list[Finding]:
-    """The findings of :func:`check` that take little time beside a fit, on a smaller sample."""
+    """The findings of :func:`check` that take little time compared with a fit, on a smaller sample."""
     recording = Recording.of(points, poses, intensities, None, None)
     return _sorted(_find(recording, None, frames.CHEAP))
 
@@ -92,17 +89,24 @@ def _sorted(findings: list[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
+def _stops(findings: list[Finding]) -> bool:
+    return any(finding.severity == "error" for finding in findings)
+
+
 def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
     """All findings. `config` None: only the cheap ones."""
     found, recording = _usable(recording)
     if _stops(found):
-        return found  # nothing below can be computed
-    found += trajectory.check_times(recording)
-    found += before_fit.check_elevation(recording)
-    found += trajectory.check_rounding(recording)
-    found += check_intensities(recording)
-    found += trajectory.check_duplicates(recording)
-    wrong = frames.check_still(recording, effort) or frames.check_frames(recording, effort)
+        return found
+    for checked in (
+        trajectory.check_times,
+        noise.check_elevation,
+        trajectory.check_rounding,
+        check_intensities,
+        trajectory.check_duplicates,
+    ):
+        found += checked(recording)
+    wrong = [*frames.check_still(recording, effort)] or [*frames.check_frames(recording, effort)]
     if not _stops(wrong):
         wrong += trajectory.check_lengths(recording)
     if not _stops(wrong):  # else the scans do not agree, whatever the clock
@@ -110,55 +114,41 @@ def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort)
         wrong += check_doppler(recording)
         if config is not None and not any(finding.severity != "note" for finding in wrong):
             wrong += frames.check_clock(recording, effort)
-        wrong += before_fit.check_ground(recording)
+        wrong += noise.check_ground(recording)
     found += wrong
     if config is not None and not _stops(found):
-        found += before_fit.check_noise_and_cost(recording, config)
+        found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
-            found += check_drift(recording, config)
+            found += noise.check_drift(recording, config)
     return found
-
-
-def _stops(findings: list[Finding]) -> bool:
-    """Whether a finding is an error."""
-    return any(finding.severity == "error" for finding in findings)
 
 
 def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
     """Findings about rows, scans and poses that a fit leaves out, and the recording without them."""
     found = []
-    kept = [measured(scan) for scan in recording.points]
-    finite = sum(int(np.isfinite(scan).all(axis=1).sum()) for scan in recording.points)
-    rows, total = sum(int(mask.sum()) for mask in kept), sum(map(len, kept))
-    left_out = "Nothing needs to be done: a fit leaves them out."
+    left_out = [~measured(scan) for scan in recording.points]
+    total, unmeasured = sum(map(len, left_out)), sum(int(mask.sum()) for mask in left_out)
+    infinite = total - sum(int(np.isfinite(scan).all(axis=1).sum()) for scan in recording.points)
+    nothing = "Nothing needs to be done: a fit leaves them out."
     for count, name, what in (
-        (total - finite, "returns_not_finite", "have coordinates that are not finite"),
-        (finite - rows, "padding", "are no measurements: 0 0 0, or one point many times in succession"),
+        (infinite, "returns_not_finite", "have coordinates that are not finite"),
+        (
+            unmeasured - infinite,
+            "padding",
+            "are no measurements: 0 0 0, or one point many times in succession",
+        ),
     ):
         if count > 0:
-            found.append(Finding(name, "note", f"{count} of {total} returns {what}.", left_out))
-    if rows < total:
-        recording = _without(recording, kept)
-    empty = np.array([not mask.any() for mask in kept])
+            found.append(Finding(name, "note", f"{count} of {total} returns {what}.", nothing))
+    if unmeasured:
+        recording = recording.without(left_out)
+    empty = np.array([mask.all() for mask in left_out])
     if empty.any():
-        evidence = f"{int(empty.sum())} of {len(empty)} scans have no returns, the first is scan {int(np.argmax(empty))}."
+        evidence = (
+            f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {np.argmax(empty)}."
+        )
         if empty.all():
             return [*found, Finding("empty_scans", "error", evidence, "Pass the returns.")], recording
-        found.append(Finding("empty_scans", "note", evidence, left_out))
+        found.append(Finding("empty_scans", "note", evidence, nothing))
     found += trajectory.check_rigid(recording)
     return found, recording.select(np.flatnonzero(~empty & are_rigid(recording.poses)))
-
-
-def _without(recording: Recording, masks: list[np.ndarray]) -> Recording:
-    """The rows of each scan in its mask (N_i,)."""
-
-    def kept(arrays: list[np.ndarray] | None) -> list[np.ndarray] | None:
-        return None if arrays is None else [a[mask] for a, mask in zip(arrays, masks, strict=True)]
-
-    return Recording(
-        [scan[mask] for scan, mask in zip(recording.points, masks, strict=True)],
-        recording.poses,
-        kept(recording.intensities),
-        kept(recording.doppler_mps),
-        recording.times_s,
-    )

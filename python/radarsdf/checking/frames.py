@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Frames, axes, units and clocks: what the scans say of them by agreeing with each other, or not."""
+"""Checks of frames, axes, units and clocks by the agreement of scans."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,14 +16,15 @@ from radarsdf.checking.agreement import (
     MIN_RETURNS,
     Agreement,
     Comparison,
+    Hypothesis,
     choose_pairs,
+    hypotheses,
     inverse,
     pairs_apart,
     relative,
+    standing_still,
 )
-from radarsdf.checking.finding import Finding, Severity
-from radarsdf.checking.hypotheses import Hypothesis, hypotheses, standing_still
-from radarsdf.checking.recording import FloatArray, Recording
+from radarsdf.checking.recording import Finding, FloatArray, Recording, Severity
 from radarsdf.io.poses.trajectory import Trajectory
 
 # A hypothesis is noted if the scans agree better by this: of the mean logarithm of distances, and of its standard error. It
@@ -69,15 +71,12 @@ FULL = Effort(pairs=48, returns=1000, queries=80, all_axes=True)
 CHEAP = Effort(pairs=20, returns=400, queries=40, all_axes=False, lags=(1, 2))
 
 
-def check_frames(recording: Recording, effort: Effort = FULL) -> list[Finding]:
-    """Tells what is wrong with frames, axes and units, if the scans then agree much better than as given.
-
-    Poses must be rigid transforms.
-    """
+def check_frames(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+    """The mistake in frames, axes or units without which the scans agree much better. Poses must be rigid transforms."""
     poses = recording.poses
     pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
     if len(pairs) < _MIN_PAIRS:
-        return []
+        return
     agreement = Agreement(recording.points, effort.returns, effort.queries)
     guesses = hypotheses(poses, pairs, all_axes=effort.all_axes)
     motions = relative(poses, pairs)
@@ -89,17 +88,15 @@ def check_frames(recording: Recording, effort: Effort = FULL) -> list[Finding]:
     in_world = in_world and not _looks_out_of_its_frame(recording, pairs)
     best = _best(recording, pairs, guesses, scores[:-1], in_world)
     if best is None:
-        return []
+        return
     guess, gain, significance = best
-    return [
-        Finding(
-            guess.finding,
-            _severity(gain, guess.finding),
-            f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times "
-            f"closer to each other ({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
-            guess.mend,
-        )
-    ]
+    yield Finding(
+        guess.finding,
+        _severity(gain, guess.finding),
+        f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times "
+        f"closer to each other ({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
+        guess.mend,
+    )
 
 
 def _severity(gain: float, finding: str) -> Severity:
@@ -107,12 +104,12 @@ def _severity(gain: float, finding: str) -> Severity:
     return "error" if gain >= _ERROR_GAINS.get(finding, _ERROR_GAIN) else "note"
 
 
-def check_still(recording: Recording, effort: Effort = FULL) -> list[Finding]:
-    """Tells whether all positions are the same although the sensor moved: what the scans see then changes with time."""
+def check_still(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+    """Whether all positions are the same although the sensor moved: what the scans see then changes with time."""
     positions = recording.poses[:, :3, 3]
     usable = np.flatnonzero([len(scan) >= MIN_RETURNS for scan in recording.points])
     if len(usable) < 2 or (positions != positions[0]).any():
-        return []
+        return
     agreement = Agreement(recording.points, effort.returns, effort.queries)
     # Neighbours, and scans that are half of the recording apart.
     scores = []
@@ -130,35 +127,34 @@ def check_still(recording: Recording, effort: Effort = FULL) -> list[Finding]:
             f", but returns of scans far apart in time are {np.exp(change):.2f} times farther from each other than those of "
             f"neighbours ({change / error:.0f} standard errors): the sensor moved"
         )
-    return [
-        Finding(
-            "poses_stand_still",
-            "error" if moved else "warning",
-            f"{evidence}.",
-            "Pass the position of the sensor for each scan. If it stood still, the map knows what is seen from there.",
-        )
-    ]
+    yield Finding(
+        "poses_stand_still",
+        "error" if moved else "warning",
+        f"{evidence}.",
+        "Pass the position of the sensor for each scan. If it stood still, the map knows what is seen from there.",
+    )
 
 
 def check_clock(recording: Recording, effort: Effort = FULL) -> list[Finding]:
-    """Tells whether the scans agree better with the poses of an earlier or a later time."""
-    count = len(recording)
+    """Whether the scans agree better with the poses of an earlier or a later time."""
+    count, poses = len(recording), recording.poses
     if count < 2 * _MIN_PAIRS:
         return []
-    poses = recording.poses
-    clocks = [(np.arange(count, dtype=np.float64), "steps between scans")]
-    if recording.ascending_times_s is not None:
-        clocks.insert(0, (recording.ascending_times_s, "s"))
+    # In s, or in scans where poses were taken from the wrong row.
+    clocks = [(recording.ascending_times_s, "s"), (np.arange(count, dtype=np.float64), "steps between scans")]
     pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
     agreement = Agreement(recording.points, effort.returns, effort.queries)
-    found = [_shifted(agreement, poses, times, unit, pairs) for times, unit in clocks]
-    return next((findings for findings in found if findings), [])
+    for times, unit in clocks:
+        found = [] if times is None else [*_shifted(agreement, poses, times, unit, pairs)]
+        if found:
+            return found
+    return []
 
 
 def _shifted(
     agreement: Agreement, poses: FloatArray, times: FloatArray, unit: str, pairs: NDArray[np.int64]
-) -> list[Finding]:
-    """:func:`check_clock` by one clock: in s, or in scans where poses were taken from the wrong row."""
+) -> Iterator[Finding]:
+    """:func:`check_clock` by one clock."""
     step = float(np.median(np.diff(times)))
     shifts = step * np.array([-8.0, -4, -2, -1, -0.5, 0.5, 1, 2, 4, 8])
     shifts = shifts[np.abs(shifts) <= (times[-1] - times[0]) / 4]
@@ -166,24 +162,22 @@ def _shifted(
     far = float(np.abs(shifts).max(initial=0))
     pairs = pairs[((times[pairs] - far >= times[0]) & (times[pairs] + far <= times[-1])).all(axis=1)]
     if len(pairs) < _MIN_PAIRS or not len(shifts):
-        return []
+        return
     shifted = [relative(_at(poses, times, times + shift), pairs) for shift in shifts]
     scores = agreement.scores(pairs, np.stack([relative(poses, pairs), *shifted]))
     comparison = Comparison.of(scores[0], scores[1:])
     best = int(np.argmax(comparison.gains))
-    if comparison.gains[best] < _MIN_GAIN or comparison.significance[best] < _MIN_SIGNIFICANCE:
-        return []
-    shift = shifts[best]
-    return [
-        Finding(
-            "clock_offset",
-            _severity(comparison.gains[best], "clock_offset"),
-            f"With the poses of a time about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
-            f"different scans are {np.exp(comparison.gains[best]):.2f} times closer to each other "
-            f"({len(pairs)} pairs of scans, {comparison.significance[best]:.0f} standard errors).",
-            "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
-        )
-    ]
+    gain, significance, shift = comparison.gains[best], comparison.significance[best], shifts[best]
+    if gain < _MIN_GAIN or significance < _MIN_SIGNIFICANCE:
+        return
+    yield Finding(
+        "clock_offset",
+        _severity(gain, "clock_offset"),
+        f"With the poses of a time about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
+        f"different scans are {np.exp(gain):.2f} times closer to each other "
+        f"({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
+        "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
+    )
 
 
 def _best(
@@ -263,15 +257,8 @@ def _looks_out_of_its_frame(recording: Recording, pairs: NDArray[np.int64]) -> b
     """
     rows = np.unique(pairs)
     given = [np.asarray(recording.points[i], np.float64) for i in rows.tolist()]
-    if (
-        np.median(
-            [
-                np.linalg.norm(np.median(scan, axis=0)) / max(float(scan.std(axis=0).max()), 1e-9)
-                for scan in given
-            ]
-        )
-        > _AFAR
-    ):
+    afar = [np.linalg.norm(np.median(scan, axis=0)) / max(scan.std(axis=0).max(), 1e-9) for scan in given]
+    if np.median(afar) > _AFAR:
         return False  # no sensor sees all its returns in one direction, such as those of UTM coordinates
     moved = [
         (scan - pose[:3, 3]) @ pose[:3, :3] for scan, pose in zip(given, recording.poses[rows], strict=True)

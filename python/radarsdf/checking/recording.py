@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The scans, poses and other arrays of a check. Only their shapes are right: their values are what is checked."""
+"""The input of a check, with shapes that fit together, and what a check finds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,21 +23,43 @@ from radarsdf.checks import (
 from radarsdf.io.scans import chosen
 
 FloatArray = NDArray[np.float64]
+Arrays = list[NDArray[Any]]
 
-_ENOUGH = 40  # scans tell what returns of this sensor are like
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+"""From the worst to the mildest."""
+
+_SAMPLE = 40  # scans that show what returns of a sensor are like
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is worth knowing before a fit."""
+
+    name: str
+    """A short name in lower case that does not change between versions, such as ``poses_inverted``."""
+    severity: Severity
+    """``error``: a map of these data would be nonsense. ``warning``: it would suffer. ``note``: for information."""
+    evidence: str
+    """One sentence with the numbers that show it."""
+    mend: str
+    """One sentence that says what to do."""
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.name}: {self.evidence} {self.mend}".rstrip()
 
 
 @dataclass(frozen=True)
 class Recording:
-    """F scans with N_i returns each."""
+    """F scans with N_i returns each. Only shapes are valid: the values are what is checked."""
 
-    points: list[NDArray[Any]]
-    """F arrays (N_i, 3), as given: sensor frame, m, if nothing is wrong."""
+    points: Arrays
+    """F arrays (N_i, 3); sensor frame, m, if nothing is wrong."""
     poses: FloatArray
-    """(F, 4, 4), as given: T_world_sensor, m, if nothing is wrong."""
-    intensities: list[NDArray[Any]] | None
+    """(F, 4, 4); T_world_sensor, m, if nothing is wrong."""
+    intensities: Arrays | None
     """F arrays (N_i,), sensor units."""
-    doppler_mps: list[NDArray[Any]] | None
+    doppler_mps: Arrays | None
     """F arrays (N_i,), m/s."""
     times_s: FloatArray | None
     """(F,) time of each scan, s."""
@@ -51,7 +73,7 @@ class Recording:
         doppler_mps: Sequence[ArrayLike] | None,
         times_s: ArrayLike | None,
     ) -> Recording:
-        """The arrays, if their shapes fit together. Else a TypeError or a ValueError that names the argument."""
+        """Raises a TypeError or a ValueError that names the argument whose shape or type does not fit."""
         scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(one_for_each_scan(points, "points"))]
         check_scan_shapes(scans)
         T_world_sensor = pose_matrices(poses, len(scans))
@@ -60,12 +82,14 @@ class Recording:
             msg = f"times_s must have shape ({len(scans)},), not {times.shape}"
             raise ValueError(msg)
         if times is not None:
-            times[np.abs(times) > MAX_TIME_S] = np.nan  # they are none
-        values = [
-            None if given is None else _values_of(given, scans, name)
-            for given, name in ((intensities, "intensities"), (doppler_mps, "doppler_mps"))
-        ]
-        return cls(scans, T_world_sensor, values[0], values[1], times)
+            times[np.abs(times) > MAX_TIME_S] = np.nan
+        return cls(
+            scans,
+            T_world_sensor,
+            _values(intensities, scans, "intensities"),
+            _values(doppler_mps, scans, "doppler_mps"),
+            times,
+        )
 
     def __len__(self) -> int:
         return len(self.points)
@@ -86,7 +110,16 @@ class Recording:
             None if self.times_s is None else self.times_s[scans],
         )
 
-    def some_scans(self, count: int = _ENOUGH) -> NDArray[np.int64]:
+    def without(self, left_out: Sequence[NDArray[np.bool_]]) -> Recording:
+        """Without the rows of each scan in its mask (N_i,)."""
+
+        def kept(arrays: Arrays) -> Arrays:
+            return [values[~mask] for values, mask in zip(arrays, left_out, strict=True)]
+
+        intensities, doppler = (a if a is None else kept(a) for a in (self.intensities, self.doppler_mps))
+        return Recording(kept(self.points), self.poses, intensities, doppler, self.times_s)
+
+    def some_scans(self, count: int = _SAMPLE) -> NDArray[np.int64]:
         """Numbers of at most about `count` scans, at equal steps."""
         return np.arange(0, len(self), -(-len(self) // count))
 
@@ -99,7 +132,9 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
     return real_array(values, name)
 
 
-def _values_of(given: Sequence[ArrayLike], scans: list[NDArray[Any]], name: str) -> list[NDArray[Any]]:
+def _values(given: Sequence[ArrayLike] | None, scans: Arrays, name: str) -> Arrays | None:
+    if given is None:
+        return None
     values = [
         _numbers(value, f"{name} of scan {i}") for i, value in enumerate(one_for_each_scan(given, name))
     ]

@@ -1,18 +1,19 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What poses tell alone: whether they are rigid transforms, jumps, duplicates, and lengths that are no metres."""
+"""Checks of the trajectory: rigid transforms, rounding, units, times, duplicates, jumps."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
-from radarsdf.checking.finding import Finding, Severity
 from radarsdf.checking.frames import FULL, Effort
-from radarsdf.checking.recording import FloatArray, Recording
+from radarsdf.checking.recording import Finding, FloatArray, Recording, Severity
 from radarsdf.checks import are_rigid
 from radarsdf.poses.rigid import steps, turned_by
 from radarsdf.returns.moving import folding_interval_mps, sensor_velocity
@@ -23,6 +24,7 @@ _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
 _COARSE_M = 0.01  # steps of positions. Smaller ones are less than the noise of any radar
 _FAST_MPS = 100.0  # faster than cars and drones
 _JUMP = 3.0  # times the steps round it
+_LEAST_JUMP = 0.2  # in distances between returns of a scan: smaller ones are below what scans measure
 _ROUND = 3  # steps before and after
 _JUMPS_TRIED = 12
 _MIN_GAIN, _MIN_SIGNIFICANCE = 0.1, 3.0  # as in frames.py; few pairs lie across a jump
@@ -31,162 +33,143 @@ _DOPPLER_SLACK_M = 1.0  # a step may be longer by this than the speed allows twi
 _CAUGHT_UP = 1.5  # times the median step
 
 
-def check_rigid(recording: Recording) -> list[Finding]:  # noqa: PLR0911 - one for each thing they may be
-    """Tells whether the matrices are rigid transforms, and what they may be if not."""
+def check_rigid(recording: Recording) -> Iterator[Finding]:
+    """Whether the matrices are rigid transforms, and what they may be if not."""
     poses, usable = recording.poses, are_rigid(recording.poses)
-    if 0 < 2 * (~usable).sum() < len(usable):
-        return [
-            Finding(
-                "poses_not_rigid",
-                "warning",
-                f"{int((~usable).sum())} of {len(poses)} poses are not finite or not rigid, the first is pose {int(np.argmin(usable))}.",
-                "A fit leaves out their scans. Make rotations from unit quaternions in the order x y z w.",
-            )
-        ]
-    finite = np.isfinite(poses).all(axis=(1, 2))
-    if not finite.all():
-        return [
-            _not_rigid(
-                f"{int((~finite).sum())} of {len(poses)} poses are not finite, the first is pose {int(np.argmin(finite))}.",
-                "Leave out these poses and their scans.",
-            )
-        ]
+    count, wrong = len(poses), int((~usable).sum())
+    if wrong == 0:
+        return
+    which = f"{wrong} of {count} poses are no rigid transforms, the first is pose {np.argmin(usable)}"
+    from_quaternions = "Make rotations from unit quaternions in the order x y z w, or from angles in rad."
+    if 2 * wrong < count:
+        yield Finding(
+            "poses_not_rigid", "warning", f"{which}.", f"A fit leaves out their scans. {from_quaternions}"
+        )
+        return
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     last = np.array([0.0, 0, 0, 1])
-    if (poses[:, :, 3] == last).all() and not (poses[:, 3] == last).all():
-        return [
-            Finding(
+    ends = (poses[:, 3] == last).all(axis=1)
+    pose = poses[np.argmin(usable)]
+    rotations = np.where(finite[:, None, None], poses[:, :3, :3], np.eye(3))
+    products = rotations @ rotations.transpose(0, 2, 1)
+    orthogonal = np.abs(products - np.eye(3)).max(axis=(1, 2)) < _MAX_ROTATION_ERROR
+    left_handed = np.linalg.det(rotations) < 0
+    scale2 = float(np.trace(products[np.argmin(usable)])) / 3
+    scaled = np.abs(products[np.argmin(usable)] / max(scale2, 1e-300) - np.eye(3)).max() < _MAX_ROTATION_ERROR
+    name, evidence, mend = next(
+        texts
+        for holds, *texts in (
+            (
+                not finite.all(),
+                "poses_not_rigid",
+                f"{(~finite).sum()} of {count} poses are not finite, the first is pose {np.argmin(finite)}.",
+                "Leave out these poses and their scans.",
+            ),
+            (
+                (poses[:, :, 3] == last).all() and not ends.all(),
                 "poses_transposed",
-                "error",
                 "The translations are in the last row of the poses, and the last column is 0 0 0 1.",
                 "Transpose each pose: poses.transpose(0, 2, 1).",
-            )
-        ]
-    rotation = poses[:, :3, :3]
-    products = rotation @ rotation.transpose(0, 2, 1)
-    scales = np.sqrt(np.trace(products, axis1=1, axis2=2) / 3)
-    determinants = np.linalg.det(rotation)
-    orthogonal = np.abs(products - np.eye(3)).max(axis=(1, 2)) < _MAX_ROTATION_ERROR
-    if orthogonal.all() and (determinants < 0).any():
-        return [
-            Finding(
+            ),
+            (
+                orthogonal.all() and left_handed.any(),
                 "mirrored",
-                "error",
-                f"{int((determinants < 0).sum())} of {len(poses)} poses are left-handed: their rotations have determinant -1.",
+                f"{left_handed.sum()} of {count} poses are left-handed: their rotations have determinant -1.",
                 "Use right-handed frames: x forward, y left, z up.",
-            )
-        ]
-    off = ~orthogonal | ~(poses[:, 3] == last).all(axis=1)
-    if not off.any():
-        return []
-    first = int(np.argmax(off))
-    evidence = f"{int(off.sum())} of {len(poses)} poses are no rigid transforms, the first is pose {first}:"
-    if not (poses[first, 3] == last).all():
-        return [
-            _not_rigid(
-                f"{evidence} its last row is not 0 0 0 1.", "Make each pose of a rotation and a position."
-            )
-        ]
-    if np.abs(products[first] / max(scales[first] ** 2, 1e-300) - np.eye(3)).max() < _MAX_ROTATION_ERROR:
-        return [
-            _not_rigid(
-                f"{evidence} its rotation is multiplied by {scales[first]:.4g}.",
+            ),
+            (
+                not (pose[3] == last).all(),
+                "poses_not_rigid",
+                f"{which}: its last row is not 0 0 0 1.",
+                "Make each pose of a rotation and a position.",
+            ),
+            (
+                scaled,
+                "poses_not_rigid",
+                f"{which}: its rotation is multiplied by {np.sqrt(scale2):.4g}.",
                 "Divide the rotations by this factor; a scaled map has positions without a metre.",
-            )
-        ]
-    return [
-        _not_rigid(
-            f"{evidence} the rows of its rotation are not orthogonal, with numbers up to {np.abs(rotation[first]).max():.3g}.",
-            "Make rotations from unit quaternions in the order x y z w, or from angles in rad.",
+            ),
+            (
+                True,
+                "poses_not_rigid",
+                f"{which}: the rows of its rotation are not orthogonal, with numbers up to {np.abs(pose[:3, :3]).max():.3g}.",
+                from_quaternions,
+            ),
         )
-    ]
+        if holds
+    )
+    yield Finding(name, "error", evidence, mend)
 
 
-def _not_rigid(evidence: str, mend: str) -> Finding:
-    return Finding("poses_not_rigid", "error", evidence, mend)
-
-
-def check_rounding(recording: Recording) -> list[Finding]:
-    """Tells whether the positions were rounded to float32 far from the origin, as with UTM coordinates."""
+def check_rounding(recording: Recording) -> Iterator[Finding]:
+    """Whether the positions were rounded to float32 far from the origin, as with UTM coordinates."""
     positions = recording.poses[:, :3, 3]
     rounded = positions.astype(np.float32)
     step_m = float(np.spacing(np.abs(rounded).max()))
-    if step_m < _COARSE_M or (rounded != positions).any():
-        return []
-    return [
-        Finding(
+    if step_m >= _COARSE_M and (rounded == positions).all():
+        yield Finding(
             "positions_rounded",
             "warning",
             f"The positions of the poses are float32, which has steps of {step_m:.3g} m there: they are off by up to "
             f"{step_m / 2:.3g} m.",
             "Keep poses in float64, or subtract an origin before they become float32.",
         )
-    ]
 
 
-def check_lengths(recording: Recording) -> list[Finding]:
-    """Tells whether ranges and speeds can be in metres. The poses must be finite."""
-    medians = []
-    for i in recording.some_scans().tolist():
-        ranges = np.linalg.norm(np.asarray(recording.points[i], np.float64), axis=1)
-        if len(ranges):
-            medians.append(float(np.median(ranges)))
-    median = float(np.median(medians)) if medians else 1.0
+def check_lengths(recording: Recording) -> Iterator[Finding]:
+    """Whether ranges and speeds can be in metres. The poses must be finite."""
+    scans = (
+        np.asarray(recording.points[i], np.float64)
+        for i in recording.some_scans()
+        if len(recording.points[i])
+    )
+    medians = [float(np.median(np.linalg.norm(scan, axis=1))) for scan in scans]
+    median_m = float(np.median(medians)) if medians else 1.0
     mend = "Pass points and positions in metres."
-    if median > _FAR_M or median < _NEAR_M:
+    if median_m > _FAR_M or median_m < _NEAR_M:
         # Points of a world frame far from its origin, such as UTM, have no ranges. Their distances to the sensor do.
-        severity: Severity = "error" if median > _VERY_FAR_M or median < _NEAR_M / 10 else "warning"
-        return [
-            Finding(
-                "units", severity, f"Half of the returns are {median:.4g} m or more from the sensor.", mend
-            )
-        ]
-    if recording.ascending_times_s is not None and len(recording) > 2:
-        speeds = _steps_m(recording) / np.diff(recording.ascending_times_s)
-        speed = float(np.median(speeds))
+        severity: Severity = "error" if median_m > _VERY_FAR_M or median_m < _NEAR_M / 10 else "warning"
+        yield Finding(
+            "units", severity, f"Half of the returns are {median_m:.4g} m or more from the sensor.", mend
+        )
+    elif recording.ascending_times_s is not None and len(recording) > 2:
+        speed = float(np.median(_steps_m(recording) / np.diff(recording.ascending_times_s)))
         if speed > _FAST_MPS:
-            return [Finding("units", "error", f"By its poses, the sensor moves at {speed:.4g} m/s.", mend)]
-    return []
+            yield Finding("units", "error", f"By its poses, the sensor moves at {speed:.4g} m/s.", mend)
 
 
-def check_times(recording: Recording) -> list[Finding]:
-    """Tells whether the times can be those of the scans."""
+def check_times(recording: Recording) -> Iterator[Finding]:
+    """Whether the times can be those of the scans."""
     times = recording.times_s
-    if times is None or len(times) < 2:
-        return []
-    if not np.isfinite(times).all():
-        return [
-            Finding(
-                "times",
-                "warning",
-                f"{int((~np.isfinite(times)).sum())} of {len(times)} times are not finite: none is used.",
+    if times is None or len(times) < 2 or recording.ascending_times_s is not None:
+        return
+    infinite, waits = int((~np.isfinite(times)).sum()), np.diff(times)
+    evidence, mend = next(
+        texts
+        for holds, *texts in (
+            (
+                infinite,
+                f"{infinite} of {len(times)} times are not finite: none is used.",
                 "Leave out these scans.",
-            )
-        ]
-    if recording.ascending_times_s is not None:
-        return []
-    waits = np.diff(times)
-    if (waits == 0).all():
-        return [
-            Finding(
-                "times",
-                "warning",
+            ),
+            (
+                (waits == 0).all(),
                 f"All scans have the time {times[0]:g} s.",
                 "Use the times of record, if those of the messages were never set.",
-            )
-        ]
-    return [
-        Finding(
-            "times",
-            "warning",
-            f"{int((waits <= 0).sum())} of {len(waits)} times are not later than the one before.",
-            "Sort scans, poses and times together, and leave out scans that come twice.",
+            ),
+            (
+                True,
+                f"{(waits <= 0).sum()} of {len(waits)} times are not later than the one before.",
+                "Sort scans, poses and times together, and leave out scans that come twice.",
+            ),
         )
-    ]
+        if holds
+    )
+    yield Finding("times", "warning", evidence, mend)
 
 
-def check_duplicates(recording: Recording) -> list[Finding]:
-    """Tells whether scans, or the poses of different scans, are the same."""
-    found = []
+def check_duplicates(recording: Recording) -> Iterator[Finding]:
+    """Whether scans, or the poses of different scans, are the same."""
     first_of: dict[tuple[object, ...], int] = {}
     repeated = []
     for i, scan in enumerate(recording.points):
@@ -197,48 +180,39 @@ def check_duplicates(recording: Recording) -> list[Finding]:
         if same != i and np.array_equal(recording.points[same], scan):
             repeated.append((same, i))
     if repeated:
-        found.append(
-            Finding(
-                "duplicate_scans",
-                "warning",
-                f"{len(repeated)} of {len(recording)} scans are copies of another one, such as scan {repeated[0][1]} of "
-                f"scan {repeated[0][0]}.",
-                "Leave out the copies: they count as measurements that never were.",
-            )
+        yield Finding(
+            "duplicate_scans",
+            "warning",
+            f"{len(repeated)} of {len(recording)} scans are copies of another one, such as scan {repeated[0][1]} of "
+            f"scan {repeated[0][0]}.",
+            "Leave out the copies: they count as measurements that never were.",
         )
     if len(recording) < 3:
-        return found
+        return
     same_pose = (recording.poses[1:] == recording.poses[:-1]).all(axis=(1, 2))
     same_pose[[later - 1 for earlier, later in repeated if later == earlier + 1]] = False
     lengths = _steps_m(recording)
     moving = lengths[~same_pose]
     if not same_pose.any() or not len(moving):
-        return found
+        return
     # A sensor that stands still has such poses too. One whose poses are held catches up with a leap.
     after = lengths[1:][same_pose[:-1] & ~same_pose[1:]]
     plain = lengths[1:][~same_pose[:-1] & ~same_pose[1:]]
     usual = float(np.median(plain)) if len(plain) >= _ROUND else float(np.median(moving)) / 2
     held = len(after) >= 2 and float(np.median(after)) > _CAUGHT_UP * usual > 0
-    found.append(
-        Finding(
-            "duplicate_poses",
-            "warning" if held else "note",
-            f"{int(same_pose.sum())} of {len(recording)} scans have exactly the pose of the scan before"
-            + (
-                f", and the step after is {np.median(after) / usual:.1f} times the usual one."
-                if held
-                else "."
-            ),
-            "Interpolate the poses at the times of the scans."
-            if held
-            else "Nothing needs to be done where the sensor stood still.",
-        )
+    leap = f", and the step after is {np.median(after) / usual:.1f} times the usual one" if held else ""
+    yield Finding(
+        "duplicate_poses",
+        "warning" if held else "note",
+        f"{same_pose.sum()} of {len(recording)} scans have exactly the pose of the scan before{leap}.",
+        "Interpolate the poses at the times of the scans."
+        if held
+        else "Nothing needs to be done where the sensor stood still.",
     )
-    return found
 
 
 def check_jumps(recording: Recording, effort: Effort = FULL) -> list[Finding]:
-    """Tells where the trajectory jumps: a step far longer than those round it, without which the scans agree better.
+    """Where the trajectory jumps: a step far longer than those round it, without which the scans agree better.
 
     A recording that pauses while the sensor moves has long steps too; then the scans agree with them.
     """
@@ -253,8 +227,9 @@ def check_jumps(recording: Recording, effort: Effort = FULL) -> list[Finding]:
     changes = _changes(recording, durations)
     usual = float(np.median(changes))
     suspects = np.flatnonzero(changes > _JUMP * max(usual, 0.1 * float(np.median(sizes)))).tolist()
-    suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
     agreement = Agreement(recording.points, effort.returns, 2 * effort.queries)
+    suspects = [k for k in suspects if changes[k] * durations[k] > _LEAST_JUMP * agreement.spacing_m(k)]
+    suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
     interval = None if recording.doppler_mps is None else folding_interval_mps(recording.doppler_mps)
     confirmed = [
         k

@@ -16,9 +16,9 @@ import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.scan_log import LoggedScan, ScanId, ScanLog
-from radarsdf.poses.by_doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
+from radarsdf.poses.doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
 from radarsdf.poses.drive import LEAST_TOLD, Drive, followed, rates_of
-from radarsdf.poses.rates import Rate
+from radarsdf.poses.motion import Rate
 from radarsdf.poses.rigid import Floats, rotation_vector
 from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begun
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities

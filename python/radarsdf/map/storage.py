@@ -304,7 +304,7 @@ class _History(TypedDict):
 
 
 class _Poses(TypedDict):
-    """What :func:`radarsdf.poses.way.way_of` writes."""
+    """What :func:`radarsdf.poses.posed.way_of` writes."""
 
     verdict: str
     improved: bool | None

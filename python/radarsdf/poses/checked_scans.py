@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What was recorded besides poses, checked."""
+"""Scans, times and Doppler, checked for shapes, values and units."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import MAX_TIME_S, real_array
 from radarsdf.io.scans import Scans, filled
-from radarsdf.poses.by_doppler import NOT_USED, NoVelocityError, SensorVelocities
+from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
@@ -79,17 +79,15 @@ class CheckedScans:
 
     def check_intervals(self) -> None:
         """Raises a ValueError if the times between scans cannot be in seconds."""
-        assert self.times_s is not None
-        if len(self.scans) < 2:
+        if self.times_s is None or len(self.scans) < 2:
             return
         interval_s = float(np.median(np.diff(self.times_s)))
+        speed_mps = 0.0 if self.velocities is None else self.velocities.usual_mps
+        range_m = median_range_m(self.scans)
         what = f"times of scans are {interval_s:.3g} s apart, median"
-        far = self.velocities is not None and (
-            self.velocities.usual_mps * interval_s > _MOST_REACHES * median_range_m(self.scans)
-        )
+        far = speed_mps * interval_s > _MOST_REACHES * range_m
         if far:
-            assert self.velocities is not None
-            what = f"{what}: at {self.velocities.usual_mps:.1f} m/s, {self.velocities.usual_mps * interval_s:.0f} m, while returns are {median_range_m(self.scans):.1f} m away"
+            what = f"{what}: at {speed_mps:.1f} m/s, {speed_mps * interval_s:.0f} m, while returns are {range_m:.1f} m away"
         if far or not _INTERVALS_S[0] <= interval_s <= _INTERVALS_S[1]:
             units = [
                 unit for unit, size_s in _UNITS_S.items() if _USUAL_S[0] <= interval_s * size_s <= _USUAL_S[1]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A drive without poses: scan after scan, pass after pass."""
+"""Tracking of a drive without poses, in passes that learn its motion prior."""
 
 from __future__ import annotations
 
@@ -12,20 +12,18 @@ import numpy as np
 from tqdm import tqdm
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.by_doppler import DopplerMotion, SensorVelocities
-from radarsdf.poses.expected import ExpectedStep
+from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope
-from radarsdf.poses.motion import Motion
+from radarsdf.poses.motion import ExpectedStep, Motion, MotionPrior, Rate
 from radarsdf.poses.planes import plane_cell_m
-from radarsdf.poses.rates import Habits, Rate
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector
 from radarsdf.poses.tracking import Tracked, Tracker
 from radarsdf.progress import hides_bar
 
 # What a drive begins with. Its own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
 # scans were lost, up to 9 degrees.
-_TURNS = Habits(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
-_MOVES = Habits(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
+_TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
+_MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 _PASSES = 3
 # Of a step's variance, that the returns must take away where nothing else measures the way. Below a half, the motion before
 # says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
@@ -47,9 +45,9 @@ class Drive:
     times_s: Floats
     velocities: SensorVelocities | None
     gyroscope: Gyroscope | None
-    turns: Habits = _TURNS
+    turns: MotionPrior = _TURNS
     """Of the sensor, in its own frame."""
-    moves: Habits = _MOVES
+    moves: MotionPrior = _MOVES
     """Likewise."""
 
     def expected(self, i: int, turn: Rate | None, move: Rate | None) -> ExpectedStep:
@@ -89,10 +87,15 @@ class Drive:
         times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
         # The tracked steps begin the estimate; it finds how good they are. Where something else was measured, that tells.
         motion = Motion.of(poses, _TRACKED_M, _TRACKED_RAD, times_s)
+        duration_s = float(np.median(np.diff(times_s)))
+        # No evidence beside the returns that they were tracked by, but for how this sensor usually moves.
+        least = duration_s**2 * np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
         if self.gyroscope is not None:
+            least[1] = 0.0
             motion = motion.with_turns(
                 np.stack([self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)])
             )
+        motion = dataclasses.replace(motion, least_variances=least)
         if self.velocities is None:
             return [motion]
         turns = np.stack([found.turn for found in tracked[rows][1:]])
@@ -100,15 +103,15 @@ class Drive:
         common = np.full((2, 3), [[0.0], [self.usual_turn_rad_s]])
         if self.gyroscope is not None:
             common[1] = np.sqrt(self.gyroscope.bias.covariance.diagonal())
-        common = common.ravel() * np.median(np.diff(times_s))
+        common = common.ravel() * duration_s
         # Tracked translations beside Doppler, or in its place, double the errors of positions on simulated drives.
         return [
             dataclasses.replace(motion.rotations_only(), bias_sigma=common),
             DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns),
         ]
 
-    def told_anew(self, tracked: Sequence[Tracked], rows: slice) -> list[Floats]:
-        """The scans (N_i, 3) among these, without the returns of those that the sensor took while it stood.
+    def new_returns(self, tracked: Sequence[Tracked], rows: slice) -> list[Floats]:
+        """The scans (N_i, 3) among these, without the returns of those that the sensor repeated while it stood.
 
         They are those of the first such scan again, with the same errors: counted as new, they would draw all poses to these errors.
         """
@@ -127,52 +130,6 @@ class Drive:
                     continue
             first = R if stood else None
         return scans
-
-    def learnt(self, found: _Pass) -> Drive:
-        """With what a pass shows of it."""
-        durations_s = np.diff(self.times_s)
-        return dataclasses.replace(
-            self,
-            turns=self.turns.learnt(found.turns, durations_s),
-            moves=self.moves.learnt(found.moves, durations_s),
-        )
-
-
-@dataclass
-class _Pass:
-    """All scans of a drive, tracked once."""
-
-    tracked: list[Tracked]
-    turns: list[Rate | None]
-    """Of each of the F - 1 steps, rad/s in the frame of the sensor. None: the drive was lost there."""
-    moves: list[Rate | None]
-    """Likewise, m/s."""
-
-    @classmethod
-    def of(cls, drive: Drive, tracker: Tracker) -> _Pass:
-        found = cls([tracker.follow(drive.scans[0], None)], [], [])
-        turn = move = None
-        for i in range(1, len(drive.scans)):
-            expected = drive.expected(i, turn, move)
-            before = found.tracked[-1]
-            now = tracker.follow(drive.scans[i], expected)
-            turn = move = None
-            if now.piece == before.piece and expected.duration_s > 0:
-                turn, move = rates_of(before.pose, now, expected.duration_s)
-            found.turns.append(turn)
-            found.moves.append(move)
-            found.tracked.append(now)
-        return found
-
-    def rotations(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """(F - 1, 3) rotation vectors of the steps, rad, and their covariances. NaN where the drive was lost."""
-        durations_s = np.diff(times_s)
-        turns = np.full((len(durations_s), 3), np.nan)
-        covariance = np.tile(np.eye(3), (len(durations_s), 1, 1))
-        for i, (rate, duration_s) in enumerate(zip(self.turns, durations_s.tolist(), strict=True)):
-            if rate is not None:
-                turns[i], covariance[i] = rate.mean * duration_s, rate.covariance * duration_s**2
-        return turns, covariance
 
 
 def _squared_deviations(values: Floats, covariance: Floats) -> Floats:
@@ -193,23 +150,57 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rat
     return Rate(now.turn / duration_s, of_turn), Rate(way / duration_s, of_way)
 
 
+def _rotations(turns: Sequence[Rate | None], times_s: Floats) -> tuple[Floats, Floats]:
+    """(F - 1, 3) rotation vectors of steps with these rates, rad, and their covariances. NaN where the drive was lost."""
+    durations_s = np.diff(times_s)
+    vectors = np.full((len(durations_s), 3), np.nan)
+    covariance = np.tile(np.eye(3), (len(durations_s), 1, 1))
+    for i, (rate, duration_s) in enumerate(zip(turns, durations_s.tolist(), strict=True)):
+        if rate is not None:
+            vectors[i], covariance[i] = rate.mean * duration_s, rate.covariance * duration_s**2
+    return vectors, covariance
+
+
+def _tracked(
+    drive: Drive, tracker: Tracker
+) -> tuple[list[Tracked], tuple[list[Rate | None], list[Rate | None]]]:
+    """One pass over the scans, and the rates of turning, rad/s, and moving, m/s, of each step. None: it was lost there."""
+    tracked = [tracker.follow(drive.scans[0], None)]
+    turns: list[Rate | None] = []
+    moves: list[Rate | None] = []
+    turn = move = None
+    for i in range(1, len(drive.scans)):
+        expected = drive.expected(i, turn, move)
+        before, now = tracked[-1], tracker.follow(drive.scans[i], expected)
+        turn = move = None
+        if now.piece == before.piece and expected.duration_s > 0:
+            turn, move = rates_of(before.pose, now, expected.duration_s)
+        turns.append(turn)
+        moves.append(move)
+        tracked.append(now)
+    return tracked, (turns, moves)
+
+
 def followed(
     drive: Drive, config: FitConfig, num_threads: int, progress: bool | None = False
 ) -> tuple[Drive, list[Tracked]]:
-    """The drive with its habits, and its scans where the last pass found them."""
+    """The drive with its own motion prior, and its scans where the last pass found them."""
     gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
     cell_m = plane_cell_m(drive.scans, config.leaf_size_m)
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
-        tracker = Tracker(cell_m, config.returns, num_threads)
-        found = _Pass.of(drive, tracker)
-        tracked = found.tracked
+        tracked, rates = _tracked(drive, Tracker(cell_m, config.returns, num_threads))
         if i == 0 and drive.turns_slowly and tracked[-1].piece > 0:
             # Its returns agree nowhere. The next passes search less far.
             usual = np.full(3, drive.usual_turn_rad_s**2)
-            drive = dataclasses.replace(drive, turns=Habits(usual, usual, True))
-        drive = drive.learnt(found)
+            drive = dataclasses.replace(drive, turns=MotionPrior(usual, usual, True))
+        turns, moves = (
+            prior.learnt(of_steps, np.diff(drive.times_s))
+            for prior, of_steps in zip((drive.turns, drive.moves), rates, strict=True)
+        )
+        drive = dataclasses.replace(drive, turns=turns, moves=moves)
         if i == 0 and gyroscope is not None:
             # Rotations that were found with its help could not tell its bias.
-            drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(*found.rotations(drive.times_s)))
+            learnt = gyroscope.learnt(*_rotations(rates[0], drive.times_s))
+            drive = dataclasses.replace(drive, gyroscope=learnt)
     return drive, tracked

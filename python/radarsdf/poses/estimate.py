@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses of all scans at once, from common planes and what was measured of the motion."""
+"""Poses of all scans at once, from common planes and measured motion."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.groups import Groups
 from radarsdf.poses.motion import Motion
-from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
+from radarsdf.poses.planes import Groups, PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, moved
 from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import SensorNoise
@@ -81,7 +80,8 @@ class PosesEstimate:
             if finest and decrement < _SETTLED**2 * increments.size:
                 break
         assert noise is not None
-        diagonal, below, gradient = _prior(motions, poses)
+        evidence = [motion.as_evidence() for motion in motions]
+        diagonal, below, gradient = _prior(evidence, poses)
         diagonal[len(given) // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
 
@@ -90,7 +90,7 @@ class PosesEstimate:
                 diagonal, below, gradient + more, _EXACT, _MOST_ITERATIONS, False, num_threads
             )[0]
 
-        return cls(poses, covariance + _by_biases(motions, poses, solved), motions, noise, rounds)
+        return cls(poses, covariance + _by_biases(evidence, poses, solved), motions, noise, rounds)
 
 
 def _by_biases(

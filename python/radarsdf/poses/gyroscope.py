@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
-from radarsdf.poses.rates import Rate
+from radarsdf.poses.motion import Rate
 from radarsdf.poses.rigid import Floats, nearest_rotation
 
 # What a gyroscope begins with: the bias and the noise of cheap ones. The drive itself replaces them.

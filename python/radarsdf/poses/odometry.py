@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses from the radar alone."""
+"""Radar odometry: poses of scans from returns, Doppler and an IMU."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from radarsdf.checks import MAX_TIME_S, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
-from radarsdf.poses.by_doppler import NOT_USED, doppler_sign
 from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.doppler import NOT_USED, doppler_sign
 from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
-from radarsdf.poses.inertial import Inertial, implausible_rates, levelled
+from radarsdf.poses.imu import Inertial, implausible_rates, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
@@ -36,28 +36,29 @@ _MAX_RATE_RAD_S = 1e4  # more than any gyroscope measures, even in degrees
 
 
 class NotToldError(ValueError):
-    """Neither the returns nor anything else tells how the sensor moved."""
+    """Neither the returns nor anything else measures how the sensor moved."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Poses that were found without any being given."""
+    """Poses that were estimated without any being given."""
 
     poses: Floats
-    """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, turned so that z points up."""
+    """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, rotated so that z points up."""
     covariance: Floats
     """(F, 6, 6) as of :class:`RefinedPoses`, relative to the scan in the middle of each piece."""
     pieces: NDArray[np.int64]
-    """(F,) number of the piece of the drive that each scan belongs to. Where the drive was lost, over a gap in time mostly, a new
-    piece begins: its place relative to the one before is dead reckoning, and no map should join them."""
+    """(F,) number of the piece of the drive that each scan belongs to. Where tracking was lost, mostly over a gap in time, a new
+    piece begins: its position relative to the one before is dead reckoning, and no map should join them."""
     agreeing: Floats
     """(F,) share of the returns of each scan that lie on planes of the scans before it. NaN where a piece begins."""
     report: dict[str, Any]
-    """`verdict` in words; `length_m` of the way; `pieces`, their number; `told` and `told_turn`, the share of the variance of a
-    step's translation and rotation that the returns took away, in the direction that they tell least of, median; `doppler` and
-    `gyroscope`, whether they were used; `doppler_sign`, -1 if the radar's Doppler is positive as the sensor comes nearer;
-    `gyroscope_bias`, rad/s; `imu`, None or how it was found to sit: `R_sensor_imu`, its deviation `sigma_rad`, `late_s`, by which the
-    times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes; `movers`, returns that were left out; `notes` on what was not used and what was assumed; `scans`, `seconds`."""
+    """`verdict` in words; `length_m` of the trajectory; `pieces`, their number; `told` and `told_turn`, the median share of the
+    variance of a step's translation and rotation that the returns removed, in the least certain direction; `doppler` and
+    `gyroscope`, whether they were used; `doppler_sign`, -1 if Doppler is positive for what comes nearer; `gyroscope_bias`,
+    rad/s; `imu`, None or its `R_sensor_imu` with `sigma_rad`, `late_s`, by which the times of scans are too late in its clock, and
+    `lever_m`, from it to the radar in its axes; `movers`, returns that were excluded; `notes` on what was not used or was assumed;
+    `scans`, `seconds`."""
 
     def longest_piece(self) -> slice:
         """The scans of the piece with the most scans: those to make a map of."""
@@ -77,11 +78,11 @@ def odometry(
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> Odometry:
-    """Finds the poses of scans from the radar alone.
+    """Estimates the poses of scans from the radar alone.
 
-    Each scan is moved onto the planes of the scans before it, near where its Doppler, a gyroscope or the motion so far lead.
-    Over a gap, where it may be is searched. Then all scans are moved at once, as by :func:`refine_poses`. How this sensor turns
-    and moves, its noise and the bias of its gyroscope are found from the drive.
+    Fits each scan to the planes of the scans before it, starting from Doppler, a gyroscope or the motion so far; over a gap, by a
+    search. Then adjusts all scans at once, as :func:`refine_poses` does. The motion prior, the noise of the sensor and the bias of
+    its gyroscope are estimated from the drive.
 
     Parameters
     ----------
@@ -97,9 +98,9 @@ def odometry(
     angular_velocity_times_s : (G,) array_like, optional
         When it was measured, s, in the clock of `times_s`. Default: at the times of the scans.
     imu : Imu, optional
-        An IMU in axes of its own, in place of `angular_velocity`; of Scans, theirs. How it sits on the radar and what time is
-        between their clocks is found, from its accelerometer and the Doppler, or from turns that the returns tell; the accelerometer
-        also tells which way is up.
+        An IMU in axes of its own, in place of `angular_velocity`; of Scans, theirs. Its rotation on the radar and the offset of
+        its clock are estimated from its accelerometer and the Doppler, or from turns that returns measure. The accelerometer
+        also gives the direction of up.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
     progress : bool, optional
@@ -113,14 +114,14 @@ def odometry(
     Raises
     ------
     ValueError
-        If scans, Doppler, times or rates are invalid, if there are no times, or if the returns do not tell what nothing
-        else measures: without Doppler, the way along a wall, say; without a gyroscope, the turns of a radar with few returns
-        that is slower than 20 m/s. If Doppler was given and not used, the error says why.
+        If scans, Doppler, times or rates are invalid, if there are no times, or if nothing measures a part of the motion:
+        without Doppler, the position along a wall; without a gyroscope, the turns of a radar with few returns that is slower
+        than 20 m/s. If Doppler was given and not used, the error says why.
 
     Notes
     -----
-    The scale is that of the radar's ranges and, with Doppler, of its speeds. Without an accelerometer, where gravity points is
-    not known: the first scan is taken to be level.
+    The scale is that of the radar's ranges and, with Doppler, of its speeds. Without an accelerometer, the first scan is assumed
+    to be level.
 
     Examples
     --------
@@ -172,7 +173,7 @@ def odometry(
         float(np.linalg.norm(steps(poses[rows])[:, :3, 3], axis=1).sum()) for rows in pieces_of(tracked)
     )
     report = {
-        "verdict": _words(pieces, length_m, velocities is not None, inertial),
+        "verdict": _verdict(pieces, length_m, velocities is not None, inertial),
         "length_m": length_m,
         "pieces": int(pieces[-1]) + 1,
         "told": told[0],
@@ -199,7 +200,7 @@ def _together(
     covariance = np.zeros((len(poses), 6, 6))
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for rows in pieces_of(tracked):
-        returns = SensorReturns.of(drive.told_anew(tracked, rows), limits.min_range_m, limits.max_range_m)
+        returns = SensorReturns.of(drive.new_returns(tracked, rows), limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
         motions = drive.motions(tracked, rows)
@@ -210,29 +211,23 @@ def _together(
 
 
 def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tuple[float, float]:
-    """What the returns tell of translations and rotations. Raises a NotToldError where nothing does; notes what is assumed."""
+    """The shares of variance that returns took away. Raises a NotToldError where nothing measures a motion; notes assumptions."""
     if len(tracked) < 2:
         return 0.0, 0.0
     way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
     dropped = any(note.startswith(NOT_USED) for note in notes)
     doppler = "Doppler that most returns of a scan agree on" if dropped else "their Doppler (doppler_mps)"
+    turns_known = drive.gyroscope is not None or drive.turns_slowly
     for told, least, measured, moved, missing in (
         (way, LEAST_TOLD, drive.velocities is not None, "moved", doppler),
-        (
-            turn,
-            _LEAST_TOLD_TURN,
-            drive.gyroscope is not None or drive.turns_slowly,
-            "turned",
-            "its angular_velocity",
-        ),
+        (turn, _LEAST_TOLD_TURN, turns_known, "turned", "its angular_velocity"),
     ):
         if not measured and told < least:
             msg = (
                 f"the returns alone do not tell how the sensor {moved}: of a step's variance, they take away {told:.1%}, and "
                 f"{least:.0%} is needed. Give {missing}, or poses"
             )
-            msg = ". ".join([msg, *(note.rstrip(".") for note in notes)])
-            raise NotToldError(msg)
+            raise NotToldError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
     if drive.gyroscope is None and turn < _LEAST_TOLD_TURN:
         notes.append(
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
@@ -241,16 +236,19 @@ def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tup
     return way, turn
 
 
-def _words(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
+def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
     sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
     by = " and ".join(filter(None, [", ".join(sources[:-1]), sources[-1]]))
-    whole = f"{len(pieces)} scans along {length_m:.1f} m were placed by {by}."
+    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by {by}."]
     if inertial.alignment is not None:
-        whole = f"{whole} {inertial.alignment.words}"
+        sentences.append(inertial.alignment.words)
     begins = np.flatnonzero(np.diff(pieces)) + 1
-    if len(begins) == 0:
-        return whole
-    return f"{whole} The drive was lost before the scans {', '.join(map(str, begins))}: {len(begins) + 1} pieces, which do not belong together."
+    if len(begins):
+        before = ", ".join(map(str, begins))
+        sentences.append(
+            f"The drive was lost before the scans {before}: {len(begins) + 1} pieces, which do not belong together."
+        )
+    return " ".join(sentences)
 
 
 def _checked_rates(

@@ -1,17 +1,63 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses that were refined or found, as those who make maps use them."""
+"""Refined or found poses, as maps and reports use them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.odometry import Odometry
 from radarsdf.poses.refine import RefinedPoses
 from radarsdf.poses.rigid import Floats
-from radarsdf.poses.way import pose_sigmas, way_of
+
+_MOST = 500  # scans whose poses are kept: a plot shows no more
+
+
+def pose_sigmas(covariance: Floats) -> tuple[float, float]:
+    """Standard deviations of a pose's position, m, and rotation, rad, by axis, of the median scan.
+
+    These are what ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of a :class:`FitConfig` state.
+
+    Parameters
+    ----------
+    covariance : (F, 6, 6) ndarray
+        Of :class:`RefinedPoses` or :class:`Odometry`.
+    """
+    position_m, turn_rad = np.median(_sigmas(covariance), axis=0).tolist()
+    return position_m, turn_rad
+
+
+def _sigmas(covariance: Floats) -> Floats:
+    """(F, 2) of positions, m, and rotations, rad, root mean square of the three axes."""
+    variances = np.einsum("fii->fi", covariance).reshape(-1, 2, 3).mean(axis=2)
+    sigmas: Floats = np.sqrt(np.maximum(variances, 0.0))
+    return sigmas
+
+
+def way_of(found: RefinedPoses | Odometry, given: Floats | None, rows: slice = slice(None)) -> dict[str, Any]:
+    """The trajectory of the scans `rows` for the report of a fit, as values of JSON. `given` (F, 4, 4): the poses before.
+
+    `step_m` and `step_rad` are deviations of a given step; `before` and `after` positions, m, of some `scans`; `sigma_m` and
+    `sigma_rad` standard deviations by axis of their poses.
+    """
+    poses, covariance = found.poses[rows], found.covariance[rows]
+    some = np.unique(np.linspace(0, len(poses) - 1, min(_MOST, len(poses))).astype(np.int64))
+    sigmas = _sigmas(covariance)[some]
+    return {
+        "verdict": found.report["verdict"],
+        "improved": found.improved if isinstance(found, RefinedPoses) else None,
+        "step_m": found.report.get("sigma_m"),
+        "step_rad": found.report.get("sigma_rad"),
+        "scans": some.tolist(),
+        "before": None if given is None else given[rows][some, :3, 3].tolist(),
+        "after": poses[some, :3, 3].tolist(),
+        "sigma_m": sigmas[:, 0].tolist(),
+        "sigma_rad": sigmas[:, 1].tolist(),
+    }
 
 
 @dataclass(frozen=True)
@@ -26,9 +72,9 @@ class Posed:
     """(K, 4, 4) the poses before. None: there were none."""
     pieces: int = 1
     way: dict[str, Any] | None = None
-    """What the report of a map keeps of them. None: they are as given."""
+    """The trajectory for the report of a map. None: the poses are as given."""
     sigmas: tuple[float, float] | None = None
-    """Standard deviations of a pose, m and rad. None: they are not known."""
+    """Standard deviations of a pose, m and rad, if known."""
     notes: tuple[str, ...] = ()
     """Sentences on what was not used."""
 
@@ -39,22 +85,22 @@ class Posed:
 
     @classmethod
     def refined(cls, refined: RefinedPoses, given: Floats) -> Posed:
-        """Given poses (F, 4, 4) that were refined. If they were kept, their deviations are not known: the covariance is that of
-        the refined ones."""
+        """Given poses (F, 4, 4) that were refined. Deviations are known only of poses that were not kept."""
         sigmas = pose_sigmas(refined.covariance) if refined.improved else None
-        rows, way = slice(0, len(given)), way_of(refined, given)
-        return cls(refined.poses, rows, given, 1, way, sigmas, tuple(refined.report.get("notes", ())))
+        rows, notes = slice(0, len(given)), tuple(refined.report.get("notes", ()))
+        return cls(refined.poses, rows, given, 1, way_of(refined, given), sigmas, notes)
 
     @classmethod
     def found(cls, found: Odometry) -> Posed:
         """The longest piece of a drive without poses."""
         rows = found.longest_piece()
         sigmas, way = pose_sigmas(found.covariance[rows]), way_of(found, None, rows)
-        notes = tuple(found.report["notes"])
-        return cls(found.poses[rows], rows, None, found.report["pieces"], way, sigmas, notes)
+        return cls(
+            found.poses[rows], rows, None, found.report["pieces"], way, sigmas, tuple(found.report["notes"])
+        )
 
     def config(self, config: FitConfig) -> FitConfig:
-        """With the errors of the poses, unless it states some itself."""
+        """`config` with the errors of the poses, unless it states some itself."""
         stated = config.returns.pose_sigma_m or config.returns.pose_sigma_rad
         if self.sigmas is None or stated:
             return config

@@ -11,17 +11,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import MISSING_POSES, instance, not_negative, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
-from radarsdf.poses.by_doppler import NOT_USED, DopplerMotion, unexplained_motion
 from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.doppler import NOT_USED, DopplerMotion, unexplained_motion
 from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.rigid import Floats, moved_by, steps
+from radarsdf.poses.rigid import Floats, increments, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 from radarsdf.returns.rays import LeftOut
@@ -38,17 +37,18 @@ class RefinedPoses:
     """Poses that returns of different scans agree on, and whether they are better than the given ones."""
 
     poses: Floats
-    """(F, 4, 4) T_world_sensor: the refined poses if they are an improvement, else the given ones. As a whole, they are
-    neither moved nor turned: mean position and mean rotation are those of the given poses."""
+    """(F, 4, 4) T_world_sensor: the refined poses if they are an improvement, else the given ones. Mean position and mean
+    rotation are those of the given poses."""
     covariance: Floats
-    """(F, 6, 6) of `poses`, relative to that of the scan in the middle: translation, m, and rotation vector about
-    the sensor, rad, in world axes. Loops over more than 32 scans are left out, so it is rather too large there."""
+    """(F, 6, 6) of `poses`, relative to the scan in the middle: translation, m, and rotation vector about the sensor, rad, in
+    world axes. Conservative where a loop closes over more than 32 scans."""
     improved: bool
-    """Whether returns that took no part agree better with those of other scans, by more than chance gives one of a thousand."""
+    """Whether held-out returns agree better with those of other scans, at a significance level of 0.001."""
     report: dict[str, Any]
-    """`verdict` in words; `gain`, by which the logarithm of the density of other scans' returns rose at them, and its `gain_error`; `sigma_m` and
-    `sigma_rad` of a given step and its `bias`; `movers`, returns left out by their Doppler, and `notes` on what was not used; how far the poses moved, `moved_m` and `moved_rad`, root mean square; `noise`
-    of the sensor; `scans`, `returns`, `rounds`, `seconds`."""
+    """`verdict` in words; `gain`, the mean increase of the log density of other scans' returns at held-out ones, and its
+    `gain_error`; `sigma_m` and `sigma_rad` of a given step and its `bias`; `moved_m` and `moved_rad`, root mean square change of
+    the poses; `noise` of the sensor; `movers`, returns excluded by their Doppler; `notes` on what was not used; `scans`,
+    `returns`, `rounds`, `seconds`."""
 
 
 def refine_poses(
@@ -64,9 +64,9 @@ def refine_poses(
 ) -> RefinedPoses:
     """Refines the poses of scans, so that their returns lie on common surfaces.
 
-    All scans at once: a return's distance from a plane that scans have in common is a residual, in which the planes are
-    unknown, too; the given motions from scan to scan are others. The noise of the sensor, the errors of the given steps and
-    their bias are found from the data. Scans that see the same place again close a loop, whatever the time between them.
+    Adjusts all scans at once: residuals are the distances of returns from planes that scans have in common, which are unknown,
+    too, and the given motions from scan to scan. The noise of the sensor, the errors of the given steps and their bias are
+    estimated. Scans that see the same place again close a loop, whatever the time between them.
 
     Parameters
     ----------
@@ -76,12 +76,12 @@ def refine_poses(
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan.
     doppler_mps : sequence of F arrays, optional
-        (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured. It measures the
-        velocity of the sensor, and what moves is left out. It needs `times_s`.
+        (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured. Returns that
+        move are excluded. Needs `times_s`.
     times_s : (F,) array_like, optional
         Of the scans, s. After a gap, a step has larger errors. By default all steps are alike.
     sigma_m, sigma_rad : float, optional
-        Standard deviations of each component of a step's translation, m, and rotation, rad. By default found from the data.
+        Standard deviations of each component of a step's translation, m, and rotation, rad. By default estimated.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
     progress : bool, optional
@@ -90,7 +90,7 @@ def refine_poses(
     Returns
     -------
     RefinedPoses
-        With the given poses where returns that took no part do not agree better. The same bits with any number of threads.
+        With the given poses where held-out returns do not agree better. The same bits with any number of threads.
 
     Raises
     ------
@@ -99,8 +99,8 @@ def refine_poses(
 
     Notes
     -----
-    "Improved" says that a map is sharper. It does not say that the trajectory is nearer to the truth: what returns do not
-    tell, along a corridor say, stays as the given steps have it.
+    "Improved" means that a map is sharper, not that the trajectory is nearer to the truth: what returns do not measure, such
+    as the position along a corridor, follows the given steps.
 
     Examples
     --------
@@ -178,11 +178,8 @@ def _squared_differences(given: Floats, found: Floats) -> Floats:
     """(F, 6, 6) outer products of the increments from given poses to others, once the scans in the middle coincide."""
     middle = len(given) // 2
     placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found[middle]), found)
-    turns = np.einsum("fij,fkj->fik", placed[:, :3, :3], given[:, :3, :3])
-    increments = np.concatenate(
-        [placed[:, :3, 3] - given[:, :3, 3], Rotation.from_matrix(turns).as_rotvec()], axis=1
-    )
-    squares: Floats = np.einsum("fi,fj->fij", increments, increments)
+    off = increments(given, placed)
+    squares: Floats = np.einsum("fi,fj->fij", off, off)
     return squares
 
 

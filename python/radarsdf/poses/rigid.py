@@ -20,6 +20,13 @@ def moved(poses: Floats, increments: Floats) -> Floats:
     return found
 
 
+def increments(first: Floats, second: Floats) -> Floats:
+    """(F, 6) from poses to others (F, 4, 4), as :func:`moved` takes them."""
+    turns = np.einsum("fij,fkj->fik", second[:, :3, :3], first[:, :3, :3])
+    translations = second[:, :3, 3] - first[:, :3, 3]
+    return np.concatenate([translations, Rotation.from_matrix(turns).as_rotvec()], axis=1)
+
+
 def steps(poses: Floats) -> Floats:
     """(F - 1, 4, 4) motion from each pose to the next, in the frame of the first of the two."""
     return between(poses[:-1], poses[1:])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scan after scan onto the planes of those before it."""
+"""Tracking: each scan is fitted to the planes of those before it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf._core import LocalPlanes
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.expected import ExpectedStep
+from radarsdf.poses.motion import ExpectedStep
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.rigid import Floats, moved, rotation_vector
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -184,7 +184,7 @@ class Tracker:
             shifted = pose.copy()
             shifted[:3, 3] += shift * cell_m * axis
             hessian, gradient, doubt, _ = self._planes[-1].beside(scan, shifted, self._noise.variances)
-            hessian, _ = _told(hessian, gradient, doubt)
+            hessian, _ = _without_normal_errors(hessian, gradient, doubt)
             information.append(1 / (axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis))
         chance = min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
         widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
@@ -203,7 +203,7 @@ class Tracker:
                 hessian, gradient, doubt, weight = planes.beside(
                     scan, np.ascontiguousarray(pose), self._noise.variances
                 )
-                hessian, gradient = _told(hessian, gradient, doubt)
+                hessian, gradient = _without_normal_errors(hessian, gradient, doubt)
                 off = np.concatenate(
                     [pose[:3, 3] - middle[:3, 3], rotation_vector(pose[:3, :3] @ middle[:3, :3].T)]
                 )
@@ -283,7 +283,7 @@ def _apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
     return apart
 
 
-def _told(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
+def _without_normal_errors(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
     """Hessian and gradient without the share that errors of the normals make (errors in variables, Fuller 1987).
 
     Along a wall, normals that point a little along it would tell where the sensor is.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Whether returns that took no part agree better."""
+"""The verdict: whether held-out returns agree better."""
 
 from __future__ import annotations
 
@@ -24,9 +24,8 @@ _BY_CHANCE = 1e-3  # probability that true poses seem improved
 _LEAST_GAIN = 0.001
 _HELD_OUT = 0.2  # of the returns
 _PLACE = 0.25  # edge of a place, in median ranges: what is seen as one thing from near and far is smaller
-_NEARBY = (
-    0.5  # edge of a cell, in median ranges, whose returns of other scans only say that scans overlap there
-)
+# Edge of a cell, in median ranges, whose returns of other scans only say that scans overlap there.
+_NEARBY = 0.5
 _MOST_COUNTED = 100_000  # returns of these cells
 
 
@@ -52,8 +51,7 @@ class Verdict:
 
     @property
     def needed(self) -> float:
-        """The gain that matters and that neither chance nor crowding explains: Student's t, since of few scans or places the standard error
-        is uncertain, too."""
+        """The gain that matters and that neither chance (Student's t) nor crowding explains."""
         if self.parts < 2:
             return np.inf
         return max(

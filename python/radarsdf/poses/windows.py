@@ -1,32 +1,140 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses of drives of any length: of windows of scans, which are joined by the scans that they have in common."""
+"""Poses of drives of any length: windows of scans, joined by the scans that they share."""
 
 from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scan, Scans, scans_in_memory
-from radarsdf.poses.joining import JoinedPoses
 from radarsdf.poses.odometry import NotToldError, Odometry, odometry
 from radarsdf.poses.refine import RefinedPoses, refine_poses
-from radarsdf.poses.rigid import Floats, aligned, moved_by, steps
+from radarsdf.poses.rigid import (
+    Floats,
+    aligned,
+    alignment,
+    covariance_in,
+    increments,
+    moved,
+    moved_by,
+    placed,
+    steps,
+)
 from radarsdf.progress import hides_bar
+
+_NOWHERE = -1  # piece of a scan that has no pose
 
 # Of one window, whichever is reached first. Measured, an estimate takes 0.6 kB a return: a quarter of a GB at most.
 _SCANS, _RETURNS = 240, 400_000
 _LEAST_SCANS = 32  # of a dense sensor: fewer scans hardly overlap
 _COMMON = 0.25  # share of the scans of a window that are in the next one, too
+
+
+class JoinedPoses:
+    """Takes the poses of one window after another. The world is that of the first."""
+
+    def __init__(self) -> None:
+        self.poses: Floats = np.zeros((0, 4, 4))
+        """(F, 4, 4) T_world_sensor, m."""
+        self.covariance: Floats = np.zeros((0, 6, 6))
+        """(F, 6, 6) relative to the scan in the middle of its window."""
+        self.agreeing: Floats = np.zeros(0)
+        """(F,) as of :class:`Odometry`; NaN where it is not known."""
+        self._pieces = np.zeros(0, np.int64)
+        self._upright = True
+
+    @property
+    def pieces(self) -> NDArray[np.int64]:
+        """(F,) as of :class:`Odometry`. A scan without a pose is a piece of its own."""
+        begins = (np.diff(self._pieces) != 0) | (self._pieces[1:] == _NOWHERE)
+        numbers: NDArray[np.int64] = np.concatenate([[0], np.cumsum(begins)])
+        return numbers
+
+    def skip(self, begin: int, count: int) -> None:
+        """A window of `count` scans from number `begin` on that has no poses."""
+        new = begin + count - len(self.poses)
+        last = self.poses[-1:] if len(self.poses) else np.eye(4)[None]
+        nowhere, unknown = np.full(new, _NOWHERE), np.full(new, np.nan)
+        self._extend(np.repeat(last, new, axis=0), np.zeros((new, 6, 6)), nowhere, unknown)
+
+    def add(
+        self,
+        begin: int,
+        poses: Floats,
+        covariance: Floats,
+        pieces: NDArray[np.int64] | None = None,
+        agreeing: Floats | None = None,
+        *,
+        upright: bool = False,
+    ) -> None:
+        """A window of poses (K, 4, 4) from number `begin` on, in a world of its own.
+
+        `upright`: the z axis of that world points up. Between two such windows, no tilt adds up.
+        """
+        pieces = np.zeros(len(poses), np.int64) if pieces is None else pieces
+        agreeing = np.full(len(poses), np.nan) if agreeing is None else agreeing
+        common = len(self.poses) - begin
+        piece = self._pieces[-1] if common else _NOWHERE
+        if piece == _NOWHERE:
+            self._add_piece(begin, poses, covariance, pieces, agreeing)
+            self._upright = upright
+            return
+        same = (self._pieces[begin:] == piece) & (pieces[:common] == pieces[common - 1])
+        first = common - int(same[::-1].cumprod().sum())  # of those that both have in one piece
+        rows, before = slice(begin + first, begin + common), self.poses[begin + first :]
+        T = alignment(poses[first:common], before)
+        if upright and self._upright:
+            T = placed(_about_z(T), poses[first:common], before)
+        there: Floats = np.einsum("ij,fjk->fik", T, poses)
+        # From one window's poses to the other's bit by bit: at its ends, a window knows least.
+        shares = np.arange(1, common - first + 1) / (common - first + 1)
+        self.poses[rows] = _between(before, there[first:common], shares)
+        turned = covariance_in(covariance, T[:3, :3])
+        later = shares > 0.5
+        self.covariance[rows][later] = turned[first:common][later]
+        numbers = piece + pieces[common:] - pieces[common - 1]
+        self._extend(there[common:], turned[common:], numbers, agreeing[common:])
+
+    def _add_piece(
+        self, begin: int, poses: Floats, covariance: Floats, pieces: NDArray[np.int64], agreeing: Floats
+    ) -> None:
+        """A window that nothing joins to those before. It begins where the last scan before was."""
+        T = placed(np.eye(4), poses[:1], self.poses[begin - 1 : begin]) if begin else np.eye(4)
+        numbers = int(self._pieces[:begin].max(initial=_NOWHERE)) + 1 + pieces
+        for name in ("poses", "covariance", "agreeing", "_pieces"):
+            setattr(self, name, getattr(self, name)[:begin])
+        turned = covariance_in(covariance, T[:3, :3])
+        self._extend(np.einsum("ij,fjk->fik", T, poses), turned, numbers, agreeing)
+
+    def _extend(self, poses: Floats, covariance: Floats, pieces: NDArray[np.int64], agreeing: Floats) -> None:
+        self.poses = np.concatenate([self.poses, poses])
+        self.covariance = np.concatenate([self.covariance, covariance])
+        self._pieces = np.concatenate([self._pieces, pieces])
+        self.agreeing = np.concatenate([self.agreeing, agreeing])
+
+
+def _about_z(T: Floats) -> Floats:
+    """(4, 4) the rotation about z that is nearest to that of T."""
+    angle = np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0, 0, angle]).as_matrix()
+    return turn
+
+
+def _between(first: Floats, second: Floats, shares: Floats) -> Floats:
+    """Poses (K, 4, 4) between two: shares (K,) of the way to the second."""
+    return moved(first, shares[:, None] * increments(first, second))
 
 
 @dataclass(frozen=True)
@@ -39,13 +147,7 @@ class Window:
     common: int
     """So many of the first ones are also the last ones of the window before."""
 
-    def whole(self, imu: Imu | None) -> Scans:
-        """In memory, with what all of them have."""
-        return scans_in_memory(self.scans, imu)
-
-    @property
-    def words(self) -> str:
-        """For messages."""
+    def __str__(self) -> str:
         return f"scans {self.begin} to {self.begin + len(self.scans) - 1}"
 
 
@@ -54,9 +156,8 @@ def windows(scans: Iterable[Scan]) -> Iterator[Window]:
     held: list[Scan] = []
     begin = common = returns = 0
     for scan in scans:
-        if len(held) > common and (
-            len(held) >= _SCANS or (len(held) >= _LEAST_SCANS and returns >= _RETURNS)
-        ):
+        full = len(held) >= _SCANS or (len(held) >= _LEAST_SCANS and returns >= _RETURNS)
+        if full and len(held) > common:
             yield Window(begin, held, common)
             common = max(1, round(_COMMON * len(held)))
             begin, held = begin + len(held) - common, held[-common:]
@@ -89,21 +190,19 @@ def refine_in_windows(
         joined.add(window.begin, answer.poses, answer.covariance)
         given.append(whole.poses[window.common :])
         answers.append(answer)
-    _refuse_none(answers)
     before = np.concatenate(given)
     if len(answers) == 1:
         return answers[0], before
     better = [answer for answer in answers if answer.improved]
     poses = aligned(joined.poses, before) if better else before
-    of_steps = {
-        name: float(np.median([answer.report[name] for answer in better]))
-        for name in ("sigma_m", "sigma_rad")
-        if better
-    }
     report = {
         "verdict": _verdict(len(better), len(answers)),
         "windows": [answer.improved for answer in answers],
-        **of_steps,
+        **{
+            name: float(np.median([answer.report[name] for answer in better]))
+            for name in ("sigma_m", "sigma_rad")
+            if better
+        },
         **moved_by(before, poses),
         "notes": _once(answer.report.get("notes", []) for answer in answers),
         "scans": len(poses),
@@ -117,7 +216,7 @@ def find_in_windows(
 ) -> Odometry:
     """As :func:`odometry`, in memory that grows by the poses alone. Poses of the scans are not used.
 
-    Scans of a window in which nothing tells how the sensor moved have no poses: each of them is a piece.
+    Scans of a window in which nothing measures how the sensor moved have no poses: each of them is a piece.
 
     Raises
     ------
@@ -135,36 +234,31 @@ def find_in_windows(
                 found = odometry(whole, config=config, progress=False)
         except NotToldError as why:
             refused = refused or why
-            notes.append([f"There are no poses of the {window.words}: {why}"])
+            notes.append([f"There are no poses of the {window}: {why}"])
             joined.skip(window.begin, len(whole.points))
             continue
-        joined.add(
-            window.begin,
-            found.poses,
-            found.covariance,
-            found.pieces,
-            found.agreeing,
-            upright=found.report["imu"] is not None,
-        )
+        upright = found.report["imu"] is not None
+        joined.add(window.begin, found.poses, found.covariance, found.pieces, found.agreeing, upright=upright)
         answers.append(found)
         notes.append(found.report["notes"])
     if not answers and refused is not None:
         raise refused
-    _refuse_none(answers)
     if len(answers) == 1 and refused is None:
         return answers[0]
-    pieces = joined.pieces
-    between_scans = np.linalg.norm(steps(joined.poses)[:, :3, 3], axis=1)
-    length_m = float(between_scans[np.diff(pieces) == 0].sum())
-    imus = [found.report["imu"] for found in answers if found.report["imu"] is not None]
+    pieces, reports = joined.pieces, [found.report for found in answers]
+    count, lengths_m = int(pieces[-1]) + 1, np.linalg.norm(steps(joined.poses)[:, :3, 3], axis=1)
+    length_m = float(lengths_m[np.diff(pieces) == 0].sum())
+    words = f"{len(pieces)} scans along {length_m:.1f} m were placed, in {len(answers)} windows of scans."
+    if count > 1:
+        words += f" {count} pieces do not belong together; the longest has {np.bincount(pieces).max()} scans."
     report = {
-        "verdict": _words(pieces, length_m, len(answers)),
+        "verdict": words,
         "length_m": length_m,
-        "pieces": int(pieces[-1]) + 1,
-        "doppler": any(found.report["doppler"] for found in answers),
-        "doppler_sign": answers[0].report["doppler_sign"],
-        "gyroscope": any(found.report["gyroscope"] for found in answers),
-        "imu": imus[0] if imus else None,
+        "pieces": count,
+        "doppler": any(of_window["doppler"] for of_window in reports),
+        "doppler_sign": reports[0]["doppler_sign"],
+        "gyroscope": any(of_window["gyroscope"] for of_window in reports),
+        "imu": next((of_window["imu"] for of_window in reports if of_window["imu"] is not None), None),
         "notes": _once(notes),
         "scans": len(pieces),
         "seconds": time.perf_counter() - begin_s,
@@ -175,16 +269,20 @@ def find_in_windows(
 def _read(
     scans: Iterable[Scan], imu: Imu | None, description: str, progress: bool | None
 ) -> Iterator[tuple[Window, Scans]]:
-    """Each window, in memory."""
+    """Each window, in memory. Raises a ValueError if there is none."""
+    window = None
     with tqdm(desc=description, unit="scan", disable=hides_bar(progress)) as bar:
         for window in windows(scans):
-            yield window, window.whole(imu)
+            yield window, scans_in_memory(window.scans, imu)
             bar.update(len(window.scans) - window.common)
+    if window is None:
+        msg = "there are no scans"
+        raise ValueError(msg)
 
 
 @contextmanager
 def _named(window: Window) -> Iterator[None]:
-    """Errors say of which window they are: they number its scans from its first one."""
+    """Errors name their window: they number its scans from its first one."""
     try:
         yield
     except NotToldError:
@@ -192,14 +290,8 @@ def _named(window: Window) -> Iterator[None]:
     except ValueError as error:
         if window.begin == 0:
             raise
-        msg = f"{window.words}, numbered from the first of them: {error}"
+        msg = f"{window}, numbered from the first of them: {error}"
         raise ValueError(msg) from error
-
-
-def _refuse_none(answers: Sequence[object]) -> None:
-    if not answers:
-        msg = "there are no scans"
-        raise ValueError(msg)
 
 
 def _once(notes: Iterable[Iterable[str]]) -> list[str]:
@@ -211,10 +303,3 @@ def _verdict(better: int, count: int) -> str:
         return f"The given poses are kept: in none of {count} windows of scans do returns that took no part agree better with those of other scans."
     kept = "" if better == count else " In the others, the given steps are kept."
     return f"The refined poses make a sharper map in {better} of {count} windows of scans: returns that took no part agree better with those of other scans.{kept}"
-
-
-def _words(pieces: NDArray[np.int64], length_m: float, count: int) -> str:
-    whole = f"{len(pieces)} scans along {length_m:.1f} m were placed, in {count} windows of scans."
-    if pieces[-1] == 0:
-        return whole
-    return f"{whole} {int(pieces[-1]) + 1} pieces do not belong together; the longest has {int(np.bincount(pieces).max())} scans."

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.checking.finding import Finding
+from radarsdf.checking.recording import Finding
 from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
 from radarsdf.view.surface import thinned

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Motion from the Doppler of scans: velocities of the sensor, and the way from scan to scan."""
+"""Velocities of the sensor by Doppler, and the motion from scan to scan that they imply."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.poses.motion import Motion, spans_of
-from radarsdf.poses.rigid import Floats, rotation, rotation_vector, steps
+from radarsdf.poses.motion import Motion, spans_of, way
+from radarsdf.poses.rigid import Floats, rotation_vector, steps
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _ASKED = 400  # returns of a scan, and
@@ -130,15 +130,6 @@ def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
     return mean, covariance - np.einsum("fi,fj->fij", gain, covariance[:, 2]), int(weak.sum())
 
 
-def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
-    """(..., 3) of a sensor that turns evenly by the rotation vectors `turn` (..., 3) while its velocity changes evenly, in its
-    first frame, m."""
-    middle = np.einsum("...ij,j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
-    end = np.einsum("...ij,j->...i", rotation(turn), end_mps)
-    found: Floats = duration_s / 6 * (begin_mps + 4 * middle + end)
-    return found
-
-
 @dataclass(frozen=True)
 class DopplerMotion(Motion):
     """Translations from scan to scan, by velocities. Which way a step leads depends on how the sensor turned meanwhile."""
@@ -209,16 +200,13 @@ def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
 
 def _likely_turns(velocities: SensorVelocities, durations_s: Floats, given: Floats) -> Floats:
     """(F - 1, 3) rotation vectors of given steps: of those that differ by whole turns, the one whose way ends nearest."""
-    found = []
+    found, means = [], velocities.mean_mps
     for i, step in enumerate(given):
         shortest = rotation_vector(step[:3, :3])
         angle = float(np.linalg.norm(shortest))
         longer = shortest * (1 - 2 * np.pi / angle) if angle > 0 else shortest
-        ways = [
-            way(turn, velocities.mean_mps[i], velocities.mean_mps[i + 1], float(durations_s[i]))
-            for turn in (shortest, longer)
-        ]
-        off = [float(np.linalg.norm(end - step[:3, 3])) for end in ways]
+        ends = (way(turn, means[i], means[i + 1], float(durations_s[i])) for turn in (shortest, longer))
+        off = [float(np.linalg.norm(end - step[:3, 3])) for end in ends]
         found.append(longer if off[1] < off[0] else shortest)
     return np.array(found).reshape(-1, 3)
 

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""An IMU and Doppler velocities measure the same motion: how the IMU sits on the radar, which way is up, what time is between
-their clocks.
+"""An IMU and Doppler velocities measure the same motion: axes of the IMU, up, and time between their clocks.
 
 The velocity by Doppler changes as the accelerometer says, once both are turned into one frame by the gyroscope. With R the
 rotation from the IMU's axes to the radar's, Q(t) that of the IMU since the beginning, and v the velocity of the radar in its
@@ -15,36 +14,100 @@ the time between the clocks. Gauss and Newton's method ends it.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from radarsdf.io.imu import Imu
-from radarsdf.poses.by_doppler import SensorVelocities
-from radarsdf.poses.gyroscope import FIRST_BIAS_RAD_S
-from radarsdf.poses.imu_motion import ImuMotion
-from radarsdf.poses.rigid import Floats, nearest_rotation, rotation, skew
+from radarsdf.poses.doppler import SensorVelocities
+from radarsdf.poses.gyroscope import FIRST_BIAS_RAD_S, Gyroscope, UnalignedGyroscope
+from radarsdf.poses.rigid import Floats, covariance_in, nearest_rotation, rotation, skew
 
-_WINDOW_S, _WINDOW_SCANS = (
-    4.0,
-    10,
-)  # of a window, at least: longer ones gave the real walk the same rotation, to 0.5 degrees
+# Of a window, at least: longer ones gave the real walk the same rotation, to 0.5 degrees.
+_WINDOW_S, _WINDOW_SCANS = 4.0, 10
 _LATEST_S, _LATE_STEP_S = 0.5, 0.02  # times between the clocks that are tried
 _UNRELATED_S = 2.0  # from here on, the motions that are compared have nothing to do with each other
 _UNRELATED = 60  # such times that are tried: none must fit as well
 _LEFT = 4.0  # times their variance, that velocities may differ from what the IMU says: 0.1 to 0.5 where it is right
 _KNOWN_RAD = 0.1  # standard deviation of a rotation that is of use
-_SEGMENTS, _SEGMENT_S = (
-    64,
-    10.0,
-)  # parts of a drive with biases of their own: at most so many, at least so long
+# Parts of a drive with biases of their own: at most so many, at least so long.
+_SEGMENTS, _SEGMENT_S = 64, 10.0
 _BIAS_CHANGE_RAD_S = 1e-3  # from one of them to the next: of cheap gyroscopes, over minutes
 _FORCE_BIAS, _LEVER_M = 0.2, 0.3  # deviations of the accelerometer's bias, m/s², and of the lever
 _ITERATIONS, _SETTLED = 20, 1e-4
 _MOST_SCANS = 20_000  # that tell it: of longer drives, every second, third … window
 _MEDIAN = 2.366  # of a chi-squared variable of three
 _ROBUST = 3.0  # deviations from which on a velocity counts less
+
+# Half of the time, nothing that a radar is mounted on turns faster, or is accelerated more: a turn a second, three times gravity.
+_MOST_RAD_S, _MOST_MPS2 = 6.0, 30.0
+
+
+@dataclass(frozen=True)
+class ImuMotion:
+    """The motion of an IMU, integrated."""
+
+    times_s: Floats
+    rates: Floats
+    """(G, 3) rad/s without bias."""
+    forces: Floats
+    """(G, 3) m/s² without bias, in its axes."""
+    turns: Floats
+    """(G, 3, 3) to the frame of the first time."""
+
+    @classmethod
+    def of(cls, imu: Imu, rate_bias: Floats, force_bias: Floats) -> ImuMotion:
+        assert imu.specific_force is not None
+        parts = len(rate_bias)
+        elapsed = imu.times_s - imu.times_s[0]
+        part = np.minimum((elapsed / max(elapsed[-1], 1e-9) * parts).astype(np.int64), parts - 1)
+        rates = imu.angular_velocity - rate_bias[part]
+        durations = np.diff(imu.times_s)[:, None]
+        turns = cumulated(0.5 * (rates[1:] + rates[:-1]) * durations)
+        return cls(imu.times_s, rates, imu.specific_force - force_bias, turns)
+
+    def integral(self, values: Floats) -> Floats:
+        """Of values (G, …) over time, by the trapezoidal rule."""
+        found = np.zeros_like(values)
+        durations = np.diff(self.times_s).reshape(-1, *[1] * (values.ndim - 1))
+        np.cumsum(0.5 * (values[1:] + values[:-1]) * durations, axis=0, out=found[1:])
+        return found
+
+    def at(self, values: Floats, times_s: Floats) -> Floats:
+        """Values (G, …) at times between."""
+        after = np.clip(np.searchsorted(self.times_s, times_s), 1, len(self.times_s) - 1)
+        width = self.times_s[after] - self.times_s[after - 1]
+        share = np.where(width > 0, (times_s - self.times_s[after - 1]) / np.maximum(width, 1e-12), 1.0)
+        share = np.clip(share, 0, 1).reshape(-1, *[1] * (values.ndim - 1))
+        found: Floats = values[after - 1] + share * (values[after] - values[after - 1])
+        return found
+
+    def turns_at(self, times_s: Floats) -> Floats:
+        """(F, 3, 3) rotations at times between."""
+        after = np.clip(np.searchsorted(self.times_s, times_s), 1, len(self.times_s) - 1)
+        left = (times_s - self.times_s[after - 1])[:, None]
+        small = Rotation.from_rotvec(self.rates[after - 1] * left).as_matrix()
+        found: Floats = np.einsum("fij,fjk->fik", self.turns[after - 1], small)
+        return found
+
+
+def cumulated(turns: Floats) -> Floats:
+    """(N + 1, 3, 3) products of rotation vectors (N, 3), the identity first: where a body is that turns so, step after step."""
+    count = len(turns) + 1
+    width = int(np.ceil(np.sqrt(count)))
+    padded = np.zeros((width * width, 3))
+    padded[1:count] = turns
+    found: Floats = Rotation.from_rotvec(padded).as_matrix().reshape(width, width, 3, 3)
+    # Rows side by side, then one row after another: few steps of many products each.
+    for k in range(1, width):
+        found[:, k] = np.einsum("rij,rjk->rik", found[:, k - 1], found[:, k])
+    for row in range(1, width):
+        found[row] = np.einsum("ij,kjl->kil", found[row - 1, -1], found[row])
+    return found.reshape(-1, 3, 3)[:count]
 
 
 @dataclass(frozen=True)
@@ -311,3 +374,73 @@ def _fitted(imu: Imu, velocities: SensorVelocities, times_s: Floats, state: _Sta
         imu.times_s + state.late_s,
         up / np.linalg.norm(up, axis=1, keepdims=True),
     )
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """What is used of it."""
+
+    gyroscope: Gyroscope | None
+    """None: there is none, or it is not used."""
+    alignment: ImuAlignment | None = None
+    """How the IMU sits on the radar, by its accelerometer and Doppler. None: they do not tell."""
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls, imu: Imu | None, velocities: SensorVelocities | None, times_s: Floats, begin_s: float
+    ) -> Inertial:
+        """Of scans at `times_s` (F,) after `begin_s`, in the clock of the IMU."""
+        if imu is None:
+            return cls(None)
+        if (why := implausible_rates(imu.angular_velocity, velocities)) is not None:
+            return cls(None).without(why)
+        imu = dataclasses.replace(imu, times_s=imu.times_s - begin_s)
+        if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
+            note = "The IMU is not used: it measured before or after all scans. Are both times of one clock?"
+            return cls(None, notes=(note,))
+        alignment = None if velocities is None else ImuAlignment.of(imu, velocities, times_s)
+        if alignment is not None:
+            measured = (alignment.angular_velocity, alignment.times_s)
+            return cls(Gyroscope.of(*measured, times_s, alignment.bias_rad_s), alignment)
+        R = imu.R_sensor_imu
+        rates = imu.angular_velocity if R is None else np.einsum("ij,gj->gi", R, imu.angular_velocity)
+        return cls((UnalignedGyroscope if R is None else Gyroscope).of(rates, imu.times_s, times_s))
+
+    def without(self, why: object) -> Inertial:
+        """Not used, and why."""
+        note = f"The gyroscope is not used: {why}."
+        return Inertial(None, notes=(*self.notes, note))
+
+    @property
+    def report(self) -> dict[str, Any] | None:
+        """For the report of the poses. None: nothing was aligned."""
+        if self.alignment is None:
+            return None
+        names = ("R_sensor_imu", "sigma_rad", "late_s", "lever_m")
+        values = ((name, getattr(self.alignment, name)) for name in names)
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values}
+
+
+def implausible_rates(angular_velocity: Floats, velocities: SensorVelocities | None) -> str | None:
+    """Why rates (G, 3) cannot be in rad/s. None: they can."""
+    rate = float(np.median(np.linalg.norm(angular_velocity, axis=1)))
+    speed_mps = 0.0 if velocities is None else velocities.usual_mps
+    if rate <= _MOST_RAD_S and rate * speed_mps <= _MOST_MPS2:
+        return None
+    across = f", {rate * speed_mps:.0f} m/s² across the trajectory at {speed_mps:.1f} m/s" * (speed_mps > 0)
+    return f"the median of its rates is {rate:.3g} rad/s{across}. They may be in deg/s: give rad/s"
+
+
+def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
+    """Poses (F, 4, 4) and covariances (F, 6, 6) in a world whose z axis points up, by `up` (F, 3) in the frame of the radar.
+
+    The first position stays at the origin; the world is turned no further than it takes.
+    """
+    now = np.einsum("fij,fj->i", poses[:, :3, :3], up)
+    turn, _ = Rotation.align_vectors([[0, 0, 1.0]], [now])
+    if now[2] < 0 and np.hypot(now[0], now[1]) < 1e-9 * -now[2]:
+        turn = Rotation.from_rotvec([np.pi, 0, 0])  # upside down: any axis would do
+    R, found = turn.as_matrix(), poses.copy()
+    found[:, :3] = np.einsum("ij,fjk->fik", R, poses[:, :3])
+    return found, covariance_in(covariance, R)
