@@ -9,7 +9,7 @@ import shutil
 import pytest
 import radarsdf
 import trimesh
-from radarsdf.tiles import cluster
+from radarsdf.tiles import tasks
 
 from .calls import call, refusal, values
 
@@ -94,6 +94,6 @@ def test_a_tile_that_is_not_in_the_plan(city, capsys, tmp_path):
 
 def test_no_cluster(city, capsys, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(tasks, "_CONNECT_S", 0.5)
     words = ["tiles", "fit", city, "--cluster", "tcp://127.0.0.1:9"]
     assert "127.0.0.1:9" in refusal(capsys, tmp_path, *words)

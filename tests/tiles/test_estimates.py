@@ -10,9 +10,8 @@ from radarsdf import FitConfig
 from radarsdf.budget.estimate import estimate_rays
 from radarsdf.io import Scan
 from radarsdf.tiles.fit_tiles import plan_tiles
-from radarsdf.tiles.plan import Plan
-from radarsdf.tiles.ray_files import read_rays
-from radarsdf.tiles.tile_fit import report_of
+from radarsdf.tiles.plan import Plan, report_of
+from radarsdf.tiles.planning import read_rays
 
 
 def test_a_tile_of_two_returns_makes_no_other_one_larger(drive, tmp_path):

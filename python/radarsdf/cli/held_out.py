@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.map.map import Map
 from radarsdf.returns.movers import rays_as_measured
-from radarsdf.tiles.any_map import predicted
+from radarsdf.tiles.tiled_map import predicted
 
 if TYPE_CHECKING:
     from radarsdf.cli.results import Results

@@ -30,7 +30,7 @@ def is_map(path: Path) -> bool:
 
 def load_map(path: Path) -> Map:
     """Read a map. Tiles that are missing are said on standard error."""
-    from radarsdf.tiles.any_map import lacking, load
+    from radarsdf.tiles.tiled_map import lacking, load
 
     radar_map = load(path)
     if tiles := lacking(radar_map):

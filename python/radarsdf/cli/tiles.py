@@ -169,8 +169,8 @@ def _without_intensities(scan: Any) -> Any:
 def _executor(options: argparse.Namespace, folder: Path) -> AbstractContextManager[Executor | None]:
     """What runs the tasks. None: this process."""
     if options.cluster is not None:
-        from radarsdf.tiles.cluster import cluster_executor
         from radarsdf.tiles.plan import Plan
+        from radarsdf.tiles.tasks import cluster_executor
 
         plan = Plan.load(folder)
         return cluster_executor(options.cluster, max(tile.memory_bytes for tile in plan.tiles))
@@ -253,8 +253,7 @@ def _say_plan(results: Results, plan: Plan, folder: Path) -> None:
 
 def _status(results: Results, folder: Path, names: list[str] | None) -> int:
     """Name the tiles that are not done, of all or of these `names`. The exit status is 1 if there are any."""
-    from radarsdf.tiles.plan import Plan, failure_of
-    from radarsdf.tiles.tile_fit import is_done
+    from radarsdf.tiles.plan import Plan, failure_of, is_done
 
     plan = Plan.load(folder)
     missing = {}

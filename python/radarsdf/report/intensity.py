@@ -13,7 +13,7 @@ from radarsdf.report.page import Section, Sentence, grid, image, note, paragraph
 from radarsdf.report.subject import Subject
 from radarsdf.returns.movers import rays_as_measured
 from radarsdf.returns.rays import Rays
-from radarsdf.tiles.any_map import predicted
+from radarsdf.tiles.tiled_map import predicted
 
 _Floats = NDArray[np.float64]
 
