@@ -104,8 +104,8 @@ class _OnDisk:
         if "points" not in arrays:
             msg = f"{self.path} is not a scan of this map"
             raise ValueError(msg)
-        columns: list[Any] = [arrays.get(name) for name in FIELDS]
-        return LoggedScan(self.pose, *columns, self.time_s)
+        columns: dict[str, Any] = {name: arrays.get(name) for name in FIELDS}
+        return LoggedScan(self.pose, **columns, time_s=self.time_s)
 
 
 class SealedScan(ValueError):
@@ -344,7 +344,7 @@ def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> dict[Sca
         msg = "the origin is missing"
         raise ValueError(msg)
     check_arrays(arrays, {"counts": (np.int64, len(described.held)), "times_s": (np.float64, len(ids))})
-    poses = check_poses(arrays["poses"], len(ids)) if ids else []
+    poses = check_poses(arrays["poses"], len(ids)) if ids else np.zeros((0, 4, 4))
     columns = {name: _by_scan(arrays, name, described.held) for name in FIELDS}
     scans: dict[ScanId, LoggedScan] = {}
     for i, (scan_id, pose, time_s) in enumerate(zip(ids, poses, arrays["times_s"].tolist(), strict=True)):
@@ -353,7 +353,8 @@ def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> dict[Sca
             if (column := columns[name][i]) is not None:
                 check_values_of_scan(column, points, name, i)
         known_s = time_s if np.isfinite(time_s) else None
-        scans[scan_id] = LoggedScan(pose.copy(), *(columns[name][i] for name in FIELDS), known_s)
+        own = {name: column[i] for name, column in columns.items()}
+        scans[scan_id] = LoggedScan(pose.copy(), **own, time_s=known_s)
     return scans
 
 

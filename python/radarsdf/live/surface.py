@@ -28,7 +28,7 @@ from radarsdf.live.regions import (
 )
 from radarsdf.live.triangles import GrowingTriangles, Triangles
 from radarsdf.returns.cells import merged_keys
-from radarsdf.returns.evidence import BLOCK_BITS, Looks, ReturnsOfCells, sums_round
+from radarsdf.returns.evidence import BLOCK_BITS, Looks, sums_round
 from radarsdf.returns.gaps import bridged
 from radarsdf.returns.mean_rays import MeanRays
 from radarsdf.returns.noise import SensorNoise
@@ -206,12 +206,11 @@ class GrowingSurface:
         centre = regions_of(reached)
         # Bridges depend on medians of blocks of 32 cells, and on their two ends.
         own, around = regions_near(centre, 2), regions_near(centre, 3)
-        returns = self._true_returns(around, noise)
+        means, normals = self._true_returns(around)
         before = self.distances.gather(around)["keys"]
-        crossed = self._find_crossed(centre, around, returns.means, num_threads)
-        found = bridged(
-            crossed, returns.told.keys, returns.told.counts, config.encoding.bridge_cells, num_threads
-        )
+        crossed = self._find_crossed(centre, around, means, num_threads)
+        counts = means.counts.astype(np.float64)
+        found = bridged(crossed, means.keys, counts, config.encoding.bridge_cells, num_threads)
         # At the rim of what was gathered, bridges lack an end.
         leaf_keys = np.concatenate(
             [found[np.isin(found >> REGION_BITS, own)], before[~np.isin(before >> REGION_BITS, own)]]
@@ -221,19 +220,19 @@ class GrowingSurface:
         reached = np.union1d(reached, cubes_near(came_or_went, _BLOCK_CELLS, 1))
         there = regions_of(np.union1d(leaf_keys, before))
         redone = np.intersect1d(regions_of(cubes_near(reached, _LARGE_CELLS, cells_smoothed(config))), there)
-        near = regions_near(
-            redone, 1
-        )  # all that has a part in what their corners get: smoothing reaches no farther
+        # All that has a part in what their corners get: smoothing reaches no farther.
+        near = regions_near(redone, 1)
         leaf_keys = leaf_keys[np.isin(leaf_keys >> REGION_BITS, near)]
-        rows = self._distances_of(leaf_keys, redone, returns.within(near), num_threads)
+        here = np.isin(means.keys >> REGION_BITS, near)
+        rows = self._distances_of(leaf_keys, redone, means.select(here), normals[here], noise, num_threads)
         self.distances.put(redone, rows)
         return redone
 
-    def _true_returns(self, regions: Keys, noise: SensorNoise) -> _TrueReturns:
+    def _true_returns(self, regions: Keys) -> tuple[MeanRays, NDArray[np.float32]]:
+        """Mean rays and normals of the leaf cells in these regions whose returns are no ghosts: what distances are made of."""
         leaves, cells = self._leaves.gather(regions), self._cells.gather(regions)
         is_true = ~cells["ghosts"][CellBlocks(cells["keys"]).rows(merged_keys(leaves["keys"]), 1)]
-        means = means_of(leaves).select(is_true)
-        return _TrueReturns(means, leaves["normals"][is_true], told_by(means, noise, self._config.returns))
+        return means_of(leaves).select(is_true), leaves["normals"][is_true]
 
     def _find_crossed(self, regions: Keys, around: Keys, means: MeanRays, num_threads: int) -> Keys:
         """Keys of the leaf cells in `around` that rays cross near their returns: found anew in `regions`."""
@@ -243,20 +242,27 @@ class GrowingSurface:
         found: Keys = self._crossed.gather(around)["keys"]
         return found
 
-    def _distances_of(self, leaf_keys: Keys, regions: Keys, returns: _TrueReturns, num_threads: int) -> Rows:
-        """Columns of the leaf cells in these regions. `leaf_keys`, `returns`: of these and of the regions round them."""
+    def _distances_of(
+        self,
+        leaf_keys: Keys,
+        regions: Keys,
+        means: MeanRays,
+        normals: NDArray[np.float32],
+        noise: SensorNoise,
+        num_threads: int,
+    ) -> Rows:
+        """Columns of the leaf cells in these regions. `leaf_keys`, `means`, `normals`: of these and of the regions round them."""
         config = self._config
         own = np.isin(leaf_keys >> REGION_BITS, regions)
+        told = told_by(means, noise, config.returns)
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
-        distances_m = average_at_vertices(
-            table, returns.means, returns.told, returns.normals, config, num_threads
-        )
+        distances_m = average_at_vertices(table, means, told, normals, config, num_threads)
         # As the field's features hold it.
         distances_m = distances_m / np.float32(config.sigma_m) * np.float32(config.sigma_m)
         _, vertices = table.leaf_vertices()
         values = distances_m[vertices[own]]
         crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)
-        information, detections = sums_round(returns.told, leaf_keys[own], num_threads)
+        information, detections = sums_round(told, leaf_keys[own], num_threads)
         return {
             "keys": leaf_keys[own],
             "values": values,
@@ -264,16 +270,3 @@ class GrowingSurface:
             "information": information,
             "detections": detections,
         }
-
-
-@dataclass(frozen=True)
-class _TrueReturns:
-    """Leaf cells whose returns are no ghosts, in the order of their keys: what distances are made of."""
-
-    means: MeanRays
-    normals: NDArray[np.float32]
-    told: ReturnsOfCells
-
-    def within(self, regions: Keys) -> _TrueReturns:
-        here = np.isin(self.means.keys >> REGION_BITS, regions)
-        return _TrueReturns(self.means.select(here), self.normals[here], self.told.select(here))
