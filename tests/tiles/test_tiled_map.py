@@ -56,19 +56,6 @@ def test_no_step_between_tiles(city, points, offset_m):
     assert np.median(np.abs(after - before)) < 0.01
 
 
-def test_the_gradient_is_that_of_the_blended_distance(city, points):
-    # Inside a cell, the field of a quick map is trilinear, and so is that of each tile.
-    near = near_borders(points) + [0.05, 0.03, 0.02]
-    near = near[city.observed(near)]
-    step = 1e-3
-    expected = np.stack([
-        (city.sdf(near + step * axis) - city.sdf(near - step * axis)) / (2 * step) for axis in np.eye(3)
-    ], axis=1)  # fmt: skip
-    error = np.linalg.norm(city.gradient(near) - expected, axis=1)
-    assert np.median(error) < 0.01
-    assert np.quantile(error, 0.9) < 0.1
-
-
 def test_little_memory_gives_the_same_bits(folder, city, points):
     small = TiledMap(folder, memory_bytes=1)
     np.testing.assert_array_equal(small.sdf(points), city.sdf(points))
